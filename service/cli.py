@@ -98,7 +98,7 @@ def _log_to_stderr() -> None:
     # nothing is set up here where lines are JSON: the console did
     logging.basicConfig(format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     logging.getLogger().setLevel(logging.INFO)
-    # each names an odd request of a client; whoever sends them is not to fill the log
+    # each names an odd request; a client that sends many must not fill the log
     for chatty in ("alembic", "python_multipart"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
 
@@ -134,7 +134,7 @@ def serve(
 ) -> None:
     """Answer REST requests and the web page, with a job driver and a cluster beside it."""
     with Console(as_json=as_json) as console, _service_errors():
-        from service.supervisor import serve as serve_until_told
+        from service.supervisor import serve as serve_until_stopped
 
         _log_to_stderr()
         settings = _settings(
@@ -160,7 +160,7 @@ def serve(
             console.status(f"gablework listens on {url}")
             console.document({"url": url, "state": str(settings.state)})
 
-        serve_until_told(settings, on_ready, with_driver=driver)
+        serve_until_stopped(settings, on_ready, with_driver=driver)
 
 
 @app.command(name="driver")

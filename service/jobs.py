@@ -211,4 +211,4 @@ class Upload:
     created_at: dt.datetime
     expires_at: dt.datetime
     preflight: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """What the header tells: format, CRS, points, bounds, density, warnings."""
+    """Facts from the header: format, CRS, points, bounds, density, warnings."""

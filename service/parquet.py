@@ -1,4 +1,4 @@
-"""GeoParquet from strangers: what a file holds, told by decoding it once, piece by piece, and keeping nothing.
+"""Checks a GeoParquet file of a stranger: decodes it once, piece by piece, and keeps nothing.
 
 A few bytes of Parquet can stand for millions of rows, and one long text for as many copies of itself: sizes in the
 footer do not tell. So the columns that will be read are decoded here, by the child with little memory and little time
@@ -55,7 +55,7 @@ def parquet_facts(path: Path) -> tuple[int, str, dict[str, Any] | None]:
             about = geometry_column(path, file.schema_arrow)
             if about.encoding != "WKB" and about.encoding not in DEPTHS:
                 raise UnreadableInputError(str(path), f"its geometries are encoded as {about.encoding[:40]!r}", FIX)
-            crs = None if about.crs is None else _told_crs(path, about.crs)
+            crs = None if about.crs is None else _crs_of(path, about.crs)
             rows = file.metadata.num_rows
             if rows == 0:
                 raise EmptyInputError(str(path), "it has no rows", "Give polygons of buildings")
@@ -104,8 +104,8 @@ def _plain(path: Path, column: pa.Array) -> pa.Array:
     return column
 
 
-def _told_crs(path: Path, text: str) -> dict[str, Any]:
-    """Name and code of a CRS, from its text alone where that tells them."""
+def _crs_of(path: Path, text: str) -> dict[str, Any]:
+    """Name and code of a CRS, from its text alone if it has them."""
     crs = checked_crs(text, path=str(path))
     code = CODE.fullmatch(text.strip())
     identity = json.loads(text).get("id") if text.lstrip().startswith("{") else None

@@ -170,7 +170,7 @@ class Supervisor:
 
 
 class _Server(uvicorn.Server):
-    """A server that tells when it listens, and everybody when it is to end."""
+    """A server that reports when it listens, and when it must end."""
 
     def __init__(
         self, config: uvicorn.Config, app: FastAPI, *, on_ready: Callable[[], None], on_exit: Callable[[], None]

@@ -73,7 +73,7 @@ def examine_vector(path: Path) -> dict[str, Any]:
     if suffix == ".shp":
         if not head.startswith(SHAPE_MAGIC):
             raise UnreadableInputError(str(path), f"not a Shapefile: it begins with {head[:4]!r}", FIX)
-        return _told("shapefile", None, None, None, [])
+        return _facts("shapefile", None, None, None, [])
     if suffix == ".gpkg":
         if not head.startswith(SQLITE_MAGIC) or head[68:72] not in APPLICATION_IDS:
             raise UnreadableInputError(str(path), f"not a GeoPackage: it begins with {head[:16]!r}", FIX)
@@ -82,11 +82,11 @@ def examine_vector(path: Path) -> dict[str, Any]:
         from service.parquet import parquet_facts
 
         rows, column, crs = parquet_facts(path)
-        return _told("geoparquet", rows, [column], crs, [])
+        return _facts("geoparquet", rows, [column], crs, [])
     return _geojson(path, head)
 
 
-def _told(
+def _facts(
     kind: str, count: int | None, layers: list[str] | None, crs: dict[str, Any] | None, problems: list[str]
 ) -> dict[str, Any]:
     return {
@@ -154,14 +154,16 @@ def _contents(path: Path, database: sqlite3.Connection) -> dict[str, Any]:
         _check_table(path, database, str(row[0]))
     layers = [str(row[0]) for row in found]
     if len(found) != 1:
-        return _told("geopackage", None, layers, None, [f"{len(found)} layers could be the footprints: give one"])
+        return _facts(
+            "geopackage", None, layers, None, [f"{len(found)} layers could be the footprints: give one"]
+        )
     table = layers[0].replace('"', '""')
     count = int(database.execute(f'SELECT count(*) FROM "{table}"').fetchone()[0])  # noqa: S608 - quoted; SQLite takes no names as parameters
     if count == 0:
         raise EmptyInputError(str(path), f"layer {layers[0][:60]!r} has no features", FIX)
     _, _, name, organization, code = found[0]
     crs = None if name is None else {"name": str(name)[:200], "epsg": int(code) if organization == "EPSG" else None}
-    return _told("geopackage", count, layers, crs, [])
+    return _facts("geopackage", count, layers, crs, [])
 
 
 def _check_table(path: Path, database: sqlite3.Connection, name: str) -> None:
@@ -199,7 +201,7 @@ def _geojson(path: Path, head: bytes) -> dict[str, Any]:
     name = named[1].decode() if named else "WGS 84 (CRS84)"
     code = re.search(r"EPSG:(?:[\d.]*:)?(\d{4,6})$", name)
     crs = {"name": name, "epsg": int(code[1]) if code else None}
-    return _told("geojson", max(count, 1), None, crs, [])
+    return _facts("geojson", max(count, 1), None, crs, [])
 
 
 def _levels(path: Path) -> Iterator[tuple[tuple[int, int, int], int]]:

@@ -1,21 +1,21 @@
 r"""Cron times in a time zone.
 
-Five fields, as in Debian's cron (`man 5 crontab`): minute, hour, day of the month, month, day of the week. Beside `*`,
-lists, ranges, steps and names of months and days there are `L` (the month's last day), `LW` (its last weekday), `5L`
-(its last Friday) and `MON#2` (its second Monday). Where neither field of days starts with a star, a day that fits one
-of them counts; else it must fit both.
+Five fields, as in Debian's cron (`man 5 crontab`): minute, hour, day of the month, month, day of the week. It has `*`,
+lists, ranges, steps, names of months and days, `L` (the last day of the month), `LW` (its last weekday), `5L` (its last
+Friday) and `MON#2` (its second Monday). If neither field of days starts with a star, a day must fit one of them;
+otherwise both.
 
-Clocks that are put forward and back
-------------------------------------
+Clock changes
+-------------
 As in Debian's cron there are two kinds of expression:
 
-- *Fixed times* have no star at the start of minute and hour (`30 2 * * *`). A local time that the clock leaps over
-  comes at the first minute after the gap; several that fall into one gap come once. A local time that comes twice
-  counts the first time only. So there is exactly one run a day where one was meant.
-- *Wildcards* have a star at the start of one of the two (`*/15 * * * *`, `0 */6 * * *`). They follow the clock on the
-  wall: what it leaps over does not come, what comes twice runs twice. So the distance in time stays the same.
+- *Fixed times* have no star at the start of minute and hour (`30 2 * * *`). A local time that the clock skips comes at
+  the first minute after the gap; several in one gap come once. A local time that exists twice counts only the first
+  time. A daily time therefore comes exactly once a day.
+- *Wildcards* have a star at the start of one of the two (`*/15 * * * *`, `0 */6 * * *`). They follow the local clock: a
+  skipped time does not come, a repeated one comes twice. The interval therefore stays the same.
 
-`*/30 2 * * *` is of the second kind: it does not come at all on the day on which there is no hour 2.
+`*/30 2 * * *` is of the second kind: it does not come on the day without an hour 2.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from pipeline.errors import SettingsError
 from pipeline.schedule.time_zones import time_zone
 
 LONGEST = 200
-"""Characters of an expression."""
+"""Most characters of an expression."""
 
 WORDS: Mapping[str, str] = {
     "@hourly": "0 * * * *",
@@ -42,7 +42,7 @@ WORDS: Mapping[str, str] = {
     "@yearly": "0 0 1 1 *",
     "@annually": "0 0 1 1 *",
 }
-"""Words that stand for five fields."""
+"""Words for five fields."""
 
 FIELDS: Mapping[str, str] = {
     "minute": "0 to 59",
@@ -51,22 +51,22 @@ FIELDS: Mapping[str, str] = {
     "month": "1 to 12 or JAN to DEC",
     "day-of-week": "0 to 7 (0 and 7 are Sunday) or SUN to SAT, with L or #1 to #5 behind it",
 }
-"""The fields in their order, and what they take."""
+"""The fields in their order, and their values."""
 
 _MINUTE = dt.timedelta(minutes=1)
 _PROBE = dt.datetime(2000, 1, 1)  # noqa: DTZ001 - the calendar has no time zone
-"""Where it is tried whether an expression ever comes: within the 50 years after this each 29 February falls on each day
-of the week."""
+"""Start of the test whether an expression ever comes: in the 50 years from here 29 February falls on every day of the
+week."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Cron:
-    """An expression in a time zone; checked when it is made.
+    """An expression in a time zone, checked at construction.
 
     Raises
     ------
     SettingsError
-        The expression, the time zone, or both cannot be used.
+        The expression, the time zone or both are not valid.
 
     >>> Cron("30 2 * * *", "Europe/Amsterdam").next_time(dt.datetime(2026, 3, 29, tzinfo=dt.UTC)).isoformat()
     '2026-03-29T03:00:00+02:00'
@@ -75,7 +75,7 @@ class Cron:
     expression: str
     """Five fields, or one of `WORDS`."""
     time_zone: str
-    """A name of the IANA database; `UTC` where nothing else is said."""
+    """A name of the IANA database, such as `UTC`."""
 
     def __post_init__(self) -> None:
         faults = expression_faults(self.expression)
@@ -93,12 +93,12 @@ class Cron:
 
     @property
     def is_wildcard(self) -> bool:
-        """Whether it follows the clock on the wall, where that is put forward and back."""
+        """Whether it follows the local clock through clock changes."""
         minute, hour = self.fields.split()[:2]
         return minute.startswith("*") or hour.startswith("*")
 
     def times(self, after: dt.datetime) -> Iterator[dt.datetime]:
-        """All times after a time, in the time zone; each later than the one before it.
+        """All times after a time, in the time zone and in order.
 
         Parameters
         ----------
@@ -141,12 +141,12 @@ class Cron:
         return [at for at, _ in zip(self.times(after), range(count), strict=False)]
 
 
-# The library walks over the calendar without a time zone; which times on the wall exist, and how often, is told here.
+# The library walks over the calendar without a time zone; this code decides which local times exist, and how often.
 # (With one it loses times where clocks are shifted by half an hour.)
 
 
 def _fixed_times(fields: str, start: dt.datetime, zone: dt.tzinfo) -> Iterator[dt.datetime]:
-    """Each time on the wall once, in UTC: the first of two, or the end of the gap that it falls into."""
+    """Each local time once, in UTC: the first of two, or the end of its gap."""
     for wall in CronSim(fields, start.replace(tzinfo=None)):
         real = wall
         while not (found := _instants(real, zone)):
@@ -155,15 +155,15 @@ def _fixed_times(fields: str, start: dt.datetime, zone: dt.tzinfo) -> Iterator[d
 
 
 def _wildcard_times(fields: str, start: dt.datetime, zone: dt.tzinfo) -> Iterator[dt.datetime]:
-    """Each time on the wall as often as it comes, in UTC and in order."""
+    """Each local time as often as it exists, in UTC and in order."""
     wall_start = start.replace(tzinfo=None)
     both = [start.replace(fold=fold).utcoffset() or dt.timedelta() for fold in (0, 1)]
-    # what lies before the start in an hour that comes twice may come again
+    # times before the start, in an hour that exists twice, may come again
     held: list[dt.datetime] = []
     for wall in CronSim(fields, wall_start - abs(both[1] - both[0])):
         found = _instants(wall, zone)
         if found:
-            # nothing that follows comes before the first time of this one
+            # no later local time comes before the first instant of this one
             while held and held[0] < found[0]:
                 yield heapq.heappop(held)
             for at in found:
@@ -173,7 +173,7 @@ def _wildcard_times(fields: str, start: dt.datetime, zone: dt.tzinfo) -> Iterato
 
 
 def _instants(wall: dt.datetime, zone: dt.tzinfo) -> list[dt.datetime]:
-    """When a clock on the wall shows a time, in UTC: once, twice, or never."""
+    """The instants of a local time, in UTC: one, two or none."""
     found = [wall.replace(tzinfo=zone, fold=fold).astimezone(dt.UTC) for fold in (0, 1)]
     if found[0] == found[1]:
         return found[:1]
@@ -181,37 +181,37 @@ def _instants(wall: dt.datetime, zone: dt.tzinfo) -> list[dt.datetime]:
 
 
 def expression_faults(expression: str) -> list[str]:
-    """What is wrong with an expression, in a sentence each; empty where nothing is."""
-    told = f"cron is {expression[:80]!r}"
+    """The faults of an expression, one sentence each."""
+    shown = f"cron is {expression[:80]!r}"
     if len(expression) > LONGEST:
-        return [f"{told}... with {len(expression)} characters: use at most {LONGEST}"]
+        return [f"{shown}... with {len(expression)} characters: use at most {LONGEST}"]
     parts = _fields_of(expression).split()
     if expression.strip().startswith("@") and expression.strip().lower() not in WORDS:
-        return [f"{told}: use one of {', '.join(WORDS)}, or five fields"]
+        return [f"{shown}: use one of {', '.join(WORDS)}, or five fields"]
     if len(parts) != len(FIELDS):
-        return [f"{told} with {len(parts)} fields: use five, {', '.join(FIELDS)}, such as '30 2 * * *'"]
+        return [f"{shown} with {len(parts)} fields: use five, {', '.join(FIELDS)}, such as '30 2 * * *'"]
     faults = [
-        f"{told}: its {name} is {part[:40]!r}, use {allowed}{_about_ranges(part)}"
+        f"{shown}: its {name} is {part[:40]!r}, use {allowed}{_about_ranges(part)}"
         for (name, allowed), part, place in zip(FIELDS.items(), parts, range(len(parts)), strict=True)
         if not _is_usable(" ".join("*" * place) + f" {part} " + " ".join("*" * (len(FIELDS) - 1 - place)))
     ]
     if not faults and not _comes(" ".join(parts)):
-        faults.append(f"{told}: no such day ever comes, use a day that the month has")
+        faults.append(f"{shown}: this date never occurs; use a day that the month has")
     return faults
 
 
 def _fields_of(expression: str) -> str:
-    """The five fields that an expression stands for."""
+    """The five fields of an expression or a word."""
     return WORDS.get(expression.strip().lower(), expression)
 
 
 def _about_ranges(part: str) -> str:
-    """What is easily overlooked about ranges."""
+    """A hint about ranges."""
     return "; a range goes up, and SUN is 0: write FRI,SAT,SUN for FRI-SUN" if "-" in part else ""
 
 
 def _is_usable(fields: str) -> bool:
-    """Whether the library reads them; a number of thousands of digits is no number to Python."""
+    """Whether the library can read them; Python refuses numbers of thousands of digits."""
     try:
         CronSim(fields, _PROBE)
     except (CronSimError, ValueError):
@@ -220,7 +220,7 @@ def _is_usable(fields: str) -> bool:
 
 
 def _comes(fields: str) -> bool:
-    """Whether there is any such time."""
+    """Whether there is such a time."""
     try:
         return next(CronSim(fields, _PROBE), None) is not None
     except CronSimError:

@@ -1,4 +1,4 @@
-"""Which times of a schedule have passed since it was last looked at."""
+"""Times of a schedule that have passed since the last look."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from collections.abc import Iterator
 from pipeline.schedule.cron import Cron
 
 MAX_COUNTED = 10_000
-"""Slots that are counted one by one: a week of every minute. Of a longer stretch only its ends are known."""
+"""Most slots that are counted, a week of every minute; of more only the first and the last ones are found."""
 
 _WINDOW = dt.timedelta(hours=1)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PassedSlots:
-    """Times that have passed, in UTC; a time that is due is called a slot."""
+    """Slots (times of a schedule) that have passed, in UTC."""
 
     latest: dt.datetime
     """The last of them."""
     earlier: int = 0
-    """How many came before it."""
+    """Number of slots before it."""
     first: dt.datetime | None = None
-    """The first of those before it; None where there are none."""
+    """The first slot before it; None if there is none."""
     before_latest: dt.datetime | None = None
-    """The last of those before it; None where there are none."""
+    """The last slot before it; None if there is none."""
     is_counted: bool = True
-    """Whether all were counted; else there are more than `earlier`."""
+    """Whether `earlier` is exact; otherwise there are more."""
 
 
 def passed_slots(cron: Cron, decided_until: dt.datetime, now: dt.datetime) -> PassedSlots | None:
@@ -37,16 +37,16 @@ def passed_slots(cron: Cron, decided_until: dt.datetime, now: dt.datetime) -> Pa
     Parameters
     ----------
     cron : Cron
-        When the schedule is due.
+        The times of the schedule.
     decided_until : datetime
-        Up to which time every slot was decided, this one included. With a time zone.
+        All slots up to this time, inclusive, are decided. With a time zone.
     now : datetime
         The present; a slot at this very time has passed. With a time zone.
 
     Returns
     -------
     PassedSlots or None
-        None where none has passed, also where the clock was put back.
+        None if none has passed, also after the clock was put back.
 
     >>> hour, at = dt.timedelta(hours=1), dt.datetime(2026, 1, 1, 0, 30, tzinfo=dt.UTC)
     >>> found = passed_slots(Cron("@hourly", "UTC"), at, at + 3 * hour)
@@ -66,7 +66,7 @@ def passed_slots(cron: Cron, decided_until: dt.datetime, now: dt.datetime) -> Pa
 
 
 def _ends_of_many(cron: Cron, first: dt.datetime, now: dt.datetime) -> PassedSlots:
-    """The last two are found from the end, looking back farther and farther."""
+    """Find the last two from the end, in windows that grow."""
     back = _WINDOW
     while True:
         near = list(_up_to(now, cron.times(now.astimezone(dt.UTC) - back)))
@@ -78,5 +78,5 @@ def _ends_of_many(cron: Cron, first: dt.datetime, now: dt.datetime) -> PassedSlo
 
 
 def _up_to(now: dt.datetime, times: Iterator[dt.datetime]) -> Iterator[dt.datetime]:
-    """In UTC: within one zone Python would compare the clock on the wall, which goes back in autumn."""
+    """Times up to now, compared in UTC: within one zone Python compares local times, which go back in autumn."""
     return itertools.takewhile(lambda at: at <= now.astimezone(dt.UTC), (at.astimezone(dt.UTC) for at in times))

@@ -44,7 +44,7 @@ def upgrade(connection: Connection) -> None:
     Parameters
     ----------
     connection : sqlalchemy.Connection
-        In a transaction that nobody else can be in at the same time; the caller commits.
+        In a transaction that excludes all other migrations; the caller commits.
     """
     config = _config()
     config.attributes["connection"] = connection

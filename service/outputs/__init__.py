@@ -1,7 +1,7 @@
 """A finished run, or a comparison of several, as outputs for download, and its buildings as pages of GeoJSON.
 
-The driver writes (`write_outputs`, `write_comparison_outputs`), the front end only reads: what it needs for a page of
-buildings lies ready in files, so that it loads no numerical library.
+The driver writes (`write_outputs`, `write_comparison_outputs`), the front end only reads. Pages of buildings are
+prepared in files, and the front end loads no numerical library.
 """
 
 from service.outputs.assemble import write_outputs

@@ -1,4 +1,4 @@
-"""Assembling the outputs of a finished run: one pass over its tiles, one tile in memory at a time."""
+"""Assembles the outputs of a finished run: one pass over its tiles, one tile in memory at a time."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from service.outputs.kinds import OUTPUTS, chosen
 
 if TYPE_CHECKING:
     from service.outputs.building_index import BuildingIndexFile
-    from service.outputs.footprints import FeatureCollectionFile, Way
+    from service.outputs.footprints import FeatureCollectionFile, Wgs84Transformation
     from service.outputs.merged_cityjson import MergedCityJson
     from service.outputs.merged_table import MergedTable
     from service.outputs.report import Tally
 
 Progress = Callable[[int, int], None]
-"""Gets the tiles that are done and all tiles; what it raises ends the work, and nothing half is left."""
+"""Gets the number of tiles done and of all tiles. An exception from it ends the work and leaves no partial file."""
 
 _TABLES = ("buildings", "planes", "rejected")
 
@@ -60,18 +60,18 @@ def write_outputs(
 ) -> None:
     """Write the outputs of a finished run, and the index of its buildings.
 
-    Every file gets its name when it is whole, the catalogue comes last; doing it again gives the same bytes. One tile
-    is in memory at a time.
+    Every file gets its name when it is complete, and the catalogue comes last. A repetition gives the same bytes. One
+    tile is in memory at a time.
 
     Parameters
     ----------
     run_dir : Path
         A run directory whose run ended.
     out_dir : Path
-        Folder to write into; made where it is missing.
+        Folder to write into; made if it is missing.
     wanted : sequence of str, optional
         Ids of `OUTPUTS`; all by default. The file of features and the index are always written: the service needs
-        them to answer for single buildings.
+        them for single buildings.
     on_progress : callable
         Gets tiles done and all tiles.
 
@@ -85,38 +85,38 @@ def write_outputs(
         The folder cannot be written.
     """
     from pipeline.io.storage import LocalStorage, sha256_of
-    from service.outputs.footprints import Way
+    from service.outputs.footprints import Wgs84Transformation
     from service.outputs.report import report, report_bytes
 
     names = {kind.output_id for kind in chosen(wanted)}
     manifest = _manifest(run_dir)
     tiles, failed_tiles = published_tiles(run_dir)
-    way = Way.of_run(manifest["crs"])
+    to_wgs84 = Wgs84Transformation.of_run(manifest["crs"])
     storage = LocalStorage(root=out_dir)
     with contextlib.ExitStack() as stack:
-        sinks = _Sinks(stack, storage, run_dir, tiles, names, way)
+        sinks = _Sinks(stack, storage, run_dir, tiles, names, to_wgs84)
         for done, tile in enumerate(tiles):
             on_progress(done, len(tiles))
             sinks.add(tile)
         tally = sinks.tally
     on_progress(len(tiles), len(tiles))
     if "report" in names:
-        found = report(manifest, tally, way.crs, failed_tiles, run_dir)
+        found = report(manifest, tally, to_wgs84.crs, failed_tiles, run_dir)
         storage.put(OUTPUTS["report"].filename, report_bytes(found))
     if tally.modelled and not any(tile.meshes for tile in tiles):
-        # the run was asked for none
+        # the run was requested without meshes
         names.discard("meshes")
         (out_dir / OUTPUTS["meshes"].filename).unlink(missing_ok=True)
     stored = {}
     for kind in chosen(names):
         path = out_dir / kind.filename
         stored[kind.output_id] = StoredOutput(size_bytes=path.stat().st_size, sha256=sha256_of(path))
-    catalogue = Catalogue(outputs=stored, crs=way.crs, n_buildings=tally.buildings)
+    catalogue = Catalogue(outputs=stored, crs=to_wgs84.crs, n_buildings=tally.buildings)
     storage.put(CATALOGUE_NAME, catalogue.to_json().encode())
 
 
 def _manifest(run_dir: Path) -> Mapping[str, Any]:
-    """What run.json holds, of a run that ended.
+    """The content of run.json of a run that ended.
 
     Raises
     ------
@@ -128,15 +128,15 @@ def _manifest(run_dir: Path) -> Mapping[str, Any]:
 
     status = read_manifest(run_dir).status
     if status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
-        raise RunError(f"{run_dir} is {status.value}: outputs are made of runs that ended")
+        raise RunError(f"{run_dir} is {status.value}: outputs are made only of runs that ended")
     found: Mapping[str, Any] = json.loads((run_dir / NAME).read_text(encoding="utf-8"))
     return found
 
 
 def published_tiles(run_dir: Path) -> tuple[list[RunTile], dict[str, str]]:
-    """The tiles of a run that own something, neighbours near one another, and why others failed.
+    """The tiles of a run that own something, in an order that keeps neighbours together, and errors of failed tiles.
 
-    A tile's state is the last thing that it writes, so what it lists is there.
+    A tile writes its state last, so the files that the state lists exist.
     """
     tiles, failed = [], {}
     for path in (run_dir / "state").glob("*.json"):
@@ -149,7 +149,7 @@ def published_tiles(run_dir: Path) -> tuple[list[RunTile], dict[str, str]]:
 
 
 def z_order(tile_key: str) -> int:
-    """Place of a tile on the Z-order curve: rows of a file that follow one another are near one another.
+    """Position of a tile on the Z-order curve: successive rows of a file are near each other.
 
     Examples
     --------
@@ -163,7 +163,7 @@ def z_order(tile_key: str) -> int:
 
 
 class _Sinks:
-    """What one pass over the tiles writes to."""
+    """The files that one pass over the tiles writes."""
 
     def __init__(
         self,
@@ -172,7 +172,7 @@ class _Sinks:
         run_dir: Path,
         tiles: Sequence[RunTile],
         names: set[str],
-        way: Way,
+        to_wgs84: Wgs84Transformation,
     ) -> None:
         from service.outputs.building_index import NAME as INDEX_NAME
         from service.outputs.building_index import BuildingIndexFile
@@ -186,7 +186,7 @@ class _Sinks:
             return path
 
         self._run_dir = run_dir
-        self._way = way
+        self._to_wgs84 = to_wgs84
         self.tally: Tally = Tally()
         self._headers = {tile.key: read_header(run_dir / tile.cityjson) for tile in tiles}
         self._tables: dict[str, MergedTable] = {}
@@ -194,7 +194,7 @@ class _Sinks:
             if name in names:
                 sources = [run_dir / tile.table(name) for tile in tiles]
                 self._tables[name] = stack.enter_context(
-                    MergedTable(file(OUTPUTS[name].filename), name, sources, way.projjson)
+                    MergedTable(file(OUTPUTS[name].filename), name, sources, to_wgs84.projjson)
                 )
         self._city: MergedCityJson | None = None
         if "cityjson" in names:
@@ -206,11 +206,11 @@ class _Sinks:
         self._index: BuildingIndexFile = stack.enter_context(BuildingIndexFile(file(INDEX_NAME)))
         stream = stack.enter_context(file(OUTPUTS["geojson"].filename).open("wb"))
         self._features: FeatureCollectionFile = stack.enter_context(
-            contextlib.closing(FeatureCollectionFile(stream, way.crs))
+            contextlib.closing(FeatureCollectionFile(stream, to_wgs84.crs))
         )
 
     def add(self, tile: RunTile) -> None:
-        """Write one tile to everything."""
+        """Write one tile to all files."""
         from pipeline.export.solid_geometry import SOLID_COLUMNS
         from service.outputs.footprints import feature_texts
         from service.outputs.merged_table import read_tile
@@ -228,7 +228,7 @@ class _Sinks:
             self.tally.planes += 1
         self.tally.count_rejected(tables["rejected"].column("reason").to_pylist())
         rows = [{**row, "tile": tile.key} for row in tables["buildings"].drop_columns(list(SOLID_COLUMNS)).to_pylist()]
-        for feature in feature_texts(rows, self._way):
+        for feature in feature_texts(rows, self._to_wgs84):
             start = self._features.add(feature)
             self._index.add(
                 record=feature.record,
@@ -242,7 +242,7 @@ class _Sinks:
             self.tally.count_building(feature.record, has_geometry=feature.bounds_deg is not None)
 
     def _add_cityjson(self, tile: RunTile) -> dict[str, tuple[int, int]]:
-        """Write the tile's features; where each building's line lies in the tile's own file."""
+        """Write the tile's features; start and size of each building's line in the tile's own file."""
         from service.outputs.merged_cityjson import features
 
         places = {}

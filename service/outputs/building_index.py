@@ -1,7 +1,7 @@
-"""The index of a job's buildings: a SQLite file that tells which building is where, written once, then only read.
+"""The index of a job's buildings: a SQLite file, written once, then only read.
 
-It holds what a request filters by and where in other files the answer lies ready, so that a page of buildings costs
-neither a Parquet reader nor a transformation of coordinates. Readers open it as immutable: no locks, also on a
+It holds the columns that requests filter by, and where the prepared answers are in other files. A page of buildings
+needs neither a Parquet reader nor a transformation of coordinates. Readers open it as immutable: no locks, also on a
 network folder.
 """
 
@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any, Self
 
 NAME = "index.sqlite"
-"""File name in the folder of outputs; no output itself."""
+"""File name in the folder of outputs; not an output itself."""
 FEATURES_NAME = "buildings.geojson"
 """The file of features that the index points into."""
 
@@ -42,7 +42,7 @@ CREATE TABLE building (
     city_size INTEGER NOT NULL,
     planes BLOB NOT NULL              -- JSON, compressed
 );
--- narrow, so that a look at all rows stays cheap; in the order in which pages are told
+-- narrow, which keeps a scan of all rows cheap; in the order of pages
 CREATE TABLE key (
     building_id TEXT PRIMARY KEY,
     place INTEGER NOT NULL,
@@ -73,7 +73,7 @@ class BuildingIndexFile:
 
     def __init__(self, path: Path) -> None:
         self._connection = sqlite3.connect(path, isolation_level=None)
-        # the file gets its name when it is whole, so nothing must survive a crash here
+        # the file gets its name when it is complete, so nothing here needs to survive a crash
         for setting in ("journal_mode=OFF", "synchronous=OFF", "cache_size=-32000", "locking_mode=EXCLUSIVE"):
             self._connection.execute(f"PRAGMA {setting}")
         self._connection.executescript(_LAYOUT)

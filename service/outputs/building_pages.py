@@ -17,7 +17,7 @@ from service.outputs.building_index import FEATURES_NAME, NAME, Box
 from service.outputs.catalogue import ResultsCrs
 
 GONE = "the buildings of this job are no longer in the state folder: submit it again"
-"""What is told where the files were removed."""
+"""The message if the files were removed."""
 MAX_LIMIT = 10_000
 """Most buildings of one page."""
 MAX_OFFSET = 10**12
@@ -76,7 +76,7 @@ class FeaturePart:
     geometry_start: int
     geometry_size: int
     native: bytes | None
-    """The geometry to be told; None for the one in the file."""
+    """The geometry to show; None for the one in the file."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -108,7 +108,7 @@ class BuildingPage:
         Parameters
         ----------
         members : mapping
-            What stands beside type and features, such as links.
+            Members beside type and features, such as links.
         """
         head = {"type": "FeatureCollection", "numberMatched": self.matched, "numberReturned": len(self.parts)}
         waiting = bytearray(json.dumps({**head, **members}, ensure_ascii=False).encode()[:-1])
@@ -128,14 +128,14 @@ def parsed_bbox(text: str, *, native: bool) -> Box:
     Parameters
     ----------
     text : str
-        West, south, east, north (or x_min, y_min, x_max, y_max), parted by commas.
+        West, south, east, north (or x_min, y_min, x_max, y_max), separated by commas.
     native : bool
         Whether the numbers are the tiles' own coordinates.
 
     Raises
     ------
     RequestError
-        It is no window; one over the 180th meridian is to be asked for in two halves.
+        It is not a window. A window over the 180th meridian must be requested in two halves.
 
     Examples
     --------
@@ -152,18 +152,18 @@ def parsed_bbox(text: str, *, native: bool) -> Box:
     if south > north:
         raise RequestError([f"query bbox is {text!r}: its south {south:g} lies north of its north {north:g}"])
     if west > east:
-        hint = "" if native else "; a window over the 180th meridian is asked for in two halves"
+        hint = "" if native else "; request a window over the 180th meridian in two halves"
         raise RequestError([f"query bbox is {text!r}: its west {west:g} lies east of its east {east:g}{hint}"])
     return west, south, east, north
 
 
 def checked_choice(choice: CoordinateChoice | None, crs: ResultsCrs, parameter: str) -> bool:
-    """Whether the tiles' own coordinates are meant; they are the only ones where the CRS is unknown.
+    """Whether the tiles' own coordinates are meant; they are the only ones if the CRS is unknown.
 
     Raises
     ------
     RequestError
-        WGS 84 is asked for by name, but the CRS of the tiles is unknown.
+        WGS 84 is requested, but the CRS of the tiles is unknown.
     """
     if crs.is_known:
         return choice is not None and choice.is_native
@@ -188,7 +188,7 @@ def opened_index(out_dir: Path) -> Iterator[sqlite3.Connection]:
         raise NoSuchOutputError(GONE)
     connection = sqlite3.connect(f"{path.as_uri()}?mode=ro&immutable=1", uri=True)
     try:
-        # many requests at once are as large as their caches; the system keeps the file's pages anyway
+        # small, since many requests may run at once; the system caches the pages of the file anyway
         connection.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
         yield connection
     except sqlite3.OperationalError:
@@ -229,8 +229,8 @@ def building_page(out_dir: Path, query: BuildingQuery) -> BuildingPage:
 def _selection(connection: sqlite3.Connection, query: BuildingQuery) -> tuple[str, list[str], list[Any]]:
     """Tables, conditions and their values.
 
-    A narrow window looks at the tiles first and then at their buildings only; for a wide one a walk over all buildings
-    in the order of their ids is cheaper.
+    A narrow window selects tiles first and then only their buildings; for a wide one a scan of all buildings in the
+    order of their ids is cheaper.
     """
     conditions: list[str] = []
     values: list[Any] = []
@@ -243,7 +243,7 @@ def _selection(connection: sqlite3.Connection, query: BuildingQuery) -> tuple[st
         ).fetchone()
         (total,) = connection.execute("SELECT total(n) FROM tile").fetchone()
         if near <= _NARROW_SHARE * total:
-            # CROSS JOIN keeps SQLite from turning the order round
+            # CROSS JOIN prevents SQLite from reversing the order
             source = "tile CROSS JOIN key ON key.tile = tile.tile"
             conditions.append(window.format("tile"))
             values += corners
@@ -257,7 +257,7 @@ def _selection(connection: sqlite3.Connection, query: BuildingQuery) -> tuple[st
 
 
 def _window(query: BuildingQuery) -> tuple[str, Sequence[float]]:
-    """The condition of the window, its table to be named, and its values."""
+    """The condition of the window, with a placeholder for the table, and its values."""
     assert query.bbox is not None
     low_x, low_y, high_x, high_y = query.bbox
     names = ("x_min", "x_max", "y_min", "y_max") if query.bbox_native else ("west", "east", "south", "north")

@@ -1,4 +1,4 @@
-"""The catalogue of a folder of outputs: which there are, how large, with which sha256. It is written last."""
+"""The catalogue of a folder of outputs: names, sizes and sha256. It is written last."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NAME = "outputs.json"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StoredOutput:
-    """One output as it lies in the folder."""
+    """One output in the folder."""
 
     size_bytes: int
     """Its size."""
@@ -30,13 +30,13 @@ class ResultsCrs:
     """The coordinate reference system (CRS) of the results."""
 
     name: str | None
-    """As the run told it; None where it is unknown."""
+    """Name as in the run; None if unknown."""
     uri: str | None
-    """Of its horizontal part at the OGC; None where it has no EPSG code or is unknown."""
+    """URI of its horizontal part at the OGC; None without an EPSG code."""
     to_wgs84: str | None
-    """PROJ's words for the way to WGS 84; None where the CRS is unknown."""
+    """PROJ's description of the transformation to WGS 84; None if the CRS is unknown."""
     accuracy_m: float | None
-    """Accuracy of that way in metres; None where PROJ tells none."""
+    """Accuracy of that transformation in metres; None if PROJ gives none."""
 
     @property
     def is_known(self) -> bool:
@@ -46,16 +46,16 @@ class ResultsCrs:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Catalogue:
-    """What a folder of outputs holds."""
+    """The content of a folder of outputs."""
 
     outputs: Mapping[str, StoredOutput]
     """By id, in the order of the process's table."""
     crs: ResultsCrs
-    """Of the results."""
+    """The CRS of the results."""
     n_buildings: int
     """Rows of the buildings table."""
     runs: tuple[str, ...] = ()
-    """Of a comparison the labels of its runs, each with a folder of outputs of its own; else none."""
+    """Labels of the runs of a comparison, each with its own folder of outputs; empty otherwise."""
 
     def to_json(self) -> str:
         """The catalogue as JSON text."""
@@ -73,18 +73,18 @@ class Catalogue:
         )
 
     def missing(self, output_id: str) -> NoSuchOutputError:
-        """Why there is no such output, and what there is."""
+        """The error for a missing output, with the list of existing ones."""
         there = ", ".join(self.outputs) or "none"
         if self.runs and output_id in OUTPUTS:
-            told = f"{output_id} is an output of each of this job's runs: ask with ?method= and one of"
-            return NoSuchOutputError(f"{told} {', '.join(self.runs)}")
+            problem = f"{output_id} is an output of each of this job's runs: add ?method= and one of"
+            return NoSuchOutputError(f"{problem} {', '.join(self.runs)}")
         if output_id not in KINDS:
             return NoSuchOutputError(f"there is no output {output_id[:80]!r}; this job has: {there}")
         return NoSuchOutputError(f"this job was asked not to make {output_id}, or had nothing for it; it has: {there}")
 
 
 def run_outputs(out_dir: Path, label: str) -> Path:
-    """Where the outputs of one run of a comparison lie, below those of the comparison."""
+    """The folder of outputs of one run of a comparison, below those of the comparison."""
     return out_dir / "runs" / label
 
 
@@ -103,7 +103,7 @@ def read_catalogue(out_dir: Path) -> Catalogue:
 
 
 def output_file(out_dir: Path, output_id: str) -> Path:
-    """Where an output lies.
+    """The file of an output.
 
     Raises
     ------

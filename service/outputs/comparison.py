@@ -1,4 +1,4 @@
-"""Assembling the outputs of a finished comparison: those of each run as if it were alone, then those of all."""
+"""Assembles the outputs of a finished comparison: those of each run, then those of all runs together."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ RUNS = "runs"
 """Folder of the run directories below the comparison's."""
 
 _TEXTS = frozenset({".json", ".html", ".md"})
-"""Endings of the files that tell where inputs lay; tables and models do not."""
+"""Endings of files that may contain paths of inputs; tables and models do not."""
 
 _KEPT_BACK = frozenset({"quarantine", "scratch"})
-"""Folders of a run that are no results."""
+"""Folders of a run that are not results."""
 
 
 def _nothing(done: int, total: int) -> None:
@@ -41,21 +41,21 @@ def write_comparison_outputs(
 ) -> None:
     """Write the outputs of a finished comparison.
 
-    Each run gets all outputs of a run in a folder of its own, so that its buildings can be asked for like those of a
-    reconstruction. No output tells a folder of the server: of a path what remains is the file's name.
+    Each run gets all outputs of a run in its own folder: its buildings can be requested like those of a reconstruction.
+    No output names a folder of the server: only the file name of a path remains.
 
     Parameters
     ----------
     folder : Path
         The comparison's folder: `index.html`, `compare.json`, `buildings.parquet` and `runs/<label>/`.
     labels : sequence of str
-        The runs, in the order in which they are told.
+        The runs, in the order of the comparison.
     out_dir : Path
-        Folder to write into; made where it is missing.
+        Folder to write into; made if it is missing.
     wanted : sequence of str, optional
         Ids of `COMPARISON_OUTPUTS`; all by default.
     on_progress : callable
-        Gets what is done, tiles and files, and all of it; what it raises ends the work.
+        Gets the number of tiles and files done, and of all. An exception from it ends the work.
 
     Raises
     ------
@@ -73,8 +73,8 @@ def write_comparison_outputs(
     tiles = {label: len(published_tiles(folder / RUNS / label)[0]) for label in labels}
     done, total = 0, sum(tiles.values()) + len(files)
     for label in labels:
-        told = _after(done, total, on_progress)
-        write_outputs(folder / RUNS / label, run_outputs(out_dir, label), on_progress=told)
+        progress = _after(done, total, on_progress)
+        write_outputs(folder / RUNS / label, run_outputs(out_dir, label), on_progress=progress)
         done += tiles[label]
     clean = _cleaner(folder, labels)
     storage = LocalStorage(root=out_dir)
@@ -101,16 +101,16 @@ def write_comparison_outputs(
 
 
 def _after(before: int, total: int, on_progress: Progress) -> Progress:
-    """Progress of a part as that of the whole."""
+    """Turn the progress of a part into that of the whole."""
 
-    def told(done: int, _of: int) -> None:
+    def progress(done: int, _of: int) -> None:
         on_progress(before + done, total)
 
-    return told
+    return progress
 
 
 def _files(folder: Path) -> Iterator[str]:
-    """What the archive holds, relative to the folder."""
+    """The files of the archive, relative to the folder."""
     for path in folder.rglob("*"):
         name = path.relative_to(folder)
         hidden = any(part.startswith(".") or part in _KEPT_BACK for part in name.parts)
@@ -126,10 +126,10 @@ def _add(archive: zipfile.ZipFile, folder: Path, name: str, clean: Callable[[str
 
 
 def _cleaner(folder: Path, labels: Sequence[str]) -> Callable[[str], str]:
-    """A function that takes the server's folders out of a text, also as a page writes them."""
+    """A function that removes the server's folders from a text, also in the spelling of a page."""
     manifests = [json.loads((folder / RUNS / label / "run.json").read_text(encoding="utf-8")) for label in labels]
     paths = {entry["path"] for manifest in manifests for entry in manifest["inputs"]}
-    # the request tells them again, links followed
+    # the request repeats them with links resolved
     requests = [manifest.get("request", {}) for manifest in manifests]
     asked = {request.get(name) for request in requests for name in ("footprints", "overrides", "aoi")}
     paths |= {path for path in asked if path is not None}
@@ -141,10 +141,10 @@ def _cleaned(path: Path, clean: Callable[[str], str]) -> str:
     """The text of a file without the server's folders and machines."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".json":
-        # by its values: a path may be written with escapes
+        # cleans the values: a path may be written with escapes
         document = _mapped(json.loads(text), clean)
         if path.name == "run.json":
-            # by process, whose name has that of its machine
+            # the name of a process contains that of its machine
             peaks = document["peak_memory_bytes"].values()
             document["peak_memory_bytes"] = {f"process {n}": peak for n, peak in enumerate(peaks, start=1)}
         return json.dumps(document, indent=1, ensure_ascii=False) + "\n"

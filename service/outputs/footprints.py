@@ -1,4 +1,4 @@
-"""Footprints as GeoJSON: the way to WGS 84, and one feature a building."""
+"""Footprints as GeoJSON: the transformation to WGS 84, and one feature per building."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pipeline.export.solid_geometry import SOLID_COLUMNS
 from service.outputs.catalogue import ResultsCrs
 
 DECIMALS = 9
-"""Of degrees: a tenth of a millimetre."""
+"""Decimals of degrees: a tenth of a millimetre."""
 
 _NOT_PROPERTIES = frozenset({"geometry", "bbox", *SOLID_COLUMNS})
 _UNKNOWN = (
@@ -29,21 +29,21 @@ FloatArray = npt.NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Way:
-    """From the CRS of a run to WGS 84."""
+class Wgs84Transformation:
+    """The transformation from the CRS of a run to WGS 84."""
 
     crs: ResultsCrs
-    """What is told of it."""
+    """Its description for clients."""
     transformer: pyproj.Transformer | None
-    """None where the CRS is unknown."""
+    """None if the CRS is unknown."""
     projjson: Mapping[str, Any] | None
-    """The CRS as PROJJSON; None where it is unknown."""
+    """The CRS as PROJJSON; None if it is unknown."""
 
     @classmethod
-    def of_run(cls, crs: Mapping[str, Any] | None) -> Way:
-        """The way for the `crs` entry of a run.json.
+    def of_run(cls, crs: Mapping[str, Any] | None) -> Wgs84Transformation:
+        """The transformation for the `crs` entry of a run.json.
 
-        A compound CRS goes by its horizontal part: footprints have no elevation.
+        A compound CRS counts by its horizontal part: footprints have no elevation.
         """
         if crs is None or crs.get("wkt") is None:
             unknown = ResultsCrs(name=None, uri=None, to_wgs84=None, accuracy_m=None)
@@ -53,18 +53,18 @@ class Way:
         code = flat.to_epsg()
         transformer = pyproj.Transformer.from_crs(flat, "OGC:CRS84", always_xy=True)
         accuracy_m = transformer.accuracy
-        told = ResultsCrs(
+        results_crs = ResultsCrs(
             name=whole.name,
             uri=None if code is None else f"http://www.opengis.net/def/crs/EPSG/0/{code}",
             to_wgs84=transformer.description,
             accuracy_m=None if accuracy_m is None or accuracy_m < 0 else float(accuracy_m),
         )
-        return cls(crs=told, transformer=transformer, projjson=whole.to_json_dict())
+        return cls(crs=results_crs, transformer=transformer, projjson=whole.to_json_dict())
 
     def degrees(self, geometries: npt.NDArray[np.object_]) -> npt.NDArray[np.object_]:
-        """Geometries in longitude and latitude, exterior rings counter-clockwise; as they are where the CRS is unknown.
+        """Geometries in longitude and latitude, exterior rings counter-clockwise; unchanged if the CRS is unknown.
 
-        What has no place in WGS 84 becomes None.
+        A geometry without coordinates in WGS 84 becomes None.
         """
         if self.transformer is None:
             return geometries
@@ -81,7 +81,7 @@ class Way:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FeatureText:
-    """The feature of one building, and what the index of buildings needs to know of it."""
+    """The feature of one building, with the values for the index of buildings."""
 
     building_id: str
     record: Mapping[str, Any]
@@ -95,25 +95,25 @@ class FeatureText:
     native: bytes
     """The geometry in the coordinates of the tiles."""
     bounds: tuple[float, float, float, float] | None
-    """In the coordinates of the tiles; None without a geometry."""
+    """Bounds in the coordinates of the tiles; None without a geometry."""
     bounds_deg: tuple[float, float, float, float] | None
-    """West, south, east, north; as `bounds` where the CRS is unknown."""
+    """West, south, east, north; equal to `bounds` if the CRS is unknown."""
 
 
-def feature_texts(rows: Sequence[Mapping[str, Any]], way: Way) -> list[FeatureText]:
+def feature_texts(rows: Sequence[Mapping[str, Any]], to_wgs84: Wgs84Transformation) -> list[FeatureText]:
     """The features of the rows of a buildings table.
 
     Parameters
     ----------
     rows : sequence of mapping
         With `geometry` as ISO WKB or None, and `bbox`.
-    way : Way
-        To WGS 84.
+    to_wgs84 : Wgs84Transformation
+        From the CRS of the rows.
     """
     if not rows:
         return []
     own = np.asarray(shapely.from_wkb(np.array([row["geometry"] for row in rows], dtype=object)), dtype=object)
-    degrees = way.degrees(own)
+    degrees = to_wgs84.degrees(own)
     texts = []
     for row, mine, turned, bounds, bounds_deg in zip(
         rows, own, degrees, shapely.bounds(own), shapely.bounds(degrees), strict=True
@@ -156,14 +156,14 @@ def _bounds(values: FloatArray) -> tuple[float, float, float, float] | None:
 
 
 class FeatureCollectionFile:
-    """Writes features one a line as one GeoJSON feature collection, and tells where each lies.
+    """Writes features, one per line, as a GeoJSON feature collection; returns the position of each.
 
     Parameters
     ----------
     stream : binary file
         To be written.
     crs : ResultsCrs
-        Of the results: an unknown one is told.
+        The CRS of the results; an unknown one gets a note.
     """
 
     def __init__(self, stream: BinaryIO, crs: ResultsCrs) -> None:

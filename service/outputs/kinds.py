@@ -1,4 +1,4 @@
-"""The outputs of the processes: tables of what a finished job offers for download."""
+"""The outputs of the processes: tables of the files that a finished job offers for download."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 from service.errors import NoSuchOutputError
 
 GEOPARQUET = "application/vnd.apache.parquet"
-"""Media type of Parquet, GeoParquet included."""
+"""Media type of Parquet and GeoParquet."""
 CITYJSONSEQ = "application/city+json-seq"
-"""Media type of CityJSONSeq: a line of metadata, then one CityJSONFeature a line."""
+"""Media type of CityJSONSeq: a line of metadata, then one CityJSONFeature per line."""
 CITYJSON = "application/city+json"
 """Media type of a whole CityJSON document."""
 GEOJSON = "application/geo+json"
@@ -35,9 +35,9 @@ class OutputKind:
     title: str
     """A few words."""
     description: str
-    """What is in it, and how to read it."""
+    """Content, and how to read it."""
     media_type: str
-    """The one type that it is served as."""
+    """The type that it is served as."""
     filename: str
     """Name of the file in the folder of outputs, and the last part of the name that a browser saves."""
     schema: Mapping[str, Any]
@@ -52,7 +52,7 @@ _OF_A_RUN = (
     OutputKind(
         output_id="buildings",
         title="Buildings as GeoParquet",
-        description="One row a candidate, modelled or not: status and reason, roof type, footprint, solids, heights, "
+        description="One row per candidate, modelled or not: status and reason, roof type, footprint, solids, heights, "
         "volume, quality and validity. GeoParquet 1.1 in the CRS of the tiles, all tiles in one file.",
         media_type=GEOPARQUET,
         filename="buildings.parquet",
@@ -61,7 +61,7 @@ _OF_A_RUN = (
     OutputKind(
         output_id="planes",
         title="Roof planes as GeoParquet",
-        description="One row a roof plane: its face in 3D, slope, aspect, coefficients, area and residuals.",
+        description="One row per roof plane: its face in 3D, slope, aspect, coefficients, area and residuals.",
         media_type=GEOPARQUET,
         filename="planes.parquet",
         schema=_binary(GEOPARQUET),
@@ -69,7 +69,7 @@ _OF_A_RUN = (
     OutputKind(
         output_id="rejected",
         title="Rejected objects as GeoParquet",
-        description="One row an object that was judged to be no building, with its reason.",
+        description="One row per object that was judged not to be a building, with its reason.",
         media_type=GEOPARQUET,
         filename="rejected.parquet",
         schema=_binary(GEOPARQUET),
@@ -77,8 +77,8 @@ _OF_A_RUN = (
     OutputKind(
         output_id="meshes",
         title="Meshes as OBJ or GLB in a zip file",
-        description="The solids as Wavefront OBJ in full coordinates, one file a building (or a tile, if asked for); "
-        "or, if asked for, as GLB, one file a tile. The names in the zip file are those of the column mesh_path.",
+        description="The solids as Wavefront OBJ in full coordinates, one file per building (or per tile, on "
+        "request); or, on request, as GLB, one file per tile. The names in the zip file are in the column mesh_path.",
         media_type=ZIP,
         filename="meshes.zip",
         schema=_binary(ZIP),
@@ -86,8 +86,8 @@ _OF_A_RUN = (
     OutputKind(
         output_id="cityjson",
         title="Buildings as CityJSONSeq",
-        description="CityJSON 2.0 as text lines: one line of metadata, then one feature a building with the record as "
-        "its attributes, a BuildingPart with semantic surfaces a solid.",
+        description="CityJSON 2.0 as text lines: one line of metadata, then one feature per building with the record "
+        "as its attributes, and a BuildingPart with semantic surfaces per solid.",
         media_type=CITYJSONSEQ,
         filename="buildings.city.jsonl",
         schema={"type": "string", "contentMediaType": CITYJSONSEQ},
@@ -96,7 +96,7 @@ _OF_A_RUN = (
         output_id="geojson",
         title="Footprints as GeoJSON",
         description="RFC 7946: footprints in WGS 84 with all columns as properties; one without an outline has a null "
-        "geometry. Where the CRS of the tiles is unknown the coordinates are theirs, and `coordRefSys` is null.",
+        "geometry. If the CRS of the tiles is unknown, the coordinates are in that CRS, and `coordRefSys` is null.",
         media_type=GEOJSON,
         filename="buildings.geojson",
         schema={"type": "object", "format": "geojson-feature-collection", "contentMediaType": GEOJSON},
@@ -116,8 +116,8 @@ _OF_A_COMPARISON = (
     OutputKind(
         output_id="page",
         title="Comparison as a page",
-        description="One page for a browser: the methods side by side, with pictures and a table a building. It holds "
-        "all that it shows, and nothing of it may reach the service.",
+        description="One page for a browser: the methods side by side, with pictures and a table per building. It "
+        "holds all that it shows, and its content cannot reach the service.",
         media_type=HTML,
         filename="index.html",
         schema={"type": "string", "contentMediaType": HTML},
@@ -125,7 +125,7 @@ _OF_A_COMPARISON = (
     OutputKind(
         output_id="table",
         title="Comparison as GeoParquet",
-        description="One row a building and method: status and reason, roof type, planes, residuals, seconds, "
+        description="One row per building and method: status and reason, roof type, planes, residuals, seconds, "
         "footprint.",
         media_type=GEOPARQUET,
         filename="buildings.parquet",
@@ -142,7 +142,7 @@ _OF_A_COMPARISON = (
     OutputKind(
         output_id="archive",
         title="The whole comparison in a zip file",
-        description="Page, table, summary, and a run directory a method with all its tables and models.",
+        description="Page, table, summary, and a run directory per method with all its tables and models.",
         media_type=ZIP,
         filename="comparison.zip",
         schema=_binary(ZIP),
@@ -150,17 +150,17 @@ _OF_A_COMPARISON = (
 )
 
 OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _OF_A_RUN}
-"""The outputs of a run by their ids, in the order in which they are told: those of the process `reconstruct`."""
+"""The outputs of a run by their ids, in the order of lists: those of the process `reconstruct`."""
 
 COMPARISON_OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _OF_A_COMPARISON}
 """The outputs of the process `compare`."""
 
 KINDS: Mapping[str, OutputKind] = {**OUTPUTS, **COMPARISON_OUTPUTS}
-"""All outputs; no two processes mean different things by one id."""
+"""All outputs; an id means the same in all processes."""
 
 
 def chosen(wanted: Iterable[str] | None, kinds: Mapping[str, OutputKind] = OUTPUTS) -> tuple[OutputKind, ...]:
-    """The kinds of some ids, in the table's order; all of them for None.
+    """The kinds of some ids, in the order of the table; all of them for None.
 
     Raises
     ------

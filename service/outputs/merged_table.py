@@ -1,4 +1,4 @@
-"""One table of a run as one GeoParquet file: the tiles' rows one after the other, few in memory at a time."""
+"""One table of a run as one GeoParquet file: the rows of the tiles in sequence, few in memory at a time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import geo_metadata, solid_names, stored_schema
 
-ROWS_A_GROUP = 5_000
+ROWS_PER_GROUP = 5_000
 """Rows in one row group: a reader with a window skips the groups whose `bbox` is elsewhere."""
 
 
@@ -31,7 +31,7 @@ class MergedTable:
     sources : sequence of Path
         The tiles' files, whose `geo` metadata are united.
     projjson : mapping or None
-        The CRS of a table without tiles; None where it is unknown.
+        The CRS of a table without tiles; None if it is unknown.
     """
 
     def __init__(
@@ -51,21 +51,21 @@ class MergedTable:
         named = table.append_column(self._schema.field("tile"), pa.array([tile] * table.num_rows, pa.string()))
         self._waiting.append(named.select(self._schema.names).cast(self._schema))
         self._rows += table.num_rows
-        if self._rows >= ROWS_A_GROUP:
+        if self._rows >= ROWS_PER_GROUP:
             self._write(whole_groups=True)
 
     def _write(self, *, whole_groups: bool) -> None:
-        """Write what waits, in whole row groups or all of it."""
+        """Write the waiting rows, in whole row groups or all of them."""
         united = pa.concat_tables(self._waiting) if self._waiting else self._schema.empty_table()
-        count = united.num_rows // ROWS_A_GROUP * ROWS_A_GROUP if whole_groups else united.num_rows
+        count = united.num_rows // ROWS_PER_GROUP * ROWS_PER_GROUP if whole_groups else united.num_rows
         if count:
-            self._writer.write_table(united.slice(0, count).combine_chunks(), row_group_size=ROWS_A_GROUP)
+            self._writer.write_table(united.slice(0, count).combine_chunks(), row_group_size=ROWS_PER_GROUP)
         # a copy: a slice would keep the whole table in memory
         rest = united.slice(count).combine_chunks()
         self._waiting, self._rows = ([rest] if rest.num_rows else []), rest.num_rows
 
     def __enter__(self) -> Self:
-        """Be written to."""
+        """Open for writing."""
         return self
 
     def __exit__(
@@ -107,7 +107,7 @@ def united_metadata(parts: Iterable[dict[str, Any]]) -> dict[str, Any]:
     Parameters
     ----------
     parts : iterable of dict
-        As `pipeline.export.geoparquet.geo_metadata` makes them, of one CRS; at least one.
+        Made by `pipeline.export.geoparquet.geo_metadata`, of one CRS; at least one.
 
     Raises
     ------
@@ -120,8 +120,8 @@ def united_metadata(parts: Iterable[dict[str, Any]]) -> dict[str, Any]:
     if any(part["columns"]["geometry"]["crs"] != found[0]["columns"]["geometry"]["crs"] for part in found):
         raise RunError("the tiles have more than one CRS: files of two runs lie in one directory")
     names = dict.fromkeys(name for part in found for name in part["columns"])
-    told = {name: [part["columns"][name] for part in found if name in part["columns"]] for name in names}
-    return {**found[0], "columns": {name: _united_column(columns) for name, columns in told.items()}}
+    columns_of = {name: [part["columns"][name] for part in found if name in part["columns"]] for name in names}
+    return {**found[0], "columns": {name: _united_column(columns) for name, columns in columns_of.items()}}
 
 
 def _united_column(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -136,7 +136,7 @@ def _united_column(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _united_bounds(bounds: Sequence[Sequence[float]]) -> list[float]:
-    """The bounds of several bounds; flat where one of them is.
+    """The bounds of several bounds; flat if one of them is.
 
     >>> _united_bounds([[0.0, 0.0, 1.0, 2.0, 2.0, 3.0], [-1.0, 1.0, 0.0, 1.0, 5.0, 9.0]])
     [-1.0, 0.0, 0.0, 2.0, 5.0, 9.0]

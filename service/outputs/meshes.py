@@ -1,4 +1,4 @@
-"""The OBJ files of a run: all of them as one zip file, and one building's; zip files whose bytes tell no time."""
+"""The OBJ files of a run: all in one zip file, or those of one building. The bytes of a zip file hold no time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def zip_files(archive: zipfile.ZipFile, run_dir: Path, names: list[str]) -> None
     run_dir : Path
         The run directory.
     names : list of str
-        Paths relative to it, in the order in which they are to lie in the archive.
+        Paths relative to it, in the order of the archive.
     """
     for name in names:
         entry = _entry(name)
@@ -32,7 +32,7 @@ def zip_files(archive: zipfile.ZipFile, run_dir: Path, names: list[str]) -> None
 
 
 def zip_text(archive: zipfile.ZipFile, name: str, text: str) -> None:
-    """Add a text as a file, likewise without a time."""
+    """Add a text as a file, also without a time."""
     archive.writestr(_entry(name), text.encode())
 
 

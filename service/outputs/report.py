@@ -63,15 +63,15 @@ def report(
     Parameters
     ----------
     manifest : mapping
-        What `run.json` holds.
+        The content of `run.json`.
     tally : Tally
         Counts of the merged tables.
     crs : ResultsCrs
-        Of the results.
+        The CRS of the results.
     failed_tiles : mapping of str
-        Why each tile failed that could not be published.
+        The error of each tile that could not be published.
     run_dir : Path
-        The run directory, whose name is not told.
+        The run directory; its name is removed.
     """
     clean = cleaner([entry["path"] for entry in manifest["inputs"]], run_dir)
     inputs = [{"name": Path(entry["path"]).name, **_without(entry, "path")} for entry in manifest["inputs"]]
@@ -123,7 +123,7 @@ def report_bytes(found: Mapping[str, Any]) -> bytes:
 
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:
-    """Counts, most first."""
+    """Counts, largest first."""
     return dict(sorted(counts.items(), key=lambda entry: (-entry[1], entry[0])))
 
 
@@ -132,9 +132,9 @@ def _without(entry: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def cleaner(paths: Sequence[str], run_dir: Path) -> Callable[[str], str]:
-    """A function that takes the server's folders out of a text: what remains are file names."""
+    """A function that removes the server's folders from a text: only file names remain."""
     folders = {str(Path(path).parent) for path in paths} | {str(run_dir), str(run_dir.resolve())}
-    # longest first, or a folder's own subfolder would keep its tail
+    # longest first: otherwise the end of a subfolder would remain
     ordered = sorted((folder for folder in folders if folder not in ("/", ".")), key=len, reverse=True)
 
     def clean(text: str) -> str:

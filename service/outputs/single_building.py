@@ -17,12 +17,12 @@ from service.outputs.meshes import building_lines
 from service.outputs.single_glb import cut_glb
 
 ID_PATTERN = "^[a-z2-7]{24}$"
-"""What a building_id looks like."""
+"""Pattern of a building_id."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StoredBuilding:
-    """Where the parts of one building lie."""
+    """The parts of one building, and where its files are."""
 
     building_id: str
     """The building."""
@@ -35,13 +35,13 @@ class StoredBuilding:
     planes: list[dict[str, Any]]
     """Its rows of the planes table without geometry."""
     city_start: int
-    """Of its line in the tile's CityJSONSeq file."""
+    """Start of its line in the tile's CityJSONSeq file, in bytes."""
     city_size: int
     """Bytes of the line."""
 
 
 def stored_building(out_dir: Path, building_id: str, *, native: bool = False) -> StoredBuilding:
-    """Look one building up.
+    """Look up one building.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def stored_building(out_dir: Path, building_id: str, *, native: bool = False) ->
     building_id : str
         As a client gave it.
     native : bool
-        Whether the feature's coordinates are to be the tiles' own.
+        Whether the feature gets the tiles' own coordinates.
 
     Raises
     ------
@@ -90,12 +90,12 @@ def stored_building(out_dir: Path, building_id: str, *, native: bool = False) ->
 
 
 def building_obj(run_dir: Path, building: StoredBuilding, lod: str | None = None) -> Iterator[str]:
-    """The lines of a building's OBJ, also where one file holds a whole tile; in the record's level of detail or `lod`.
+    """The lines of a building's OBJ, also if one file holds a whole tile; in the record's level of detail or `lod`.
 
     Raises
     ------
     NoSuchBuildingError
-        It has no model, the job was asked for no OBJ files or another level of detail, or its file is gone.
+        It has no model, the job was requested without OBJ files or in another level of detail, or its file is gone.
     """
     return building_lines(_mesh_file(run_dir, building, "obj", lod), building.building_id)
 
@@ -106,7 +106,7 @@ def building_glb(run_dir: Path, building: StoredBuilding, lod: str | None = None
     Raises
     ------
     NoSuchBuildingError
-        It has no model, the job was asked for no GLB files or another level of detail, or its file is gone.
+        It has no model, the job was requested without GLB files or in another level of detail, or its file is gone.
     """
     path = _mesh_file(run_dir, building, "glb", lod)
     content = cut_glb(path, building.building_id)
@@ -116,7 +116,7 @@ def building_glb(run_dir: Path, building: StoredBuilding, lod: str | None = None
 
 
 def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str, lod: str | None) -> Path:
-    """The file of a building's mesh, of one kind and level of detail; that of the record for None.
+    """The file of a building's mesh, of one kind and level of detail; the record's for None.
 
     Raises
     ------
@@ -131,8 +131,8 @@ def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str, lod: str | 
         raise NoSuchBuildingError(f"this job was asked for no meshes: take building {name} as CityJSON")
     kind = building.mesh_path.rpartition(".")[2]
     if kind != wanted:
-        told = f"this job was asked for meshes as {kind.upper()}, not as {wanted.upper()}"
-        raise NoSuchBuildingError(f"{told}: take building {name} with f={kind}")
+        problem = f"this job has meshes as {kind.upper()}, not as {wanted.upper()}"
+        raise NoSuchBuildingError(f"{problem}: take building {name} with f={kind}")
     path = run_dir / building.mesh_path
     if lod not in {None, own_lod}:
         # named by pipeline.export.tile.mesh_path
@@ -146,7 +146,7 @@ def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str, lod: str | 
 
 
 def building_cityjson(run_dir: Path, building: StoredBuilding) -> dict[str, Any]:
-    """A CityJSON document of one building, whole by itself: its objects, vertices, transform and extent.
+    """A complete CityJSON document of one building: its objects, vertices, transform and extent.
 
     Raises
     ------

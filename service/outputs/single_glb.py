@@ -1,6 +1,6 @@
-"""One building cut out of a tile's GLB file: its node with the bytes that it uses, and no numerical library.
+"""One building cut out of a tile's GLB file: its node with its bytes, without a numerical library.
 
-The files are those of `pipeline.export.glb`: one buffer, vertices and indices in views of their own, and no accessor
+The files are those of `pipeline.export.glb`: one buffer, vertices and indices in separate views, and no accessor is
 used by two buildings.
 """
 
@@ -16,7 +16,7 @@ _INDEX_BYTES = 4
 
 
 def cut_glb(path: Path, building_id: str) -> bytes | None:
-    """The GLB file of one building, at the place that it has in the tile's; None where the tile has no such node.
+    """The GLB file of one building, placed as in the tile; None if the tile has no such node.
 
     Raises
     ------
@@ -33,7 +33,7 @@ def cut_glb(path: Path, building_id: str) -> bytes | None:
 
 
 def _of_node(document: dict[str, Any], node: dict[str, Any], stream: BinaryIO, start: int) -> bytes:
-    """The file of one node; the binary data of the tile's file begin at `start`."""
+    """The file of one node; the binary data of the tile's file begins at `start`."""
     mesh = document["meshes"][node["mesh"]]
     used = sorted({n for p in mesh["primitives"] for n in (*p["attributes"].values(), p["indices"])})
     views = [{**view, "byteLength": 0} for view in document["bufferViews"]]

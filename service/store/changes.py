@@ -1,4 +1,4 @@
-"""The two ways in which a job changes: its status with an event, and events alone. Within a transaction."""
+"""Changes of a job: its status with an event, or events alone. Within a transaction."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from service.store.records import job_of, storable
 from service.store.tables import EVENTS, JOBS
 
 MAX_KEPT = 1000
-"""Events of a job that are kept beside its status events and the latest progress of each stage."""
+"""Events per job that are kept beside its status events and the latest progress of each stage."""
 _LASTING = ("status", "progress")
 
 
 def lock_job(connection: Connection, job_id: str) -> sa.Row[Any] | None:
-    """A job's row, which nobody else changes until the transaction ends; None where there is no such job."""
+    """A job's row, locked until the transaction ends; None if there is no such job."""
     return _row(connection, job_id, locked=True)
 
 
@@ -67,7 +67,7 @@ def _row(connection: Connection, job_id: str, *, locked: bool) -> sa.Row[Any] | 
 def move(
     connection: Connection, row: sa.Row[Any], status: JobStatus, *, now: dt.datetime, message: str, **values: Any
 ) -> None:
-    """Bring a locked job to a status, and tell it as an event."""
+    """Change the status of a locked job, with an event."""
     message = storable(message)
     ends: dict[str, Any] = {}
     if status is not JobStatus.RUNNING:
@@ -94,20 +94,20 @@ def move(
 
 
 def append(connection: Connection, row: sa.Row[Any], events: Sequence[JobEvent], now: dt.datetime) -> None:
-    """Add events to a locked job: the store gives the numbers and the time; progress never falls.
+    """Add events to a locked job. The store gives the numbers and the time; progress never decreases.
 
-    Of every stage only the latest progress is kept, and of the other events, but for changes of status, the last
-    `MAX_KEPT`: a job's events stay few however long it runs. Numbers are never given twice.
+    A job keeps all changes of status, the latest progress of each stage, and the last `MAX_KEPT` of its other events:
+    they stay few however long it runs. A number is never used twice.
     """
     if not events:
         return
     progress, stage, message = row.progress, row.stage, row.message
-    told = []
+    rows = []
     for sequence, event in enumerate(events, start=row.last_event + 1):
         progress = max(progress, min(event.progress, 100))
         stage = storable(event.stage, 64) or stage
         message = storable(event.message) or message
-        told.append(
+        rows.append(
             {
                 "job_id": row.job_id,
                 "sequence": sequence,
@@ -121,13 +121,13 @@ def append(connection: Connection, row: sa.Row[Any], events: Sequence[JobEvent],
                 "message": storable(event.message),
             }
         )
-    latest = {item["stage"]: item["sequence"] for item in told if item["kind"] == "progress"}
+    latest = {item["stage"]: item["sequence"] for item in rows if item["kind"] == "progress"}
     of_job = EVENTS.c.job_id == row.job_id
     if latest:
         connection.execute(
             sa.delete(EVENTS).where(of_job, EVENTS.c.kind == "progress", EVENTS.c.stage.in_(list(latest)))
         )
-    kept = [item for item in told if item["kind"] != "progress" or latest[item["stage"]] == item["sequence"]]
+    kept = [item for item in rows if item["kind"] != "progress" or latest[item["stage"]] == item["sequence"]]
     connection.execute(sa.insert(EVENTS), kept)
     if any(item["kind"] not in _LASTING for item in kept):
         _forget_oldest(connection, row.job_id)

@@ -42,8 +42,8 @@ def give_up(connection: Connection, row: sa.Row[Any], *, now: dt.datetime, max_a
     elif status is JobStatus.DISMISSED:
         move(connection, row, status, now=now, message="dismissed; its driver was lost", **counted)
     else:
-        told = f"attempt {job.attempt} is lost: driver {job.lease_owner} was silent; the job waits for another"
-        move(connection, row, status, now=now, message=told, **counted)
+        reason = f"attempt {job.attempt} is lost: driver {job.lease_owner} was silent; the job waits for another"
+        move(connection, row, status, now=now, message=reason, **counted)
 
 
 def take_first(connection: Connection, driver: str, *, now: dt.datetime, lease_s: float) -> str | None:
@@ -72,7 +72,7 @@ def take_first(connection: Connection, driver: str, *, now: dt.datetime, lease_s
 def renew(connection: Connection, held: Job, *, until: dt.datetime) -> bool:
     """Lengthen a lease; True where the job is to be dismissed.
 
-    A lease that has ended, but that nobody took, is as good as new.
+    An expired lease that no driver took can be renewed.
 
     Raises
     ------
@@ -117,8 +117,8 @@ def release(
     if row.dismiss_requested:
         move(connection, row, JobStatus.DISMISSED, now=now, message="dismissed", **counted)
         return
-    told = message or f"driver {held.lease_owner} gave the job back; it waits for another"
-    move(connection, row, JobStatus.ACCEPTED, now=now, message=told, not_before=not_before, **counted)
+    reason = message or f"driver {held.lease_owner} gave the job back; it waits for another"
+    move(connection, row, JobStatus.ACCEPTED, now=now, message=reason, not_before=not_before, **counted)
 
 
 def _claimable(now: dt.datetime) -> sa.ColumnElement[bool]:

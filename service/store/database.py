@@ -1,4 +1,4 @@
-"""The engine: SQLite's traps, PostgreSQL's time-outs, transactions, the database's clock, and faults in our words."""
+"""The database: connections, transactions, clock, migrations; its faults as `StoreError`."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _EPOCH_JULIAN = 2440587.5
 _WRITES = "gablework_writes"
 _POOL_SIZE = 10
 _WAIT_S = 30
-"""Seconds for which a statement waits: for SQLite's write lock, for a connection, for PostgreSQL's answer."""
-_TRY_AGAIN_S = 0.01
+"""Most seconds that a statement waits: for SQLite's write lock, for a connection, for PostgreSQL's answer."""
+_RETRY_S = 0.01
 _LOCK_MIGRATIONS = 0x6761626C01
 LOCK_SUBMISSIONS = 0x6761626C02
 """Numbers of PostgreSQL's advisory locks."""
@@ -50,12 +50,12 @@ class Database:
         self._url = _parsed(url)
         self.is_sqlite = self._url.get_backend_name() == "sqlite"
         self.engine = _sqlite_engine(self._url) if self.is_sqlite else _postgresql_engine(self._url)
-        # SQLite's own wait is a sleep of growing length: threads of one process queue here, fairly
+        # SQLite's own wait is a sleep of growing length; threads of one process queue here in order
         self._one_writer = threading.Lock() if self.is_sqlite else contextlib.nullcontext()
 
     @property
-    def told_name(self) -> str:
-        """The database in a message that clients may see: no folder, no user, no password."""
+    def public_name(self) -> str:
+        """The name of the database in messages to clients: without folder, user and password."""
         if self.is_sqlite:
             return f"the SQLite database {Path(self._url.database or '').name}"
         return f"the PostgreSQL database {self._url.database or ''} at {self._url.host or 'a local socket'}"
@@ -69,7 +69,7 @@ class Database:
         StoreError
             The database does not answer.
         """
-        with self._told_faults(), self.engine.begin() as connection:
+        with self._faults_in_our_words(), self.engine.begin() as connection:
             yield connection
 
     @contextlib.contextmanager
@@ -81,13 +81,13 @@ class Database:
         StoreError
             The database does not answer.
         """
-        with self._told_faults(), self._one_writer, self.engine.connect() as connection:
+        with self._faults_in_our_words(), self._one_writer, self.engine.connect() as connection:
             connection.execution_options(**{_WRITES: True})
             with connection.begin():
                 yield connection
 
     def migrate(self) -> None:
-        """Bring the tables to this version; several processes may do so at once.
+        """Migrate the tables to this version; several processes may do so at once.
 
         Raises
         ------
@@ -95,7 +95,7 @@ class Database:
             The database does not answer, or is of a newer version.
         """
         if self.is_sqlite and self._url.database is not None:
-            with self._told_faults():
+            with self._faults_in_our_words():
                 Path(self._url.database).parent.mkdir(parents=True, exist_ok=True)
         with self.write() as connection:
             self.lock(connection, _LOCK_MIGRATIONS)
@@ -105,54 +105,56 @@ class Database:
                 migrations.upgrade(connection)
 
     def check(self) -> None:
-        """Whether the database answers and has this version's tables.
+        """Check that the database answers and has the tables of this version.
 
         Raises
         ------
         StoreError
-            It does not, or it has not.
+            It does not answer, or has other tables.
         """
         if self.is_sqlite and not Path(self._url.database or "").is_file():
-            raise StoreError(f"{self.told_name} does not exist: start the service once, it makes the database")
+            raise StoreError(f"{self.public_name} does not exist: start the service once, it makes the database")
         with self.read() as connection:
             found = migrations.current(connection)
         self._check_not_newer(found)
         if found != migrations.head():
             raise StoreError(
-                f"{self.told_name} has the tables of revision {found or 'none'}, this version needs "
+                f"{self.public_name} has the tables of revision {found or 'none'}, this version needs "
                 f"{migrations.head()}: start the service or a driver once, they migrate it"
             )
 
     def lock(self, connection: Connection, number: int) -> None:
-        """Until the transaction ends nobody else holds this lock; a writer of SQLite is alone anyway."""
+        """Hold a lock until the transaction ends; a writer of SQLite is alone anyway."""
         if not self.is_sqlite:
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(number)))
 
     def now(self, connection: Connection) -> dt.datetime:
         """The database's clock, in UTC; to the millisecond on SQLite.
 
-        Not the start of the transaction: who waited for a lock gets the time after the wait.
+        Not the start of the transaction: after a wait for a lock it is the time after the wait.
         """
         if self.is_sqlite:
             days = connection.execute(sa.select(sa.func.julianday("now"))).scalar_one()
             return _EPOCH + dt.timedelta(milliseconds=round((days - _EPOCH_JULIAN) * 86_400_000))
-        told: dt.datetime = connection.execute(sa.select(sa.func.clock_timestamp())).scalar_one()
-        return told.astimezone(dt.UTC)
+        now: dt.datetime = connection.execute(sa.select(sa.func.clock_timestamp())).scalar_one()
+        return now.astimezone(dt.UTC)
 
     def _check_not_newer(self, found: str | None) -> None:
         if found is not None and found not in migrations.known():
-            raise StoreError(f"{self.told_name} is of a newer version of gablework (revision {found}): update this one")
+            raise StoreError(
+                f"{self.public_name} is of a newer version of gablework (revision {found}): update this one"
+            )
 
     @contextlib.contextmanager
-    def _told_faults(self) -> Iterator[None]:
-        """Faults of the database as `StoreError`; faults of ours as they are."""
+    def _faults_in_our_words(self) -> Iterator[None]:
+        """Raise faults of the database as `StoreError`, our own as they are."""
         try:
             yield
         except (exc.OperationalError, exc.InterfaceError, exc.TimeoutError, OSError) as error:
-            raise StoreError(f"{self.told_name} does not answer: {_cause(error)}") from error
+            raise StoreError(f"{self.public_name} does not answer: {_cause(error)}") from error
         except exc.DBAPIError as error:
             if error.connection_invalidated or _code(error).startswith(_PASSING):
-                raise StoreError(f"{self.told_name} does not answer: {_cause(error)}") from error
+                raise StoreError(f"{self.public_name} does not answer: {_cause(error)}") from error
             raise
 
 
@@ -161,7 +163,7 @@ def _parsed(url: str) -> URL:
         parsed = sa.make_url(url)
     except exc.ArgumentError as error:
         raise StartUpError(
-            "the database URL cannot be understood: it reads sqlite:////path/to/file.db or "
+            "the database URL cannot be understood: use sqlite:////path/to/file.db or "
             "postgresql+pg8000://user:password@host/database"
         ) from error
     backend = parsed.get_backend_name()
@@ -182,19 +184,19 @@ def _sqlite_engine(url: URL) -> Engine:
     @event.listens_for(engine, "connect")
     def connected(connection: Any, record: Any) -> None:
         del record
-        # the driver would begin transactions late, and never for reads: we begin them ourselves
+        # the driver would begin transactions late, and never for reads; `begun` begins them
         connection.isolation_level = None
         cursor = connection.cursor()
         cursor.execute(f"PRAGMA busy_timeout = {_WAIT_S * 1000}")
         cursor.execute("PRAGMA foreign_keys = ON")
-        # a job that was answered with 201 survives a power cut
+        # a job whose request was answered with 201 survives a power cut
         cursor.execute("PRAGMA synchronous = FULL")
         _use_wal(cursor)
         cursor.close()
 
     @event.listens_for(engine, "begin")
     def begun(connection: Connection) -> None:
-        # a transaction that reads first and writes later would fail where another wrote in between
+        # a transaction that reads first and writes later would fail if another wrote in between
         writes = connection.get_execution_options().get(_WRITES, False)
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
@@ -202,10 +204,10 @@ def _sqlite_engine(url: URL) -> Engine:
 
 
 def _use_wal(cursor: sqlite3.Cursor) -> None:
-    """Have a new database use a write-ahead log.
+    """Switch a new database to a write-ahead log.
 
-    Where two connections switch at the same time, each holds the lock that the other waits for: SQLite then refuses one
-    of them at once, whatever its time-out. It finds the work done a moment later.
+    If two connections switch at the same time, each holds the lock that the other waits for. SQLite then refuses one of
+    them at once, whatever its time-out. A moment later that one finds the switch done.
     """
     until = time.monotonic() + _WAIT_S
     while cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
@@ -214,7 +216,7 @@ def _use_wal(cursor: sqlite3.Cursor) -> None:
         except sqlite3.OperationalError as error:
             if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > until:
                 raise
-            time.sleep(_TRY_AGAIN_S)
+            time.sleep(_RETRY_S)
 
 
 def _postgresql_engine(url: URL) -> Engine:
@@ -235,7 +237,7 @@ def _postgresql_engine(url: URL) -> Engine:
     def connected(connection: Any, record: Any) -> None:
         del record
         cursor = connection.cursor()
-        # a client that vanished must not keep its locks, and a statement ends before the socket's time-out
+        # a client that vanished must lose its locks, and a statement must end before the socket's time-out
         cursor.execute(f"SET idle_in_transaction_session_timeout = '{_WAIT_S}s'")
         cursor.execute(f"SET statement_timeout = '{_WAIT_S - 5}s'")
         cursor.close()
@@ -245,15 +247,15 @@ def _postgresql_engine(url: URL) -> Engine:
 
 
 def _code(error: exc.DBAPIError) -> str:
-    """PostgreSQL's SQLSTATE or the name of SQLite's fault; empty where there is none."""
+    """PostgreSQL's SQLSTATE or the name of SQLite's fault; empty if there is none."""
     if isinstance(error.orig, sqlite3.Error):
         return getattr(error.orig, "sqlite_errorname", "")
-    told = error.orig.args[0] if error.orig is not None and error.orig.args else None
-    return str(told.get("C", "")) if isinstance(told, dict) else ""
+    details = error.orig.args[0] if error.orig is not None and error.orig.args else None
+    return str(details.get("C", "")) if isinstance(details, dict) else ""
 
 
 def _cause(error: Exception) -> str:
-    """The driver's own words, without the statement and its values."""
+    """The message of the database driver, without the statement and its values."""
     cause = error.orig if isinstance(error, exc.DBAPIError) and error.orig is not None else error
-    told = cause.args[0] if cause.args else None
-    return str(told.get("M", told)) if isinstance(told, dict) else str(cause)
+    details = cause.args[0] if cause.args else None
+    return str(details.get("M", details)) if isinstance(details, dict) else str(cause)

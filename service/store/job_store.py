@@ -281,7 +281,7 @@ class JobStore:
         message : str
             Why, for the client.
         retry_after_s : float
-            Seconds for which nobody claims it.
+            Seconds during which it cannot be claimed.
 
         Raises
         ------

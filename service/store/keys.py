@@ -27,18 +27,18 @@ def add(connection: Connection, key: Key) -> None:
 
 
 def by_digest(connection: Connection, digest: str) -> Key | None:
-    """The key with this digest, a revoked one too; None where there is none."""
+    """The key with this digest, also if it is revoked; None if there is none."""
     row = connection.execute(sa.select(KEYS).where(KEYS.c.digest == storable(digest))).one_or_none()
     return None if row is None else key_of(row)
 
 
 def every(connection: Connection) -> list[Key]:
-    """All keys, revoked ones too, oldest first."""
+    """All keys, also revoked ones, oldest first."""
     return [key_of(row) for row in connection.execute(sa.select(KEYS).order_by(KEYS.c.created_at, KEYS.c.key_id))]
 
 
 def revoke(connection: Connection, key_id: str, now: dt.datetime) -> None:
-    """Revoke a key; one that is revoked already keeps its time, one that does not exist is no fault."""
+    """Revoke a key; one that is revoked already keeps its time; one that does not exist is ignored."""
     one = sa.and_(KEYS.c.key_id == storable(key_id), KEYS.c.revoked_at.is_(None))
     connection.execute(sa.update(KEYS).where(one).values(revoked_at=now))
 

@@ -12,7 +12,7 @@ def lease_expired(job: Job, now: dt.datetime) -> bool:
 
     Examples
     --------
-    A job that nobody holds has no lease that could end.
+    A job without a holder has no lease that could expire.
     """
     return job.status is JobStatus.RUNNING and job.lease_until is not None and job.lease_until <= now
 

@@ -11,7 +11,7 @@ from service.keys import Key, Scope
 
 
 def storable(text: str, limit: int | None = None) -> str:
-    """Text that both databases take: no NUL, no lone surrogates, not longer than the column.
+    """Text that both databases accept: no NUL, no lone surrogates, not longer than the column.
 
     >>> storable("abc", 2)
     'ab'

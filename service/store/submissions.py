@@ -19,12 +19,12 @@ from service.store.tables import EVENTS, JOB_UPLOADS, JOBS, UPLOADS
 
 
 def check_queue(connection: Connection, owner: str | None, *, max_queued: int, max_queued_per_key: int) -> None:
-    """Refuse where too many jobs wait. Without keys only the whole line counts.
+    """Refuse if too many jobs wait. Without keys only the total counts.
 
     Raises
     ------
     QueueFullError
-        The line, or this key's part of it, is full.
+        The queue, or this key's part of it, is full.
     """
     waiting = sa.select(sa.func.count()).select_from(JOBS).where(JOBS.c.status == JobStatus.ACCEPTED.value)
     total = connection.execute(waiting).scalar_one()
@@ -98,7 +98,7 @@ def insert(
 
 
 def hold_uploads(connection: Connection, needed: Sequence[str]) -> None:
-    """See to it that uploads stay until the commit: who removes one looks for those who need it afterwards.
+    """Keep uploads until the commit; a removal checks afterwards whether a job needs them.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def dismiss(connection: Connection, job_id: str, owner: str | None, now: dt.date
 
 
 def remove(connection: Connection, job_id: str) -> None:
-    """Forget a job that is over, with its events.
+    """Delete a job that is over, with its events.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The tables, as `service.migrations` makes them; a test holds the two against each other."""
+"""The tables, as made by `service.migrations`; a test compares the two."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ METADATA = sa.MetaData()
 
 
 class UtcTime(sa.types.TypeDecorator[dt.datetime]):
-    """A time with a time zone, on SQLite too: there it is stored as UTC and comes back as UTC."""
+    """A time with a time zone. SQLite stores it as UTC and returns UTC."""
 
     impl = sa.DateTime(timezone=True)
     cache_ok = True
@@ -68,9 +68,9 @@ JOBS = sa.Table(
     sa.Column("last_event", sa.Integer, nullable=False),
     sa.Column("schedule_id", sa.String(32)),
 )
-"""One row a job. `duration_ms` is set when a job that was started is over; `last_event` is its events' counter.
+"""One row per job. `duration_ms` is set when a job that was started is over; `last_event` counts its events.
 
-`schedule_id` is no foreign key: a job stays when its schedule goes, and still tells what it came of.
+`schedule_id` is not a foreign key: a job stays when its schedule is removed, and still names it.
 """
 
 sa.Index("jobs_in_line", JOBS.c.status, JOBS.c.priority.desc(), JOBS.c.created_at, JOBS.c.job_id)
@@ -93,7 +93,7 @@ EVENTS = sa.Table(
     sa.Column("progress", sa.Integer, nullable=False),
     sa.Column("message", sa.Text, nullable=False),
 )
-"""What happened to jobs."""
+"""One row per event of a job."""
 
 UPLOADS = sa.Table(
     "uploads",
@@ -107,7 +107,7 @@ UPLOADS = sa.Table(
     sa.Column("expires_at", UtcTime, nullable=False),
     sa.Column("preflight", sa.JSON, nullable=False),
 )
-"""One row a file that a client sent."""
+"""One row per file that a client sent."""
 
 sa.Index("uploads_by_expiry", UPLOADS.c.expires_at)
 
@@ -117,7 +117,7 @@ JOB_UPLOADS = sa.Table(
     sa.Column("job_id", sa.String(32), sa.ForeignKey("jobs.job_id", ondelete="CASCADE"), primary_key=True),
     sa.Column("upload_id", sa.String(32), primary_key=True),
 )
-"""Which job reads which upload; no foreign key to it, since an upload may go when the job is over."""
+"""One row per job and upload that it reads; not a foreign key, since an upload may be removed after the job."""
 
 sa.Index("job_uploads_by_upload", JOB_UPLOADS.c.upload_id)
 
@@ -131,7 +131,7 @@ KEYS = sa.Table(
     sa.Column("created_at", UtcTime, nullable=False),
     sa.Column("revoked_at", UtcTime),
 )
-"""One row a key; the key itself is stored nowhere."""
+"""One row per key; the key itself is not stored."""
 
 SCHEDULES = sa.Table(
     "schedules",
@@ -160,7 +160,7 @@ SCHEDULES = sa.Table(
     sa.Column("missed_slots", sa.BigInteger, nullable=False),
     sa.Column("failed", sa.BigInteger, nullable=False),
 )
-"""One row a schedule. `last_number` is its runs' counter; the four last columns count its slots by outcome."""
+"""One row per schedule. `last_number` counts its entries; the four last columns count its slots by outcome."""
 
 sa.Index("schedules_by_next", SCHEDULES.c.next_at)
 sa.Index("schedules_by_age", SCHEDULES.c.created_at, SCHEDULES.c.schedule_id)
@@ -184,7 +184,7 @@ SCHEDULE_RUNS = sa.Table(
     sa.Column("message", sa.Text, nullable=False),
     sa.UniqueConstraint("schedule_id", "slot", name="one_fate_a_slot"),
 )
-"""What became of slots and of runs by hand, which have no slot. No slot can be decided twice."""
+"""The history of schedules. A run by hand has no slot. No slot can be decided twice."""
 
 SCHEDULE_UPLOADS = sa.Table(
     "schedule_uploads",
@@ -194,6 +194,6 @@ SCHEDULE_UPLOADS = sa.Table(
     ),
     sa.Column("upload_id", sa.String(32), primary_key=True),
 )
-"""Which schedule needs which upload."""
+"""One row per schedule and upload that it needs."""
 
 sa.Index("schedule_uploads_by_upload", SCHEDULE_UPLOADS.c.upload_id)

@@ -205,7 +205,7 @@ def test_words_filter_alone_repeated_and_with_commas(client: TestClient, job_id:
         ("bbox", "inf,0,1,1", "give four numbers"),
         ("bbox", "", "give four numbers"),
         ("bbox", "0,2,1,1", "south 2 lies north"),
-        ("bbox", "170,0,-170,1", "180th meridian is asked for in two halves"),
+        ("bbox", "170,0,-170,1", "180th meridian in two halves"),
         ("bbox-crs", "EPSG:28992", "bbox-crs"),
         ("crs", "epsg", "crs"),
         ("limit", "0", "limit"),

@@ -334,7 +334,7 @@ def test_a_method_that_was_not_compared_is_told_with_those_that_were(
 def test_an_output_of_a_run_says_how_to_ask_for_it(client: TestClient, job_id: str) -> None:
     for path in ("results/cityjson", "results?outputs=cityjson"):
         told = runs.problem(client.get(f"/jobs/{job_id}/{path}"), 404, "no-such-output")
-        assert f"ask with ?method= and one of {ROBUST}, {FAITHFUL}" in told
+        assert f"add ?method= and one of {ROBUST}, {FAITHFUL}" in told
     runs.problem(client.get(f"/jobs/{job_id}/results/page?method={ROBUST}"), 404, "no-such-output")
 
 

@@ -189,7 +189,7 @@ def test_a_merged_table_holds_every_row_of_every_tile_and_no_other(run_dir: Path
 def test_row_groups_have_one_size_wherever_the_tiles_end(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(merged_table, "ROWS_A_GROUP", 2)
+    monkeypatch.setattr(merged_table, "ROWS_PER_GROUP", 2)
     write_outputs(run_dir, tmp_path, ("planes", "rejected"))
     for name, rows in (("planes", 10), ("rejected", 4)):
         file = pq.ParquetFile(tmp_path / f"{name}.parquet")
