@@ -154,9 +154,7 @@ def _contents(path: Path, database: sqlite3.Connection) -> dict[str, Any]:
         _check_table(path, database, str(row[0]))
     layers = [str(row[0]) for row in found]
     if len(found) != 1:
-        return _facts(
-            "geopackage", None, layers, None, [f"{len(found)} layers could be the footprints: give one"]
-        )
+        return _facts("geopackage", None, layers, None, [f"{len(found)} layers could be the footprints: give one"])
     table = layers[0].replace('"', '""')
     count = int(database.execute(f'SELECT count(*) FROM "{table}"').fetchone()[0])  # noqa: S608 - quoted; SQLite takes no names as parameters
     if count == 0:

@@ -128,7 +128,7 @@ def _manifest(run_dir: Path) -> Mapping[str, Any]:
 
     status = read_manifest(run_dir).status
     if status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
-        raise RunError(f"{run_dir} is {status.value}: outputs are made only of runs that ended")
+        raise RunError(f"{run_dir} is {status.value}: outputs are made of runs that ended")
     found: Mapping[str, Any] = json.loads((run_dir / NAME).read_text(encoding="utf-8"))
     return found
 
