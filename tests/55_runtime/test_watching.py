@@ -239,7 +239,7 @@ def test_a_failing_command_reports_it_in_json_and_restores_the_loggers(
     def serve() -> None:
         with Console() as console:
             logging.getLogger("a.library").warning("a line of a library")
-            console.tell("listening")
+            console.status("listening")
             raise ZeroDivisionError("by nought")
 
     with pytest.raises(typer.Exit):
