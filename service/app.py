@@ -73,6 +73,7 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
         redoc_url=None,
         redirect_slashes=False,
         generate_unique_id_function=lambda route: route.name,
+        separate_input_output_schemas=False,
     )
     app.state.settings = settings
     app.state.store = kept

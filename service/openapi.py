@@ -1,7 +1,7 @@
-"""The OpenAPI document: what the framework finds, completed with what every path can answer, as version 3.0.
+"""The OpenAPI document of the framework, with the problems that every path can answer, as version 3.0.
 
-OGC API - Processes asks for OpenAPI 3.0 and its clients read that; the framework writes 3.1. The two differ in a few
-words of JSON Schema, which are put back here.
+OGC API - Processes and its clients need OpenAPI 3.0, while the framework writes 3.1. The two differ in a few words of
+JSON Schema, which are translated here.
 """
 
 from __future__ import annotations
@@ -11,20 +11,24 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
+from pydantic.json_schema import models_json_schema
 
 from pipeline import __version__
-from service.routes.documented import SCHEMAS, problems
+from service.routes.answers import problems
+from service.wire.buildings import CityJson, FeaturePage
+from service.wire.jobs import JobForm, ServerSentEvent
+from service.wire.problems import Problem
 
 VERSION = "3.0.3"
 """Of the document's format."""
 
 TAGS = (
-    {"name": "service", "description": "What is here, what is met, whether it works."},
-    {"name": "processes", "description": "What can be done, and how to ask for it."},
+    {"name": "service", "description": "Landing page, conformance, health and metrics."},
+    {"name": "processes", "description": "The processes and how to start them."},
     {"name": "uploads", "description": "Files that jobs read."},
-    {"name": "jobs", "description": "What was asked for: status, events, dismissal."},
-    {"name": "schedules", "description": "What is run again and again: when, and what became of each time."},
-    {"name": "results", "description": "What came out: files and single buildings."},
+    {"name": "jobs", "description": "Status, events and dismissal of jobs."},
+    {"name": "schedules", "description": "Jobs that run again and again: when, and what happened each time."},
+    {"name": "results", "description": "Files and single buildings."},
 )
 """Chapters of the document."""
 
@@ -32,6 +36,9 @@ DESCRIPTION = (
     "Valid LoD2 building models from raw airborne LiDAR tiles, by OGC API - Processes. Send tiles to `/uploads` or "
     "`/jobs`, follow the job, fetch its results. Every error is a problem document (RFC 9457)."
 )
+
+REFERENCED = (Problem, FeaturePage, CityJson, JobForm, ServerSentEvent)
+"""Models that paths reference under other media types than JSON; the framework finds the others."""
 
 _METHODS = ("get", "put", "post", "delete", "patch", "head", "options")
 
@@ -49,13 +56,16 @@ def document(app: FastAPI) -> dict[str, Any]:
         components = found.setdefault("components", {}).setdefault("schemas", {})
         for name in ("HTTPValidationError", "ValidationError"):
             components.pop(name, None)
-        components.update(SCHEMAS)
+        _, schemas = models_json_schema(
+            [(model, "validation") for model in REFERENCED], ref_template="#/components/schemas/{model}"
+        )
+        components.update(schemas["$defs"])
         for path, operation in operations(found):
             _complete(path, operation)
         app.openapi_schema = {**as_version_3_0(found), "openapi": VERSION}
         for _, operation in operations(app.openapi_schema):
             for parameter in operation.get("parameters", ()):
-                # one that is not sent is not there; no query can say null
+                # an optional parameter may be absent; a query cannot hold null
                 parameter["schema"].pop("nullable", None)
     return app.openapi_schema
 
@@ -67,11 +77,11 @@ def operations(found: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]
 
 
 _UNCOUNTED = ("/healthz", "/readyz")
-"""Paths that whoever watches the service may ask as often as it likes."""
+"""Paths without a limit of requests, for monitoring."""
 
 
 def _complete(path: str, operation: dict[str, Any]) -> None:
-    """Add the problems that the application gives wherever they can come up."""
+    """Add the problems that every path can answer."""
     responses = operation["responses"]
     if "HTTPValidationError" in str(responses.get("422")):
         del responses["422"]
@@ -82,7 +92,7 @@ def _complete(path: str, operation: dict[str, Any]) -> None:
         general += [413, 415]
     if "security" in operation:
         general += [401, 403]
-        # without keys on loopback nothing is asked for
+        # on loopback the service may have no keys
         operation["security"] = [{}, *operation["security"]]
     elif "requestBody" in operation:
         general.append(403)

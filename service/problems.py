@@ -1,7 +1,7 @@
 """Exceptions as problem documents (RFC 9457): the one table from a type to a status, a type URI and a title.
 
-Types of OGC API - Processes keep their own URIs; ours are `urn:gablework:problem:…`; what HTTP itself says
-(405, 406, 415, ...) is `about:blank`.
+Types of OGC API - Processes keep their own URIs; ours are `urn:gablework:problem:…`; statuses of HTTP itself
+(405, 406, 415, ...) are `about:blank`.
 """
 
 from __future__ import annotations
@@ -15,25 +15,28 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
+from fastapi.responses import Response
 from sqlalchemy import exc as sql
 from starlette.exceptions import HTTPException
 
 from pipeline.errors import InputError, SettingsError
 from service import errors
 from service.jobs import Fault, JobFailure
+from service.wire.base import respond
+from service.wire.faults import sentences
+from service.wire.problems import Problem
 
 OGC = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
-"""Where the standard keeps its types."""
+"""Prefix of the standard's types."""
 
 OWN = "urn:gablework:problem:"
-"""Where ours are."""
+"""Prefix of our types."""
 
 MEDIA_TYPE = "application/problem+json"
 """Of every problem document."""
 
 RETRY_AFTER_S = 30
-"""Seconds after which a client may come again where nothing better is known."""
+"""Seconds after which a client may try again, if nothing better is known."""
 
 _log = logging.getLogger("gablework.service")
 
@@ -49,7 +52,7 @@ class Kind:
     title: str
     """The same words for every problem of this kind."""
     retry: bool = False
-    """Whether `Retry-After` tells when to come again."""
+    """Whether the answer has `Retry-After`."""
 
     @property
     def word(self) -> str:
@@ -71,7 +74,7 @@ KINDS: Mapping[type[Exception], Kind] = {
     ),
     errors.TooManySchedulesError: Kind(status=409, type_uri=f"{OWN}too-many-schedules", title="Too many schedules"),
     errors.ChangedMeanwhileError: Kind(
-        status=412, type_uri=f"{OWN}changed-meanwhile", title="Somebody else has changed it"
+        status=412, type_uri=f"{OWN}changed-meanwhile", title="It was changed in the meantime"
     ),
     errors.ResultNotReadyError: Kind(status=404, type_uri=f"{OGC}result-not-ready", title="The results are not ready"),
     errors.RequestError: Kind(status=400, type_uri=f"{OWN}invalid-request", title="The request does not fit"),
@@ -92,7 +95,7 @@ KINDS: Mapping[type[Exception], Kind] = {
     sql.InterfaceError: _AWAY,
     sql.TimeoutError: _AWAY,
 }
-"""What an exception is told as; a subclass is told as its nearest base."""
+"""The kind of problem of each exception; a subclass has that of its nearest base."""
 
 INTERNAL = Kind(status=500, type_uri=f"{OWN}internal", title="A fault of the service")
 """Anything else."""
@@ -108,11 +111,11 @@ FAILURES: Mapping[Fault, Kind] = {
     Fault.LOST: Kind(status=503, type_uri=f"{OWN}job-failed-lost", title="Drivers were lost over the job"),
     Fault.INTERNAL: Kind(status=500, type_uri=f"{OWN}job-failed-internal", title="A fault of the service"),
 }
-"""What a failed job's results answer, by the cause."""
+"""The answer of a failed job's results, by the cause."""
 
 
 class JobFailedError(errors.ServiceError):
-    """Results were asked of a job that failed."""
+    """The requested results are those of a job that failed."""
 
     def __init__(self, failure: JobFailure) -> None:
         self.failure = failure
@@ -120,7 +123,7 @@ class JobFailedError(errors.ServiceError):
 
 
 def kind_of(error: Exception) -> Kind:
-    """Which kind of problem an exception is.
+    """The kind of problem of an exception.
 
     >>> kind_of(errors.NoSuchJobError("x")).word
     'no-such-job'
@@ -134,26 +137,25 @@ def kind_of(error: Exception) -> Kind:
 
 def document(
     kind: Kind, detail: str, instance: str, faults: Sequence[str] = (), members: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """The members of a problem document; `errors` only where several things can be wrong at once."""
-    found: dict[str, Any] = {
-        "type": kind.type_uri,
-        "title": kind.title,
-        "status": kind.status,
-        "detail": _encodable(detail),
-        "instance": _encodable(instance),
-    }
-    if faults:
-        found["errors"] = [_encodable(fault) for fault in faults]
-    return found | dict(members or {})
+) -> Problem:
+    """A problem document; `errors` only if several things can be wrong together."""
+    return Problem(
+        type=kind.type_uri,
+        title=kind.title,
+        status=kind.status,
+        detail=_encodable(detail),
+        instance=_encodable(instance),
+        errors=[_encodable(fault) for fault in faults] or None,
+        **(members or {}),
+    )
 
 
 def _encodable(text: str) -> str:
-    """The text without halves of characters, which JSON can bring in and UTF-8 cannot carry out."""
+    """The text without lone surrogates, which JSON can hold and UTF-8 cannot."""
     return text.encode("utf-8", "replace").decode("utf-8")
 
 
-def failure_document(failure: JobFailure, instance: str) -> dict[str, Any]:
+def failure_document(failure: JobFailure, instance: str) -> Problem:
     """Why a job failed, as a problem document: the `exception` of its status."""
     return document(FAILURES[failure.fault], failure.detail, instance)
 
@@ -165,18 +167,14 @@ def answer(
     faults: Sequence[str] = (),
     headers: Mapping[str, str] | None = None,
     members: Mapping[str, Any] | None = None,
-) -> JSONResponse:
+) -> Response:
     """A response with a problem document; `members` are those of the kind alone."""
-    return JSONResponse(
-        document(kind, detail, instance, faults, members),
-        status_code=kind.status,
-        headers=dict(headers or {}),
-        media_type=MEDIA_TYPE,
-    )
+    problem = document(kind, detail, instance, faults, members)
+    return respond(problem, status_code=kind.status, headers=headers, media_type=MEDIA_TYPE)
 
 
-def answer_error(error: Exception, instance: str) -> JSONResponse:
-    """The response that an exception of ours, of the pipeline or of the database becomes."""
+def answer_error(error: Exception, instance: str) -> Response:
+    """The response for an exception of ours, of the pipeline or of the database."""
     kind = kind_of(error)
     headers = {}
     if kind.status == HTTPStatus.UNAUTHORIZED:
@@ -186,52 +184,33 @@ def answer_error(error: Exception, instance: str) -> JSONResponse:
         headers["Retry-After"] = str(max(1, math.ceil(after)))
     faults = getattr(error, "faults", ())
     if kind is _AWAY:
-        # a database's own words can hold its address
+        # a database's own message can hold its address
         _log.error("the database does not answer: %s", error)
         return answer(kind, "The database does not answer; nothing was lost, try again.", instance, (), headers)
     if kind is INTERNAL:
-        return answer(kind, "The service has logged what happened; please report it.", instance)
+        return answer(kind, "The service has logged the fault; please report it.", instance)
     return answer(kind, str(error) or kind.title, instance, faults, headers, getattr(error, "members", None))
-
-
-def validation_faults(error: RequestValidationError) -> list[str]:
-    """One sentence a fault that the framework found."""
-    faults = []
-    for fault in error.errors():
-        if fault["type"] == "json_invalid":
-            faults.append(f"the body is no JSON: {fault.get('ctx', {}).get('error', fault['msg'])}")
-            continue
-        place = [str(part) for part in fault["loc"]]
-        where = " ".join([place[0], ".".join(place[1:])]).strip()
-        told = "" if fault["type"] == "missing" else f" is {_short(fault.get('input'))}"
-        faults.append(f"{where}{told}: {fault['msg']}")
-    return faults
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def install(app: FastAPI) -> None:
     """Make every error of an application a problem document, the framework's own included."""
 
-    async def on_error(request: Request, error: Exception) -> JSONResponse:
+    async def on_error(request: Request, error: Exception) -> Response:
         return answer_error(error, request.url.path)
 
-    async def on_http_error(request: Request, error: Exception) -> JSONResponse:
+    async def on_http_error(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
         kind = Kind(status=error.status_code, type_uri="about:blank", title=HTTPStatus(error.status_code).phrase)
         detail = str(error.detail)
         if error.status_code == HTTPStatus.NOT_FOUND and detail == kind.title:
-            detail = f"There is nothing at {request.url.path}; /openapi.json lists what there is"
+            detail = f"There is nothing at {request.url.path}; /openapi.json lists all paths"
         if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
             detail = f"{request.method} is not possible here"
         return answer(kind, detail, request.url.path, (), error.headers)
 
-    async def on_validation_error(request: Request, error: Exception) -> JSONResponse:
+    async def on_validation_error(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
-        return answer_error(errors.RequestError(validation_faults(error)), request.url.path)
+        return answer_error(errors.RequestError(sentences(error.errors())), request.url.path)
 
     app.add_exception_handler(HTTPException, on_http_error)
     app.add_exception_handler(RequestValidationError, on_validation_error)

@@ -18,7 +18,7 @@ import uuid
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from service.errors import NoSpaceError, RequestError, TooLargeError
 from service.filenames import clean_filename
@@ -232,26 +232,3 @@ def remove_leftovers(folder: StateFolder, *, now_s: float, stale_s: float = STAL
                 shutil.rmtree(path, ignore_errors=True)
                 removed.append(path)
     return removed
-
-
-def as_document(upload: Upload, base: str) -> dict[str, Any]:
-    """The upload as clients see it.
-
-    Parameters
-    ----------
-    upload : Upload
-        The record.
-    base : str
-        URL of the service, without a slash at its end.
-    """
-    this = f"{base}/uploads/{upload.upload_id}"
-    return {
-        "uploadID": upload.upload_id,
-        "filename": upload.filename,
-        "bytes": upload.size_bytes,
-        "sha256": upload.sha256,
-        "created": upload.created_at.isoformat(),
-        "expires": upload.expires_at.isoformat(),
-        "preflight": dict(upload.preflight),
-        "links": [{"href": this, "rel": "self", "type": "application/json", "title": "this upload"}],
-    }

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
+from pydantic import AfterValidator
 
 from pipeline.model import Reason, RoofType, Status
-from service.errors import RequestError
 from service.outputs.building_pages import (
     MAX_LIMIT,
     MAX_OFFSET,
@@ -24,19 +25,20 @@ from service.outputs.building_pages import (
 from service.outputs.catalogue import ResultsCrs
 from service.outputs.kinds import CITYJSON, GEOJSON, GLB, OBJ
 from service.outputs.single_building import (
-    ID_PATTERN,
     StoredBuilding,
     building_cityjson,
     building_glb,
     building_obj,
     stored_building,
 )
+from service.routes.answers import JOB_ID, header, problems, reference
 from service.routes.bound import Base
-from service.routes.documented import JOB_ID, problems
 from service.routes.finished_jobs import FinishedJob, FinishedRun
 from service.routes.negotiation import preferred
 from service.routes.results import FAILED
-from service.routes.status import link
+from service.wire.base import link
+from service.wire.buildings import CityJson, Feature, FeaturePage
+from service.wire.queries import words
 
 router = APIRouter(tags=["results"])
 
@@ -67,69 +69,76 @@ _PAGE_EXAMPLE = {
     "links": [{"href": f"http://127.0.0.1:8000/jobs/{JOB_ID}/buildings?limit=1", "rel": "self", "type": GEOJSON}],
     "features": [_FEATURE_EXAMPLE],
 }
-_LINKS = {"type": "array", "items": {"$ref": "#/components/schemas/Link"}}
-_FEATURE: dict[str, Any] = {
-    "type": "object",
-    "required": ["type", "id", "geometry", "properties"],
-    "properties": {
-        "type": {"type": "string", "enum": ["Feature"]},
-        "id": {"type": "string", "pattern": ID_PATTERN},
-        "geometry": {
-            "anyOf": [
-                {
-                    "type": "object",
-                    "required": ["type", "coordinates"],
-                    "properties": {
-                        "type": {"type": "string", "enum": ["Polygon", "MultiPolygon"]},
-                        "coordinates": {"type": "array"},
-                    },
-                },
-                {"type": "null"},
-            ]
-        },
-        "properties": {"type": "object", "description": "The columns of the table buildings, and `tile`."},
-        "links": _LINKS,
-    },
-}
-_PAGE: dict[str, Any] = {
-    "type": "object",
-    "required": ["type", "numberMatched", "numberReturned", "links", "features"],
-    "properties": {
-        "type": {"type": "string", "enum": ["FeatureCollection"]},
-        "numberMatched": {"type": "integer", "minimum": 0},
-        "numberReturned": {"type": "integer", "minimum": 0},
-        "coordRefSys": {
-            "anyOf": [{"type": "string"}, {"type": "null"}],
-            "description": "Told where the coordinates are not CRS84.",
-        },
-        "links": _LINKS,
-        "features": {"type": "array", "items": _FEATURE},
-    },
-}
-_CITYJSON: dict[str, Any] = {
-    "type": "object",
-    "required": ["type", "version", "transform", "CityObjects", "vertices"],
-    "properties": {
-        "type": {"type": "string", "enum": ["CityJSON"]},
-        "version": {"type": "string", "enum": ["2.0"]},
-        "transform": {"type": "object"},
-        "metadata": {"type": "object"},
-        "CityObjects": {"type": "object"},
-        "vertices": {"type": "array"},
-    },
-}
-_CRS_HEADER = {
-    "Content-Crs": {"description": "CRS of the coordinates; absent where it has no URI.", "schema": {"type": "string"}}
-}
+_CRS_HEADER = header("Content-Crs", "CRS of the coordinates; absent if it has no URI.")
 
 _Coordinates = Annotated[
     CoordinateChoice | None,
     Query(
         alias="crs",
         description="Coordinates of the answer: CRS84 (longitude, latitude; the default) or native (easting, northing "
-        "of the tiles). Where the CRS of the tiles is unknown, native is the default and all there is.",
+        "of the tiles). If the CRS of the tiles is unknown, only native is possible, and the default.",
     ),
 ]
+
+
+_Statuses = Annotated[list[str] | None, AfterValidator(words(list(Status)))]
+_RoofTypes = Annotated[list[str] | None, AfterValidator(words(list(RoofType)))]
+_Reasons = Annotated[list[str] | None, AfterValidator(words(list(Reason)))]
+
+
+def _any_of(kind: type[Status | RoofType | Reason]) -> str:
+    return f"Any of: {', '.join(kind)}; with commas, or the parameter again."
+
+
+@dataclasses.dataclass(frozen=True)
+class _Asked:
+    """The query parameters of a page of buildings."""
+
+    bbox: Annotated[
+        str | None,
+        Query(
+            description="Only buildings whose footprint's bounds meet this window: west,south,east,north. Buildings "
+            "without a footprint never do. Split a window over the 180th meridian into two requests.",
+            examples=["9.99,53.55,10.01,53.57"],
+        ),
+    ] = None
+    bbox_crs: Annotated[
+        CoordinateChoice | None, Query(alias="bbox-crs", description="Coordinates of bbox; CRS84 by default.")
+    ] = None
+    crs: _Coordinates = None
+    status: Annotated[_Statuses, Query(description=_any_of(Status))] = None
+    roof_type: Annotated[_RoofTypes, Query(description=_any_of(RoofType))] = None
+    reason: Annotated[_Reasons, Query(description=_any_of(Reason))] = None
+    limit: Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Most buildings of the page.")] = 100
+    offset: Annotated[int, Query(ge=0, le=MAX_OFFSET, description="Buildings before the page.")] = 0
+
+    def query(self, known: ResultsCrs) -> BuildingQuery:
+        """The query, in the coordinates of the results."""
+        bbox_native = checked_choice(self.bbox_crs, known, "bbox-crs")
+        return BuildingQuery(
+            bbox=None if self.bbox is None else parsed_bbox(self.bbox, native=bbox_native),
+            bbox_native=bbox_native,
+            native=checked_choice(self.crs, known, "crs"),
+            statuses=tuple(self.status or ()),
+            roof_types=tuple(self.roof_type or ()),
+            reasons=tuple(self.reason or ()),
+            limit=self.limit,
+            offset=self.offset,
+        )
+
+    def again(self, label: str | None, start: int) -> str:
+        """The same query from another building on."""
+        lists = (("status", self.status), ("roof_type", self.roof_type), ("reason", self.reason))
+        given = [
+            ("method", label),
+            ("bbox", self.bbox),
+            ("bbox-crs", None if self.bbox_crs is None else self.bbox_crs.value),
+            ("crs", None if self.crs is None else self.crs.value),
+            *((name, ",".join(values or ()) or None) for name, values in lists),
+            ("limit", self.limit),
+            ("offset", start),
+        ]
+        return urlencode([(name, value) for name, value in given if value is not None])
 
 
 @router.get(
@@ -139,89 +148,32 @@ _Coordinates = Annotated[
     responses={
         200: {
             "description": "A page of buildings, sorted by building_id. One without an outline has a null geometry.",
-            "content": {GEOJSON: {"schema": _PAGE, "example": _PAGE_EXAMPLE}},
+            "content": {GEOJSON: {"schema": reference(FeaturePage), "example": _PAGE_EXAMPLE}},
             "headers": _CRS_HEADER,
         },
         **problems(400, 404, 406, *FAILED),
     },
 )
-def buildings(
-    request: Request,
-    finished: FinishedRun,
-    base: Base,
-    bbox: Annotated[
-        str | None,
-        Query(
-            description="Only buildings whose footprint's bounds meet this window: west,south,east,north. Those "
-            "without a footprint never do. A window over the 180th meridian is asked for in two halves.",
-            examples=["9.99,53.55,10.01,53.57"],
-        ),
-    ] = None,
-    bbox_crs: Annotated[
-        CoordinateChoice | None, Query(alias="bbox-crs", description="Coordinates of bbox; by default those of CRS84.")
-    ] = None,
-    crs: _Coordinates = None,
-    statuses: Annotated[
-        list[str] | None, Query(alias="status", description=f"Any of: {', '.join(Status)}; with commas, or again.")
-    ] = None,
-    roof_types: Annotated[
-        list[str] | None, Query(alias="roof_type", description=f"Any of: {', '.join(RoofType)}; likewise.")
-    ] = None,
-    reasons: Annotated[
-        list[str] | None, Query(alias="reason", description=f"Any of: {', '.join(Reason)}; likewise.")
-    ] = None,
-    limit: Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Most buildings of the page.")] = 100,
-    offset: Annotated[int, Query(ge=0, le=MAX_OFFSET, description="Buildings to pass over.")] = 0,
-) -> Response:
+def buildings(request: Request, finished: FinishedRun, base: Base, asked: Annotated[_Asked, Depends()]) -> Response:
     """List buildings by window, status, roof type and reason, in pages."""
     preferred(request.headers.get("accept"), [GEOJSON])
     known = finished.catalogue.crs
-    faults: list[str] = []
-    words = {
-        "status": _listed("status", statuses, list(Status), faults),
-        "roof_type": _listed("roof_type", roof_types, list(RoofType), faults),
-        "reason": _listed("reason", reasons, list(Reason), faults),
-    }
-    if faults:
-        raise RequestError(faults)
-    native = checked_choice(crs, known, "crs")
-    bbox_native = checked_choice(bbox_crs, known, "bbox-crs")
-    page = building_page(
-        finished.out_dir,
-        BuildingQuery(
-            bbox=None if bbox is None else parsed_bbox(bbox, native=bbox_native),
-            bbox_native=bbox_native,
-            native=native,
-            statuses=words["status"],
-            roof_types=words["roof_type"],
-            reasons=words["reason"],
-            limit=limit,
-            offset=offset,
-        ),
-    )
-    asked = [
-        ("method", finished.label),
-        ("bbox", bbox),
-        ("bbox-crs", None if bbox_crs is None else bbox_crs.value),
-        ("crs", None if crs is None else crs.value),
-        *((name, ",".join(values) or None) for name, values in words.items()),
-        ("limit", limit),
-    ]
+    query = asked.query(known)
+    page = building_page(finished.out_dir, query)
     collection = f"{base}/jobs/{finished.job.job_id}"
+    limit, offset = asked.limit, asked.offset
 
-    def at(start: int) -> str:
-        return f"{collection}/buildings?{urlencode([(n, v) for n, v in (*asked, ('offset', start)) if v is not None])}"
+    def at(start: int, rel: str, title: str) -> dict[str, Any]:
+        href = f"{collection}/buildings?{asked.again(finished.label, start)}"
+        return link(href, rel, title, GEOJSON).model_dump()
 
-    links = [
-        link(at(offset), "self", "These buildings", GEOJSON),
-        link(collection, "collection", "The job"),
-    ]
+    links = [at(offset, "self", "These buildings"), link(collection, "collection", "The job").model_dump()]
     if offset + len(page.parts) < page.matched and page.parts:
-        links.append(link(at(offset + limit), "next", "More buildings", GEOJSON))
+        links.append(at(offset + limit, "next", "The next buildings"))
     if offset > 0:
-        links.append(link(at(max(0, offset - limit)), "prev", "Buildings before them", GEOJSON))
-    members = {**_crs_members(known, native=native), "links": links}
-    return StreamingResponse(page.chunks(members), media_type=GEOJSON, headers=_headers(known, native=native))
+        links.append(at(max(0, offset - limit), "prev", "The buildings before"))
+    members = {**_crs_members(known, native=query.native), "links": links}
+    return StreamingResponse(page.chunks(members), media_type=GEOJSON, headers=_headers(known, native=query.native))
 
 
 @router.get(
@@ -232,10 +184,10 @@ def buildings(
         200: {
             "description": "The record with its planes; or its mesh; or a CityJSON document of its own.",
             "content": {
-                GEOJSON: {"schema": _FEATURE, "example": _FEATURE_EXAMPLE},
+                GEOJSON: {"schema": reference(Feature), "example": _FEATURE_EXAMPLE},
                 OBJ: {"schema": {"type": "string"}},
                 GLB: {"schema": {"type": "string", "format": "binary"}},
-                CITYJSON: {"schema": _CITYJSON},
+                CITYJSON: {"schema": reference(CityJson)},
             },
             "headers": _CRS_HEADER,
         },
@@ -247,19 +199,19 @@ def building(
     finished: FinishedRun,
     base: Base,
     building_id: Annotated[
-        str, Path(alias="buildingID", description="As the lists tell it.", examples=["3givd2mvtyerfjxv2yytjbmi"])
+        str, Path(alias="buildingID", description="As in the lists.", examples=["3givd2mvtyerfjxv2yytjbmi"])
     ],
     wanted: Annotated[
         Literal["json", "obj", "glb", "cityjson"] | None,
-        Query(alias="f", description="Stands above the header Accept."),
+        Query(alias="f", description="Overrides the header Accept."),
     ] = None,
     lod: Annotated[
         Literal["1.2", "1.3", "2.2"] | None,
-        Query(description="Of an OBJ or GLB: one of the levels of detail that the job made; default the finest."),
+        Query(description="Level of detail of an OBJ or GLB, one that the job made; default the finest."),
     ] = None,
     crs: _Coordinates = None,
 ) -> Response:
-    """Tell one building: all columns and its roof planes, or its model as OBJ, GLB or CityJSON."""
+    """One building: all columns and its roof planes, or its model as OBJ, GLB or CityJSON."""
     media_type = (
         preferred(request.headers.get("accept"), list(_FORMATS.values())) if wanted is None else _FORMATS[wanted]
     )
@@ -273,7 +225,7 @@ def building(
         headers["Content-Disposition"] = f'inline; filename="{found.building_id}.obj"'
     elif media_type == GLB:
         content = building_glb(finished.run_dir, found, lod)
-        headers.pop("Content-Crs", None)  # metres from an origin: the file tells it
+        headers.pop("Content-Crs", None)  # metres from an origin, which the file states
         headers["Content-Disposition"] = f'inline; filename="{found.building_id}.glb"'
     elif media_type == CITYJSON:
         content = _json(building_cityjson(finished.run_dir, found))
@@ -299,21 +251,12 @@ def _feature(found: StoredBuilding, finished: FinishedJob, base: str, *, native:
         **found.feature,
         "properties": {**found.feature["properties"], "planes": found.planes},
         **_crs_members(finished.catalogue.crs, native=native),
-        "links": links,
+        "links": [entry.model_dump() for entry in links],
     }
 
 
-def _listed(name: str, values: list[str] | None, allowed: list[str], faults: list[str]) -> tuple[str, ...]:
-    """The words of a parameter that may come several times, with commas, or both."""
-    words = [word.strip() for value in values or () for word in value.split(",") if word.strip()]
-    faults.extend(
-        f"query {name} is {word[:80]!r}: use one of {', '.join(allowed)}" for word in words if word not in allowed
-    )
-    return tuple(dict.fromkeys(words))
-
-
 def _crs_members(crs: ResultsCrs, *, native: bool) -> dict[str, Any]:
-    """What is told of coordinates that are not CRS84; null where the CRS is unknown."""
+    """The member for coordinates that are not CRS84; null if the CRS is unknown."""
     return {"coordRefSys": crs.uri or crs.name} if native else {}
 
 

@@ -1,43 +1,45 @@
-"""What happens to a job: as a stream of server-sent events, or as a list for those who poll."""
+"""Events of a job: as a stream of server-sent events, or as a list for clients that poll."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import AsyncIterator, Callable, Mapping
-from typing import Annotated, Literal
+from typing import Annotated
 
 import anyio
 from fastapi import APIRouter, Header, Query, Request, Response
-from fastapi.responses import JSONResponse, StreamingResponse
+from fastapi.responses import StreamingResponse
 from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 from starlette.concurrency import run_in_threadpool
 from starlette.types import Receive, Scope, Send
 
 from service.errors import NoSuchJobError, TooManyRequestsError
 from service.jobs import JobEvent
+from service.routes.answers import document, problems, reference
 from service.routes.bound import Base, Reader, Settings_, Store
-from service.routes.documented import document, problems, reference
 from service.routes.jobs import JobId
 from service.routes.negotiation import preferred
-from service.routes.status import event_data, link
+from service.routes.status import event_document
 from service.store import JobStore
+from service.wire.base import link, respond
+from service.wire.jobs import EventList, ServerSentEvent
+from service.wire.queries import EventQuery
 
 router = APIRouter(tags=["jobs"])
 
 RECONNECT_MS = 2000
-"""Milliseconds after which a client comes again when its connection breaks."""
+"""Milliseconds after which a client reconnects if its connection breaks."""
 
 KEEP_ALIVE_S = 15.0
-"""Seconds without an event after which a comment tells that the stream lives."""
+"""Seconds without an event after which a comment keeps the stream alive."""
 
 LONGEST_LOOK_S = 2.0
-"""Seconds between looks at a job to which nothing happens; a job to which something happens is looked at sooner."""
+"""Longest time in seconds between looks at a job without events; the first looks come sooner."""
 
 PAGE = 500
-"""Events that are read at once."""
+"""Events that are read together."""
 
 REPRESENTATIONS: Mapping[str, str] = {"application/json": "json", "text/event-stream": "sse"}
-"""Media types of the events, and how the parameter f calls them; the first one counts among equals."""
+"""Media types of the events with their names in the parameter f; the first one wins among equals."""
 
 _EXAMPLE = {
     "events": [
@@ -55,20 +57,16 @@ _EXAMPLE = {
     "links": [],
 }
 
+_LIST_OR_STREAM = document(EventList, "The events: a list, or a stream if `text/event-stream` is requested.", _EXAMPLE)
+_LIST_OR_STREAM["content"]["text/event-stream"] = {"schema": reference(ServerSentEvent)}
+
 
 @router.get(
     "/jobs/{jobID}/events",
     summary="Events of a job",
-    response_class=JSONResponse,
     responses={
-        200: {
-            "description": "The events: a list, or a stream where `text/event-stream` is asked for.",
-            "content": {
-                **document("EventList", "", _EXAMPLE)["content"],
-                "text/event-stream": {"schema": reference("ServerSentEvent")},
-            },
-        },
-        204: {"description": "The job is over and all its events are known: do not come again."},
+        200: _LIST_OR_STREAM,
+        204: {"description": "The job is over and the client has all its events: it should not reconnect."},
         **problems(404, 406),
     },
 )
@@ -79,29 +77,25 @@ async def events(
     store: Store,
     settings: Settings_,
     caller: Reader,
-    wanted: Annotated[
-        Literal["json", "sse"] | None, Query(alias="f", description="Stands above the header Accept.")
-    ] = None,
-    after: Annotated[int, Query(ge=0, le=2**31 - 1, description="Only events with a higher id.")] = 0,
-    limit: Annotated[int, Query(ge=1, le=PAGE, description="Most events of a list.")] = PAGE,
+    query: Annotated[EventQuery, Query()],
     last_event_id: Annotated[
-        str | None, Header(alias="Last-Event-ID", description="Where a broken stream goes on.")
+        str | None, Header(alias="Last-Event-ID", description="Where to continue a broken stream.")
     ] = None,
 ) -> Response:
-    """Follow a job. A stream ends after the status with which the job is over; it resumes by `Last-Event-ID`."""
+    """Follow a job. A stream ends after the job's last status; it resumes by `Last-Event-ID`."""
     found = await run_in_threadpool(store.get, job_id, owner=caller.owner)
+    after = query.after
     if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
         after = max(after, min(int(last_event_id[:10]), 2**31 - 1))
-    chosen = wanted or preferred(request.headers.get("accept"), list(REPRESENTATIONS))
+    chosen = query.f or preferred(request.headers.get("accept"), list(REPRESENTATIONS))
     if REPRESENTATIONS.get(chosen, chosen) == "json":
-        told = await run_in_threadpool(store.events, job_id, after, limit)
-        place = f"{base}/jobs/{job_id}/events?f=json&limit={limit}"
+        listed = await run_in_threadpool(store.events, job_id, after, query.limit)
+        place = f"{base}/jobs/{job_id}/events?f=json&limit={query.limit}"
         links = [link(f"{place}&after={after}", "self", "These events")]
-        if told:
-            links.append(link(f"{place}&after={told[-1].sequence}", "next", "What comes after them"))
-        return JSONResponse(
-            {"events": [event_data(event) for event in told], "links": links}, headers={"Cache-Control": "no-store"}
-        )
+        if listed:
+            links.append(link(f"{place}&after={listed[-1].sequence}", "next", "The events after them"))
+        page = EventList(events=[event_document(event) for event in listed], links=links)
+        return respond(page, headers={"Cache-Control": "no-store"})
     if found.status.is_over and not await run_in_threadpool(store.events, job_id, after, 1):
         return Response(status_code=204)
     streams: Streams = request.app.state.streams
@@ -110,7 +104,7 @@ async def events(
 
 
 class Streams:
-    """How many streams are open, and whether they are to end because the process does."""
+    """The number of open streams, and whether they must end because the process does."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -126,7 +120,7 @@ class Streams:
         """
         if self.count >= most:
             raise TooManyRequestsError(
-                f"{self.count} event streams are open and {most} may: poll the job, or come again", 30.0
+                f"{self.count} event streams are open, the limit is {most}: poll the job, or try again later", 30.0
             )
         self.count += 1
 
@@ -136,7 +130,7 @@ class Streams:
 
 
 class EventStream(StreamingResponse):
-    """A stream of events, counted until it ends or its client goes."""
+    """A stream of events, counted until it ends or its client disconnects."""
 
     media_type = "text/event-stream"
 
@@ -155,7 +149,7 @@ class EventStream(StreamingResponse):
 async def follow(
     store: JobStore, job_id: str, after: int, poll_s: float, is_closing: Callable[[], bool]
 ) -> AsyncIterator[bytes]:
-    """Events of a job as they come, until it is over, gone, or the process ends.
+    """Events of a job as they come, until the job is over or removed, or the process ends.
 
     Parameters
     ----------
@@ -164,31 +158,31 @@ async def follow(
     job_id : str
         The job.
     after : int
-        Number of the last event that the client knows.
+        Number of the last event that the client has.
     poll_s : float
-        Seconds between looks while something happens.
+        Seconds between looks after an event.
     is_closing : callable
         Whether the process ends.
     """
     yield format_sse_event(retry=RECONNECT_MS)
     pause_s, quiet_s = poll_s, 0.0
     while not is_closing():
-        told = await run_in_threadpool(store.events, job_id, after, PAGE)
-        for event in told:
+        found = await run_in_threadpool(store.events, job_id, after, PAGE)
+        for event in found:
             yield _message(event)
             after = event.sequence
-        if told and told[-1].status is not None and told[-1].status.is_over:
+        if found and found[-1].status is not None and found[-1].status.is_over:
             return
-        if told:
+        if found:
             pause_s, quiet_s = poll_s, 0.0
             continue
         if quiet_s >= KEEP_ALIVE_S:
             quiet_s = 0.0
             try:
-                found = await run_in_threadpool(store.get, job_id)
+                job = await run_in_threadpool(store.get, job_id)
             except NoSuchJobError:
                 return
-            if found.status.is_over and not await run_in_threadpool(store.events, job_id, after, 1):
+            if job.status.is_over and not await run_in_threadpool(store.events, job_id, after, 1):
                 return
             yield KEEPALIVE_COMMENT
         await anyio.sleep(pause_s)
@@ -197,5 +191,5 @@ async def follow(
 
 
 def _message(event: JobEvent) -> bytes:
-    data = json.dumps(event_data(event), ensure_ascii=False)
+    data = event_document(event).model_dump_json(exclude_defaults=True)
     return format_sse_event(data_str=data, event=event.kind, id=str(event.sequence))

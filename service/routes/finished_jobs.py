@@ -1,4 +1,4 @@
-"""Jobs whose results are there: where they lie, or why there are none; of a comparison those of one run."""
+"""Jobs with results: where the results are, or why there are none; for a comparison also those of one run."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class FinishedJob:
     catalogue: Catalogue
     """What the outputs are."""
     label: str | None = None
-    """Which run of a comparison was asked for; None for the comparison as a whole, and of other jobs."""
+    """The requested run of a comparison; None for the whole comparison, and for other jobs."""
 
     def run(self, label: str) -> FinishedJob:
         """One run of a comparison, as if it were a job of its own.
@@ -53,7 +53,7 @@ class FinishedJob:
         )
 
     def address(self, path: str, **query: str) -> str:
-        """A path below the job with a query that leads to the same run again."""
+        """A path below the job with the query that selects the same run."""
         given = {**({} if self.label is None else {"method": self.label}), **query}
         return f"{path}?{urlencode(given)}" if given else path
 
@@ -93,26 +93,26 @@ _Label = Annotated[
     str | None,
     Query(
         alias="method",
-        description="Of a comparison the run that is meant, by its label: METHOD, or METHOD-PRESET.",
+        description="A run of a comparison, by its label: METHOD, or METHOD-PRESET.",
         examples=["fuzzy-sart"],
     ),
 ]
 
 
 def _results(finished: _Finished, label: _Label = None) -> FinishedJob:
-    """What the job offers, or one run of it."""
+    """The job's results, or those of one run."""
     return finished if label is None else finished.run(label)
 
 
 def _buildings(finished: _Finished, label: _Label = None) -> FinishedJob:
-    """The run whose buildings are meant: of a comparison the first one, unless another is named."""
+    """The run of the buildings: by default the first one of a comparison."""
     if label is None and finished.catalogue.runs:
         return finished.run(finished.catalogue.runs[0])
     return finished if label is None else finished.run(label)
 
 
 Finished = Annotated[FinishedJob, Depends(_results)]
-"""The job of the path, with its results; of a comparison those of one run, where it is named."""
+"""The job of the path with its results; of a comparison those of one run, if it is named."""
 
 FinishedRun = Annotated[FinishedJob, Depends(_buildings)]
-"""The job of the path, with the results of one run."""
+"""The job of the path with the results of one run."""

@@ -1,4 +1,4 @@
-"""Whether the service lives, whether it can work, and its figures."""
+"""Whether the process lives and can work, and its metrics."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ import os
 import tempfile
 
 from fastapi import APIRouter, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import Response
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from service.errors import StoreError
 from service.files import StateFolder
 from service.metrics import Metrics
+from service.routes.answers import document
 from service.routes.bound import Folder, Reader, Store
-from service.routes.documented import document
 from service.store import JobStore
+from service.wire.base import respond
+from service.wire.landing import Health
 
 router = APIRouter(tags=["service"])
 
@@ -22,11 +24,11 @@ router = APIRouter(tags=["service"])
 @router.get(
     "/healthz",
     summary="Whether the process lives",
-    responses={200: document("Health", "It does.", {"status": "ok"})},
+    responses={200: document(Health, "It does.", {"status": "ok"})},
 )
-async def healthz() -> JSONResponse:
-    """Tell that the process answers; nothing else is asked."""
-    return JSONResponse({"status": "ok"})
+async def healthz() -> Response:
+    """Say that the process answers; nothing else is checked."""
+    return respond(Health(status="ok"))
 
 
 _READY = {"status": "ok", "checks": {"database": "ok", "state": "ok", "driver": "running"}}
@@ -36,21 +38,21 @@ _READY = {"status": "ok", "checks": {"database": "ok", "state": "ok", "driver": 
     "/readyz",
     summary="Whether the service can work",
     responses={
-        200: document("Health", "It can.", _READY),
-        503: document("Health", "It cannot now.", {"status": "unavailable", "checks": {"database": "does not answer"}}),
+        200: document(Health, "It can.", _READY),
+        503: document(Health, "It cannot now.", {"status": "unavailable", "checks": {"database": "does not answer"}}),
     },
 )
-def readyz(request: Request, store: Store, folder: Folder) -> JSONResponse:
-    """Tell whether the database answers and the state folder can be written.
+def readyz(request: Request, store: Store, folder: Folder) -> Response:
+    """Check whether the database answers and the state folder can be written.
 
-    The driver is told but does not count: without one jobs are still taken, and wait.
+    The driver is listed but does not count: without a driver jobs are still accepted, and wait.
     """
     checks = {"database": _database(store), "state": _state(folder)}
     is_ready = all(found == "ok" for found in checks.values())
     driver = getattr(request.app.state, "driver", None)
     checks["driver"] = "elsewhere" if driver is None else driver()
-    return JSONResponse(
-        {"status": "ok" if is_ready else "unavailable", "checks": checks},
+    return respond(
+        Health(status="ok" if is_ready else "unavailable", checks=checks),
         status_code=200 if is_ready else 503,
         headers={"Cache-Control": "no-store"},
     )
@@ -76,11 +78,11 @@ def _state(folder: StateFolder) -> str:
 
 @router.get(
     "/metrics",
-    summary="Figures for Prometheus",
+    summary="Metrics for Prometheus",
     response_class=Response,
     responses={
         200: {
-            "description": "The figures.",
+            "description": "The metrics.",
             "content": {
                 "text/plain": {"schema": {"type": "string"}, "example": 'gablework_jobs{status="running"} 1.0'}
             },
@@ -88,7 +90,7 @@ def _state(folder: StateFolder) -> str:
     },
 )
 def metrics(request: Request, caller: Reader) -> Response:
-    """Tell requests, durations and jobs by status, in the text format of Prometheus."""
+    """Requests, durations and jobs by status, in the text format of Prometheus."""
     del caller
-    figures: Metrics = request.app.state.metrics
-    return Response(figures.render(), headers={"Content-Type": CONTENT_TYPE_LATEST})
+    metrics_: Metrics = request.app.state.metrics
+    return Response(metrics_.render(), headers={"Content-Type": CONTENT_TYPE_LATEST})

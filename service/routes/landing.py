@@ -8,82 +8,72 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Query, Request, Response
-from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
+from fastapi.responses import FileResponse, HTMLResponse
 
+from service.routes.answers import document, problems
 from service.routes.bound import Base, visitor
-from service.routes.documented import document, problems
 from service.routes.negotiation import preferred
-from service.routes.status import RELATIONS, link
+from service.wire.base import RELATIONS, link, respond
+from service.wire.landing import Conformance, LandingPage
 
 VIEWER = Path(__file__).resolve().parents[1] / "viewer" / "dist"
-"""Where the build of the web page lies."""
+"""The built web page."""
 
 SPECIFICATION = "http://www.opengis.net/spec/ogcapi-processes-1/1.0/conf/"
 
 CONFORMANCE = tuple(
     f"{SPECIFICATION}{name}" for name in ("core", "json", "oas30", "ogc-process-description", "job-list", "dismiss")
 )
-"""What of the standard is met."""
+"""The parts of the standard that are met."""
 
 OPENAPI_TYPE = "application/vnd.oai.openapi+json;version=3.0"
 
 router = APIRouter(tags=["service"], dependencies=[Depends(visitor)])
 
-Format = Annotated[Literal["json", "html"] | None, Query(alias="f", description="Stands above the header Accept.")]
-
+Format = Annotated[Literal["json", "html"] | None, Query(alias="f", description="Overrides the header Accept.")]
 
 REPRESENTATIONS: Mapping[str, str] = {"application/json": "json", "text/html": "html"}
-"""Media types of the landing page, and how the parameter f calls them; the first one counts among equals."""
+"""Media types of the landing page with their names in the parameter f; the first one wins among equals."""
+
+_JSON_OR_PAGE = document(
+    LandingPage,
+    "Links to everything else; for browsers the web page.",
+    {"title": "gablework", "links": [{"href": "/processes", "rel": "processes"}]},
+)
+_JSON_OR_PAGE["content"]["text/html"] = {"schema": {"type": "string"}}
 
 
 @router.get(
     "/",
     summary="Landing page",
-    response_class=JSONResponse,
-    responses={
-        200: {
-            "description": "Links to everything else; for browsers the web page.",
-            "content": {
-                "application/json": {
-                    "schema": {"$ref": "#/components/schemas/LandingPage"},
-                    "example": {"title": "gablework", "links": [{"href": "/processes", "rel": "processes"}]},
-                },
-                "text/html": {"schema": {"type": "string"}},
-            },
-        },
-        **problems(400, 406),
-    },
+    responses={200: _JSON_OR_PAGE, **problems(400, 406)},
 )
 def landing(request: Request, base: Base, wanted: Format = None) -> Response:
-    """Tell where everything is: JSON for machines, the web page for browsers."""
+    """Links to everything: JSON for machines, the web page for browsers."""
     chosen = wanted or preferred(request.headers.get("accept"), list(REPRESENTATIONS))
     return web_page() if REPRESENTATIONS.get(chosen, chosen) == "html" else _for_machines(base)
 
 
-def landing_page(base: str) -> dict[str, Any]:
-    """The landing page for machines."""
-    return {
-        "title": "gablework",
-        "description": "Valid LoD2 building models from raw airborne LiDAR tiles.",
-        "links": [
+def _for_machines(base: str) -> Response:
+    page = LandingPage(
+        title="gablework",
+        description="Valid LoD2 building models from raw airborne LiDAR tiles.",
+        links=[
             link(f"{base}/", "self", "This page"),
             link(f"{base}/?f=html", "alternate", "The web page", "text/html"),
             link(f"{base}/openapi.json", "service-desc", "The API", OPENAPI_TYPE),
             link(f"{base}/docs", "service-doc", "The API for people", "text/html"),
-            link(f"{base}/conformance", f"{RELATIONS}conformance", "What of OGC API - Processes is met"),
+            link(f"{base}/conformance", f"{RELATIONS}conformance", "The parts of OGC API - Processes that are met"),
             link(f"{base}/processes", f"{RELATIONS}processes", "The processes"),
             link(f"{base}/jobs", f"{RELATIONS}job-list", "The jobs"),
             link(f"{base}/schedules", "schedules", "The schedules"),
         ],
-    }
-
-
-def _for_machines(base: str) -> Response:
-    return JSONResponse(landing_page(base), headers={"Vary": "Accept"})
+    )
+    return respond(page, headers={"Vary": "Accept"})
 
 
 def web_page() -> Response:
-    """The web page, or one that tells how to build it."""
+    """The web page, or one that says how to build it."""
     page = VIEWER / "index.html"
     headers = {"Vary": "Accept", "Cache-Control": "no-cache"}
     if page.is_file():
@@ -108,13 +98,11 @@ UNBUILT = """<!doctype html>
 @router.get(
     "/conformance",
     summary="Conformance classes",
-    responses={
-        200: document("Conformance", "The classes.", {"conformsTo": list(CONFORMANCE)}),
-    },
+    responses={200: document(Conformance, "The classes.", {"conformsTo": list(CONFORMANCE)})},
 )
-def conformance() -> JSONResponse:
-    """Tell which parts of OGC API - Processes are met."""
-    return JSONResponse({"conformsTo": list(CONFORMANCE)})
+def conformance() -> Response:
+    """List the parts of OGC API - Processes that are met."""
+    return respond(Conformance(conformsTo=list(CONFORMANCE)))
 
 
 @router.get("/docs", include_in_schema=False)
@@ -135,7 +123,7 @@ def _docs(api: Mapping[str, Any]) -> str:
             )
     titles = {tag["name"]: tag["description"] for tag in api["tags"]}
     body = "".join(
-        f"<h2>{escape(name)}</h2><p>{escape(titles[name])}</p>{''.join(told)}" for name, told in chapters.items()
+        f"<h2>{escape(name)}</h2><p>{escape(titles[name])}</p>{''.join(texts)}" for name, texts in chapters.items()
     )
     info = api["info"]
     return (
@@ -148,8 +136,8 @@ def _docs(api: Mapping[str, Any]) -> str:
 
 def _parameters(operation: Mapping[str, Any]) -> str:
     """The parameters of an operation as a list."""
-    told = [
+    listed = [
         f"<li><code>{escape(given['name'])}</code> ({given['in']}) {escape(given.get('description', ''))}</li>"
         for given in operation.get("parameters", ())
     ]
-    return f"<ul>{''.join(told)}</ul>" if told else ""
+    return f"<ul>{''.join(listed)}</ul>" if listed else ""

@@ -7,31 +7,33 @@ from pathlib import Path as FilePath
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request, Response
-from fastapi.responses import FileResponse, JSONResponse
+from fastapi.responses import FileResponse
 from starlette.exceptions import HTTPException
 
 from service.errors import RequestError
 from service.outputs import KINDS, OUTPUTS, output_file
 from service.outputs.kinds import HTML
+from service.routes.answers import JOB_ID, document, header, problems
 from service.routes.bound import Base
-from service.routes.documented import JOB_ID, problems
 from service.routes.finished_jobs import Finished
 from service.routes.negotiation import preferred
+from service.wire.base import respond
+from service.wire.queries import words
+from service.wire.results import OutputFile, Results
 
 router = APIRouter(tags=["results"])
 
 FAILED = (422, 500, 503)
-"""What the results of a failed job answer, by the cause."""
+"""Status codes of a failed job's results, by the cause."""
 
 SANDBOX = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; font-src data:; script-src 'unsafe-inline'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
 )
-"""Content security policy of a page among the results. It is whole by itself: it may show what it holds, but load and
-send nothing, and it is of an origin of its own, so that nothing in it reaches the service, its keys or its storage."""
+"""Content security policy of a page among the results. The page is self-contained: it may show its own content, but
+load and send nothing. It has its own origin, so nothing in it reaches the service, its keys or its storage."""
 
 _RANGES = re.compile(r"bytes=\s*(\d{1,18}-\d{0,18}|-\d{1,18})(\s*,\s*(\d{1,18}-\d{0,18}|-\d{1,18}))*\s*", re.IGNORECASE)
-_HEX = "[0-9a-f]"
 
 _EXAMPLE = {
     output_id: {
@@ -44,33 +46,13 @@ _EXAMPLE = {
     }
     for output_id, size in (("buildings", 89_644), ("report", 6_767))
 }
-_REFERENCE = {
-    "type": "object",
-    "required": ["href", "rel", "type", "title", "bytes", "sha256"],
-    "properties": {
-        "href": {"type": "string", "format": "uri"},
-        "rel": {"type": "string"},
-        "type": {"type": "string", "description": "Media type."},
-        "title": {"type": "string"},
-        "bytes": {"type": "integer", "minimum": 0},
-        "sha256": {"type": "string", "pattern": f"^{_HEX}{{64}}$"},
-    },
-}
 
 
 @router.get(
     "/jobs/{jobID}/results",
     summary="Results of a job",
     responses={
-        200: {
-            "description": "The outputs by reference.",
-            "content": {
-                "application/json": {
-                    "schema": {"type": "object", "additionalProperties": _REFERENCE},
-                    "example": _EXAMPLE,
-                }
-            },
-        },
+        200: document(Results, "The outputs by reference.", _EXAMPLE),
         **problems(400, 404, *FAILED),
     },
 )
@@ -80,10 +62,10 @@ def results(
     outputs: Annotated[
         list[str] | None, Query(description="Only these, with commas between them or the parameter again.")
     ] = None,
-) -> JSONResponse:
-    """List what a finished job offers, each with media type, size and sha256."""
+) -> Response:
+    """List the outputs of a finished job, each with media type, size and sha256."""
     stored = finished.catalogue.outputs
-    wanted = [word.strip() for value in outputs or () for word in value.split(",") if word.strip()]
+    wanted = words()(outputs) or []
     unknown = [name for name in wanted if name not in KINDS]
     if unknown:
         raise RequestError([f"query outputs names {unknown[0][:80]!r}: use {', '.join(KINDS)}"])
@@ -92,36 +74,36 @@ def results(
         raise finished.catalogue.missing(missing[0])
     place = f"{base}/jobs/{finished.job.job_id}/results"
     found = {
-        name: {
-            "href": finished.address(f"{place}/{name}"),
-            "rel": "item",
-            "type": KINDS[name].media_type,
-            "title": KINDS[name].title,
-            "bytes": entry.size_bytes,
-            "sha256": entry.sha256,
-        }
+        name: OutputFile(
+            href=finished.address(f"{place}/{name}"),
+            rel="item",
+            type=KINDS[name].media_type,
+            title=KINDS[name].title,
+            bytes=entry.size_bytes,
+            sha256=entry.sha256,
+        )
         for name, entry in stored.items()
         if not wanted or name in wanted
     }
-    return JSONResponse(found, headers={"Cache-Control": "private, no-cache"})
+    return respond(Results(found), headers={"Cache-Control": "private, no-cache"})
 
 
 def _file_answers() -> dict[int | str, dict[str, Any]]:
-    """What the path of a file answers: one media type an output."""
+    """Answers of the path of a file: one media type per output."""
     content: dict[str, dict[str, Any]] = {}
     for kind in KINDS.values():
         value = {"type": "object"} if kind.schema["type"] == "object" else {"type": "string", "format": "binary"}
         content[kind.media_type] = {"schema": value}
     headers = {
-        "ETag": {"description": "The sha256.", "schema": {"type": "string"}},
-        "Accept-Ranges": {"description": "Ranges of bytes are served.", "schema": {"type": "string"}},
-        "Content-Disposition": {"description": "A name to save it under.", "schema": {"type": "string"}},
+        **header("ETag", "The sha256."),
+        **header("Accept-Ranges", "Ranges of bytes are served."),
+        **header("Content-Disposition", "A name to save it under."),
     }
     part = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
     return {
         200: {"description": "The file.", "content": content, "headers": headers},
-        206: {"description": "The range of bytes that was asked for.", "content": {**content, **part}},
-        304: {"description": "The file is the one that the client has."},
+        206: {"description": "The requested range of bytes.", "content": {**content, **part}},
+        304: {"description": "The client has this file already."},
         **problems(400, 404, 406, 416, *FAILED),
     }
 
@@ -140,7 +122,7 @@ def result(
         str, Path(alias="outputID", description=f"One of {', '.join(KINDS)}.", examples=["buildings"])
     ],
 ) -> Response:
-    """Send one output; ranges of bytes are served, so that Parquet can be read from afar."""
+    """Send one output; ranges of bytes are served, so Parquet can be read remotely."""
     path = output_file(finished.out_dir, output_id)
     kind, stored = KINDS[output_id], finished.catalogue.outputs[output_id]
     preferred(request.headers.get("accept"), [kind.media_type])
@@ -183,7 +165,7 @@ def _is_known(if_none_match: str, etag: str) -> bool:
 
 
 def _check_range(request: Request, size: int) -> None:
-    """Refuse a range behind the end; one that cannot be understood is ignored, as RFC 9110 (14.2) wants it.
+    """Refuse a range behind the end; one that cannot be parsed is ignored, as RFC 9110 (14.2) requires.
 
     Raises
     ------
@@ -199,5 +181,5 @@ def _check_range(request: Request, size: int) -> None:
         request.scope["headers"] = [entry for entry in request.scope["headers"] if entry[0] != b"range"]
         return
     if any(int(first) >= size if first else int(last) == 0 for first, last in ends):
-        told = f"the range {text[:80]} lies behind the end: there are {size} bytes"
-        raise HTTPException(416, told, {"Content-Range": f"bytes */{size}"})
+        problem = f"the range {text[:80]} lies behind the end: there are {size} bytes"
+        raise HTTPException(416, problem, {"Content-Range": f"bytes */{size}"})

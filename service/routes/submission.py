@@ -1,4 +1,4 @@
-"""From a draft to a job in the line, to a schedule, or to nothing at all: what a refused call stored goes again."""
+"""From a draft to a waiting job or a schedule. If the call is refused, what it stored is removed."""
 
 from __future__ import annotations
 
@@ -6,32 +6,34 @@ import contextlib
 import dataclasses
 from collections.abc import AsyncIterator, Callable, Iterable
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Annotated, Self, TypeVar
 
 import anyio
 import anyio.to_thread
+from fastapi import Depends, Request
 
 from service.auth import Principal
 from service.drafts import Draft, Inline
 from service.errors import ForbiddenError, UploadInUseError
 from service.fetching import resolve_inputs
 from service.files import StateFolder
-from service.jobs import InputReference, Job, JobRequest
+from service.jobs import InputReference, Job, JobRequest, Upload
 from service.keys import Scope
+from service.routes.bound import Folder, Settings_, Store, Submitter
 from service.settings import ServiceSettings
 from service.store import JobStore
 from service.uploads import receive, remove_file
 
 Made = TypeVar("Made")
-"""What a checked request becomes: a job, or a schedule."""
+"""A job, or a schedule."""
 
 WRITERS = 3
-"""Threads that write jobs: few, for writers wait for one another, and those who only look are not to wait for them."""
+"""Threads that write jobs: few, because writers wait for one another and readers must not wait for them."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Submission:
-    """What it takes to submit for one caller; a context manager that takes back its uploads when a call breaks off."""
+    """A call that submits for one caller. As a context manager it removes its uploads if the call fails."""
 
     store: JobStore
     folder: StateFolder
@@ -42,8 +44,8 @@ class Submission:
     made: list[str] = dataclasses.field(default_factory=list)
     """Ids of the uploads of this call."""
 
-    async def keep(self, stream: AsyncIterator[bytes], filename: str) -> InputReference:
-        """Store a file that came with the call."""
+    async def receive(self, stream: AsyncIterator[bytes], filename: str, sha256: str | None = None) -> Upload:
+        """Store a file that came with the call; `sha256` is the digest that the client promised."""
         upload = await receive(
             stream,
             filename,
@@ -51,19 +53,24 @@ class Submission:
             folder=self.folder,
             settings=self.settings,
             owner=self.caller.key_id,
+            sha256=sha256,
         )
         self.made.append(upload.upload_id)
-        return InputReference(kind="upload", value=upload.upload_id)
+        return upload
+
+    async def keep(self, stream: AsyncIterator[bytes], filename: str) -> InputReference:
+        """Store a file that came with the call, as an input of its job."""
+        return InputReference(kind="upload", value=(await self.receive(stream, filename)).upload_id)
 
     async def submit(self, draft: Draft) -> Job:
-        """Put a job into the line; its row is committed when this returns.
+        """Queue a job; its row is committed when this returns.
 
         Raises
         ------
         RequestError, InputRefusedError, NoSuchUploadError
-            An input cannot be had.
+            An input cannot be used.
         ForbiddenError
-            A priority that this key may not ask for.
+            The priority needs another scope.
         QueueFullError
             Too many jobs wait.
         """
@@ -80,21 +87,21 @@ class Submission:
         return await self.checked(draft, create)
 
     async def checked(self, draft: Draft, write: Callable[[JobRequest], Made]) -> Made:
-        """Check all that is checked before a job is taken, then write what is to be made of the request.
+        """Check a request, then write what is made from it.
 
         Parameters
         ----------
         draft : Draft
-            What is asked for.
+            The request; its files are not stored yet.
         write : callable
-            Writes a job, or a schedule of jobs; runs in one of the threads that write.
+            Writes a job or a schedule of jobs; runs in one of the threads that write.
 
         Raises
         ------
         RequestError, InputRefusedError, NoSuchUploadError
-            An input cannot be had.
+            An input cannot be used.
         ForbiddenError
-            A priority that this key may not ask for.
+            The priority needs another scope.
         """
         if draft.priority > 0 and Scope.ADMIN not in self.caller.scopes:
             raise ForbiddenError(
@@ -119,7 +126,7 @@ class Submission:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Remove the uploads of a call that broke off, also where the client has gone."""
+        """Remove the uploads of a call that failed, also if the client has disconnected."""
         if kind is None:
             return
         with anyio.CancelScope(shield=True):
@@ -127,10 +134,21 @@ class Submission:
 
     def _remove(self, upload_ids: Iterable[str]) -> None:
         for upload_id in upload_ids:
-            # in use: the job was made, and it was the client who did not wait for the answer
+            # in use: the job was made, but the client did not wait for the answer
             with contextlib.suppress(UploadInUseError):
                 self.store.remove_upload(upload_id)
                 remove_file(upload_id, self.folder)
+
+
+async def _submission(
+    request: Request, store: Store, folder: Folder, settings: Settings_, caller: Submitter
+) -> Submission:
+    threads = request.app.state.submitting
+    return Submission(store=store, folder=folder, settings=settings, caller=caller, threads=threads)
+
+
+Submitting = Annotated[Submission, Depends(_submission)]
+"""A submission for the caller, who may submit."""
 
 
 async def _once(content: bytes) -> AsyncIterator[bytes]:

@@ -1,29 +1,28 @@
-"""Uploads: send a file by itself, look at it, remove it. A job names it afterwards."""
+"""Uploads: send a file by itself, look at it, remove it. Later a job names it."""
 
 from __future__ import annotations
 
 import base64
 import binascii
 import re
-from collections.abc import AsyncIterator
 from http import HTTPStatus
 from typing import Annotated, Any
-from urllib.parse import unquote, urlencode
+from urllib.parse import unquote
 
-from fastapi import APIRouter, Header, HTTPException, Path, Query, Request, Response
-from fastapi.responses import JSONResponse
+from fastapi import APIRouter, Depends, Header, HTTPException, Path, Query, Request, Response
 from python_multipart.multipart import parse_options_header
-from starlette.concurrency import run_in_threadpool
 
 from service.errors import RequestError, TooLargeError
-from service.files import StateFolder
 from service.jobs import Upload
 from service.multipart import Form, Part
-from service.routes.bound import Base, Folder, Reader, Settings_, Store, Submitter
-from service.routes.documented import document, problems
+from service.routes.answers import document, header, problems
+from service.routes.bound import Base, Folder, Reader, Store, Submitter
+from service.routes.submission import Submission, Submitting
 from service.settings import ServiceSettings
-from service.store import JobStore
-from service.uploads import as_document, receive, remove_file
+from service.uploads import remove_file
+from service.wire import uploads as wire
+from service.wire.base import link, page_links, respond
+from service.wire.queries import Page
 
 router = APIRouter(tags=["uploads"])
 
@@ -33,7 +32,7 @@ FILE_FIELD = "file"
 """Field of a form that holds the file."""
 MAX_PARTS = 20
 FORM_SLACK_BYTES = 65_536
-"""What a form may have beside the file."""
+"""Bytes that a form may have beside the file."""
 DIGEST = re.compile(r"(?:^|,)\s*sha-256\s*=\s*:([A-Za-z0-9+/=]*):", re.IGNORECASE)
 
 EXAMPLE: dict[str, Any] = {
@@ -62,11 +61,47 @@ EXAMPLE: dict[str, Any] = {
     },
     "links": [{"href": f"http://127.0.0.1:8000/uploads/{UPLOAD_ID}", "rel": "self", "type": "application/json"}],
 }
-_LOCATION = {"Location": {"description": "The upload.", "schema": {"type": "string"}}}
 
-UploadId = Annotated[
-    str, Path(alias="uploadID", description="As the answer to the upload tells it.", examples=[UPLOAD_ID])
-]
+UploadId = Annotated[str, Path(alias="uploadID", description="As in the answer to the upload.", examples=[UPLOAD_ID])]
+
+_BINARY = {"type": "string", "format": "binary"}
+_FORM = {"type": "object", "required": [FILE_FIELD], "properties": {FILE_FIELD: _BINARY}}
+
+
+def _named(
+    filename: Annotated[
+        str | None,
+        Query(max_length=1024, description="Name of the file, if the body is the file; its ending decides the format."),
+    ] = None,
+    content_disposition: Annotated[
+        str | None, Header(description='Names the file likewise: `attachment; filename="a.laz"`.')
+    ] = None,
+    x_filename: Annotated[str | None, Header(description="Names the file likewise, percent-encoded.")] = None,
+) -> str:
+    """The name of the file; empty if there is none."""
+    return filename or _disposition_name(content_disposition) or unquote(x_filename or "")
+
+
+def _promised(
+    content_digest: Annotated[
+        str | None, Header(description="`sha-256=:base64:` of the file (RFC 9530); a file that differs is refused.")
+    ] = None,
+    repr_digest: Annotated[str | None, Header(description="As Content-Digest.")] = None,
+) -> str | None:
+    """The SHA-256 in the digest headers, hexadecimal; other algorithms are ignored."""
+    found = set()
+    for value in (content_digest, repr_digest):
+        for text in DIGEST.findall(value or ""):
+            try:
+                raw = base64.b64decode(text, validate=True)
+            except (binascii.Error, ValueError):
+                raw = b""
+            if len(raw) != 32:
+                raise RequestError([f"the digest is {text[:80]!r}: write sha-256=:the base64 of 32 bytes:"])
+            found.add(raw.hex())
+    if len(found) > 1:
+        raise RequestError(["Content-Digest and Repr-Digest differ: send one"])
+    return found.pop() if found else None
 
 
 @router.post(
@@ -74,21 +109,20 @@ UploadId = Annotated[
     summary="Send a file",
     status_code=201,
     responses={
-        201: document("Upload", "The file is stored, and what its header tells.", EXAMPLE, headers=_LOCATION),
+        201: document(
+            wire.Upload,
+            "The file is stored; `preflight` has the content of its header.",
+            EXAMPLE,
+            headers=header("Location", "The upload."),
+        ),
         **problems(400, 413, 415, 422, 507),
     },
     openapi_extra={
         "requestBody": {
             "required": True,
             "content": {
-                "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
-                "multipart/form-data": {
-                    "schema": {
-                        "type": "object",
-                        "required": [FILE_FIELD],
-                        "properties": {FILE_FIELD: {"type": "string", "format": "binary"}},
-                    }
-                },
+                "application/octet-stream": {"schema": _BINARY},
+                "multipart/form-data": {"schema": _FORM},
             },
         }
     },
@@ -96,68 +130,55 @@ UploadId = Annotated[
 async def send(
     request: Request,
     base: Base,
-    settings: Settings_,
-    store: Store,
-    folder: Folder,
-    caller: Submitter,
-    filename: Annotated[
-        str | None,
-        Query(
-            max_length=1024, description="Name of the file, where the body is the file; its ending tells the format."
-        ),
-    ] = None,
-    content_disposition: Annotated[
-        str | None, Header(description='Names the file likewise: `attachment; filename="a.laz"`.')
-    ] = None,
-    x_filename: Annotated[str | None, Header(description="Names the file likewise, percent-encoded.")] = None,
-    content_digest: Annotated[
-        str | None, Header(description="`sha-256=:base64:` of the file (RFC 9530); what differs is refused.")
-    ] = None,
-    repr_digest: Annotated[str | None, Header(description="As Content-Digest.")] = None,
-) -> JSONResponse:
-    """Send one file, as the body itself or as the field `file` of a form; it is stored as it comes in.
+    submitting: Submitting,
+    named: Annotated[str, Depends(_named)],
+    digest: Annotated[str | None, Depends(_promised)],
+) -> Response:
+    """Send one file, as the body itself or as the field `file` of a form; it is stored while it arrives.
 
-    The answer tells what the file's header says. `usable: false` comes with `problems` that a job can still heal, such
-    as a missing projected CRS.
+    The answer has the content of the file's header. `usable: false` comes with `problems` that a job can still heal,
+    such as a missing projected CRS.
     """
     encoding = request.headers.get("content-encoding", "identity").strip().lower()
     if encoding != "identity":
         raise HTTPException(
             HTTPStatus.UNSUPPORTED_MEDIA_TYPE, f"Content-Encoding is {encoding[:40]!r}: send the file as it is"
         )
-    digest = _promised(content_digest, repr_digest)
     is_form = request.headers.get("content-type", "").strip().lower().startswith("multipart/")
-    _check_length(request, settings, slack_bytes=FORM_SLACK_BYTES if is_form else 0)
-
-    async def keep(stream: AsyncIterator[bytes], name: str) -> Upload:
-        return await receive(
-            stream, name, store=store, folder=folder, settings=settings, owner=caller.key_id, sha256=digest
-        )
-
+    _check_length(request, submitting.settings, slack_bytes=FORM_SLACK_BYTES if is_form else 0)
     if is_form:
         if digest is not None:
             raise RequestError(["the digest is that of a whole form: send the file as the body itself"])
         form = Form(aiter(request.stream()), request.headers["content-type"], max_parts=MAX_PARTS)
-        upload = await _from_form(form, keep, store, folder)
+        async with submitting as submission:
+            upload = await _from_form(form, submission)
     else:
-        named = filename or _disposition_name(content_disposition) or unquote(x_filename or "")
         if not named:
             raise RequestError(["the file has no name: add ?filename=tile.laz, or the header Content-Disposition"])
-        upload = await keep(aiter(request.stream()), named)
-    told = as_document(upload, base)
-    return JSONResponse(told, status_code=201, headers={"Location": f"{base}/uploads/{upload.upload_id}"})
+        upload = await submitting.receive(aiter(request.stream()), named, sha256=digest)
+    headers = {"Location": f"{base}/uploads/{upload.upload_id}"}
+    return respond(upload_document(upload, base), status_code=201, headers=headers)
 
 
-async def _from_form(form: Form, keep: Any, store: JobStore, folder: StateFolder) -> Upload:
-    """The one file of a form; nothing is kept of a form that is not whole."""
+def upload_document(upload: Upload, base: str) -> wire.Upload:
+    """The upload as clients see it."""
+    return wire.Upload(
+        uploadID=upload.upload_id,
+        filename=upload.filename,
+        bytes=upload.size_bytes,
+        sha256=upload.sha256,
+        created=upload.created_at,
+        expires=upload.expires_at,
+        preflight=wire.Preflight(**upload.preflight),
+        links=[link(f"{base}/uploads/{upload.upload_id}", "self", "This upload")],
+    )
+
+
+async def _from_form(form: Form, submission: Submission) -> Upload:
+    """The one file of a form."""
     upload: Upload | None = None
-    try:
-        async for part in form.parts():
-            upload = await keep(part.chunks(), _file_name(part, is_first=upload is None))
-    except BaseException:
-        if upload is not None:
-            await run_in_threadpool(_remove, upload.upload_id, store, folder)
-        raise
+    async for part in form.parts():
+        upload = await submission.receive(part.chunks(), _file_name(part, is_first=upload is None))
     if upload is None:
         raise RequestError([f"the form has no file: send one, as the field {FILE_FIELD!r}"])
     return upload
@@ -177,7 +198,7 @@ def _file_name(part: Part, *, is_first: bool) -> str:
 
 
 def _check_length(request: Request, settings: ServiceSettings, *, slack_bytes: int) -> None:
-    """Refuse what says itself that it is too long, before it is read."""
+    """Refuse a body that is too long by its own header, before it is read."""
     length = request.headers.get("content-length", "")
     if length.isascii() and length.isdigit() and int(length) > settings.max_upload_bytes + slack_bytes:
         raise TooLargeError(
@@ -186,25 +207,8 @@ def _check_length(request: Request, settings: ServiceSettings, *, slack_bytes: i
         )
 
 
-def _promised(*headers: str | None) -> str | None:
-    """The SHA-256 that digest headers promise, hexadecimal; other algorithms are passed over."""
-    found = set()
-    for header in headers:
-        for text in DIGEST.findall(header or ""):
-            try:
-                raw = base64.b64decode(text, validate=True)
-            except (binascii.Error, ValueError):
-                raw = b""
-            if len(raw) != 32:
-                raise RequestError([f"the digest is {text[:80]!r}: write sha-256=:the base64 of 32 bytes:"])
-            found.add(raw.hex())
-    if len(found) > 1:
-        raise RequestError(["Content-Digest and Repr-Digest differ: send one"])
-    return found.pop() if found else None
-
-
 def _disposition_name(header: str | None) -> str:
-    """The file name of a Content-Disposition header; empty where there is none."""
+    """The file name of a Content-Disposition header; empty if there is none."""
     if header is None:
         return ""
     encoded = re.search(r"filename\*\s*=\s*utf-8'[^']*'([^;\s]+)", header, re.IGNORECASE)
@@ -214,58 +218,41 @@ def _disposition_name(header: str | None) -> str:
     return options.get(b"filename", b"").decode("utf-8", "replace")
 
 
-def _remove(upload_id: str, store: JobStore, folder: StateFolder) -> None:
-    store.remove_upload(upload_id)
-    remove_file(upload_id, folder)
-
-
 @router.get(
     "/uploads",
     summary="List uploads",
     responses={
-        200: document("UploadList", "The uploads, newest first.", {"uploads": [EXAMPLE], "links": EXAMPLE["links"]}),
+        200: document(wire.UploadList, "The uploads, newest first.", {"uploads": [EXAMPLE], "links": EXAMPLE["links"]}),
         **problems(400),
     },
 )
-def uploads(
-    base: Base,
-    store: Store,
-    caller: Reader,
-    limit: Annotated[int, Query(ge=1, le=1000, description="Most uploads to list.")] = 100,
-    offset: Annotated[int, Query(ge=0, le=2**31 - 1, description="Uploads to pass over.")] = 0,
-) -> JSONResponse:
+def uploads(base: Base, store: Store, caller: Reader, page: Annotated[Page, Query()]) -> Response:
     """List the uploads that this key may see."""
-    found = store.list_uploads(owner=caller.owner, limit=limit + 1, offset=offset)
-
-    def page(start: int, relation: str) -> dict[str, str]:
-        query = urlencode({"limit": limit, "offset": start})
-        return {"href": f"{base}/uploads?{query}", "rel": relation, "type": "application/json"}
-
-    links = [page(offset, "self")]
-    if len(found) > limit:
-        links.append(page(offset + limit, "next"))
-    if offset > 0:
-        links.append(page(max(0, offset - limit), "prev"))
-    return JSONResponse({"uploads": [as_document(upload, base) for upload in found[:limit]], "links": links})
+    found = store.list_uploads(owner=caller.owner, limit=page.limit + 1, offset=page.offset)
+    links = page_links(f"{base}/uploads", (), len(found), page.limit, page.offset)
+    listed = [upload_document(upload, base) for upload in found[: page.limit]]
+    return respond(wire.UploadList(uploads=listed, links=links))
 
 
 @router.get(
     "/uploads/{uploadID}",
-    summary="What is known of an upload",
-    responses={200: document("Upload", "What is known of it.", EXAMPLE), **problems(404)},
+    summary="An upload",
+    responses={200: document(wire.Upload, "The upload.", EXAMPLE), **problems(404)},
 )
-def upload(upload_id: UploadId, base: Base, store: Store, caller: Reader) -> JSONResponse:
-    """Tell what is known of an upload; its bytes are not given out again."""
-    return JSONResponse(as_document(store.upload(upload_id, owner=caller.owner), base))
+def upload(upload_id: UploadId, base: Base, store: Store, caller: Reader) -> Response:
+    """The record of an upload; its bytes cannot be downloaded."""
+    return respond(upload_document(store.upload(upload_id, owner=caller.owner), base))
 
 
 @router.delete(
     "/uploads/{uploadID}",
     summary="Remove an upload",
     status_code=204,
-    responses={204: {"description": "It is gone."}, **problems(404, 409)},
+    responses={204: {"description": "It is removed."}, **problems(404, 409)},
 )
 def remove(upload_id: UploadId, store: Store, folder: Folder, caller: Submitter) -> Response:
-    """Remove an upload, unless a job that is not over needs it."""
-    _remove(store.upload(upload_id, owner=caller.owner).upload_id, store, folder)
+    """Remove an upload, unless an unfinished job or a schedule needs it."""
+    found = store.upload(upload_id, owner=caller.owner)
+    store.remove_upload(found.upload_id)
+    remove_file(found.upload_id, folder)
     return Response(status_code=204)

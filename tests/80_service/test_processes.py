@@ -10,11 +10,14 @@ import pytest
 
 from pipeline.methods import METHODS, PRESETS
 from pipeline.settings import RunSettings
-from service import catalogue
-from service.drafts import Inputs, reference_of
+from service.drafts import reference_of
 from service.jobs import InputReference
 from service.keys import Scope
 from service.outputs import OUTPUTS
+from service.run_settings import settings_faults, settings_schema
+from service.wire.execute import Execute
+from service.wire.inputs import CompareInputs, ReconstructInputs
+from service.wire.jobs import JobForm
 
 POINTS = b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(20) for y in range(20))
 
@@ -26,10 +29,6 @@ def execute(service, inputs: object, **body: object):
 def faults_of(answer) -> str:
     assert answer.status_code == 400, answer.text
     return "\n".join(answer.json()["errors"])
-
-
-def test_the_catalogue_of_settings_is_that_of_the_code() -> None:
-    assert catalogue.PATH.read_text(encoding="utf-8") == catalogue.render(), "run `python -m service.catalogue`"
 
 
 @pytest.mark.parametrize(
@@ -52,17 +51,17 @@ def test_the_service_finds_the_faults_of_settings_that_a_run_finds(settings: dic
         wanted: set[str] = set()
     except SettingsError as error:
         wanted = set(error.faults)
-    assert set(catalogue.load().faults(settings)) == wanted
+    assert set(settings_faults(settings)) == wanted
 
 
 def test_what_only_json_can_say_is_a_fault_too() -> None:
-    found = catalogue.load().faults({"halo_m": None, "roof": {"step_offset_spacings": 10**400}, "lattice_x_m": [1]})
+    found = settings_faults({"halo_m": None, "roof": {"step_offset_spacings": 10**400}, "lattice_x_m": [1]})
     assert len(found) == 3
     assert any("401 digits" in fault for fault in found)
 
 
 def test_the_schema_of_settings_is_a_json_schema_whose_defaults_fit_it() -> None:
-    schema = catalogue.load().schema()
+    schema = settings_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
     defaults = {
         name: {field: value["default"] for field, value in found["properties"].items()}
@@ -71,7 +70,7 @@ def test_the_schema_of_settings_is_a_json_schema_whose_defaults_fit_it() -> None
         for name, found in schema["properties"].items()
     }
     jsonschema.validate(defaults, schema)
-    assert catalogue.load().faults(defaults) == []
+    assert settings_faults(defaults) == []
 
 
 def test_the_description_names_methods_and_outputs_of_the_code(local_service) -> None:
@@ -266,7 +265,7 @@ def test_a_preset_stands_beside_the_method(local_service) -> None:
     assert RunSettings.from_mapping(stored).building.method == METHODS["fuzzy-sart"].preset("faithful")
     assert "preset is" in faults_of(execute(local_service, {**inputs, "preset": "loose"}))
     without_paper = faults_of(execute(local_service, {**inputs, "method": "arrangement"}))
-    assert "preset is faithful, which arrangement does not have: use robust" in without_paper
+    assert "preset is 'faithful', and arrangement follows no paper: use robust" in without_paper
     contradicted = {**inputs, "settings": {"preset": "robust"}}
     assert "settings.preset" in faults_of(execute(local_service, contradicted))
 
@@ -341,5 +340,6 @@ def test_any_other_href_is_none(href: str) -> None:
 
 
 def test_values_may_be_wrapped_as_the_standard_allows() -> None:
-    inputs = Inputs({"title": [{"value": "a title"}], "meshes": ["none"]})
-    assert (inputs.text("title"), inputs.word("meshes", ("none",)), inputs.faults) == ("a title", "none", [])
+    given = {"tiles": "/srv/a.laz", "title": [{"value": "a title"}], "meshes": ["none"]}
+    inputs = ReconstructInputs.model_validate({**given, "tiles": [{"href": "/srv/a.laz"}]})
+    assert (inputs.title, inputs.meshes) == ("a title", "none")

@@ -1,0 +1,154 @@
+"""What all models share."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Self
+from urllib.parse import urlencode
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    ModelWrapValidatorHandler,
+    PlainSerializer,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
+from starlette.responses import Response
+
+RELATIONS = "http://www.opengis.net/def/rel/ogc/1.0/"
+"""Prefix of the standard's link relations."""
+
+
+def timestamp(at: dt.datetime) -> str:
+    """A time as RFC 3339 in UTC, to the millisecond."""
+    return at.astimezone(dt.UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+Time = Annotated[dt.datetime, PlainSerializer(timestamp)]
+"""A time in UTC."""
+
+ZonedTime = Annotated[dt.datetime, PlainSerializer(dt.datetime.isoformat)]
+"""A time with the offset of its time zone."""
+
+
+def optional_members(schema: dict[str, Any]) -> None:
+    """Describe an optional member as one that may be absent; null is a value only of a member marked `nullable`."""
+    for name, found in schema.get("properties", {}).items():
+        found.pop("title", None)
+        if name in schema.get("required", ()):
+            continue
+        if found.get("default", 0) is None:
+            del found["default"]
+        if {"type": "null"} in found.get("anyOf", ()) and not found.pop("nullable", False):
+            rest = [option for option in found.pop("anyOf") if option != {"type": "null"}]
+            found.update(rest[0] if len(rest) == 1 else {"anyOf": rest})
+    schema.pop("title", None)
+
+
+class Answer(BaseModel):
+    """A document that the service sends. A member with its default, None, is left out."""
+
+    model_config = ConfigDict(json_schema_extra=optional_members)
+
+
+class Link(Answer):
+    """A link."""
+
+    href: str
+    rel: str
+    type: str | None = None
+    title: str | None = None
+
+
+def link(href: str, rel: str, title: str, media_type: str = "application/json") -> Link:
+    """A link to a document."""
+    return Link(href=href, rel=rel, type=media_type, title=title)
+
+
+def page_links(place: str, given: Sequence[tuple[str, object]], found: int, limit: int, offset: int) -> list[Link]:
+    """Links from a page of a list to itself and the pages beside it.
+
+    Parameters
+    ----------
+    place : str
+        Address of the list.
+    given : sequence of pair
+        The other query parameters, by name; None if not given.
+    found : int
+        Entries that were found; one more than `limit` was requested.
+    limit, offset : int
+        Largest number of entries on a page, and the number of entries before this page.
+    """
+    query = [(name, value) for name, value in given if value is not None]
+
+    def page(start: int) -> str:
+        return f"{place}?{urlencode([*query, ('limit', limit), ('offset', start)], errors='replace')}"
+
+    links = [link(page(offset), "self", "This page")]
+    if found > limit:
+        links.append(link(page(offset + limit), "next", "The next page"))
+    if offset > 0:
+        links.append(link(page(max(0, offset - limit)), "prev", "The page before"))
+    return links
+
+
+def respond(
+    document: BaseModel,
+    *,
+    status_code: int = 200,
+    headers: Mapping[str, str] | None = None,
+    media_type: str = "application/json",
+) -> Response:
+    """The response that carries a document."""
+    content = document.model_dump_json(by_alias=True, exclude_defaults=True)
+    return Response(content, status_code, dict(headers or {}), media_type)
+
+
+class Request(BaseModel):
+    """A document that clients send. All its faults are reported together, unknown and missing members included."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra=optional_members)
+
+    NOUN: ClassVar[str] = "a member"
+    """What its members are called in faults."""
+    HINTS: ClassVar[Mapping[str, str]] = {}
+    """What to give for a missing member."""
+
+    @classmethod
+    def prepared(cls, given: Any) -> Any:
+        """What is validated, from what was sent."""
+        return given
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _explained(cls, given: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        try:
+            return handler(cls.prepared(given))
+        except ValidationError as error:
+            faults = [cls._explanation(fault) for fault in error.errors(include_url=False)]
+            raise ValidationError.from_exception_data(cls.__name__, faults) from None
+
+    @classmethod
+    def _explanation(cls, fault: Any) -> InitErrorDetails:
+        kind, context, message = fault["type"], fault.get("ctx", {}), fault["msg"]
+        if kind == "extra_forbidden":
+            kind, message = "unknown", f"is not {cls.NOUN}: use {', '.join(cls.model_fields)}"
+        elif kind == "missing" and len(fault["loc"]) == 1:
+            context = {"fix": cls.HINTS.get(fault["loc"][0], "give a value")}
+        if kind == "unknown" or "fix" in context:
+            kind = PydanticCustomError(kind, message, context)
+        return InitErrorDetails(type=kind, loc=fault["loc"], input=fault["input"], ctx=context)
+
+
+class OneOf:
+    """Annotates a text as one of some words that are known when the module is loaded."""
+
+    def __init__(self, *words: str) -> None:
+        self._words = words
+
+    def __get_pydantic_core_schema__(self, *_: Any) -> CoreSchema:
+        """A literal."""
+        return core_schema.literal_schema(list(self._words))

@@ -1,0 +1,86 @@
+"""The request that starts a job: inputs of a process and the wanted outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from pydantic import ConfigDict, Field, ValidationError, field_validator
+from pydantic.json_schema import SkipJsonSchema
+
+from service.drafts import Draft
+from service.errors import RequestError
+from service.outputs import COMPARISON_OUTPUTS, OUTPUTS, OutputKind
+from service.wire.base import Request
+from service.wire.faults import FaultsError, sentences, shortened
+from service.wire.inputs import CompareInputs, Inputs, ReconstructInputs
+
+INPUTS: Mapping[str, type[Inputs]] = {"reconstruct": ReconstructInputs, "compare": CompareInputs}
+"""The inputs of every process."""
+
+KINDS: Mapping[str, Mapping[str, OutputKind]] = {"reconstruct": OUTPUTS, "compare": COMPARISON_OUTPUTS}
+"""The outputs of every process."""
+
+EXAMPLE = {
+    "inputs": {
+        "tiles": [{"href": "/uploads/0123456789abcdef0123456789abcdef"}],
+        "crs": "EPSG:28992",
+        "settings": {"candidates": {"min_area_m2": 15.0}},
+    },
+    "outputs": {"buildings": {}, "cityjson": {}},
+}
+
+
+class Execute(Request):
+    """A request for a job; other members are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    inputs: dict[str, Any] = Field(
+        default_factory=dict,
+        description="By the names that the process's description lists; each a value, a reference `{href}`, a value "
+        "with a media type `{value, encoding, mediaType}`, or a list of these.",
+    )
+    outputs: dict[str, dict[str, Any]] | None = Field(
+        default=None, description="The wanted outputs; all if it is left out."
+    )
+    mode: Literal["async", "auto"] = Field(default="async", description="Jobs run asynchronously.")
+    response: Literal["raw", "document"] = "document"
+    subscriber: SkipJsonSchema[Any] = None
+
+    @field_validator("subscriber")
+    @classmethod
+    def _no_subscriber(cls, value: Any) -> None:
+        if value is not None:
+            raise FaultsError(["subscriber is given: this service does not call back, follow the job's events"])
+
+    def draft(self, process_id: str, max_inputs: int | None = None) -> Draft:
+        """The draft of a job of a process.
+
+        Parameters
+        ----------
+        process_id : str
+            The process.
+        max_inputs : int, optional
+            Most point clouds; any number by default.
+
+        Raises
+        ------
+        RequestError
+            Naming every fault of inputs and outputs.
+        """
+        faults: list[str] = []
+        kinds, outputs, inputs = KINDS[process_id], None, None
+        try:
+            inputs = INPUTS[process_id].model_validate(self.inputs)
+        except ValidationError as error:
+            faults += sentences(error.errors(include_url=False))
+        if self.outputs is not None:
+            unknown = [name for name in self.outputs if name not in kinds]
+            faults += [f"{shortened(name)} is not an output: use {', '.join(kinds)}" for name in unknown]
+            outputs = tuple(name for name in kinds if name in self.outputs)
+        if inputs is not None and max_inputs is not None and len(inputs.tiles) > max_inputs:
+            faults.append(f"tiles has {len(inputs.tiles)} entries: use at most {max_inputs}")
+        if inputs is None or faults:
+            raise RequestError(faults)
+        return inputs.draft(process_id, outputs)

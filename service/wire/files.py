@@ -1,0 +1,152 @@
+"""Files among the inputs: by reference, or by value within the request."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, WithJsonSchema, WrapValidator
+
+from service.drafts import Inline, reference_of
+from service.jobs import InputReference
+from service.wire.base import OneOf, Request
+from service.wire.faults import json_bytes
+
+LAS, LAZ, PLY, TEXT, CSV = "application/vnd.las", "application/vnd.laszip", "application/ply", "text/plain", "text/csv"
+
+ENDINGS: Mapping[str, str] = {LAZ: ".laz", LAS: ".las", PLY: ".ply", TEXT: ".xyz", CSV: ".csv"}
+"""Media types of point clouds sent by value, and the endings of their files."""
+
+_OUTLINE_ENDINGS = {b"SQLite format 3": ".gpkg", b"PAR1": ".parquet"}
+"""Endings of footprints that are sent by value, by their first bytes; others are GeoJSON."""
+
+Source = InputReference | Inline
+"""An input: stored already, or within the request."""
+
+
+def _placed(href: Any) -> InputReference:
+    if not isinstance(href, str) or not href.strip() or not href.isprintable() or len(href) > 4096:
+        raise ValueError("use an upload, a URL or a path")
+    reference = reference_of(href)
+    if reference is None:
+        raise ValueError("use /uploads/{id}, an https URL, or an absolute path below an input folder")
+    return reference
+
+
+def _decoded(value: Any) -> bytes:
+    try:
+        content = base64.b64decode("".join(value.split()), validate=True) if isinstance(value, str) else b""
+    except (ValueError, binascii.Error):
+        content = b""
+    if not content:
+        raise ValueError("use an href, or a value with base64 content")
+    return content
+
+
+Content = Annotated[bytes, BeforeValidator(_decoded)]
+"""The bytes of a file, sent as base64."""
+
+
+class ByReference(Request):
+    """A file elsewhere."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    href: Annotated[InputReference, PlainValidator(_placed)]
+
+
+class PointsByValue(Request):
+    """A point cloud within the request."""
+
+    model_config = ConfigDict(extra="ignore")
+    HINTS: ClassVar[Mapping[str, str]] = {"value": "use an href, or a value with base64 content"}
+
+    value: Content
+    encoding: Literal["base64"] = "base64"
+    mediaType: Annotated[str, OneOf(*ENDINGS)] | None = None
+
+
+class OutlinesByValue(Request):
+    """A file of footprints within the request."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    value: Content
+    encoding: Literal["base64"]
+
+
+def points(given: Any) -> Source:
+    """A point cloud by reference or by value."""
+    if not isinstance(given, Mapping):
+        return _points(_decoded(given), None)
+    if "href" in given:
+        return ByReference.model_validate(given).href
+    sent = PointsByValue.model_validate(given)
+    return _points(sent.value, sent.mediaType)
+
+
+def _points(content: bytes, media_type: str | None) -> Inline:
+    return Inline(content=content, filename=f"tiles{ENDINGS[media_type] if media_type else _ending_of(content)}")
+
+
+def _ending_of(content: bytes) -> str:
+    """Ending of a point cloud's file, by its first bytes."""
+    if content.startswith(b"LASF"):
+        # the highest bit of the point format marks compression
+        return ".laz" if len(content) > 104 and content[104] & 0x80 else ".las"
+    return ".ply" if content.startswith(b"ply") else ".xyz"
+
+
+def outlines(given: Any) -> Source:
+    """Footprints by reference or by value."""
+    if isinstance(given, list):
+        if len(given) != 1:
+            raise ValueError("use one file")
+        given = given[0]
+    if isinstance(given, Mapping) and "href" in given:
+        return ByReference.model_validate(given).href
+    if isinstance(given, Mapping) and "value" in given:
+        if given.get("encoding") == "base64":
+            content = OutlinesByValue.model_validate(given).value
+            ending = next((end for magic, end in _OUTLINE_ENDINGS.items() if content.startswith(magic)), ".geojson")
+            return Inline(content=content, filename=f"footprints{ending}")
+        given = given["value"]
+    if not isinstance(given, Mapping) or given.get("type") != "FeatureCollection":
+        raise ValueError("use an href, or a GeoJSON FeatureCollection")
+    return Inline(content=json_bytes(given), filename="footprints.geojson")
+
+
+def _one_or_several(given: Any, handler: Any) -> Any:
+    """A list, also of a single file that is sent without one."""
+    return handler(given) if isinstance(given, list) else [points(given)]
+
+
+def _encoded(*media_types: str) -> list[dict[str, str]]:
+    return [{"type": "string", "contentEncoding": "base64", "contentMediaType": kind} for kind in media_types]
+
+
+Points = Annotated[Source, PlainValidator(points), WithJsonSchema({"oneOf": _encoded(*ENDINGS)})]
+"""A point cloud."""
+
+PointClouds = Annotated[list[Points], WrapValidator(_one_or_several), Field(min_length=1)]
+"""One point cloud or several."""
+
+Outlines = Annotated[
+    Source,
+    PlainValidator(outlines),
+    WithJsonSchema(
+        {
+            "oneOf": [
+                {
+                    "type": "object",
+                    "format": "geojson-feature-collection",
+                    "contentMediaType": "application/geo+json",
+                },
+                *_encoded("application/geopackage+sqlite3", "application/vnd.apache.parquet"),
+            ]
+        }
+    ),
+]
+"""Footprints."""

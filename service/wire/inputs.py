@@ -1,0 +1,336 @@
+"""The inputs of the processes."""
+
+from __future__ import annotations
+
+import dataclasses
+import unicodedata
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, get_args
+
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, WithJsonSchema, field_validator
+
+from pipeline.errors import CrsError
+from pipeline.io.crs import UNITS_M, horizontal_unit_of
+from service.drafts import Draft, Inline
+from service.input_policy import checked_crs
+from service.run_settings import DEFAULTS, VARIANTS, choices, settings_faults, settings_schema
+from service.wire.base import OneOf, Request
+from service.wire.faults import FaultsError, shortened
+from service.wire.files import Outlines, PointClouds
+
+MAX_METHODS = 8
+"""Most methods of one comparison."""
+
+LARGEST_COORDINATE = 1e12
+"""Bound of a rectangle's coordinates, far beyond every CRS; keeps differences finite."""
+
+GIVEN_BY = (
+    "By reference (href): an upload of this service, a path below one of its input folders, or a URL at one of its "
+    "allowed hosts. By value: base64, within the limit of a request's size."
+)
+FILES = ("tiles", "footprints")
+"""Inputs that are files."""
+
+
+def _printable(text: str) -> str:
+    if not text.strip():
+        raise ValueError("use a text")
+    if any(unicodedata.category(sign) in {"Cs", "Cc"} for sign in text if sign not in "\t\r\n"):
+        raise ValueError("use no control characters")
+    return text
+
+
+Text = Annotated[str, Field(max_length=500), AfterValidator(_printable)]
+"""A text of the user."""
+
+
+def _projected(text: str) -> str:
+    try:
+        horizontal_unit_of(checked_crs(text, path="crs"), path="crs")
+    except CrsError as error:
+        raise FaultsError([f"crs: {error.problem}. Give a projected CRS, such as EPSG:28992"]) from error
+    return text
+
+
+Crs = Annotated[str, Field(max_length=20_000), AfterValidator(_printable), AfterValidator(_projected)]
+"""A projected CRS that PROJ understands; WKT is long."""
+
+
+def _in_crs_of_tiles(given: Any, info: ValidationInfo) -> Any:
+    """The four numbers of a rectangle that states its CRS."""
+    if not isinstance(given, Mapping):
+        return given
+    crs, of_tiles = given.get("crs"), info.data.get("crs")
+    if crs is None or of_tiles is None or not _same_crs(str(crs), of_tiles):
+        raise ValueError("the rectangle is read in the tiles' CRS: give the same crs here and as the input crs")
+    return given.get("bbox")
+
+
+def _same_crs(one: str, other: str) -> bool:
+    try:
+        return checked_crs(one, path="bbox") == checked_crs(other, path="crs")
+    except CrsError:
+        return False
+
+
+def _has_area(box: list[float]) -> list[float]:
+    x_min, y_min, x_max, y_max = box
+    if not (x_min < x_max and y_min < y_max):
+        raise ValueError("use x_min, y_min, x_max, y_max with a positive width and depth")
+    return box
+
+
+_FOUR_NUMBERS = {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 4}
+Coordinate = Annotated[float, Field(gt=-LARGEST_COORDINATE, lt=LARGEST_COORDINATE, allow_inf_nan=False)]
+Box = Annotated[
+    list[Coordinate],
+    Field(min_length=4, max_length=4),
+    AfterValidator(_has_area),
+    BeforeValidator(_in_crs_of_tiles),
+    WithJsonSchema(
+        {
+            "oneOf": [
+                _FOUR_NUMBERS,
+                {
+                    "type": "object",
+                    "format": "ogc-bbox",
+                    "required": ["bbox", "crs"],
+                    "properties": {"bbox": _FOUR_NUMBERS, "crs": {"type": "string"}},
+                },
+            ]
+        }
+    ),
+]
+"""A rectangle: x_min, y_min, x_max, y_max."""
+
+RunSettings = Annotated[dict[str, Any], WithJsonSchema(settings_schema())]
+"""Tables of settings."""
+
+Meshes = Literal["building", "tile", "glb", "none"]
+
+
+def _word(name: str, title: str, description: str) -> Any:
+    """A general setting as an input of its own; what is not given comes from `settings` or is the default."""
+    return Field(None, title=title, description=description, json_schema_extra={"default": getattr(DEFAULTS, name)})
+
+
+def _settings() -> Any:
+    return Field(
+        default_factory=dict,
+        title="Settings",
+        description="The settings that differ from the defaults, as the tables of a settings file.",
+        validate_default=True,
+    )
+
+
+class Inputs(Request):
+    """The inputs of all processes. `settings` comes last in a subclass: it is checked together with the others."""
+
+    NOUN: ClassVar[str] = "an input"
+    HINTS: ClassVar[Mapping[str, str]] = {"tiles": "give one point cloud or more"}
+
+    tiles: PointClouds = Field(title="Tiles", description=f"Point clouds. {GIVEN_BY}")
+    footprints: Outlines | None = Field(
+        None,
+        title="Footprints",
+        description=f"Building outlines to be modelled, as GeoJSON, GeoPackage or GeoParquet. {GIVEN_BY}",
+    )
+    crs: Crs | None = Field(
+        None,
+        title="CRS",
+        description="Coordinate reference system of the tiles, if their header has none or a wrong one: EPSG code or "
+        "WKT.",
+        examples=["EPSG:28992"],
+    )
+    verticalUnit: Annotated[str, OneOf(*UNITS_M)] | None = Field(
+        None, title="Vertical unit", description="Unit of elevations, if the header has none or a wrong one."
+    )
+    bbox: Box | None = Field(
+        None,
+        title="Rectangle",
+        description="Only this rectangle: x_min, y_min, x_max, y_max in the tiles' CRS and its units.",
+    )
+    classes: Annotated[str, OneOf(*choices("classes"))] | None = _word(
+        "classes", "Classes", "How far the file's own classes are trusted."
+    )
+    meshes: Meshes = Field(
+        get_args(Meshes)[0],
+        title="Meshes",
+        description="One OBJ file per building (building) or per tile (tile), one GLB file per tile (glb), or none.",
+    )
+    licence: Text | None = Field(
+        None, title="Licence", description="Licence of the source data; goes into the results."
+    )
+    title: Text | None = Field(None, title="Title", description="Your own words for the job.")
+    priority: int = Field(
+        0,
+        ge=-10,
+        le=10,
+        title="Priority",
+        description="Higher goes first; more than 0 needs a key with the scope admin, if keys are used.",
+    )
+
+    @classmethod
+    def prepared(cls, given: Any) -> Any:
+        """Inputs without wrappings: a client may send each value in a list, or with its media type; null is absent."""
+        if not isinstance(given, Mapping):
+            return given
+        plain = {name: value if name in FILES else _unwrapped(name, value) for name, value in given.items()}
+        return {name: value for name, value in plain.items() if value is not None and (value or name not in _LISTS)}
+
+    def draft(self, process_id: str, outputs: tuple[str, ...] | None) -> Draft:
+        """The draft of a job.
+
+        Parameters
+        ----------
+        process_id : str
+            The process.
+        outputs : tuple of str or None
+            Ids of the wanted outputs; None for all.
+        """
+        tiles = tuple(
+            dataclasses.replace(tile, filename=tile.filename.replace("tiles", f"tiles-{n}", 1))
+            if isinstance(tile, Inline) and len(self.tiles) > 1
+            else tile
+            for n, tile in enumerate(self.tiles)
+        )
+        values = {
+            "process_id": process_id,
+            "crs": self.crs,
+            "vertical_unit": self.verticalUnit,
+            "bbox": None if self.bbox is None else tuple(map(float, self.bbox)),
+            "meshes": self.meshes,
+            "licence": self.licence,
+            "title": self.title,
+            "outputs": outputs,
+            **self.of_process(),
+        }
+        return Draft(tiles=tiles, footprints=self.footprints, priority=self.priority, values=values)
+
+    def of_process(self) -> dict[str, Any]:
+        """The fields of a `JobRequest` that differ between processes."""
+        raise NotImplementedError
+
+
+_LISTS = ("tiles", "methods")
+"""Inputs that are missing if they are empty."""
+
+
+def _unwrapped(name: str, value: Any) -> Any:
+    if isinstance(value, list) and len(value) == 1 and name not in {"methods", "bbox"}:
+        value = value[0]
+    if isinstance(value, Mapping) and set(value) <= {"value", "mediaType"} and "value" in value:
+        return value["value"]
+    return value
+
+
+def _completed(settings: dict[str, Any], info: ValidationInfo, *names: str) -> dict[str, Any]:
+    """Settings with the general ones that are inputs of their own.
+
+    Raises
+    ------
+    FaultsError
+        Naming all faults of the settings, and every input that contradicts them.
+    """
+    given = {name: info.data[name] for name in names if info.data.get(name) is not None}
+    faults = [
+        f"{name} is {word} and settings.{name} is {shortened(settings[name])}: give one of them"
+        for name, word in given.items()
+        if settings.get(name, word) != word
+    ]
+    completed = settings | given
+    faults += [f"settings: {fault}" for fault in settings_faults(completed)]
+    if faults:
+        raise FaultsError(faults)
+    return completed
+
+
+class ReconstructInputs(Inputs):
+    """The inputs of `reconstruct`."""
+
+    method: Annotated[str, OneOf(*choices("method"))] | None = _word(
+        "method", "Method", "The method that models the buildings."
+    )
+    preset: Annotated[str, OneOf(*choices("preset"))] | None = _word(
+        "preset",
+        "Preset",
+        "Where the method's settings start: those that measured better (robust), or those that keep to its paper "
+        "(faithful).",
+    )
+    lods: Annotated[str, OneOf(*choices("lods"))] | None = _word(
+        "lods",
+        "Levels of detail",
+        "LoD1.2 (blocks), LoD1.3 (level parts), LoD2.2 (roof faces), or several; records describe the finest.",
+    )
+    settings: RunSettings = _settings()
+
+    @field_validator("settings")
+    @classmethod
+    def _complete(cls, settings: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        return _completed(settings, info, "method", "preset", "lods", "classes")
+
+    def of_process(self) -> dict[str, Any]:
+        """The settings."""
+        return {"settings": self.settings}
+
+
+Variant = Annotated[str, OneOf(*VARIANTS)]
+"""METHOD or METHOD:PRESET."""
+
+
+def _as_list(given: Any) -> Any:
+    return given if isinstance(given, list) else [given]
+
+
+def _distinct(words: list[str]) -> list[str]:
+    """Methods without the default preset."""
+    found = [word.removesuffix(f":{DEFAULTS.preset}") for word in words]
+    twice = sorted({word for word in found if found.count(word) > 1})
+    if twice:
+        raise FaultsError([f"methods holds {', '.join(twice)} twice: give each once"])
+    return found
+
+
+class CompareInputs(Inputs):
+    """The inputs of `compare`."""
+
+    HINTS: ClassVar[Mapping[str, str]] = {
+        **Inputs.HINTS,
+        "methods": f"give 2 to {MAX_METHODS} of {', '.join(VARIANTS)}",
+    }
+
+    methods: Annotated[list[Variant], BeforeValidator(_as_list), AfterValidator(_distinct)] = Field(
+        min_length=2,
+        max_length=MAX_METHODS,
+        title="Methods",
+        description="The methods that run on the same candidates, each METHOD or METHOD:PRESET; the default preset is "
+        "robust.",
+        json_schema_extra={"uniqueItems": True},
+    )
+    settings: RunSettings = _settings()
+
+    @field_validator("settings")
+    @classmethod
+    def _complete(cls, settings: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        faults = [
+            f"settings.{name} is {shortened(settings[name])}: name the methods that are compared in methods"
+            for name in ("method", "preset")
+            if name in settings
+        ]
+        compared = {word.partition(":")[0] for word in info.data.get("methods", ())}
+        faults += [
+            f"settings has the table {name}, which is not compared: leave it out, or compare {name}"
+            for name in choices("method")
+            if name in settings and compared and name not in compared
+        ]
+        try:
+            completed = _completed(settings, info, "classes")
+        except FaultsError as error:
+            faults += error.faults
+        if faults:
+            raise FaultsError(faults)
+        return completed
+
+    def of_process(self) -> dict[str, Any]:
+        """Settings and methods."""
+        return {"settings": self.settings, "methods": tuple(self.methods)}

@@ -1,0 +1,107 @@
+"""Jobs: their status, list, events, and the form that sends tiles and starts one."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, WithJsonSchema
+
+from service.wire.base import Answer, Link, OneOf, Time
+from service.wire.execute import Execute
+from service.wire.problems import Problem
+
+Progress = Annotated[int, Field(ge=0, le=100)]
+Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
+
+
+class StatusInfo(Answer):
+    """Status of a job: statusInfo of OGC API - Processes 1.0, with the members of the 2.0 draft."""
+
+    jobID: str
+    id: str
+    processID: str
+    type: Literal["process"]
+    processingEntityType: Literal["ogc-api-processes"] | None = None
+    status: Status
+    title: str | None = None
+    message: str | None = None
+    stage: str | None = None
+    progress: Progress
+    created: Time
+    started: Time | None = None
+    finished: Time | None = None
+    updated: Time
+    priority: int | None = None
+    scheduleID: str | None = Field(None, description="The schedule that made the job; it may be gone.")
+    attempt: int | None = None
+    summary: dict[str, Any] | None = None
+    exception: Problem | None = None
+    request: Execute | None = None
+    links: list[Link]
+
+
+class JobList(Answer):
+    """A page of jobs."""
+
+    jobs: list[StatusInfo]
+    links: list[Link]
+
+
+class Event(Answer):
+    """Something that happened to a job."""
+
+    id: int
+    at: Time
+    kind: Annotated[str, OneOf("status", "stage", "progress", "warning", "waiting")]
+    status: Status | None = None
+    stage: str
+    done: int
+    total: int
+    progress: Progress
+    message: str
+
+
+class EventList(Answer):
+    """A page of events."""
+
+    events: list[Event]
+    links: list[Link]
+
+
+class ServerSentEvent(Answer):
+    """One event of the stream."""
+
+    event: str | None = Field(None, description="The event's kind.")
+    data: str | None = Field(None, description="The event, as JSON.")
+    id: str | None = Field(None, description="The event's id, for Last-Event-ID.")
+    retry: int | None = Field(None, ge=0, description="Milliseconds until a client reconnects.")
+
+
+File = Annotated[bytes, WithJsonSchema({"type": "string", "format": "binary"})]
+
+
+class JobForm(Answer):
+    """Fields of the form. They become the inputs of a process."""
+
+    tile: Annotated[
+        list[File], Field(min_length=1, description="Point clouds. A field without a file name holds an href.")
+    ]
+    footprints: File | None = Field(None, description="Building outlines; likewise.")
+    crs: str | None = None
+    verticalUnit: str | None = None
+    bbox: str | None = Field(None, description="x_min,y_min,x_max,y_max in the tiles' CRS.")
+    method: str | None = None
+    preset: str | None = Field(None, description="Where the method's settings start.")
+    lods: str | None = Field(None, description="Levels of detail with commas between them: 1.2, 1.3, 2.2.")
+    methods: list[str] | None = Field(
+        None,
+        description="Makes the job a comparison of these, each METHOD or METHOD:PRESET, instead of method and preset: "
+        "the field several times, or with commas.",
+    )
+    classes: str | None = None
+    settings: str | None = Field(None, description="JSON.")
+    meshes: str | None = None
+    licence: str | None = None
+    title: str | None = None
+    priority: int | None = None
+    outputs: str | None = Field(None, description="Ids of the wanted outputs, with commas between them.")

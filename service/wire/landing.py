@@ -1,0 +1,28 @@
+"""The landing page, conformance and health."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from service.wire.base import Answer, Link
+
+
+class LandingPage(Answer):
+    """Links to everything else."""
+
+    title: str
+    description: str | None = None
+    links: list[Link]
+
+
+class Conformance(Answer):
+    """The parts of OGC API - Processes that are met."""
+
+    conformsTo: list[str]
+
+
+class Health(Answer):
+    """Whether the service works."""
+
+    status: Literal["ok", "unavailable"]
+    checks: dict[str, str] | None = None

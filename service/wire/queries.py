@@ -1,0 +1,121 @@
+"""Query parameters of lists."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Callable, Sequence
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, Field
+
+from service.jobs import JobStatus
+
+_MILLISECOND = dt.timedelta(microseconds=999)
+"""The rest of the millisecond that a time in an answer names."""
+_LAST = dt.datetime.max.replace(tzinfo=dt.UTC)
+
+Limit = Annotated[int, Field(ge=1, le=1000, description="Most entries of the page.")]
+Offset = Annotated[int, Field(ge=0, le=2**31 - 1, description="Entries before the page.")]
+
+
+def words(allowed: Sequence[str] = ()) -> Callable[[list[str] | None], list[str] | None]:
+    """Splits a parameter that may come several times, with commas, or both; checks the words if some are allowed."""
+
+    def split(values: list[str] | None) -> list[str] | None:
+        if values is None:
+            return None
+        found = list(dict.fromkeys(word.strip() for value in values for word in value.split(",") if word.strip()))
+        unknown = [word for word in found if allowed and word not in allowed]
+        if unknown:
+            raise ValueError(f"{unknown[0][:80]!r} is unknown, use one of {', '.join(allowed)}")
+        return found
+
+    return split
+
+
+Words = Annotated[list[str] | None, AfterValidator(words())]
+
+
+def interval(text: str | None) -> tuple[dt.datetime | None, dt.datetime | None]:
+    """First and last time of an interval. A single time covers its millisecond, as times in answers are cut to it.
+
+    Raises
+    ------
+    ValueError
+        It is not an interval.
+
+    >>> interval("../2026-03-01T09:30:00Z")[1].isoformat()
+    '2026-03-01T09:30:00+00:00'
+    """
+    if text is None:
+        return None, None
+    parts = text.split("/")
+    if len(parts) > 2:
+        raise ValueError("use one time, or two with a slash between them")
+    first = _instant(parts[0], is_open=len(parts) == 2)
+    if len(parts) == 1:
+        # nothing comes after the last instant that can be represented
+        return first, None if first is None or first > _LAST - _MILLISECOND else first + _MILLISECOND
+    last = _instant(parts[1], is_open=True)
+    if first is not None and last is not None and first > last:
+        raise ValueError("use an end that is not before the start")
+    return first, last
+
+
+def _instant(text: str, *, is_open: bool) -> dt.datetime | None:
+    """An RFC 3339 time in UTC; None for an open end."""
+    if is_open and text in {"", ".."}:
+        return None
+    try:
+        # in a query an unescaped plus is a space
+        at = dt.datetime.fromisoformat(text.strip().replace(" ", "+") if "T" in text else text)
+        return (at if at.tzinfo is not None else at.replace(tzinfo=dt.UTC)).astimezone(dt.UTC)
+    except (ValueError, OverflowError):
+        raise ValueError("use a time such as 2026-03-01T09:30:00Z") from None
+
+
+def _is_interval(text: str | None) -> str | None:
+    interval(text)
+    return text
+
+
+Seconds = Annotated[float, Field(ge=0.0, le=1e9, allow_inf_nan=False, description="Seconds.")]
+
+
+class Page(BaseModel):
+    """Which page of a list."""
+
+    limit: Limit = 100
+    offset: Offset = 0
+
+
+class JobQuery(Page):
+    """Which jobs."""
+
+    type: Words = Field(None, description="Only `process` exists here.")
+    processID: Words = Field(None, description="Only jobs of these processes.")
+    status: Annotated[list[str] | None, AfterValidator(words([word.value for word in JobStatus]))] = Field(
+        None, description=f"Only jobs with these: {', '.join(JobStatus)}."
+    )
+    scheduleID: str | None = Field(None, description="Only jobs of this schedule.")
+    datetime: Annotated[str | None, AfterValidator(_is_interval)] = Field(
+        None, description="Created then: an RFC 3339 time, or `a/b`, `../b`, `a/..`."
+    )
+    minDuration: Seconds | None = None
+    maxDuration: Seconds | None = None
+    limit: Annotated[int, Field(ge=1, le=10_000, description="Most jobs of the page.")] = 100
+
+
+class ScheduleQuery(Page):
+    """Which schedules."""
+
+    state: Literal["active", "paused"] | None = Field(None, description="Only schedules in this state.")
+    processID: str | None = Field(None, description="Only schedules of this process.")
+
+
+class EventQuery(BaseModel):
+    """Which events, and how."""
+
+    f: Literal["json", "sse"] | None = Field(None, description="Overrides the header Accept.")
+    after: int = Field(0, ge=0, le=2**31 - 1, description="Only events with a higher id.")
+    limit: int = Field(500, ge=1, le=500, description="Most events of a list.")

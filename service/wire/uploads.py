@@ -1,0 +1,73 @@
+"""Uploads."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_serializer
+
+from service.wire.base import Answer, Link, ZonedTime
+
+
+class Crs(Answer):
+    """A coordinate reference system."""
+
+    name: str
+    epsg: int | None
+
+
+def _nullable(schema: dict[str, Any]) -> None:
+    """Describe members that may be absent or null."""
+    for found in schema["properties"].values():
+        found.pop("default", None)
+        found.pop("title", None)
+
+
+class Preflight(BaseModel):
+    """The content of a file's header; null if unknown. Only one kind of file has counts of points, or of features."""
+
+    model_config = ConfigDict(json_schema_extra=_nullable, extra="allow")
+
+    kind: Literal["points", "footprints"]
+    format: Literal["las", "laz", "copc", "ply", "ascii", "geopackage", "geojson", "geoparquet"]
+    usable: bool = Field(description="Whether a job can use it without further inputs.")
+    problems: list[str] = Field(description="What a job can heal, such as degrees by `crs`.")
+    warnings: list[str]
+    crs: Crs | None = Field(None, description="Null if the file states none.")
+    pointCount: int | None = Field(None, description="Number of lines for text that was not read through.")
+    horizontalUnitM: float | None = None
+    verticalUnitM: float | None = None
+    bounds: list[float] | None = Field(
+        None, description="x_min, y_min, z_min, x_max, y_max, z_max in the units of the CRS."
+    )
+    densityPerM2: float | None = None
+    hasReturns: bool | None = None
+    hasClasses: bool | None = None
+    acquiredFrom: str | None = None
+    acquiredTo: str | None = None
+    featureCount: int | None = None
+    layers: list[str] | None = None
+
+
+class Upload(Answer):
+    """A file that was sent."""
+
+    uploadID: str
+    filename: Annotated[str, Field(description="Cleaned name.")]
+    bytes: Annotated[int, Field(ge=1)]
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    created: ZonedTime
+    expires: ZonedTime
+    preflight: Preflight
+    links: list[Link]
+
+    @field_serializer("preflight")
+    def _as_stored(self, preflight: Preflight) -> dict[str, Any]:
+        return preflight.model_dump(exclude_unset=True)
+
+
+class UploadList(Answer):
+    """A page of uploads."""
+
+    uploads: list[Upload]
+    links: list[Link]
