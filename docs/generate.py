@@ -1,4 +1,4 @@
-"""Writes the pages of docs/reference/ that the code itself can tell, and the service's catalogue of settings.
+"""Writes the pages of docs/reference/ that the code itself can tell.
 
 `make docs` runs it; tests/00_house/test_docs.py fails where a page says other than the code.
 """
@@ -23,7 +23,6 @@ from pipeline.ruler.epochs.settings import DiffSettings
 from pipeline.ruler.evaluation.chapters import TITLES
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.settings import SECTIONS, GeneralSettings
-from service import catalogue
 from service.cli import app
 
 REFERENCE = Path(__file__).resolve().parent / "reference"
@@ -420,8 +419,6 @@ def main() -> None:
     for name, render in PAGES.items():
         (REFERENCE / name).write_text(render(), encoding="utf-8")
         print(f"wrote docs/reference/{name}")
-    catalogue.PATH.write_text(catalogue.render(), encoding="utf-8")
-    print(f"wrote service/{catalogue.PATH.name}")
 
 
 if __name__ == "__main__":

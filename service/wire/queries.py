@@ -25,9 +25,8 @@ def words(allowed: Sequence[str] = ()) -> Callable[[list[str] | None], list[str]
         if values is None:
             return None
         found = list(dict.fromkeys(word.strip() for value in values for word in value.split(",") if word.strip()))
-        unknown = [word for word in found if allowed and word not in allowed]
-        if unknown:
-            raise ValueError(f"{unknown[0][:80]!r} is unknown, use one of {', '.join(allowed)}")
+        if allowed and not set(found) <= set(allowed):
+            raise ValueError(f"use one of {', '.join(allowed)}")
         return found
 
     return split

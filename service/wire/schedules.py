@@ -10,7 +10,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_va
 from pipeline.errors import SettingsError
 from pipeline.schedule import Cron
 from service.errors import RequestError
-from service.wire.base import Answer, Link, Request, Time, ZonedTime, optional_members
+from service.wire.base import Answer, Link, OneOf, Request, Time, ZonedTime, optional_members
 from service.wire.execute import Execute
 from service.wire.faults import FaultsError
 from service.wire.inputs import Text
@@ -141,7 +141,7 @@ class ScheduleRun(Answer):
 
     number: int = Field(ge=1, description="Counts up within the schedule.")
     trigger: Literal["clock", "hand"]
-    outcome: Literal["submitted", "waiting", "skipped", "missed", "failed"]
+    outcome: Annotated[str, OneOf("submitted", "waiting", "skipped", "missed", "failed")]
     slot: Time | None = Field(None, description="When it was due; the last one if several were missed together.")
     firstSlot: Time | None = Field(None, description="The first one if several were missed together.")
     slots: int = Field(ge=1, description="Number of slots.")

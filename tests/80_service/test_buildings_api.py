@@ -212,9 +212,9 @@ def test_words_filter_alone_repeated_and_with_commas(client: TestClient, job_id:
         ("limit", "10001", "limit"),
         ("offset", "-1", "offset"),
         ("offset", str(2**64), "offset"),
-        ("status", "fine", "'fine': use one of ok, fallback, failed"),
-        ("roof_type", "onion", "'onion': use one of flat, pent"),
-        ("reason", "bad luck", "'bad luck': use one of"),
+        ("status", "fine", '["fine"]: use one of ok, fallback, failed'),
+        ("roof_type", "onion", '["onion"]: use one of flat, pent'),
+        ("reason", "bad luck", '["bad luck"]: use one of'),
     ],
 )
 def test_what_means_nothing_is_refused_with_the_fix(
@@ -225,8 +225,8 @@ def test_what_means_nothing_is_refused_with_the_fix(
 
 def test_all_wrong_words_are_told_at_once(client: TestClient, job_id: str) -> None:
     detail = refused(client, job_id, status="fine", roof_type="onion")
-    assert "'fine'" in detail
-    assert "'onion'" in detail
+    assert '"fine"' in detail
+    assert '"onion"' in detail
 
 
 def test_a_page_is_only_geojson(client: TestClient, job_id: str) -> None:

@@ -15,7 +15,6 @@ from service.jobs import InputReference
 from service.keys import Scope
 from service.outputs import OUTPUTS
 from service.run_settings import settings_faults, settings_schema
-from service.wire.execute import Execute
 from service.wire.inputs import CompareInputs, ReconstructInputs
 from service.wire.jobs import JobForm
 
@@ -29,6 +28,11 @@ def execute(service, inputs: object, **body: object):
 def faults_of(answer) -> str:
     assert answer.status_code == 400, answer.text
     return "\n".join(answer.json()["errors"])
+
+
+def test_the_fields_of_the_form_are_inputs_of_the_processes() -> None:
+    inputs = {*ReconstructInputs.model_fields, *CompareInputs.model_fields}
+    assert {name.replace("tile", "tiles") for name in JobForm.model_fields} == inputs | {"outputs"}
 
 
 @pytest.mark.parametrize(
