@@ -17,7 +17,7 @@ from pipeline.export.geoparquet import read_table
 from pipeline.export.mesh_kinds import MESHES
 from pipeline.export.putting import put_local
 from pipeline.export.tile import write_tile
-from service.processes.descriptions import MESHES as OFFERED_BY_THE_SERVICE
+from service.wire.inputs import Meshes as OfferedByTheService
 
 BUILT = (small.gable, small.two_parts, small.failed)
 
@@ -129,7 +129,7 @@ def test_an_unknown_kind_of_meshes_lists_the_known_ones(tmp_path: Path, contexts
 
 def test_the_command_line_and_the_service_offer_the_meshes_that_are_written() -> None:
     choices, _ = get_args(Meshes)
-    assert get_args(choices) == MESHES == OFFERED_BY_THE_SERVICE
+    assert get_args(choices) == MESHES == get_args(OfferedByTheService)
 
 
 @pytest.mark.parametrize(

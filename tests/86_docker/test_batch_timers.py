@@ -16,11 +16,10 @@ import yaml
 
 from pipeline import __version__
 from pipeline.schedule import Cron, Missed, Overlap
-from service.routes.documented import SCHEMAS
-from service.routes.schedule_requests import FIELDS, LONGEST_GRACE_S
 from service.schedules import OUTCOMES, Definition
 from service.settings import ServiceSettings
 from service.store.slot_book import MAX_KEPT
+from service.wire.schedules import SchedulePatch, ScheduleRequest, ScheduleRun
 
 
 @pytest.fixture(scope="module")
@@ -143,18 +142,20 @@ def test_the_bodies_that_the_page_sends_are_those_that_the_service_reads(page: s
     bodies = [json.loads(body) for body in re.findall(r"-d '(\{.*?\})'$", page, re.MULTILINE)]
     assert len(bodies) >= 3
     for body in bodies:
-        assert set(body) <= set(FIELDS)
+        assert set(body) <= set(SchedulePatch.model_fields)
         if "cron" in body:
             Cron(body["cron"], body.get("timeZone", "UTC"))
 
 
-def test_the_document_of_the_api_says_the_same_as_the_reader_of_requests() -> None:
-    fields = SCHEMAS["ScheduleRequest"]["properties"]
-    assert set(fields) == set(FIELDS) == set(SCHEMAS["SchedulePatch"]["properties"])
+def test_the_models_of_schedules_agree_with_the_records() -> None:
+    fields = ScheduleRequest.model_json_schema()["properties"]
     assert fields["missed"]["enum"] == list(Missed)
     assert fields["overlap"]["enum"] == list(Overlap)
-    assert fields["graceSeconds"]["maximum"] == LONGEST_GRACE_S
-    assert SCHEMAS["ScheduleRun"]["properties"]["outcome"]["enum"] == list(OUTCOMES)
-    assert f"Default {Definition.missed}." in fields["missed"]["description"]
-    assert f"Default {Definition.overlap}." in fields["overlap"]["description"]
-    assert f"Default {Definition.grace_s:g}." in fields["graceSeconds"]["description"]
+    defaults = {name: fields[name]["default"] for name in ("missed", "graceSeconds", "overlap", "paused")}
+    assert list(defaults.values()) == [
+        Definition.missed,
+        Definition.grace_s,
+        Definition.overlap,
+        Definition.is_paused,
+    ]
+    assert ScheduleRun.model_json_schema()["properties"]["outcome"]["enum"] == list(OUTCOMES)
