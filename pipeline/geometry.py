@@ -359,7 +359,7 @@ def _checked_search(points: FloatArray, k: int, cell_size_m: float | None) -> tu
     return points, k, cell_size_m
 
 
-_SPACING_NEIGHBOURS = 8
+_SPACING_NEIGHBOURS = 8  # one ring of neighbours on a lattice
 _LOWEST = -(2**63)
 _UNEVEN = 1.3
 """Spacings over the area and over the points that differ by more come of several densities."""

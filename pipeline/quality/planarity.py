@@ -11,7 +11,7 @@ from pipeline.model import FloatArray, IntArray
 _SWEEPS = 12
 """Jacobi sweeps: four reach machine precision for a 3 x 3 matrix, the others cost nothing then."""
 MICROMETRES_PER_MILLIMETRE = 1e3
-_LARGEST = 5e8
+_LARGEST = 5e8  # coordinates stay below it: a wider face uses a coarser unit
 
 
 @kernel

@@ -17,6 +17,7 @@ from pipeline.model import FloatArray, IntArray, LabelArray, Plane, RoofFace
 from pipeline.quality.unseen_roof import Raster, middles_of_cells, unseen_cells
 
 _MAX_CELLS = 1_000_000
+"""Cells of the raster over a roof: bounds the memory."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

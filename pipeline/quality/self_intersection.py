@@ -17,7 +17,7 @@ from pipeline.kernels.merge_sort import ascending_order
 from pipeline.kernels.orientation import segments_meet, turn_of
 from pipeline.model import IntArray
 
-_LOW_BITS = 20
+_LOW_BITS = 20  # products are split here, so that each half fits into 64 bits
 _LOW_MASK = (1 << _LOW_BITS) - 1
 
 

@@ -11,7 +11,7 @@ from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 
 _MAX_CELLS = 4_000_000
 """Of a raster: bounds the memory for points strewn over a wide area."""
-_FARTHEST = 2**63 - 1
+_FARTHEST = 2**63 - 1  # no squared distance reaches it
 _CONTINUATIONS = 12
 """Most rounds of `continue_crossings`: labels spread by one vertex per round, over gaps of a few."""
 SAME_ROOF_M = 0.15

@@ -50,11 +50,12 @@ _MERGE_TOLERANCE_M = 0.05
 _VOTE_WEIGHT = 0.03
 """Share of the largest squared distance that a neighbour's vote outweighs."""
 _VOTING_PASSES = 3
+"""Passes of voting; labels hardly change later."""
 _PLANE_COST = 5.0
 """Points that would be unexplained without a plane for it to stay."""
 _ROUNDS = 2
 """Rounds of regression, merging and assignment: labels hardly change later."""
-_MAD_TO_SIGMA = 1.4826
+_MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import best_fit_plane, cosine_of_slope, mean_square_residual
 
-_NO_MERGE = 1e30
+_NO_MERGE = 1e30  # a cost above every real one
 
 
 @kernel

@@ -29,7 +29,7 @@ from pipeline.segmentation.plane_regression import (
 
 FITTED_NEIGHBOURS = 6
 """Neighbours whose plane is a point's own: more of them reach over ridges where points are sparse."""
-_FREEDOM = FITTED_NEIGHBOURS + 1 - 3
+_FREEDOM = FITTED_NEIGHBOURS + 1 - 3  # points less the parameters of a plane
 _LOWER_QUARTILE_CHI2 = 1.92256
 """Lower quartile of the chi-squared distribution with that freedom, 4."""
 _TRIALS = 2

@@ -18,8 +18,8 @@ from pipeline.tin.predicates import orientation
 MAX_WINDOW_MM = 2_000_000
 """The largest width or depth of one triangulation."""
 
-_HILBERT_BITS = 16
-_ROUND_FACTOR = 8
+_HILBERT_BITS = 16  # of each coordinate on the curve: order only, no geometry
+_ROUND_FACTOR = 8  # points of a round over those of the round before
 
 
 @kernel

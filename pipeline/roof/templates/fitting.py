@@ -39,6 +39,7 @@ _STEP_M = 0.3
 """Faces that differ by more along a border meet in a step: three standard deviations of their points."""
 _PARAMETERS_OF_PLANE = 3
 _PARAMETERS_OF_STEP = 2
+"""Degrees of freedom in the information criterion."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

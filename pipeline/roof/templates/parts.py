@@ -17,7 +17,7 @@ from pipeline.roof.templates.shapes import CAP_SIGMAS, MAX_PLANES, best_shape, c
 
 MAX_PARTS = 6
 """Bounds the work."""
-_EVERYWHERE_M = 1e6
+_EVERYWHERE_M = 1e6  # a half plane wider than any building
 _CUT_PARAMETERS = 3.0
 """Price of a cut between points: its direction and place."""
 _CORNER_CUT_PARAMETERS = 2.0
