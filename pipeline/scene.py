@@ -13,12 +13,13 @@ import math
 import numpy as np
 
 from pipeline.model import BoolArray, ByteArray, IntArray, LabelArray
-from pipeline.terrain.facets import VertexKind
+from pipeline.terrain.facets import SceneVertices, VertexKind
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
 from pipeline.terrain.outliers import dense_enough
+from pipeline.terrain.point_assignment import ScenePoints
 from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
-from pipeline.terrain.surfaces import Fragments, ScenePoints, SceneVertices, fragments_of
+from pipeline.terrain.surfaces import Fragments, fragments_of
 from pipeline.terrain.thinning import highest_per_cell
 from pipeline.terrain.vegetation import crowns, planarity
 from pipeline.tiling import Window

@@ -13,8 +13,9 @@ from pipeline.model import IntArray, Reason
 from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, RejectedSite, object_id
 from pipeline.terrain.candidates import NOWHERE, Surfaces, Verdict
 from pipeline.terrain.facets import FacetKind
+from pipeline.terrain.fragment_sums import N_SUMS, Sum
 from pipeline.terrain.settings import CandidateSettings
-from pipeline.terrain.surfaces import N_SUMS, Fragments, Sum
+from pipeline.terrain.surfaces import Fragments
 from pipeline.tiling import Tile, TileGrid
 
 _NOT_JUDGED = Verdict(reason=Reason.TOO_FEW_POINTS, detail="ground, a step between levels, or a surface without points")

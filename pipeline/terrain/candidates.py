@@ -18,8 +18,8 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray, Reason
 from pipeline.terrain.facets import FacetKind
+from pipeline.terrain.fragment_sums import Sum
 from pipeline.terrain.settings import CandidateSettings
-from pipeline.terrain.surfaces import Sum
 
 NOWHERE = 2**62
 """Coordinate of the smallest point of a surface that has none."""

@@ -8,6 +8,7 @@ order, so that every tile that sees a facet says the same of it.
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,21 +47,72 @@ class VertexKind(IntEnum):
     """Stands above the ground among rough surroundings."""
 
 
+class SceneVertices(NamedTuple):
+    """Thinned points of a scene, the vertices of its TIN; arrays of one length v, absolute mm."""
+
+    x_mm: IntArray
+    y_mm: IntArray
+    z_mm: IntArray
+    height_mm: IntArray
+    """Height above the terrain."""
+    kind: KindArray
+    """VertexKind."""
+    planar: KindArray
+    """1 planar surroundings, 0 rough, -1 unknown."""
+
+
+class FacetLimits(NamedTuple):
+    """What makes a facet a gap or a wall; settings of `SurfaceSettings` in mm."""
+
+    max_circumradius_mm: float
+    wall_mm: int
+    """MX_zdiff from which a facet is a wall."""
+    steep_slope: float
+    """Rise over run from which a facet cuts too, if it is `steep_mm` high."""
+    steep_mm: int
+    step_height_mm: int
+    """Height above the terrain of the foot of a wall that is a step."""
+
+
+class LabelledTin(NamedTuple):
+    """The TIN of a scene, whose facets and vertices belong to fragments of surfaces."""
+
+    facets: LabelArray
+    """(m, 3) int32, vertices counter-clockwise."""
+    neighbours: LabelArray
+    """(m, 3) int32, the facet opposite each vertex; -1 at the hull."""
+    kinds: KindArray
+    """(m,) int8, FacetKind."""
+    label: LabelArray
+    """(m,) int32, fragment of each facet; -1 for none."""
+    vertex_label: LabelArray
+    """(v,) int32, fragment of each vertex; -1 for none."""
+    fragment_kind: KindArray
+    """(f,) int8, FacetKind."""
+
+
+@kernel(inline="always")
+def stands_up(kind: int) -> bool:
+    """Whether a FacetKind is one of objects, whose vertices all stand above the ground, and not a step."""
+    return kind == FacetKind.OBJECT or kind == FacetKind.BUILDING or kind == FacetKind.CROWN  # noqa: PLR1714 - compiled
+
+
+@kernel(inline="always")
+def first_corner(x: IntArray, y: IntArray, facets: LabelArray, f: int) -> int:
+    """Which corner of facet f, 0 to 2, is its smallest vertex by (x, y)."""
+    k = 0
+    for q in range(1, 3):
+        v, w = facets[f, q], facets[f, k]
+        if x[v] < x[w] or (x[v] == x[w] and y[v] < y[w]):
+            k = q
+    return k
+
+
 @kernel
-def classify_facets(
-    x: IntArray,
-    y: IntArray,
-    z: IntArray,
-    height: IntArray,
-    kind: KindArray,
-    facets: LabelArray,
-    max_radius_mm: float,
-    wall_mm: int,
-    steep_slope: float,
-    steep_mm: int,
-    step_mm: int,
-) -> KindArray:
-    """Kind of every facet, int8 (m,), from vertices in mm; steep_slope is rise over run."""
+def classify_facets(vertices: SceneVertices, facets: LabelArray, limits: FacetLimits) -> KindArray:
+    """FacetKind of every facet (m, 3), int8 (m,): by circumradius, MX_zdiff, slope and the kinds of the vertices."""
+    x, y, z, height, kind, _ = vertices
+    max_radius_mm = limits.max_circumradius_mm
     m = facets.shape[0]
     out = np.empty(m, np.int8)
     for f in range(m):
@@ -76,27 +128,27 @@ def classify_facets(
             out[f] = FacetKind.VOID
             continue
         z_difference = max(z[a], z[b], z[c]) - min(z[a], z[b], z[c])
-        ground = (kind[a] == 0) + (kind[b] == 0) + (kind[c] == 0)
-        excluded = kind[a] == 3 or kind[b] == 3 or kind[c] == 3
+        ground = (kind[a] == VertexKind.GROUND) + (kind[b] == VertexKind.GROUND) + (kind[c] == VertexKind.GROUND)
+        excluded = kind[a] == VertexKind.EXCLUDED or kind[b] == VertexKind.EXCLUDED or kind[c] == VertexKind.EXCLUDED
         if ground == 3:
-            out[f] = FacetKind.GROUND if z_difference < wall_mm else FacetKind.BORDER
+            out[f] = FacetKind.GROUND if z_difference < limits.wall_mm else FacetKind.BORDER
             continue
         if ground > 0 or excluded:
             out[f] = FacetKind.BORDER
             continue
-        cuts = z_difference >= wall_mm
-        if not cuts and z_difference >= steep_mm:
+        cuts = z_difference >= limits.wall_mm
+        if not cuts and z_difference >= limits.steep_mm:
             # slope by integer cross products: the facet's normal is (nx, ny, area2)
             uz, vz = z[b] - z[a], z[c] - z[a]
             nx, ny = uy * vz - uz * vy, uz * vx - ux * vz
-            steep = float(area2) * steep_slope
+            steep = float(area2) * limits.steep_slope
             cuts = float(nx) * nx + float(ny) * ny > steep * steep
         if cuts:
-            high = min(height[a], height[b], height[c]) >= step_mm
+            high = min(height[a], height[b], height[c]) >= limits.step_height_mm
             out[f] = FacetKind.STEP if high else FacetKind.BORDER
-        elif kind[a] == kind[b] and kind[b] == kind[c] and kind[a] != 4:
-            out[f] = FacetKind.BUILDING if kind[a] == 2 else FacetKind.OBJECT
-        elif kind[a] != 2 and kind[b] != 2 and kind[c] != 2:
+        elif kind[a] == kind[b] and kind[b] == kind[c] and kind[a] != VertexKind.CROWN:
+            out[f] = FacetKind.BUILDING if kind[a] == VertexKind.BUILDING else FacetKind.OBJECT
+        elif kind[a] != VertexKind.BUILDING and kind[b] != VertexKind.BUILDING and kind[c] != VertexKind.BUILDING:
             out[f] = FacetKind.CROWN
         else:
             out[f] = FacetKind.BORDER
@@ -120,7 +172,7 @@ def marks(
         near[v] = x0 - far_mm <= x[v] < x1 + far_mm and y0 - far_mm <= y[v] < y1 + far_mm
         shared[v] = not (x0 + far_mm <= x[v] < x1 - far_mm and y0 + far_mm <= y[v] < y1 - far_mm)
     for f in range(facets.shape[0]):
-        if kinds[f] == 0:
+        if kinds[f] == FacetKind.VOID:
             continue
         a, b, c = facets[f, 0], facets[f, 1], facets[f, 2]
         west, east = min(x[a], x[b], x[c]), max(x[a], x[b], x[c])
@@ -147,7 +199,7 @@ def label_fragments(kinds: KindArray, neighbours: LabelArray, considered: BoolAr
     kind_of = np.empty(m, np.int8)
     count = 0
     for f in range(m):
-        if label[f] >= 0 or not considered[f] or kinds[f] < 2:
+        if label[f] >= 0 or not considered[f] or kinds[f] < FacetKind.GROUND:
             continue
         label[f] = count
         kind_of[count] = kinds[f]
@@ -179,9 +231,9 @@ def label_vertices(x: IntArray, y: IntArray, facets: LabelArray, kinds: KindArra
     best_x = np.zeros(n, np.int64)
     best_y = np.zeros(n, np.int64)
     for f in range(facets.shape[0]):
-        if label[f] < 0 or (kinds[f] != 3 and kinds[f] != 4 and kinds[f] != 6):
+        if label[f] < 0 or not stands_up(kinds[f]):
             continue
-        solid = kinds[f] != 6
+        solid = kinds[f] != FacetKind.CROWN
         a, b, c = facets[f, 0], facets[f, 1], facets[f, 2]
         area2 = (x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a])
         cx, cy = x[a] + x[b] + x[c], y[a] + y[b] + y[c]

@@ -8,6 +8,8 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
+from pipeline.terrain.facets import FacetKind, LabelledTin, SceneVertices, first_corner, stands_up
+from pipeline.terrain.fragment_sums import Sum
 
 
 @kernel
@@ -63,37 +65,18 @@ def _nearest_vertex(px: int, py: int, pz: int, x: IntArray, y: IntArray, z: IntA
     return best
 
 
-class CorePoints(NamedTuple):
-    """Points of a tile's core."""
+class ScenePoints(NamedTuple):
+    """The points that a tile's core owns; arrays of one length n, absolute mm."""
 
-    x: IntArray
-    y: IntArray
-    z: IntArray
-    above_ground: IntArray
-    """(n,) int64, millimetres all."""
+    x_mm: IntArray
+    y_mm: IntArray
+    z_mm: IntArray
+    height_mm: IntArray
+    """Height above the terrain."""
     last: BoolArray
-    """(n,) bool, last returns."""
+    """Last return of its pulse."""
     allowed: KindArray
-    """(n,) int8, 0 for points that the trusted classes exclude, 2 for building, else 1."""
-
-
-class LabelledTin(NamedTuple):
-    """A TIN whose facets and vertices belong to fragments of surfaces."""
-
-    x: IntArray
-    y: IntArray
-    z: IntArray
-    """(v,) int64, vertices, millimetres."""
-    facets: LabelArray
-    neighbours: LabelArray
-    """(m, 3) int32."""
-    kinds: KindArray
-    """(m,) int8."""
-    label: LabelArray
-    vertex_label: LabelArray
-    """(m,) and (v,) int32, fragments; -1 for none."""
-    fragment_kind: KindArray
-    """(f,) int8."""
+    """By the trusted classes: 0 may not belong to a building, 2 is building, 1 anything else."""
 
 
 class AssignmentLimits(NamedTuple):
@@ -105,111 +88,148 @@ class AssignmentLimits(NamedTuple):
     far: int
 
 
-@kernel
-def assign_points(
-    points: CorePoints, surfaces: LabelledTin, limits: AssignmentLimits, sums: IntArray, lowest_point: IntArray
-) -> LabelArray:
-    """Fragment of every point of the core, int32 (n,), -1 where none; fills the columns POINTS and CANOPY of sums.
+_HINT_MM = 1000
+"""Side of the cells that each name a facet from which a walk may start: a matter of speed."""
 
-    A point belongs to the surface of the facet around it, or at walls and borders to that of the vertex
-    nearest in elevation. `lowest_point` (f, 3) int64 gets the smallest point of each fragment.
-    """
-    px, py, pz, above_ground, last, allowed = points
-    x, y, z, facets, neighbours, kinds, label, vertex_label, fragment_kind = surfaces
-    reach_mm, canopy_mm, ground_mm, far_mm = limits
-    n = px.size
-    out = np.full(n, -1, np.int32)
-    m = facets.shape[0]
-    if m == 0 or n == 0:
-        return out
-    # a start near each point: one facet a cell of 1 m, where there is none that of the cell before
-    cell = 1000
-    column0, row0 = x.min() // cell, y.min() // cell
-    columns, rows = x.max() // cell - column0 + 1, y.max() // cell - row0 + 1
+
+@kernel(inline="always")
+def _hints(vertices: SceneVertices, facets: LabelArray) -> tuple[LabelArray, int, int, int, int]:
+    """A facet near each cell, row by row, where there is none that of the cell before; the lattice of the cells."""
+    x, y = vertices.x_mm, vertices.y_mm
+    column0, row0 = x.min() // _HINT_MM, y.min() // _HINT_MM
+    columns, rows = x.max() // _HINT_MM - column0 + 1, y.max() // _HINT_MM - row0 + 1
     hint = np.full(columns * rows, -1, np.int32)
-    for f in range(m):
+    for f in range(facets.shape[0]):
         v = facets[f, 0]
-        hint[(y[v] // cell - row0) * columns + x[v] // cell - column0] = f
+        hint[(y[v] // _HINT_MM - row0) * columns + x[v] // _HINT_MM - column0] = f
     for k in range(1, hint.size):
         if hint[k] < 0:
             hint[k] = hint[k - 1]
-    previous = 0
-    for i in range(n):
-        if allowed[i] == 0 or above_ground[i] < ground_mm:
+    return hint, column0, row0, columns, rows
+
+
+@kernel(inline="always")
+def _corner_at(px: int, py: int, f: int, vertices: SceneVertices, facets: LabelArray) -> int:
+    """The vertex of facet f at a place in plan; -1 where there is none."""
+    found = -1
+    for q in range(3):
+        if f >= 0:
+            v = facets[f, q]
+            if vertices.x_mm[v] == px and vertices.y_mm[v] == py:
+                found = v
+    return found
+
+
+@kernel(inline="always")
+def _facet_at_edge(f: int, edge: int, vertices: SceneVertices, tin: LabelledTin) -> int:
+    """Of the two facets at an edge the one that is not a gap, else that with the smaller opposite vertex.
+
+    It is the same from whichever side a walk came.
+    """
+    x, y, facets, kinds = vertices.x_mm, vertices.y_mm, tin.facets, tin.kinds
+    g = tin.neighbours[f, edge]
+    if g >= 0 and kinds[g] != FacetKind.VOID:
+        v = facets[f, edge]
+        k = 0
+        while tin.neighbours[g, k] != f:
+            k += 1
+        w = facets[g, k]
+        if kinds[f] == FacetKind.VOID or x[w] < x[v] or (x[w] == x[v] and y[w] < y[v]):
+            f = g
+    return f
+
+
+@kernel(inline="always")
+def _above_facet(px: int, py: int, pz: int, f: int, vertices: SceneVertices, facets: LabelArray) -> float:
+    """Height in mm of a point above the plane of facet f, computed from its smallest vertex on."""
+    x, y, z = vertices.x_mm, vertices.y_mm, vertices.z_mm
+    k = first_corner(x, y, facets, f)
+    a, b, c = facets[f, k], facets[f, (k + 1) % 3], facets[f, (k + 2) % 3]
+    ux, uy, uz = x[b] - x[a], y[b] - y[a], z[b] - z[a]
+    vx, vy, vz = x[c] - x[a], y[c] - y[a], z[c] - z[a]
+    det = float(ux * vy - uy * vx)
+    gx, gy = float(uz * vy - vz * uy) / det, float(ux * vz - vx * uz) / det
+    above: float = float(pz - z[a]) - gx * (px - x[a]) - gy * (py - y[a])
+    return above
+
+
+@kernel(inline="always")
+def _of_corner_on_level(
+    px: int, py: int, pz: int, f: int, vertices: SceneVertices, tin: LabelledTin, reach_mm: int
+) -> int:
+    """Fragment of the corner of facet f that is nearest in elevation, then in plan; -1 beyond the reach."""
+    fragment = -1
+    best = reach_mm + 1
+    best_distance = np.int64(2**62)
+    for q in range(3):
+        v = tin.facets[f, q]
+        if tin.vertex_label[v] < 0:
             continue
-        c, r = px[i] // cell - column0, py[i] // cell - row0
+        dz = abs(pz - vertices.z_mm[v])
+        distance = (px - vertices.x_mm[v]) ** 2 + (py - vertices.y_mm[v]) ** 2
+        if dz < best or (dz == best and distance < best_distance):
+            best = dz
+            best_distance = distance
+            fragment = tin.vertex_label[v]
+    return fragment if best <= reach_mm else -1
+
+
+@kernel
+def assign_points(
+    points: ScenePoints,
+    vertices: SceneVertices,
+    tin: LabelledTin,
+    limits: AssignmentLimits,
+    sums: IntArray,
+    lowest_point: IntArray,
+) -> LabelArray:
+    """Fragment of every point of the core, int32 (n,), -1 where none; fills the columns POINTS and CANOPY of sums.
+
+    A point belongs to the surface of the facet around it, or at walls and borders to that of the vertex nearest in
+    elevation. `lowest_point` (f, 3) int64 gets the smallest point of each fragment. All in mm.
+    """
+    x, y, z = vertices.x_mm, vertices.y_mm, vertices.z_mm
+    facets, kinds, vertex_label = tin.facets, tin.kinds, tin.vertex_label
+    out = np.full(points.x_mm.size, -1, np.int32)
+    if facets.shape[0] == 0 or out.size == 0:
+        return out
+    hint, column0, row0, columns, rows = _hints(vertices, facets)
+    previous = 0
+    for i in range(out.size):
+        if points.allowed[i] == 0 or points.height_mm[i] < limits.ground:
+            continue
+        px, py, pz = points.x_mm[i], points.y_mm[i], points.z_mm[i]
+        c, r = px // _HINT_MM - column0, py // _HINT_MM - row0
         start = previous
         if 0 <= c < columns and 0 <= r < rows and hint[r * columns + c] >= 0:
             start = hint[r * columns + c]
-        f, on_edge = _facet_containing(px[i], py[i], start, x, y, facets, neighbours)
+        f, on_edge = _facet_containing(px, py, start, x, y, facets, tin.neighbours)
         if f >= 0:
             previous = f
-        at_vertex = -1
-        for q in range(3):
-            if f >= 0:
-                v = facets[f, q]
-                if x[v] == px[i] and y[v] == py[i]:
-                    at_vertex = v
+        at_vertex = _corner_at(px, py, f, vertices, facets)
         if at_vertex < 0 and f >= 0 and on_edge >= 0:
-            # on an edge: the facet that is no gap, else the one with the smaller opposite vertex, whichever way we came
-            g = neighbours[f, on_edge]
-            if g >= 0 and kinds[g] != 0:
-                v = facets[f, on_edge]
-                k = 0
-                while neighbours[g, k] != f:
-                    k += 1
-                w = facets[g, k]
-                if kinds[f] == 0 or x[w] < x[v] or (x[w] == x[v] and y[w] < y[v]):
-                    f = g
+            f = _facet_at_edge(f, on_edge, vertices, tin)
         fragment = -1
-        if f < 0 or (kinds[f] == 0 and at_vertex < 0):
+        if f < 0 or kinds[f] == FacetKind.VOID or at_vertex >= 0:
             # facets across gaps differ from tile to tile: only the nearest vertex is sure
-            v = _nearest_vertex(px[i], py[i], pz[i], x, y, z, far_mm)
-            if v >= 0 and abs(pz[i] - z[v]) <= reach_mm:
+            v = at_vertex if at_vertex >= 0 else _nearest_vertex(px, py, pz, x, y, z, limits.far)
+            if v >= 0 and abs(pz - z[v]) <= limits.reach:
                 fragment = vertex_label[v]
-        elif at_vertex >= 0:
-            if abs(pz[i] - z[at_vertex]) <= reach_mm:
-                fragment = vertex_label[at_vertex]
-        elif kinds[f] == 3 or kinds[f] == 4:
-            k = 0
-            for q in range(1, 3):
-                v, w = facets[f, q], facets[f, k]
-                if x[v] < x[w] or (x[v] == x[w] and y[v] < y[w]):
-                    k = q
-            a, b, c3 = facets[f, k], facets[f, (k + 1) % 3], facets[f, (k + 2) % 3]
-            ux, uy, uz = x[b] - x[a], y[b] - y[a], z[b] - z[a]
-            vx, vy, vz = x[c3] - x[a], y[c3] - y[a], z[c3] - z[a]
-            det = float(ux * vy - uy * vx)
-            gx, gy = float(uz * vy - vz * uy) / det, float(ux * vz - vx * uz) / det
-            over = float(pz[i] - z[a]) - gx * (px[i] - x[a]) - gy * (py[i] - y[a])
-            if abs(over) <= reach_mm:
-                fragment = label[f]
-            elif over > canopy_mm and not last[i]:
-                sums[label[f], 14] += 1
+        elif kinds[f] == FacetKind.OBJECT or kinds[f] == FacetKind.BUILDING:
+            over = _above_facet(px, py, pz, f, vertices, facets)
+            if abs(over) <= limits.reach:
+                fragment = tin.label[f]
+            elif over > limits.canopy and not points.last[i]:
+                sums[tin.label[f], Sum.CANOPY] += 1
         else:
-            best = reach_mm + 1
-            best_distance = np.int64(2**62)
-            for q in range(3):
-                v = facets[f, q]
-                if vertex_label[v] < 0:
-                    continue
-                dz = abs(pz[i] - z[v])
-                distance = (px[i] - x[v]) ** 2 + (py[i] - y[v]) ** 2
-                if dz < best or (dz == best and distance < best_distance):
-                    best = dz
-                    best_distance = distance
-                    fragment = vertex_label[v]
-            if best > reach_mm:
-                fragment = -1
-        if fragment < 0 or (
-            fragment_kind[fragment] != 3 and fragment_kind[fragment] != 4 and fragment_kind[fragment] != 6
-        ):
+            fragment = _of_corner_on_level(px, py, pz, f, vertices, tin, limits.reach)
+        if fragment < 0 or not stands_up(tin.fragment_kind[fragment]):
             continue
-        if fragment_kind[fragment] == 4 and allowed[i] != 2:
+        if tin.fragment_kind[fragment] == FacetKind.BUILDING and points.allowed[i] != 2:
             continue
         out[i] = fragment
-        sums[fragment, 13] += 1
+        sums[fragment, Sum.POINTS] += 1
         p = lowest_point[fragment]
-        if px[i] < p[0] or (px[i] == p[0] and (py[i] < p[1] or (py[i] == p[1] and pz[i] < p[2]))):
-            p[0], p[1], p[2] = px[i], py[i], pz[i]
+        if px < p[0] or (px == p[0] and (py < p[1] or (py == p[1] and pz < p[2]))):
+            p[0], p[1], p[2] = px, py, pz
     return out

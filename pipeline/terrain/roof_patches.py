@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,10 +20,25 @@ from pipeline.model import FloatArray, IntArray, LabelArray, Tin
 from pipeline.terrain.binning import points_by_cell
 from pipeline.terrain.vegetation import smallest_eigenvalue
 
-_SCALES = 3
-_UNKNOWN = 1e30
+# Not settings: patches only serve to tell units apart, and the thresholds of units are settings.
+_MAX_RADIUS_M = 3.0
+"""Facets with a wider circumcircle bridge a gap in the roof: nothing touches across them."""
 _TYPICAL_RADII = 3.0
-"""A facet with a circumradius this many times the median of the roof bridges a gap."""
+"""So does a facet with a circumradius this many times the median of a dense roof, but no less than half of that."""
+_WINDOW_MM = 1200
+"""Radius of the smallest windows around vertices."""
+_SCALES = 3
+"""The windows have one, two and four times that radius."""
+MIN_POINTS = 7
+"""Fewest points of a window and of a patch: more than twice what a plane needs."""
+_ROUGHNESS_MM = 120.0
+"""Largest orthogonal standard deviation of a planar window."""
+_DISTANCE_MM = 150.0
+"""A patch takes what lies this near to its plane: three times the noise of a good survey."""
+_MIN_COSINE = math.cos(math.radians(18.0))
+"""Cosine of the largest angle between a patch and the surroundings of its vertices."""
+_UNKNOWN = 1e30
+"""Deviation where a vertex has no plane around it."""
 MAX_BESIDE_MM = 750.0
 """A fold's border is drawn no farther than this beside the line in which its planes intersect."""
 FOLD_SINE = 0.5
@@ -47,6 +63,19 @@ class Patches:
     """(k,) elevation below which nine tenths of the vertices lie."""
     outlines_m: FloatArray
     """(k,) length of the outline in plan, against other patches and against nothing."""
+
+
+class RoofVertices(NamedTuple):
+    """Thinned points of one roof, and which of them share a facet that bridges no gap."""
+
+    x: IntArray
+    y: IntArray
+    z: IntArray
+    """(n,) int64, millimetres from a place near by, sorted by (x, y)."""
+    start: LabelArray
+    """(n + 1,) int32, where the neighbours of each vertex begin."""
+    others: LabelArray
+    """Neighbours of all vertices, int32; some twice."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -84,11 +113,11 @@ def solve_plane(s: FloatArray) -> tuple[float, float, float, bool]:
 
 
 @kernel
-def local_planes(x: IntArray, y: IntArray, z: IntArray, radius_mm: int, min_points: int) -> FloatArray:
+def local_planes(x: IntArray, y: IntArray, z: IntArray) -> FloatArray:
     """Slopes along x and y and orthogonal deviation in mm of the plane around every vertex, (n, 3).
 
-    The window is a circle, doubled up to twice where it holds too few points; what still has no plane has the
-    deviation 1e30.
+    The window is a circle, doubled up to twice where it holds too few points. Where there is still no plane the
+    deviation is `_UNKNOWN`.
     """
     n = x.size
     out = np.zeros((n, 3))
@@ -96,7 +125,7 @@ def local_planes(x: IntArray, y: IntArray, z: IntArray, radius_mm: int, min_poin
     if n == 0:
         return out
     for scale in range(_SCALES):
-        radius = radius_mm * 2**scale
+        radius = _WINDOW_MM * 2**scale
         limit = radius * radius
         start, members, column0, row0, columns, rows = points_by_cell(x, y, np.ones(n, np.bool_), radius)
         s = np.empty(10)
@@ -122,7 +151,7 @@ def local_planes(x: IntArray, y: IntArray, z: IntArray, radius_mm: int, min_poin
                     s[7] += dx * dz
                     s[8] += dy * dz
                     s[9] += dz * dz
-            if s[0] < min_points:
+            if s[0] < MIN_POINTS:
                 continue
             a, b, _, found = solve_plane(s[:9])
             if not found:
@@ -169,24 +198,13 @@ def vertex_neighbours(n: int, facets: LabelArray, sound: LabelArray) -> tuple[La
 
 
 @kernel
-def grow_patches(
-    x: IntArray,
-    y: IntArray,
-    z: IntArray,
-    start: LabelArray,
-    others: LabelArray,
-    local: FloatArray,
-    order: IntArray,
-    roughness_mm: float,
-    distance_mm: float,
-    min_cosine: float,
-    min_points: int,
-) -> tuple[LabelArray, FloatArray]:
+def grow_patches(vertices: RoofVertices, local: FloatArray, order: IntArray) -> tuple[LabelArray, FloatArray]:
     """Patch of every vertex, -1 where none took it; slopes and level at the origin of every patch (k, 3).
 
-    Seeds come in the given order, the most planar first. A vertex joins where it lies within distance_mm of the plane
-    and its own surroundings, if they are planar at all, face the same way.
+    Seeds come in the given order (n,), the most planar first by `local_planes`. A vertex joins where it lies near the
+    plane and its own surroundings, if they are planar at all, face the same way.
     """
+    x, y, z, start, others = vertices
     n = x.size
     label = np.full(n, -1, np.int32)
     tried = np.zeros(n, np.bool_)
@@ -196,7 +214,7 @@ def grow_patches(
     s = np.empty(9)
     for o in range(n):
         seed = order[o]
-        if label[seed] >= 0 or tried[seed] or local[seed, 2] > roughness_mm:
+        if label[seed] >= 0 or tried[seed] or local[seed, 2] > _ROUGHNESS_MM:
             continue
         a, b, level = local[seed, 0], local[seed, 1], 0.0
         s[:] = 0.0
@@ -213,11 +231,11 @@ def grow_patches(
                     continue
                 dx, dy, dz = float(x[w] - x[seed]), float(y[w] - y[seed]), float(z[w] - z[seed])
                 steepness = math.sqrt(1.0 + a * a + b * b)
-                if abs(dz - level - a * dx - b * dy) > distance_mm * steepness:
+                if abs(dz - level - a * dx - b * dy) > _DISTANCE_MM * steepness:
                     continue
-                if local[w, 2] <= roughness_mm:
+                if local[w, 2] <= _ROUGHNESS_MM:
                     p, q = local[w, 0], local[w, 1]
-                    if a * p + b * q + 1.0 < min_cosine * steepness * math.sqrt(1.0 + p * p + q * q):
+                    if a * p + b * q + 1.0 < _MIN_COSINE * steepness * math.sqrt(1.0 + p * p + q * q):
                         continue
                 label[w] = count
                 queue[tail] = w
@@ -237,7 +255,7 @@ def grow_patches(
                         a, b, level = na, nb, nl
                     fitted = tail
         na, nb, nl, found = solve_plane(s)
-        if tail < min_points or not found:
+        if tail < MIN_POINTS or not found:
             for k in range(tail):
                 label[queue[k]] = -1
             tried[seed] = True
@@ -249,13 +267,12 @@ def grow_patches(
 
 
 @kernel
-def fill_patches(
-    x: IntArray, y: IntArray, z: IntArray, start: LabelArray, others: LabelArray, label: LabelArray, planes: FloatArray
-) -> int:
+def fill_patches(vertices: RoofVertices, label: LabelArray, planes: FloatArray) -> int:
     """Give the vertices that no patch took to the patch beside them whose plane is nearest; the number of patches.
 
     Round by round, all vertices of a round at once. What touches no patch becomes patches of its own, without a plane.
     """
+    x, y, z, start, others = vertices
     n = x.size
     wanted = np.empty(n, np.int32)
     while True:
@@ -352,20 +369,9 @@ def border_pieces(
 
 
 def patches_of(
-    x: IntArray,
-    y: IntArray,
-    z: IntArray,
-    tin: Tin,
-    *,
-    max_radius_m: float,
-    window_m: float,
-    min_points: int,
-    roughness_m: float,
-    distance_m: float,
-    max_angle_deg: float,
-    min_step_m: float,
-) -> tuple[Patches, Borders, LabelArray, LabelArray]:
-    """Planar patches of a roof, the borders between them, and which vertices are neighbours (compressed rows).
+    x: IntArray, y: IntArray, z: IntArray, tin: Tin, min_step_m: float
+) -> tuple[Patches, Borders, RoofVertices]:
+    """Planar patches of a roof, the borders between them, and its vertices with their neighbours.
 
     Parameters
     ----------
@@ -373,32 +379,17 @@ def patches_of(
         Vertices in millimetres from a place near by, sorted by (x, y).
     tin : Tin
         Their Delaunay TIN.
-    max_radius_m : float
-        Facets with a wider circumcircle bridge a gap: nothing touches across them. Where the typical facet is small,
-        as in dense data, the limit is three times its circumradius, but no less than half of this.
-    window_m, min_points : float, int
-        Radius of the windows around the vertices, and fewest points of a window and of a patch.
-    roughness_m : float
-        Largest orthogonal deviation of a planar window.
-    distance_m : float
-        Largest orthogonal distance of a vertex to its patch's plane.
-    max_angle_deg : float
-        Largest angle between a patch and the surroundings of its vertices.
     min_step_m : float
         Planes closer than this in elevation meet.
     """
     radii = circumradii(x, y, tin.facets)
     limit = _TYPICAL_RADII * float(np.median(radii))
-    is_sound = radii <= 1000.0 * min(max(limit / 1000.0, max_radius_m / 2.0), max_radius_m)
+    is_sound = radii <= 1000.0 * min(max(limit / 1000.0, _MAX_RADIUS_M / 2.0), _MAX_RADIUS_M)
     sound = np.flatnonzero(is_sound).astype(np.int32)
-    start, others = vertex_neighbours(len(x), tin.facets, sound)
-    local = local_planes(x, y, z, round(window_m * 1000), min_points)
-    order = np.argsort(local[:, 2], kind="stable")
-    label, planes = grow_patches(
-        x, y, z, start, others, local, order,
-        roughness_m * 1000.0, distance_m * 1000.0, math.cos(math.radians(max_angle_deg)), min_points,
-    )  # fmt: skip
-    count = int(fill_patches(x, y, z, start, others, label, planes))
+    vertices = RoofVertices(x, y, z, *vertex_neighbours(len(x), tin.facets, sound))
+    local = local_planes(x, y, z)
+    label, planes = grow_patches(vertices, local, np.argsort(local[:, 2], kind="stable"))
+    count = int(fill_patches(vertices, label, planes))
     pairs, ends, area, outline = border_pieces(x, y, tin.facets, tin.neighbours, sound, label, count)
     without = np.full((count - len(planes), 3), np.nan)
     planes = np.concatenate((planes, without))
@@ -423,8 +414,7 @@ def patches_of(
             outlines_m=outlines,
         ),
         borders,
-        start,
-        others,
+        vertices,
     )
 
 

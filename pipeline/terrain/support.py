@@ -1,7 +1,6 @@
 """How far the steps of the ground filter and of planarity look: lengths that settings add up to the halo of a tile.
 
-They are no settings: each is a few cells of the terrain lattice or a number of rounds, and a test of whole scenes was
-no better with others.
+They are not settings: each belongs to the definition of its step, as a few cells of a lattice or a number of rounds.
 """
 
 from __future__ import annotations

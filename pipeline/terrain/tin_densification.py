@@ -49,16 +49,16 @@ def _join_facets(
     asked: BoolArray,
     judged: BoolArray,
     joined: BoolArray,
-    vertex_c: IntArray,
-    vertex_r: IntArray,
-    facets: LabelArray,
+    tin: tuple[IntArray, IntArray, LabelArray],
     reach: int,
     limits: tuple[float, float, float],
 ) -> None:
     """Judge the asked cells by the facets that hold them: mark what was judged, and what joins.
 
-    On an edge between two facets it is enough to join one of them.
+    On an edge between two facets it is enough to join one of them. `tin` holds column and row of the vertices (v,) and
+    the facets (m, 3).
     """
+    vertex_c, vertex_r, facets = tin
     for f in range(len(facets)):
         p, q, s = facets[f]
         bx, by = vertex_c[q] - vertex_c[p], vertex_r[q] - vertex_r[p]
@@ -113,5 +113,5 @@ def join_facets(
     vertex_r, vertex_c = np.nonzero(ground)
     tin = triangulate(np.column_stack((vertex_c, vertex_r)))
     joined, judged = np.zeros_like(ground), np.zeros_like(ground)
-    _join_facets(elevation, asked, judged, joined, vertex_c, vertex_r, tin.facets, reach, limits)
+    _join_facets(elevation, asked, judged, joined, (vertex_c, vertex_r, tin.facets), reach, limits)
     return joined, judged

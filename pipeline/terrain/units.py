@@ -22,21 +22,13 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.union_find import root_of, unite, united
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.terrain.roof_patches import Borders, Patches, patches_of
+from pipeline.terrain.roof_patches import MIN_POINTS, Borders, Patches, RoofVertices, patches_of
 from pipeline.terrain.settings import UnitSettings
 from pipeline.terrain.thinning import highest_per_cell
 from pipeline.tin.delaunay import MAX_WINDOW_MM, triangulate
 
 THINNING_M = 0.5
 """Side of the cells of which one point each enters the TIN, as in the split of a scene."""
-_MAX_RADIUS_M = 3.0
-"""Facets with a wider circumcircle bridge a gap in the roof."""
-_WINDOW_M = 1.2
-_MIN_POINTS = 7
-_ROUGHNESS_M = 0.12
-_DISTANCE_M = 0.15
-"""A patch takes what lies this near to its plane: three times the noise of a good survey."""
-_MAX_ANGLE_DEG = 18.0
 _PART_M2 = 6.0
 """Smaller patches, as chimneys and dormers, connect nothing."""
 _LEVEL_SHARE = 0.5
@@ -222,17 +214,17 @@ def _unit_of_points(
     x: IntArray,
     y: IntArray,
     z: IntArray,
-    vx: IntArray,
-    vy: IntArray,
-    vz: IntArray,
+    vertices: RoofVertices,
     cell_mm: int,
     unit: LabelArray,
     patch: LabelArray,
     planes: FloatArray,
-    start: LabelArray,
-    others: LabelArray,
 ) -> LabelArray:
-    """Unit of every point: that of its cell's vertex, or beside a border that of the nearest plane around it."""
+    """Unit of every point (n,), mm: that of its cell's vertex, or beside a border that of the nearest plane around it.
+
+    `unit` and `patch` (v,) are those of the vertices; `planes` (k, 3) are slopes and levels in mm, nan where none.
+    """
+    vx, vy, vz, start, others = vertices
     n = x.size
     out = np.empty(n, np.int32)
     column0, row0 = vx.min() // cell_mm, vy.min() // cell_mm
@@ -291,7 +283,7 @@ def units_of(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSetti
     """
     n = len(x_mm)
     one = np.zeros(n, np.int32)
-    if settings.split == "nothing" or n < 2 * _MIN_POINTS:
+    if settings.split == "nothing" or n < 2 * MIN_POINTS:
         return one
     if max(int(np.ptp(x_mm)), int(np.ptp(y_mm))) >= MAX_WINDOW_MM:
         return one
@@ -304,26 +296,13 @@ def units_of(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSetti
     tin = triangulate(np.column_stack((vx, vy)))
     if len(tin) == 0:
         return one
-    patches, borders, start, others = patches_of(
-        vx,
-        vy,
-        vz,
-        tin,
-        max_radius_m=_MAX_RADIUS_M,
-        window_m=_WINDOW_M,
-        min_points=_MIN_POINTS,
-        roughness_m=_ROUGHNESS_M,
-        distance_m=_DISTANCE_M,
-        max_angle_deg=_MAX_ANGLE_DEG,
-        min_step_m=settings.min_step_m,
-    )
+    patches, borders, vertices = patches_of(vx, vy, vz, tin, settings.min_step_m)
     unit_of_patch = units_of_patches(patches, borders, settings)
     if (unit_of_patch == unit_of_patch[0]).all():
         return one
     planes = np.column_stack((patches.slopes, patches.levels_mm))
-    label = _unit_of_points(
-        x, y, z, vx, vy, vz, cell_mm, unit_of_patch[patches.of_vertex], patches.of_vertex, planes, start, others
-    )
+    unit = unit_of_patch[patches.of_vertex]
+    label = _unit_of_points(x, y, z, vertices, cell_mm, unit, patches.of_vertex, planes)
     first = smallest_points(x, y, z, label)
     present = np.flatnonzero(first >= 0)
     smallest = first[present]

@@ -7,6 +7,7 @@ distance and use integer sums, so they are the same in every tile.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -133,19 +134,23 @@ def _spread_mm2(s: tuple[float, float, float, float, float, float, float, float,
     )
 
 
+class _Windows(NamedTuple):
+    """The windows of one scale."""
+
+    radius_mm: int
+    min_points: int
+    roughness_mm: float
+    """Largest orthogonal standard deviation of a planar window."""
+    level_mm: int
+    """Points farther above or below a vertex do not count."""
+
+
 @kernel
 def _planar(
-    x_mm: IntArray,
-    y_mm: IntArray,
-    z_mm: IntArray,
-    wanted: BoolArray,
-    radius_mm: int,
-    min_points: int,
-    roughness_mm: float,
-    level_mm: int,
-    out: KindArray,
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, wanted: BoolArray, windows: _Windows, out: KindArray
 ) -> None:
     """Kernel for one scale: fills the wanted entries of out that are still -1 with 1 (planar) or 0 (rough)."""
+    radius_mm, min_points, roughness_mm, level_mm = windows
     n = x_mm.size
     if n == 0:
         return
@@ -214,17 +219,13 @@ def planarity(
     """
     verdict = np.full(len(x_mm), -1, np.int8)
     for scale in range(PLANARITY_SCALES):
-        _planar(
-            x_mm,
-            y_mm,
-            z_mm,
-            wanted,
-            round(settings.radius_m * 1000) * 2**scale,
-            settings.min_neighbours,
-            settings.roughness_m * 1000.0 * 1.5**scale,
-            round(settings.level_m * 1000),
-            verdict,
+        windows = _Windows(
+            radius_mm=round(settings.radius_m * 1000) * 2**scale,
+            min_points=settings.min_neighbours,
+            roughness_mm=settings.roughness_m * 1000.0 * 1.5**scale,
+            level_mm=round(settings.level_m * 1000),
         )
+        _planar(x_mm, y_mm, z_mm, wanted, windows, verdict)
     return verdict
 
 

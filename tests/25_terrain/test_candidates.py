@@ -23,8 +23,8 @@ from pipeline.terrain.candidates import (
     unite_levels,
 )
 from pipeline.terrain.facets import FacetKind
+from pipeline.terrain.fragment_sums import N_SUMS, Sum
 from pipeline.terrain.settings import CandidateSettings
-from pipeline.terrain.surfaces import N_SUMS, Sum
 
 SETTINGS = CandidateSettings()
 

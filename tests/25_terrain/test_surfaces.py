@@ -15,9 +15,20 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.model import FloatArray, IntArray, KindArray, LabelArray, Tin
-from pipeline.terrain.facets import FacetKind, VertexKind, classify_facets, facet_keys, label_fragments, label_vertices
+from pipeline.terrain.facets import (
+    FacetKind,
+    FacetLimits,
+    SceneVertices,
+    VertexKind,
+    classify_facets,
+    facet_keys,
+    label_fragments,
+    label_vertices,
+)
+from pipeline.terrain.fragment_sums import N_SUMS, Sum
+from pipeline.terrain.point_assignment import ScenePoints
 from pipeline.terrain.settings import SurfaceSettings
-from pipeline.terrain.surfaces import N_SUMS, Fragments, ScenePoints, SceneVertices, Sum, fragments_of
+from pipeline.terrain.surfaces import Fragments, fragments_of
 from pipeline.tin.delaunay import triangulate
 
 Height = Callable[[FloatArray, FloatArray], FloatArray]
@@ -39,7 +50,7 @@ class Scene:
         """The fragments of a core; it owns those of the points that lie in it."""
         p = self.points
         inside = (p.x_mm >= core[0]) & (p.x_mm < core[2]) & (p.y_mm >= core[1]) & (p.y_mm < core[3])
-        owned = ScenePoints(**{f.name: getattr(p, f.name)[inside] for f in dataclasses.fields(p)})
+        owned = ScenePoints(*(values[inside] for values in p))
         fragments, labels = fragments_of(self.tin, self.vertices, owned, core, SETTINGS, canopy_m=1.0, ground_m=0.5)
         out = np.full(len(p.x_mm), -1, np.int32)
         out[inside] = labels
@@ -47,11 +58,8 @@ class Scene:
 
     def facet_kinds(self) -> KindArray:
         """Kinds of the facets."""
-        v = self.vertices
         slope = math.tan(math.radians(SETTINGS.steep_deg))
-        return classify_facets(
-            v.x_mm, v.y_mm, v.z_mm, v.height_mm, v.kind, self.tin.facets, 6000.0, 2000, slope, 1000, 2000
-        )
+        return classify_facets(self.vertices, self.tin.facets, FacetLimits(6000.0, 2000, slope, 1000, 2000))
 
 
 def built(
@@ -168,12 +176,7 @@ def test_facet_kinds_agree_with_a_slow_twin() -> None:
     kind[(random.random(len(kind)) < 0.05) & (kind == VertexKind.OBJECT)] = VertexKind.CROWN
     gap = in_box(x / 1000, scene.vertices.y_mm / 1000, 22, 26, 39, 32)
     kept = np.flatnonzero(~gap | (random.random(len(x)) < 0.02))
-    v = SceneVertices(
-        **{
-            f.name: getattr(scene.vertices, f.name)[kept] for f in dataclasses.fields(SceneVertices) if f.name != "kind"
-        },
-        kind=kind[kept],
-    )
+    v = SceneVertices(*(values[kept] for values in scene.vertices._replace(kind=kind)))
     scene = dataclasses.replace(scene, vertices=v, tin=triangulate(np.column_stack((v.x_mm, v.y_mm))))
     found = scene.facet_kinds().tolist()
     assert found == [slow_kind(scene, facet) for facet in scene.tin.facets]

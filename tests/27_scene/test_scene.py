@@ -18,6 +18,7 @@ from pipeline.model import IntArray
 from pipeline.scene import SplitTile, WindowPoints, lattice_of, split_tile
 from pipeline.terrain.candidates import Surfaces, judge_surfaces, unite_levels
 from pipeline.terrain.facets import FacetKind
+from pipeline.terrain.fragment_sums import Sum
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
 from pipeline.terrain.settings import (
@@ -27,7 +28,7 @@ from pipeline.terrain.settings import (
     SurfaceSettings,
     VegetationSettings,
 )
-from pipeline.terrain.surfaces import Fragments, Sum
+from pipeline.terrain.surfaces import Fragments
 from pipeline.tiling import Tile, TileGrid, Window
 
 GROUND, TREE, BUILDING = 2, 5, 6

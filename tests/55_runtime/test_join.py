@@ -28,10 +28,12 @@ from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split_window import Split, SplitFigures
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints, split_tile
 from pipeline.terrain.candidates import NOWHERE
-from pipeline.terrain.facets import FacetKind, VertexKind
+from pipeline.terrain.facets import FacetKind, SceneVertices, VertexKind
+from pipeline.terrain.fragment_sums import N_SUMS, Sum
+from pipeline.terrain.point_assignment import ScenePoints
 from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
 from pipeline.terrain.settings import CandidateSettings, SurfaceSettings
-from pipeline.terrain.surfaces import N_SUMS, Fragments, ScenePoints, SceneVertices, Sum, fragments_of
+from pipeline.terrain.surfaces import Fragments, fragments_of
 from pipeline.tiling import Tile, TileGrid
 from pipeline.tin.delaunay import triangulate
 
@@ -99,7 +101,7 @@ class Patchwork:
             fragments, labels = fragments_of(
                 self.tin,
                 self.vertices,
-                ScenePoints(**{f.name: getattr(p, f.name)[own] for f in dataclasses.fields(p)}),
+                ScenePoints(*(values[own] for values in p)),
                 (core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm),
                 CUT,
                 canopy_m=1.0,

@@ -30,9 +30,9 @@ from pipeline.runtime.stages.split import Splits
 from pipeline.runtime.stages.split_window import Split
 from pipeline.runtime.stages.units import divide_units
 from pipeline.terrain.candidates import NOWHERE, Surfaces, verdicts
+from pipeline.terrain.fragment_sums import N_SUMS, Sum
 from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.terrain.settings import CandidateSettings
-from pipeline.terrain.surfaces import N_SUMS, Sum
 from pipeline.tiling import MM, Tile, TileGrid
 
 

@@ -1,0 +1,140 @@
+"""Integer sums over the facets, vertices and outline of a fragment of a surface; they add up over tile borders."""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import numpy as np
+
+from pipeline.compiler import kernel
+from pipeline.model import IntArray, LabelArray
+from pipeline.terrain.facets import FacetKind, LabelledTin, SceneVertices, first_corner
+
+
+class Sum(IntEnum):
+    """Columns of the sums of a fragment; all add up over tile borders."""
+
+    FACETS = 0
+    AREA2 = 1
+    """Twice the plan area, mm2."""
+    VERTICES = 2
+    HEIGHT = 3
+    """Heights of the vertices above the terrain, mm."""
+    PLANAR = 4
+    """Vertices with planar surroundings."""
+    ROUGH = 5
+    """Vertices with rough surroundings."""
+    BOUNDARY = 6
+    """Length of the outline in plan, mm."""
+    WALL = 7
+    """Length of the outline that touches walls (MX_zdiff >= 2 m), mm."""
+    WALL_TOP = 8
+    """Length of the outline that lies at the upper half of its wall, mm."""
+    STEP = 9
+    """Length of the outline that touches steps, mm."""
+    WALLS = 10
+    """Number of wall facets along the outline."""
+    WALLS_Z_MX = 11
+    """Sum of their highest vertices Z_mx, mm."""
+    WALLS_OWN_Z = 12
+    """Sum of the fragment's own elevation at them, mm."""
+    POINTS = 13
+    CANOPY = 14
+    """Earlier returns well above the fragment."""
+    HEIGHT2 = 15
+    """Squared heights of the vertices above the terrain, mm2."""
+
+
+N_SUMS = len(Sum)
+Core = tuple[int, int, int, int]
+"""x0, y0, x1, y1 of a tile in mm, half-open."""
+
+
+@kernel(inline="always")
+def _sum_vertices(sums: IntArray, vertices: SceneVertices, vertex_label: LabelArray, core: Core) -> None:
+    """Add the vertices that the core owns to the sums of their fragments."""
+    x, y, _, height, _, planar = vertices
+    x0, y0, x1, y1 = core
+    for v in range(x.size):
+        fragment = vertex_label[v]
+        if fragment >= 0 and x0 <= x[v] < x1 and y0 <= y[v] < y1:
+            sums[fragment, Sum.VERTICES] += 1
+            sums[fragment, Sum.HEIGHT] += height[v]
+            sums[fragment, Sum.HEIGHT2] += np.int64(height[v]) * height[v]
+            if planar[v] == 1:
+                sums[fragment, Sum.PLANAR] += 1
+            elif planar[v] == 0:
+                sums[fragment, Sum.ROUGH] += 1
+
+
+@kernel(inline="always")
+def _with_room(rows: IntArray, used: int) -> IntArray:
+    """The rows (n, 3), in an array twice as long if all are used."""
+    if used < rows.shape[0]:
+        return rows
+    grown = np.empty((2 * used, 3), np.int64)
+    for m in range(used):
+        grown[m, 0], grown[m, 1], grown[m, 2] = rows[m, 0], rows[m, 1], rows[m, 2]
+    return grown
+
+
+@kernel
+def sum_fragments(
+    vertices: SceneVertices, tin: LabelledTin, core: Core, wall_mm: int
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Sums (f, N_SUMS) of the fragments over what the core owns, bounding boxes (f, 4), and rows of `along_steps`.
+
+    A facet is owned through its smallest (x, y) vertex, a vertex through itself. All in mm.
+    """
+    x, y, z = vertices.x_mm, vertices.y_mm, vertices.z_mm
+    facets, kinds, label = tin.facets, tin.kinds, tin.label
+    x0, y0, x1, y1 = core
+    sums = np.zeros((tin.fragment_kind.size, N_SUMS), np.int64)
+    boxes = np.empty((tin.fragment_kind.size, 4), np.int64)
+    boxes[:, 0] = boxes[:, 1] = 2**62
+    boxes[:, 2] = boxes[:, 3] = -(2**62)
+    along = np.empty((1024, 3), np.int64)
+    n_along = 0
+    for f in range(facets.shape[0]):
+        fragment = label[f]
+        if fragment < 0:
+            continue
+        v = facets[f, first_corner(x, y, facets, f)]
+        if not (x0 <= x[v] < x1 and y0 <= y[v] < y1):
+            continue
+        a, b, c = facets[f, 0], facets[f, 1], facets[f, 2]
+        sums[fragment, Sum.FACETS] += 1
+        sums[fragment, Sum.AREA2] += (x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a])
+        boxes[fragment, 0] = min(boxes[fragment, 0], x[a], x[b], x[c])
+        boxes[fragment, 1] = min(boxes[fragment, 1], y[a], y[b], y[c])
+        boxes[fragment, 2] = max(boxes[fragment, 2], x[a], x[b], x[c])
+        boxes[fragment, 3] = max(boxes[fragment, 3], y[a], y[b], y[c])
+        for q in range(3):
+            g = tin.neighbours[f, q]
+            if g >= 0 and kinds[g] == kinds[f]:
+                continue
+            v, w = facets[f, (q + 1) % 3], facets[f, (q + 2) % 3]
+            dx, dy = x[v] - x[w], y[v] - y[w]
+            length = np.int64(round(math.sqrt(float(dx * dx + dy * dy))))
+            sums[fragment, Sum.BOUNDARY] += length
+            if g < 0 or kinds[g] == FacetKind.VOID:
+                continue
+            ga, gb, gc = facets[g, 0], facets[g, 1], facets[g, 2]
+            top = max(z[ga], z[gb], z[gc])
+            foot = min(z[ga], z[gb], z[gc])
+            if top - foot >= wall_mm:
+                own = (z[v] + z[w]) // 2
+                sums[fragment, Sum.WALL] += length
+                sums[fragment, Sum.WALLS] += 1
+                sums[fragment, Sum.WALLS_Z_MX] += top
+                sums[fragment, Sum.WALLS_OWN_Z] += own
+                if 2 * own >= top + foot:
+                    sums[fragment, Sum.WALL_TOP] += length
+            if kinds[g] == FacetKind.STEP and kinds[f] != FacetKind.STEP:
+                sums[fragment, Sum.STEP] += length
+                along = _with_room(along, n_along)
+                along[n_along, 0], along[n_along, 1], along[n_along, 2] = fragment, label[g], length
+                n_along += 1
+    _sum_vertices(sums, vertices, tin.vertex_label, core)
+    return sums, boxes, along[:n_along].copy()
