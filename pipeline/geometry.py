@@ -223,6 +223,40 @@ def _cell_for_few(points: FloatArray) -> float:
     return max(math.sqrt(2.0 * width * depth / n), max(width, depth) / n, 1e-3)
 
 
+@kernel(inline="always")
+def _keep_least(least: FloatArray, square: float) -> None:
+    """Sort a value into the ascending `least` (k,), whose last one drops out; without branches, for speed."""
+    for m in range(len(least)):
+        other = least[m]
+        before = square < other
+        least[m] = square if before else other
+        square = other if before else square
+
+
+@kernel(inline="always")
+def _name_nearest(limit: float, held: FloatArray, holder: LabelArray, nearest: LabelArray) -> None:
+    """Write the points of the k least squares to `nearest` (k,), of equal ones the lower index first.
+
+    `holder` has the point of each square in `held`; both are overwritten. No more than k squares are below `limit`.
+    """
+    k = len(nearest)
+    ranked = 0
+    for c in range(len(held)):
+        held[ranked], holder[ranked] = held[c], holder[c]
+        ranked += held[c] <= limit
+    for c in range(ranked):
+        square, j = held[c], holder[c]
+        m = min(c, k)
+        while m > 0 and (held[m - 1] > square or (held[m - 1] == square and nearest[m - 1] > j)):
+            if m < k:
+                held[m] = held[m - 1]
+                nearest[m] = nearest[m - 1]
+            m -= 1
+        if m < k:
+            held[m] = square
+            nearest[m] = j
+
+
 @kernel
 def _nearest_neighbours(
     points: FloatArray, k: int, wanted_cell_size_m: float, named: bool
@@ -276,11 +310,7 @@ def _nearest_neighbours(
                         held[count] = square
                         holder[count] = members[q]
                         count += 1
-                        for m in range(k):
-                            other = least[m]
-                            before = square < other
-                            least[m] = square if before else other
-                            square = other if before else square
+                        _keep_least(least, square)
             # whatever is not yet seen lies beyond the rings' outer border; a hair less allows for rounding
             reach = (inset + ring * size) * (1.0 - 1e-9) - 1e-9
             if reach > 0.0 and least[k - 1] < reach * reach:
@@ -292,23 +322,7 @@ def _nearest_neighbours(
             squares[members[s], m] = least[m]
         if not named:
             continue
-        # then who has them
-        ranked = 0
-        for c in range(count):
-            held[ranked], holder[ranked] = held[c], holder[c]
-            ranked += held[c] <= least[k - 1]
-        nearest = neighbours[members[s]]
-        for c in range(ranked):
-            square, j = held[c], holder[c]
-            m = min(c, k)
-            while m > 0 and (held[m - 1] > square or (held[m - 1] == square and nearest[m - 1] > j)):
-                if m < k:
-                    held[m] = held[m - 1]
-                    nearest[m] = nearest[m - 1]
-                m -= 1
-            if m < k:
-                held[m] = square
-                nearest[m] = j
+        _name_nearest(least[k - 1], held[:count], holder, neighbours[members[s]])
     return neighbours, squares
 
 

@@ -108,10 +108,7 @@ def terrain_of(
     """
     lattice = lattice_of(window)
     kept = dense_enough(points.x_mm, points.y_mm, points.z_mm, settings.outliers)
-    if classes.ground:
-        usable = kept & (points.classification == GROUND_CLASS)
-    else:
-        usable = kept & (points.return_number >= points.return_count)
+    usable = kept & (points.classification == GROUND_CLASS if classes.ground else _is_last(points))
     terrain = ground_of(
         points.x_mm,
         points.y_mm,
@@ -123,6 +120,50 @@ def terrain_of(
         wanted=None if wanted is None else lattice_of(wanted),
     )
     return terrain, kept, _occupied(points, kept, lattice)
+
+
+def _is_last(points: WindowPoints) -> BoolArray:
+    """(n,) the last returns of their pulses."""
+    last: BoolArray = points.return_number >= points.return_count
+    return last
+
+
+def _vertices(
+    points: WindowPoints,
+    height_mm: IntArray,
+    terrain: Terrain,
+    building: BoolArray,
+    excluded: BoolArray,
+    settings: SceneSettings,
+    classes: ClassesInUse,
+) -> SceneVertices:
+    """The vertices of the scene's TIN: thinned points with what is known of them."""
+    used = (height_mm != NO_DATA) & (_is_last(points) | building)
+    # equal coordinates of different classes must not be decided by the order of the points
+    preferred = np.zeros(len(points), np.int8)
+    if classes.building or classes.ground:
+        preferred = np.where(building, 3, np.where(points.classification == GROUND_CLASS, 1, 2)).astype(np.int8)
+        preferred[excluded] = 0
+    several = points.return_count > 1
+    chosen = highest_per_cell(
+        points.x_mm,
+        points.y_mm,
+        points.z_mm,
+        preferred,
+        used,
+        settings.surfaces.thinning_m,
+        several.view(np.int8),
+    )
+    x, y, z = points.x_mm[chosen], points.y_mm[chosen], points.z_mm[chosen]
+    kind = np.full(len(chosen), VertexKind.OBJECT, np.int8)
+    kind[excluded[chosen]] = VertexKind.EXCLUDED
+    kind[ground_points(x, y, z, terrain, settings.ground)] = VertexKind.GROUND
+    if classes.ground:
+        kind[points.classification[chosen] == GROUND_CLASS] = VertexKind.GROUND
+    kind[building[chosen]] = VertexKind.BUILDING
+    planar = planarity(x, y, z, kind == VertexKind.OBJECT, settings.vegetation)
+    kind[crowns(x, y, z, planar, several[chosen], settings.vegetation)] = VertexKind.CROWN
+    return SceneVertices(x_mm=x, y_mm=y, z_mm=z, height_mm=height_mm[chosen], kind=kind, planar=planar)
 
 
 def split_tile(
@@ -156,63 +197,26 @@ def split_tile(
     near_index = np.flatnonzero(near.contains(points.x_mm, points.y_mm) & kept)
     points = points.take(near_index)
     height = height_above(points.x_mm, points.y_mm, points.z_mm, terrain.elevation_mm, terrain.column0, terrain.row0)
-    known = height != NO_DATA
-    last = points.return_number >= points.return_count
     building = (points.classification == BUILDING_CLASS) & classes.building
-    used = known & (last | building)
     excluded = np.zeros(len(points), np.bool_)
     if classes.building:
         excluded = ~np.isin(points.classification, (*NEUTRAL_CLASSES, GROUND_CLASS, BUILDING_CLASS))
-    # equal coordinates of different classes must not be decided by the order of the points
-    preferred = np.zeros(len(points), np.int8)
-    if classes.building or classes.ground:
-        preferred = np.where(building, 3, np.where(points.classification == GROUND_CLASS, 1, 2)).astype(np.int8)
-        preferred[excluded] = 0
-    several = points.return_count > 1
-    chosen = highest_per_cell(
-        points.x_mm,
-        points.y_mm,
-        points.z_mm,
-        preferred,
-        used,
-        settings.surfaces.thinning_m,
-        several.view(np.int8),
-    )
-    x, y, z = points.x_mm[chosen], points.y_mm[chosen], points.z_mm[chosen]
-    kind = np.full(len(chosen), VertexKind.OBJECT, np.int8)
-    chosen_class = points.classification[chosen]
-    kind[excluded[chosen]] = VertexKind.EXCLUDED
-    kind[ground_points(x, y, z, terrain, settings.ground)] = VertexKind.GROUND
-    if classes.ground:
-        kind[chosen_class == GROUND_CLASS] = VertexKind.GROUND
-    kind[building[chosen]] = VertexKind.BUILDING
-    planar = planarity(x, y, z, kind == VertexKind.OBJECT, settings.vegetation)
-    kind[crowns(x, y, z, planar, several[chosen], settings.vegetation)] = VertexKind.CROWN
-    tin = triangulate(np.column_stack((x, y)))
-    vertices = SceneVertices(
-        x_mm=x,
-        y_mm=y,
-        z_mm=z,
-        height_mm=height[chosen],
-        kind=kind,
-        planar=planar,
-    )
-    in_core = core.contains(points.x_mm, points.y_mm)
-    core_index = np.flatnonzero(in_core & known)
+    vertices = _vertices(points, height, terrain, building, excluded, settings, classes)
+    core_index = np.flatnonzero(core.contains(points.x_mm, points.y_mm) & (height != NO_DATA))
     allowed = np.ones(len(core_index), np.int8)
     allowed[excluded[core_index]] = 0
     allowed[building[core_index]] = 2
     if classes.ground:
         allowed[points.classification[core_index] == GROUND_CLASS] = 0
     fragments, point_fragment = fragments_of(
-        tin,
+        triangulate(np.column_stack((vertices.x_mm, vertices.y_mm))),
         vertices,
         ScenePoints(
             x_mm=points.x_mm[core_index],
             y_mm=points.y_mm[core_index],
             z_mm=points.z_mm[core_index],
             height_mm=height[core_index],
-            last=last[core_index],
+            last=_is_last(points)[core_index],
             allowed=allowed,
         ),
         (core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm),

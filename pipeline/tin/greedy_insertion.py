@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
-from pipeline.model import BoolArray, FloatArray, LabelArray, Tin
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Tin
 from pipeline.parameters import Parameters, parameter
 from pipeline.tin.delaunay import hilbert_order, unique_xy_ranked
 from pipeline.tin.half_edges import canonical_facets, locate, restore_delaunay, split_facet, start_sphere
@@ -67,6 +68,41 @@ class GreedyTin:
     """(n,) bool, True for a point that was absorbed by a facet; False for one beneath another at the same position."""
 
 
+class _Vertices(NamedTuple):
+    """The n points, the four corners counter-clockwise, and the vertex at infinity."""
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    """(n + 5,) float64 mm; the elevation of a point that is absorbed and inserted changes."""
+    rank: LabelArray
+    """(n + 4,) int32, place in the lexicographic order of (x, y)."""
+
+
+class _Absorption(NamedTuple):
+    """What a facet absorbs."""
+
+    is_inserted: bool
+    """Absorbed points are inserted at the elevation of their facet."""
+    distance_mm: float
+    """Perpendicular distance of Eq. 1."""
+    steepest: float
+    """Square of the rise over run of Eq. 2."""
+
+
+class _Buckets(NamedTuple):
+    """The unused points of every facet, as linked lists, and which of them it would insert next."""
+
+    first: LabelArray
+    """(f,) int32, the first point of every facet; -1 where there is none."""
+    following: LabelArray
+    """(n,) int32, the next point in the same facet."""
+    worst: LabelArray
+    """(f,) int32, the candidate of every facet: the point of the largest vertical error."""
+    worst_error: FloatArray
+    """(f,) float64 mm."""
+
+
 @kernel
 def _is_left(x: FloatArray, y: FloatArray, rank: LabelArray, a: int, b: int, p: int) -> bool:
     """Whether p belongs to the left of the directed edge a, b; points on it are left of its ascending direction."""
@@ -75,10 +111,9 @@ def _is_left(x: FloatArray, y: FloatArray, rank: LabelArray, a: int, b: int, p: 
 
 
 @kernel
-def _facet_plane(
-    x: FloatArray, y: FloatArray, z: FloatArray, rank: LabelArray, origin: LabelArray, facet: int
-) -> tuple[int, float, float]:
+def _facet_plane(vertices: _Vertices, origin: LabelArray, facet: int) -> tuple[int, float, float]:
     """The smallest vertex of a facet and its gradient from there: independent of the slots that the vertices are in."""
+    x, y, z, rank = vertices
     e = 4 * facet
     a, b, c = origin[e], origin[e + 1], origin[e + 2]
     if rank[b] < rank[a] and rank[b] < rank[c]:
@@ -91,21 +126,116 @@ def _facet_plane(
     return a, (uz * vy - vz * uy) / twice_area, (ux * vz - vx * uz) / twice_area
 
 
+@kernel(inline="always")
+def _around(
+    origin: LabelArray, twin: LabelArray, facet: int, infinity: int, star: LabelArray
+) -> tuple[LabelArray, int]:
+    """The real facets around the vertex in slot 0 of a facet, in `star` or a larger array; how many they are."""
+    first = 4 * facet
+    e = first
+    count = 0
+    while True:
+        if origin[e + 1] != infinity and origin[e + 2] != infinity:
+            if count == len(star):
+                star = np.concatenate((star, star))
+            star[count] = e >> 2
+            count += 1
+        e = twin[e + 2]
+        if e == first:
+            return star, count
+
+
+@kernel(inline="always")
+def _take_out(buckets: _Buckets, star: LabelArray, newest: int, unplaced: LabelArray, count: int) -> int:
+    """Empty the buckets of some facets and append their points but the newest to `unplaced`, which holds `count`."""
+    for t in star:
+        q = buckets.first[t]
+        while q >= 0:
+            if q != newest:
+                unplaced[count] = q
+                count += 1
+            q = buckets.following[q]
+        buckets.first[t] = -1
+    return count
+
+
+@kernel(inline="always")
+def _put_in(
+    buckets: _Buckets, vertices: _Vertices, origin: LabelArray, star: LabelArray, newest: int, unplaced: LabelArray
+) -> None:
+    """Put points into the buckets of the facets around the newest vertex.
+
+    The search goes from one facet to the next around that vertex: neighbours in a bucket are neighbours in the plane.
+    """
+    x, y, _, rank = vertices
+    s = 0
+    e = 4 * star[0]
+    for q in unplaced:
+        if _is_left(x, y, rank, newest, origin[e + 1], q):
+            while _is_left(x, y, rank, newest, origin[e + 2], q):
+                s = s + 1 if s + 1 < len(star) else 0
+                e = 4 * star[s]
+        else:
+            s = s - 1 if s > 0 else len(star) - 1
+            e = 4 * star[s]
+            while not _is_left(x, y, rank, newest, origin[e + 1], q):
+                s = s - 1 if s > 0 else len(star) - 1
+                e = 4 * star[s]
+        buckets.following[q] = buckets.first[e >> 2]
+        buckets.first[e >> 2] = q
+
+
+@kernel(inline="always")
+def _find_worst(buckets: _Buckets, vertices: _Vertices, origin: LabelArray, t: int, absorption: _Absorption) -> None:
+    """Set the candidate of facet t: the point of the largest vertical error, of equal ones the smallest; -1 for none.
+
+    A point that the facet absorbs is no candidate, unless absorbed points are inserted.
+    """
+    x, y, z, rank = vertices
+    buckets.worst[t] = -1
+    q = buckets.first[t]
+    if q >= 0:
+        base, gradient_x, gradient_y = _facet_plane(vertices, origin, t)
+        steepness = gradient_x * gradient_x + gradient_y * gradient_y
+        # Eq. 1 by Eq. 2: perpendicular is vertical distance times the cosine of the slope
+        absorbing_mm = -1.0
+        if steepness <= absorption.steepest and not absorption.is_inserted:
+            absorbing_mm = absorption.distance_mm * math.sqrt(1.0 + steepness)
+        largest = -1.0
+        chosen = -1
+        while q >= 0:
+            error = abs(z[q] - (z[base] + gradient_x * (x[q] - x[base]) + gradient_y * (y[q] - y[base])))
+            if error > absorbing_mm and (error > largest or (error == largest and rank[q] < rank[chosen])):
+                largest = error
+                chosen = q
+            q = buckets.following[q]
+        buckets.worst[t] = chosen
+        buckets.worst_error[t] = largest
+
+
+@kernel(inline="always")
+def _facets_of_rest(buckets: _Buckets, n_facets: int, is_absorbed: BoolArray) -> LabelArray:
+    """Facet of every point, (n,) int32, -1 where it was inserted; marks the rest as absorbed."""
+    facet_of_point = np.full(len(buckets.following), -1, np.int32)
+    for t in range(n_facets):
+        q = buckets.first[t]
+        while q >= 0:
+            facet_of_point[q] = t
+            is_absorbed[q] = True
+            q = buckets.following[q]
+    return facet_of_point
+
+
 @kernel
 def _insert_greedily(
-    x: FloatArray,
-    y: FloatArray,
-    z: FloatArray,
-    rank: LabelArray,
-    is_absorbed_inserted: bool,
-    distance_mm: float,
-    steepest: float,
+    vertices: _Vertices, absorption: _Absorption
 ) -> tuple[LabelArray, LabelArray, int, LabelArray, BoolArray]:
-    """The insertion over n points, the four corners counter-clockwise, and the vertex at infinity; z changes in place.
+    """The insertion over n points; z of the vertices changes in place.
 
     Returns origins and twins of the half-edges, the number of facets, the facet of every point or -1 where it was
     inserted, and which points are absorbed.
     """
+    x, y, z, rank = vertices
     infinity = len(x) - 1
     n = infinity - 4
     origin = np.empty(8 * (n + 4), np.int32)
@@ -116,86 +246,29 @@ def _insert_greedily(
     n_facets = 6
     restore_delaunay(x, y, origin, twin, facet)
 
+    room = 2 * (n + 4)
+    buckets = _Buckets(np.full(room, -1, np.int32), np.empty(n, np.int32), np.full(room, -1, np.int32), np.empty(room))
+    worst, worst_error = buckets.worst, buckets.worst_error
     is_absorbed = np.zeros(n, np.bool_)
-    bucket = np.full(2 * (n + 4), -1, np.int32)  # the first unused point of every facet
-    next_in_bucket = np.empty(n, np.int32)
-    worst = np.full(2 * (n + 4), -1, np.int32)  # the candidate of every facet
-    worst_error = np.empty(2 * (n + 4))
     # the candidates of all facets: the largest error first, of equal ones the smallest point
     candidates = heap_with_room(1024)
     held = 0
     star = np.empty(64, np.int32)
     unplaced = np.arange(n).astype(np.int32)
     n_unplaced = n
-    newest = (
-        n + 3
-    )  # opposite to the lower left corner, which the diagonal of the square avoids: both facets are its own
+    # opposite to the lower left corner, which the diagonal of the square avoids: both facets are its own
+    newest = n + 3
     while True:
         # only the facets around the newest vertex have changed, and all of them
-        first = 4 * facet
-        e = first
-        n_star = 0
-        while True:
-            if origin[e + 1] != infinity and origin[e + 2] != infinity:
-                if n_star == len(star):
-                    star = np.concatenate((star, star))
-                star[n_star] = e >> 2
-                n_star += 1
-                q = bucket[e >> 2]
-                while q >= 0:
-                    if q != newest:
-                        unplaced[n_unplaced] = q
-                        n_unplaced += 1
-                    q = next_in_bucket[q]
-            e = twin[e + 2]
-            if e == first:
-                break
-        for s in range(n_star):
-            bucket[star[s]] = -1
-        # points go from one facet to the next around the vertex: neighbours in a bucket are neighbours in the plane
-        s = 0
-        e = 4 * star[0]
-        for i in range(n_unplaced):
-            q = unplaced[i]
-            if _is_left(x, y, rank, newest, origin[e + 1], q):
-                while _is_left(x, y, rank, newest, origin[e + 2], q):
-                    s = s + 1 if s + 1 < n_star else 0
-                    e = 4 * star[s]
-            else:
-                s = s - 1 if s > 0 else n_star - 1
-                e = 4 * star[s]
-                while not _is_left(x, y, rank, newest, origin[e + 1], q):
-                    s = s - 1 if s > 0 else n_star - 1
-                    e = 4 * star[s]
-            next_in_bucket[q] = bucket[e >> 2]
-            bucket[e >> 2] = q
+        star, n_star = _around(origin, twin, facet, infinity, star)
+        n_unplaced = _take_out(buckets, star[:n_star], newest, unplaced, n_unplaced)
+        _put_in(buckets, vertices, origin, star[:n_star], newest, unplaced[:n_unplaced])
         n_unplaced = 0
-        for s in range(n_star):
-            t = star[s]
-            worst[t] = -1
-            q = bucket[t]
-            if q < 0:
-                continue
-            base, gradient_x, gradient_y = _facet_plane(x, y, z, rank, origin, t)
-            steepness = gradient_x * gradient_x + gradient_y * gradient_y
-            # Eq. 1 by Eq. 2: perpendicular is vertical distance times the cosine of the slope
-            absorbing_mm = -1.0
-            if steepness <= steepest and not is_absorbed_inserted:
-                absorbing_mm = distance_mm * math.sqrt(1.0 + steepness)
-            largest = -1.0
-            chosen = -1
-            while q >= 0:
-                error = abs(z[q] - (z[base] + gradient_x * (x[q] - x[base]) + gradient_y * (y[q] - y[base])))
-                if error > absorbing_mm and (error > largest or (error == largest and rank[q] < rank[chosen])):
-                    largest = error
-                    chosen = q
-                q = next_in_bucket[q]
-            if chosen < 0:
-                continue
-            worst[t] = chosen
-            worst_error[t] = largest
-            candidates = heap_push(candidates, held, -largest, rank[chosen], t)
-            held += 1
+        for t in star[:n_star]:
+            _find_worst(buckets, vertices, origin, t, absorption)
+            if worst[t] >= 0:
+                candidates = heap_push(candidates, held, -worst_error[t], rank[worst[t]], t)
+                held += 1
         newest = -1
         while held > 0 and newest < 0:
             # an entry is stale where its facet has changed since
@@ -207,23 +280,39 @@ def _insert_greedily(
             held -= 1
         if newest < 0:
             break
-        if is_absorbed_inserted:
-            base, gradient_x, gradient_y = _facet_plane(x, y, z, rank, origin, facet)
+        if absorption.is_inserted:
+            base, gradient_x, gradient_y = _facet_plane(vertices, origin, facet)
             steepness = gradient_x * gradient_x + gradient_y * gradient_y
-            if steepness <= steepest and worst_error[facet] <= distance_mm * math.sqrt(1.0 + steepness):
+            absorbing_mm = absorption.distance_mm * math.sqrt(1.0 + steepness)
+            if steepness <= absorption.steepest and worst_error[facet] <= absorbing_mm:
                 is_absorbed[newest] = True
                 z[newest] = z[base] + gradient_x * (x[newest] - x[base]) + gradient_y * (y[newest] - y[base])
         split_facet(origin, twin, facet, n_facets, newest)
         n_facets += 2
         restore_delaunay(x, y, origin, twin, facet)
-    facet_of_point = np.full(n, -1, np.int32)
-    for t in range(n_facets):
-        q = bucket[t]
-        while q >= 0:
-            facet_of_point[q] = t
-            is_absorbed[q] = True
-            q = next_in_bucket[q]
-    return origin, twin, n_facets, facet_of_point, is_absorbed
+    return origin, twin, n_facets, _facets_of_rest(buckets, n_facets, is_absorbed), is_absorbed
+
+
+def _lower_left_and_extent(xyz_mm: IntArray, margin_mm: int) -> tuple[IntArray, IntArray]:
+    """Lower left corner and extent (2,) of points (n, 3) with a margin around them."""
+    low = xyz_mm[:, :2].min(axis=0) - margin_mm
+    wide = xyz_mm[:, :2].max(axis=0) + margin_mm - low
+    if wide.max() > MAX_EXTENT_MM:
+        raise ValueError(
+            f"points with their margin extend over {wide.max() / 1000:.3f} m: triangulate windows of at most "
+            f"{MAX_EXTENT_MM / 1000:.3f} m"
+        )
+    return low, wide
+
+
+def _facets_of(points: IntArray, facet_of_point: LabelArray, inserted: IntArray, facets: LabelArray) -> LabelArray:
+    """The facet of each of some points; for an inserted one, of the ascending `inserted`, the first at its vertex."""
+    first_facet = np.full(4 + len(inserted), len(facets), np.int32)
+    np.minimum.at(first_facet, facets.ravel(), np.repeat(np.arange(len(facets), dtype=np.int32), 3))
+    found = facet_of_point[points]
+    at_vertex = found < 0
+    found[at_vertex] = first_facet[4 + np.searchsorted(inserted, points[at_vertex])]
+    return found
 
 
 def insert_greedily(points_m: FloatArray, settings: GreedyInsertionSettings, corner_z_m: float) -> GreedyTin:
@@ -265,23 +354,16 @@ def insert_greedily(points_m: FloatArray, settings: GreedyInsertionSettings, cor
     """
     n_points = len(points_m)
     if n_points == 0:
-        nothing = np.empty((0, 3), np.int32)
+        none, nothing = np.empty(0, np.int32), np.empty((0, 3), np.int32)
         return GreedyTin(
             tin=Tin(facets=nothing, neighbours=nothing),
             vertices=np.empty((0, 3)),
-            vertex_point=np.empty(0, np.int32),
-            facet_of_point=np.empty(0, np.int32),
-            absorbed=np.empty(0, np.bool_),
+            vertex_point=none,
+            facet_of_point=none,
+            absorbed=none.astype(np.bool_),
         )
     xyz_mm = np.rint(points_m * 1000.0).astype(np.int64)
-    margin_mm = round(settings.margin_m * 1000.0)
-    low = xyz_mm[:, :2].min(axis=0) - margin_mm
-    wide = xyz_mm[:, :2].max(axis=0) + margin_mm - low
-    if wide.max() > MAX_EXTENT_MM:
-        raise ValueError(
-            f"points with their margin extend over {wide.max() / 1000:.3f} m: triangulate windows of at most "
-            f"{MAX_EXTENT_MM / 1000:.3f} m"
-        )
+    low, wide = _lower_left_and_extent(xyz_mm, round(settings.margin_m * 1000.0))
     kept, kept_of_point, kept_rank = unique_xy_ranked(xyz_mm[:, :2], xyz_mm[:, 2])
     kept_mm = xyz_mm[kept]
     along_curve = hilbert_order(kept_mm[:, :2])
@@ -296,15 +378,12 @@ def insert_greedily(points_m: FloatArray, settings: GreedyInsertionSettings, cor
     rank[:n] = kept_rank[along_curve] + 2
     rank[n:] = [0, n + 2, n + 3, 1]
     surveyed_z = z.copy()
-    origin, twin, n_facets, facet_of_vertex, is_absorbed = _insert_greedily(
-        x,
-        y,
-        z,
-        rank,
-        settings.absorption == "insert",
-        settings.absorption_distance_m * 1000.0,
-        math.tan(math.radians(settings.absorption_slope_deg)) ** 2,
+    absorption = _Absorption(
+        is_inserted=settings.absorption == "insert",
+        distance_mm=settings.absorption_distance_m * 1000.0,
+        steepest=math.tan(math.radians(settings.absorption_slope_deg)) ** 2,
     )
+    origin, twin, n_facets, facet_of_vertex, is_absorbed = _insert_greedily(_Vertices(x, y, z, rank), absorption)
 
     inserted = np.sort(point[facet_of_vertex < 0])
     number_of_vertex = np.full(n + 4, -1, np.int32)
@@ -325,13 +404,8 @@ def insert_greedily(points_m: FloatArray, settings: GreedyInsertionSettings, cor
     beneath = np.ones(n_points, np.bool_)
     beneath[kept] = False
     if beneath.any():
-        first_facet = np.full(len(vertices), len(facets), np.int32)
-        np.minimum.at(first_facet, facets.ravel(), np.repeat(np.arange(len(facets), dtype=np.int32), 3))
         above = kept[kept_of_point[beneath]]
-        followed = facet_of_point[above]
-        at_vertex = followed < 0
-        followed[at_vertex] = first_facet[4 + np.searchsorted(inserted, above[at_vertex])]
-        facet_of_point[beneath] = followed
+        facet_of_point[beneath] = _facets_of(above, facet_of_point, inserted, facets)
     absorbed = np.zeros(n_points, np.bool_)
     absorbed[point] = is_absorbed
     return GreedyTin(

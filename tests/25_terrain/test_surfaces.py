@@ -431,7 +431,7 @@ def test_points_that_the_classes_exclude_are_not_assigned() -> None:
     excluded = np.random.default_rng(12).random(len(scene.points.x_mm)) < 0.3
     allowed = np.where(excluded, 0, 1).astype(np.int8)
     _, before = scene.cut()
-    _, after = dataclasses.replace(scene, points=dataclasses.replace(scene.points, allowed=allowed)).cut()
+    _, after = dataclasses.replace(scene, points=scene.points._replace(allowed=allowed)).cut()
     np.testing.assert_array_equal(after, np.where(excluded, -1, before))
 
 
@@ -440,7 +440,7 @@ def test_only_points_of_class_building_join_a_surface_of_that_class() -> None:
     v = scene.vertices
     kind = np.where(v.kind == VertexKind.OBJECT, VertexKind.BUILDING, v.kind).astype(np.int8)
     building = np.random.default_rng(13).random(len(scene.points.x_mm)) < 0.5
-    points = dataclasses.replace(scene.points, allowed=np.where(building, 2, 1).astype(np.int8))
+    points = scene.points._replace(allowed=np.where(building, 2, 1).astype(np.int8))
     fragments, labels = dataclasses.replace(scene, vertices=dataclasses.replace(v, kind=kind), points=points).cut()
     (roof,) = of_kind(fragments, FacetKind.BUILDING)
     np.testing.assert_array_equal(labels == roof, building & (points.z_mm == 6000))
