@@ -1,4 +1,4 @@
-"""Facets, planes, rings and neighbourhoods: the small geometry that all stages share.
+"""Facets, planes, rings and neighbourhoods: geometry that all stages share.
 
 Planes are z = a x + b y + c. All sums run in the order of the points, one after the other, and not through BLAS: the
 result has the same bits on every machine. Equations are those of Shorter & Kasparis.
@@ -261,9 +261,9 @@ def _name_nearest(limit: float, held: FloatArray, holder: LabelArray, nearest: L
 def _nearest_neighbours(
     points: FloatArray, k: int, wanted_cell_size_m: float, named: bool
 ) -> tuple[LabelArray, FloatArray]:
-    """The kernel of `nearest_neighbours`; returns the squared distances too, infinite where there is no neighbour.
+    """Kernel: neighbours (n, k) as in `nearest_neighbours`, and squared distances (n, k), infinite without a neighbour.
 
-    A cell size of 0 leaves it the choice; where neighbours need not be named they are all -1.
+    A cell size of 0 means about two points per cell; if neighbours need not be `named` they are all -1.
     """
     n, dimensions = points.shape
     neighbours = np.full((n, k), -1, np.int32)
@@ -336,7 +336,7 @@ def nearest_neighbours(points: FloatArray, k: int, cell_size_m: float | None = N
     k : int
         How many.
     cell_size_m : float, optional
-        Cell of the search grid: only a matter of speed. Default: about two points a cell.
+        Cell of the search grid; it only changes the speed. Default: about two points per cell.
 
     Returns
     -------
@@ -375,8 +375,9 @@ def _checked_search(points: FloatArray, k: int, cell_size_m: float | None) -> tu
 
 _SPACING_NEIGHBOURS = 8  # one ring of neighbours on a lattice
 _LOWEST = -(2**63)
+"""Below all elevations in mm."""
 _UNEVEN = 1.3
-"""Spacings over the area and over the points that differ by more come of several densities."""
+"""Ratio of the spacings over the area and over the points that shows several densities; with one it is below 1.25."""
 
 
 def point_spacing_m(points: FloatArray) -> float:
@@ -402,10 +403,10 @@ def point_spacing_m(points: FloatArray) -> float:
 def spacing_over_area_m(points: FloatArray) -> float:
     """Spacing of points in plan that holds over most of their area.
 
-    Where two strips overlap on a part of a roof, most points lie there, but not most of the roof. Every point stands
-    for an area that grows with the squared distance to its eighth neighbour; the median over the area is taken where it
-    is more than 1.3 times that over the points. Else this is `point_spacing_m`: of one density they differ by less than
-    a quarter, borders included (measured on simulated and real roofs of 1 to 30 points a m2).
+    Where two strips overlap on a part of a roof, most points lie there, but not most of the roof. A point represents an
+    area that grows with the squared distance to its eighth neighbour; the median over the area is taken if it is more
+    than 1.3 times that over the points, else `point_spacing_m`: with one density they differ by less than a quarter,
+    borders included (measured on simulated and real roofs of 1 to 30 points per m2).
 
     Parameters
     ----------

@@ -1,8 +1,7 @@
-"""What a settings class is made of: frozen fields that know their unit, range and meaning.
+"""Base of the settings classes: frozen fields with their unit, range and meaning.
 
-Every stage keeps a small frozen settings class beside its code, derived from `Parameters`;
-`pipeline.settings` composes them. The metadata serves validation, the reference docs and the test
-that holds both together.
+Every chapter has a module of settings classes derived from `Parameters`; `pipeline.settings` composes them. The
+metadata serves validation and the reference docs.
 """
 
 from __future__ import annotations
@@ -75,14 +74,13 @@ def parameter(
     doc : str
         One sentence for the reference docs.
     unit : str
-        Unit of a number, empty where it has none.
+        Unit of a number; empty without one.
     minimum, maximum : float, optional
-        Inclusive bounds of a number, or of each number of a tuple; of a whole number that may stand in the place of a
-        text.
+        Inclusive bounds of a number, of each number of a tuple, or of a whole number allowed instead of a text.
     choices : tuple of str, optional
         The valid words of a string.
     changes_geometry : bool
-        Whether the value can change results, and so belongs to the settings hash.
+        Whether the value can change results and belongs to the settings hash.
     """
     metadata = {
         "doc": doc,
@@ -96,7 +94,7 @@ def parameter(
 
 
 def _fault(name: str, value: Any, field: dataclasses.Field[Any]) -> str | None:
-    """The sentence for a value that its field does not allow, or None."""
+    """The fault of a value that its field does not allow, or None."""
     meta = field.metadata
     if not meta or value is None:
         return None
@@ -152,7 +150,7 @@ class Parameters:
             raise SettingsError(faults)
 
     def cross_faults(self) -> list[str]:
-        """Faults that concern more than one field; overridden where there are any."""
+        """Faults that concern more than one field; none by default."""
         return []
 
     def range_faults(self, low: str, high: str) -> list[str]:
@@ -170,7 +168,7 @@ def build(
 ) -> Any:
     """One settings object, or None with its faults appended, each under the name of its table.
 
-    What `values` does not name is taken from `base`, or from the defaults.
+    Fields that `values` does not name come from `base`, or from the defaults.
     """
     names = {field.name: field for field in dataclasses.fields(kind)}
     prefix = f"[{section}] " if section else ""

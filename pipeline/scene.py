@@ -1,8 +1,8 @@
 """One tile's points to surface fragments, end to end, without I/O.
 
-Ground, heights, a TIN of thinned points, wall facets, fragments: the front half of the science
-(`reconstruct` is the other). Every step declares how far it looks; `SceneSettings.support_with` is
-their sum, and a halo at least that wide makes the outcome independent of the tiles.
+Ground, heights, a TIN of thinned points, wall facets, fragments: the front half of the science (`reconstruct` is the
+other). Every step declares how far it looks; `SceneSettings.support_with` is the sum, and with a halo at least that
+wide the result does not depend on the tiles.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pipeline.tin.delaunay import triangulate
 GROUND_CLASS = 2
 BUILDING_CLASS = 6
 NEUTRAL_CLASSES = (0, 1, 12, 19)
-"""Classes that say nothing about buildings: never classified, unclassified, overlap, overhead structure."""
+"""Classes without information on buildings: never classified, unclassified, overlap, overhead structure."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class WindowPoints:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SplitTile:
-    """What the split of one tile finds."""
+    """Result of the split of one tile."""
 
     fragments: Fragments
     """Descriptors for the join."""
@@ -62,9 +62,9 @@ class SplitTile:
     point_fragment: LabelArray
     """(n,) int32, their fragments; -1 where none."""
     terrain: Terrain
-    """The ground, on the lattice of the window; drawn where the core and its surroundings ask for it."""
+    """The ground, on the lattice of the window; drawn where the core and its surroundings need it."""
     occupied: BoolArray
-    """(rows, columns) on the terrain's lattice: some point lies in the cell."""
+    """(rows, columns) on the lattice of the terrain: the cell holds a point."""
     outliers: int
     """Gross outliers in the core."""
 
@@ -91,7 +91,7 @@ def terrain_of(
     classes: ClassesInUse,
     wanted: Window | None = None,
 ) -> tuple[Terrain, BoolArray, BoolArray]:
-    """Terrain of a window, the mask of points that are no outliers, and the occupied cells.
+    """Terrain of a window, the mask of points that are not outliers, and the occupied cells.
 
     Parameters
     ----------
@@ -102,9 +102,9 @@ def terrain_of(
     settings : SceneSettings
         Outliers and ground.
     classes : ClassesInUse
-        Whether class 2 is believed.
+        Whether class 2 is the ground.
     wanted : Window, optional
-        Where terrain is asked for; in the whole window by default.
+        Where terrain is needed; in the whole window by default.
     """
     lattice = lattice_of(window)
     kept = dense_enough(points.x_mm, points.y_mm, points.z_mm, settings.outliers)

@@ -34,18 +34,18 @@ class GeneralSettings(Parameters):
     method: str = parameter("arrangement", "The method that models the buildings.", choices=tuple(METHODS))
     preset: str = parameter(
         "robust",
-        "Where the method's settings start: those that measured better, or those that keep to its paper.",
+        "Defaults of the method's settings: those that measured better, or those of its paper.",
         choices=PRESETS,
         changes_geometry=False,
     )
     lods: str = parameter(
         LODS[-1],
-        "Levels of detail of the models; the finest is that of the records.",
+        "Levels of detail of the models; records describe the finest.",
         choices=tuple(",".join(chosen) for n in range(1, len(LODS) + 1) for chosen in itertools.combinations(LODS, n)),
     )
     classes: str = parameter(
         "trust",
-        "What the file's own classes are worth: believed, only compared with what is found, or not looked at.",
+        "Use of the classes in the file: trusted, only compared with the result, or ignored.",
         choices=("trust", "audit", "ignore"),
     )
     tile_size_m: float = parameter(
@@ -58,7 +58,7 @@ class GeneralSettings(Parameters):
     )
     halo_m: float = parameter(
         0.0,
-        "Width of the ring that a tile sees around itself; 0 is the least that the settings need.",
+        "Width of the ring of points around a tile that it also sees; 0 is the least that the settings need.",
         unit="m",
         minimum=0.0,
         maximum=1000.0,
@@ -92,7 +92,7 @@ class RunSettings:
     general: GeneralSettings = dataclasses.field(default_factory=GeneralSettings)
     """The run as a whole."""
     class_codes: ClassCodeSettings = dataclasses.field(default_factory=ClassCodeSettings)
-    """What the codes of the file's classes mean."""
+    """Meaning of the class codes in the file."""
     scene: SceneSettings = dataclasses.field(default_factory=SceneSettings)
     """From a tile's points to candidates."""
     building: ReconstructSettings = dataclasses.field(default_factory=ReconstructSettings)
@@ -110,7 +110,9 @@ class RunSettings:
             object.__setattr__(self, "building", dataclasses.replace(self.building, lods=lods))
         support = self.scene.support_m
         if 0.0 < self.general.halo_m < support:
-            raise SettingsError([f"halo_m is {self.general.halo_m:g}: use at least {support:g} m, or 0 for just that"])
+            raise SettingsError(
+                [f"halo_m is {self.general.halo_m:g}: use at least {support:g} m, or 0 for exactly that"]
+            )
 
     @property
     def halo_m(self) -> float:
@@ -162,8 +164,7 @@ class RunSettings:
         Parameters
         ----------
         table : mapping
-            General settings at the top level, one table a section: those of `SECTIONS` and one named
-            after a method.
+            General settings at the top level, and one table per section: `SECTIONS` and those named after a method.
 
         Raises
         ------
@@ -179,7 +180,7 @@ class RunSettings:
             if not isinstance(values, Mapping):
                 continue
             if name not in SECTIONS and name not in METHODS:
-                faults.append(f"[{name}] is no table of settings: use one of {', '.join((*SECTIONS, *METHODS))}")
+                faults.append(f"[{name}] is not a table of settings: use one of {', '.join((*SECTIONS, *METHODS))}")
             else:
                 kind = SECTIONS[name] if name in SECTIONS else METHODS[name].settings_type
                 built[name] = build(kind, name, values, faults, _base(name, general))
@@ -222,7 +223,7 @@ class RunSettings:
 
 
 def _base(name: str, general: GeneralSettings | None) -> Parameters | None:
-    """Where the settings of a method start, None for other tables; `RunSettings` refuses a preset it does not have."""
+    """Defaults of the settings of a method, None for other tables; `RunSettings` refuses a preset it does not have."""
     if general is None or name not in METHODS or general.preset not in METHODS[name].presets:
         return None
     return METHODS[name].preset(general.preset)

@@ -1,4 +1,4 @@
-"""Hashing of lattice cells and points: what duplicates and neighbours in space are found by."""
+"""Hashing of lattice cells and points, to find duplicates and neighbours in space."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy.typing as npt
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
 
+# Constants of the hash; they change the speed, not the result.
 # 2^64 / golden ratio: Fibonacci hashing (Knuth, TAOCP 3, 6.4). Unsigned, since only that wraps safely.
 _GOLDEN = np.uint64(11400714819323198485)
 _SHIFT = np.uint64(20)
@@ -35,7 +36,7 @@ def _first_of_each(
     classification: ByteArray,
     return_count: ByteArray,
 ) -> BoolArray:
-    """Kernel: open addressing; of equal points the one of the lowest source, then class, then return count, stays."""
+    """Kernel: open addressing; of equal points the one with the lowest source, then class, then return count, stays."""
     n = x_mm.size
     keep = np.zeros(n, np.bool_)
     size = 2
@@ -83,8 +84,8 @@ def first_of_each(
 ) -> BoolArray:
     """Mask that keeps one of each set of equal points.
 
-    Points are equal where coordinates, return number and GPS time are: what overlapping inputs and
-    careless merges repeat. Which one stays depends on the values alone, not on their order.
+    Points are equal if coordinates, return number and GPS time are; overlapping inputs repeat them. Which one stays
+    depends on the values alone, not on their order.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """The lattice of tiles: anchored at the CRS's origin, half-open, in integer millimetres.
 
-A tile owns what lies in [x0, x1) x [y0, y1). Every stage declares how far it looks (its support
-radius); the halo around a tile is at least that, so that no result depends on where tiles end.
+A tile owns [x0, x1) x [y0, y1). Every stage declares how far it looks (its support); the halo around a tile is at least
+that wide, and no result depends on where tiles end.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pipeline.errors import SettingsError
 from pipeline.model import BoolArray, IntArray
 
 MM = 1000
-"""Millimetres a metre."""
+"""Millimetres per metre."""
 
 _KEY = re.compile(r"x(0|-?[1-9]\d*)_y(0|-?[1-9]\d*)")
 
@@ -48,7 +48,7 @@ class Tile:
         """
         match = _KEY.fullmatch(key)
         if match is None:
-            raise ValueError(f"{key!r} is no tile key such as x85_y447")
+            raise ValueError(f"{key!r} is not a tile key: use one such as x85_y447")
         return cls(int(match[1]), int(match[2]))
 
 

@@ -1,9 +1,9 @@
-"""Decks and roofs between two walls: what has a drop on opposite sides, along edges that run beside one another.
+"""Decks and roofs between two walls: surfaces with drops on opposite sides, along parallel edges.
 
-A bridge that meets the road on its level, and a house on a slope whose roof meets the ground uphill, pass for ground in
-openings: on one side there is no step. But across the deck, and across the roof along the contour, the surface ends at
-a drop to the left and to the right, and the two edges are parallel, which a spur of ground between two brows or the
-corner of a terrace seldom has.
+Openings take a bridge that meets the road on its level for ground, and a house on a slope whose roof meets the ground
+uphill: on one side there is no step. Across the deck, and across the roof along the contour, the surface ends at a drop
+to the left and to the right, and both edges are parallel. A spur of ground between two brows or the corner of a terrace
+seldom has such edges.
 """
 
 from __future__ import annotations
@@ -19,28 +19,30 @@ from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 from pipeline.terrain.support import ALONG_CELLS
 
 _DIRECTIONS = np.array([(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)])
-"""Rows and columns of a stride: every 18 to 27 degrees, so that one of them is nearly square to any edge."""
+"""Rows and columns of a stride: every 18 to 27 degrees, so one of them is nearly perpendicular to any edge.
+
+This and the following define what parallel edges are; how deep drops and how wide decks are can be set."""
 
 _STEEPEST = 1.0
-"""Rise over run that is no drop: by as much more must a drop fall as the points on its two sides lie apart."""
+"""Rise over run of ground: a drop must fall by this much more per distance between the points on its two sides."""
 
 _SAME_EDGE_M = 2.0
-"""An edge is the same where it lies no farther off than that, and _TURN more for each metre along it."""
+"""Two cells are at one edge if their distances to it differ by at most this, and `_TURN` per metre between them."""
 
 _TURN = 0.2
-"""Tangent of half the angle between two directions, about."""
+"""Tangent of about half the angle between two directions."""
 
 _SHARE = 0.5
-"""Of the cells along the edges so many must lie between the same two."""
+"""Share of the cells along the edges that must lie between the same two."""
 
 _FEWEST = 2
-"""And at least so many."""
+"""Least number of such cells."""
 
 _OVER_MM = 1000.0
-"""Cells along the edges that stand higher than this above the deck are no part of it: trees."""
+"""Cells along the edges that are higher than this above the deck do not count: trees."""
 
 _OVER_RISE_MM = 300.0
-"""And than so much more for each metre along them."""
+"""Increase of that height per metre along the edges."""
 
 Distances = npt.NDArray[np.float32]
 
@@ -49,9 +51,9 @@ Distances = npt.NDArray[np.float32]
 def _drop(
     lowest: Elevations, r: int, c: int, stride: tuple[int, int, float], within: float, drop_mm: float
 ) -> tuple[float, float]:
-    """How far it is along a direction to the first drop, in cells, and how deep that is in mm; -1 where there is none.
+    """Distance along a direction to the first drop, in cells, and its depth in mm; -1 where there is none.
 
-    The walk goes past what stands up steeper than 45 degrees from the surface walked on: parapets, cars, trees, houses.
+    The walk passes over objects that rise more steeply than 45 degrees: parapets, cars, trees, houses.
     """
     rows, columns = lowest.shape
     down, across, length = stride
@@ -78,7 +80,7 @@ def _drop(
 def _widths(
     lowest: Elevations, stride: tuple[int, int, float], widest: float, drop_mm: float, rise_mm: float
 ) -> tuple[Distances, Distances]:
-    """Cells to the drops on both sides along a direction; -1 where they are not there, or too low for their width."""
+    """Cells to the drops on both sides along a direction; -1 without drops, or if they are too low for the width."""
     rows, columns = lowest.shape
     ahead = np.full((rows, columns), -1.0, np.float32)
     behind = np.full((rows, columns), -1.0, np.float32)
@@ -98,7 +100,7 @@ def _widths(
 
 @kernel
 def _mark(out: BoolArray, lowest: Elevations, ahead: Distances, behind: Distances, along: tuple[float, float]) -> None:
-    """Mark the cells whose two edges go on beside one another, to one side along them."""
+    """Mark the cells whose two edges continue in parallel, on one side at least."""
     rows, columns = out.shape
     for r in range(rows):
         for c in range(columns):
@@ -130,7 +132,7 @@ def between_walls(lowest: Elevations, widest: int, drop_mm: float, rise_mm: floa
     widest : int
         Farthest that the two drops may lie apart, in cells.
     drop_mm, rise_mm : float
-        Least drop, and what it must be at least for each cell of half the width: wider decks must be higher.
+        Least drop, and least drop per cell of half the width: wider decks must be higher.
 
     Returns
     -------

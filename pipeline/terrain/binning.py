@@ -1,4 +1,4 @@
-"""Points sorted by square cells: what windows around points are gathered from."""
+"""Points sorted by square cells, for windows around points."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
-"""Whole surfaces are judged: which are candidates for buildings, and why the others are not.
+"""Judges whole surfaces: which are candidates for buildings, and why the others are not.
 
-The Z_avg rule (Shorter and Kasparis, section 3.1) asks whether a facet lies above the mean height of
-the walls. For a scene it is asked of each surface and the walls that touch it: a roof lies at the
-top of its walls, a street at their foot. Each metre of outline votes, so one tower beside a low roof
-cannot outvote the roof's own eaves.
+By the Z_avg rule (Shorter and Kasparis, section 3.1) a roof facet lies above the mean height of the walls. In a scene
+the rule applies to each surface and the walls that touch it: a roof lies at the top of its walls, a street at their
+foot. Each metre of outline votes: one tower beside a low roof cannot outvote its eaves.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ NOWHERE = 2**62
 SOLID = (FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.CROWN)
 """Kinds of the surfaces that are judged."""
 _BLOCK = 65_536
-"""Surfaces that are judged at once: what that takes on the way stays below 20 MB, however many there are."""
+"""Surfaces judged at once: it limits the memory to 20 MB."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,8 +41,7 @@ class Surfaces:
     lowest_point_mm: IntArray
     """(k, 3) smallest assigned point; NOWHERE where there is none."""
     along_steps: IntArray
-    """(s, 2) surface and step; one row a pair. Steps are told apart by their numbers, which need not be those of
-    surfaces."""
+    """(s, 2) surface and step; one row per pair. The numbers of steps need not be those of surfaces."""
 
 
 class Fault(IntEnum):
@@ -76,12 +74,12 @@ REASONS = {
     Fault.NO_WALLS: Reason.NO_WALLS,
     Fault.BELOW_Z_AVG: Reason.BELOW_Z_AVG,
 }
-"""What records say of each fault that is told."""
+"""The reason in the records for each fault."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class Verdict:
-    """What is said of a surface that is no candidate."""
+    """Why a surface is not a candidate."""
 
     reason: Reason
     """From the closed list."""
@@ -119,7 +117,7 @@ def _figures(sums: IntArray) -> dict[str, FloatArray]:
 def _limits(
     kind: KindArray, f: dict[str, FloatArray], settings: CandidateSettings
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Which surfaces are surely roofs, and the least area (m2) and width (m) that is asked of each."""
+    """Which surfaces are surely roofs, and the least area (m2) and width (m) of each."""
     sure = (f["judged"] > 0) & (f["planar_share"] >= settings.sure_planar_share)
     sure &= f["canopy_share"] <= settings.max_canopy_share
     slender = f["height_m"] > settings.max_slenderness * f["width_m"]
@@ -150,7 +148,7 @@ def _faults(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> Kin
 
 
 def judge_surfaces(surfaces: Surfaces, settings: CandidateSettings) -> KindArray:
-    """What speaks against each whole surface.
+    """The first fault of each whole surface.
 
     Parameters
     ----------
@@ -162,7 +160,7 @@ def judge_surfaces(surfaces: Surfaces, settings: CandidateSettings) -> KindArray
     Returns
     -------
     (k,) int8
-        The first Fault of each; NOT_JUDGED for ground, steps, and for what would be a candidate without points.
+        `Fault`; NOT_JUDGED for ground, steps, and surfaces that would be candidates without points.
     """
     found = np.full(len(surfaces.kind), Fault.NOT_JUDGED, np.int8)
     solid = np.flatnonzero(np.isin(surfaces.kind, SOLID))
@@ -174,7 +172,7 @@ def judge_surfaces(surfaces: Surfaces, settings: CandidateSettings) -> KindArray
 
 
 def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Verdict | None:
-    """Why one whole surface is no candidate, in words; None where it is one.
+    """Why one whole surface is not a candidate, in words; None if it is one.
 
     Parameters
     ----------
@@ -189,7 +187,7 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
 
 
 def verdicts(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> Iterator[Verdict | None]:
-    """Of each of some surfaces (k,), (k, N_SUMS), as of `judge_surface`."""
+    """The verdicts on surfaces (k,), (k, N_SUMS), each as in `judge_surface`."""
     for start in range(0, len(kind), _BLOCK):
         own = slice(start, start + _BLOCK)
         faults, figures = _faults(kind[own], sums[own], settings), _figures(sums[own])
@@ -200,10 +198,10 @@ def verdicts(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> It
         figures |= {"own": sums[own, Sum.WALLS_OWN_Z] / walls / 1000.0}
         names = list(figures)
         for fault, row in zip(faults.tolist(), np.column_stack(list(figures.values())).tolist(), strict=True):
-            yield _told(Fault(fault), dict(zip(names, row, strict=True)), settings)
+            yield _verdict(Fault(fault), dict(zip(names, row, strict=True)), settings)
 
 
-def _told(fault: Fault, f: Mapping[str, float], settings: CandidateSettings) -> Verdict | None:
+def _verdict(fault: Fault, f: Mapping[str, float], settings: CandidateSettings) -> Verdict | None:
     """A fault in words, with the figure and the threshold."""
     match fault:
         case Fault.NONE:
@@ -230,13 +228,13 @@ def _told(fault: Fault, f: Mapping[str, float], settings: CandidateSettings) -> 
 
 
 def are_objects(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> BoolArray:
-    """Which surfaces (k,) are large enough to be listed at all, as candidate or rejected."""
+    """Which surfaces (k,) are large enough to be listed, as candidate or rejected."""
     large_enough: BoolArray = sums[:, Sum.AREA2] >= 2e6 * settings.min_object_area_m2
     return np.isin(kind, SOLID) & large_enough
 
 
 def may_join(kind: KindArray, sums: IntArray, faults: KindArray, settings: CandidateSettings) -> BoolArray:
-    """Which surfaces (k,) are roof-like and mostly bounded by steps, as a dormer, a lift house or an upper storey."""
+    """Which surfaces (k,) are roof-like and mostly bounded by steps, like a dormer, a lift house or an upper storey."""
     f = _figures(sums)
     small_roof = np.isin(faults, (Fault.TOO_SMALL, Fault.TOO_NARROW, Fault.BELOW_Z_AVG))
     small_roof &= f["top_m"] >= settings.min_height_m

@@ -1,7 +1,7 @@
-"""Class codes: what the numbers in a file's classification mean, where they are not those of ASPRS.
+"""Class codes: the meaning of the numbers in a file's classification, if they are not those of ASPRS.
 
-Producers have codes of their own (67 for a building, say). They are turned into ASPRS codes where points are read, so
-that every stage knows one set only.
+Producers have their own codes (67 for a building, for example). They become ASPRS codes when points are read: every
+stage knows only one set.
 """
 
 from __future__ import annotations
@@ -11,21 +11,24 @@ import dataclasses
 from pipeline.parameters import Parameters, parameter
 
 OTHER = 255
-"""What an ASPRS code becomes that the user took from its group: no ground, no building, not undecided."""
+"""Replaces an ASPRS code that the user took out of its group: neither ground, nor building, nor undecided."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ClassCodeSettings(Parameters):
-    """Which codes of the file mean what; a code in no list can be no roof where classes are believed."""
+    """Meaning of the codes in the file; if classes are trusted, points with a code in no list cannot be roof."""
 
     ground: tuple[int, ...] = parameter((2,), "Codes that mean ground.", minimum=0, maximum=255)
     building: tuple[int, ...] = parameter((6,), "Codes that mean building.", minimum=0, maximum=255)
     vegetation: tuple[int, ...] = parameter((3, 4, 5), "Codes that mean vegetation.", minimum=0, maximum=255)
     noise: tuple[int, ...] = parameter(
-        (7, 18), "Codes that mean noise: such points are left out, whatever `classes` says.", minimum=0, maximum=255
+        (7, 18), "Codes that mean noise: such points are left out for any value of `classes`.", minimum=0, maximum=255
     )
     undecided: tuple[int, ...] = parameter(
-        (0, 1, 12, 19), "Codes that say nothing: such points are judged by their own evidence.", minimum=0, maximum=255
+        (0, 1, 12, 19),
+        "Codes without information: such points are judged by their own evidence.",
+        minimum=0,
+        maximum=255,
     )
 
     def cross_faults(self) -> list[str]:
@@ -42,7 +45,7 @@ class ClassCodeSettings(Parameters):
 
     @property
     def table(self) -> tuple[int, ...] | None:
-        """The ASPRS code of each of the 256 codes; None where all keep their own meaning.
+        """The ASPRS code of each of the 256 codes; None if all keep their own meaning.
 
         >>> ClassCodeSettings().table is None
         True

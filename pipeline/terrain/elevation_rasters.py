@@ -41,7 +41,7 @@ def terrain_at(x_mm: IntArray, y_mm: IntArray, terrain: Elevations, column0: int
 def closed(occupied: BoolArray, cells: int) -> BoolArray:
     """Closing of a mask by a square of 2 cells + 1: gaps up to so wide are filled, the outer edge stays.
 
-    Cells within 2 `cells` of the array's border are not to be used.
+    Cells within 2 `cells` of the border of the array are not valid.
     """
     rows, columns = occupied.shape
     wide = np.zeros((rows, columns), np.bool_)

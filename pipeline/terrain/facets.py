@@ -1,8 +1,8 @@
-"""Facets of a scene's TIN: what they are, and which of them neighbouring tiles see too.
+"""Facets of a scene's TIN: their kinds, and which of them neighbouring tiles see too.
 
 Facets whose elevation difference MX_zdiff reaches 2 m are walls (Shorter and Kasparis, section 3.1). What remains is
 united over shared edges, ground with ground and object with object. All decisions use exact integers, or floats in one
-order, so that every tile that sees a facet says the same of it.
+order: every tile that sees a facet decides the same.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def classify_facets(vertices: SceneVertices, facets: LabelArray, limits: FacetLi
 def marks(
     x: IntArray, y: IntArray, facets: LabelArray, kinds: KindArray, core: tuple[int, int, int, int], far_mm: int
 ) -> tuple[BoolArray, BoolArray]:
-    """Masks of the vertices that the core's points may refer to, and of those that another tile's may refer to too.
+    """Masks (v,) of the vertices that points of the core may refer to, and of those that points of other tiles may.
 
     Points refer to the vertices of the facet around them and to vertices within far_mm. Facets across gaps do not
     count, since they differ from tile to tile.
@@ -256,8 +256,7 @@ def label_vertices(x: IntArray, y: IntArray, facets: LabelArray, kinds: KindArra
 def facet_keys(x: IntArray, y: IntArray, facets: LabelArray, chosen: IntArray) -> IntArray:
     """Coordinates (k, 6) of the vertices of the chosen facets, from the smallest on, counter-clockwise.
 
-    The same facet gives the same coordinates in every tile that sees it: that is how fragments of one
-    surface find each other.
+    A facet has the same coordinates in every tile that sees it: fragments of one surface are matched by them.
     """
     corners = facets[chosen]
     first = np.lexsort((y[corners], x[corners]), axis=1)[:, :1]

@@ -11,33 +11,33 @@ from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS, PIT_CELLS, between_
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MorphologicalFilterSettings(Parameters):
-    """Sizes of the openings and what they may take; read only where the filter is morphological."""
+    """Sizes and limits of the openings; used only with the morphological filter."""
 
     max_window_m: int = parameter(
         20,
-        "Largest radius of the openings on the terrain lattice; wider objects are looked for on a coarse one.",
+        "Largest radius of the openings on the terrain lattice; wider objects are searched on a coarse lattice.",
         unit="m",
         minimum=2,
         maximum=60,
     )
     window_slope: float = parameter(
         0.15,
-        "What a step of the first openings may take, for each metre of their radius.",
+        "Height that a step of the first openings may remove, per metre of radius.",
         minimum=0.01,
         maximum=2.0,
     )
     residual_slope: float = parameter(
         0.1,
-        "The same of the second openings, which work on heights above the trend of the first ground.",
+        "The same for the second openings, which work on heights above the trend of the first ground.",
         minimum=0.01,
         maximum=2.0,
     )
     residual_step_m: float = parameter(
-        0.15, "What a step of the second openings may always take.", unit="m", minimum=0.0, maximum=3.0
+        0.15, "Height that a step of the second openings may always remove.", unit="m", minimum=0.0, maximum=3.0
     )
     residual_steepness_m: float = parameter(
         0.3,
-        "What it may take more where the trend rises by 45 degrees, in proportion elsewhere: steep ground is rough.",
+        "Additional height where the trend rises by 45 degrees, in proportion elsewhere: steep ground is rough.",
         unit="m",
         minimum=0.0,
         maximum=3.0,
@@ -51,47 +51,50 @@ class MorphologicalFilterSettings(Parameters):
     )
     clump_depth_m: float = parameter(
         4.0,
-        "Few cells that lie deeper below the trend are a clump of low outliers.",
+        "A few cells that lie deeper below the trend are a clump of low outliers.",
         unit="m",
         minimum=0.5,
         maximum=50.0,
     )
     widest_m: int = parameter(
         102,
-        "Objects up to this width are cut off on a coarse lattice, where they are high enough for wide_slope.",
+        "Objects up to this width are cut off on a coarse lattice, if they are high enough for wide_slope.",
         unit="m",
         minimum=0,
         maximum=240,
     )
     wide_slope: float = parameter(
         0.12,
-        "What a step of these openings may take, for each metre of their radius: so high are wide objects at least.",
+        "Height that a step of these openings may remove, per metre of radius: the least height of wide objects.",
         minimum=0.01,
         maximum=2.0,
     )
     wall_drop_m: float = parameter(
         1.0,
-        "Decks and roofs between two parallel drops are no ground where both are deeper than this, and than wide_slope "
-        "times half the width between them; up to widest_m wide.",
+        "Decks and roofs between two parallel drops are not ground if both drops are deeper than this and than "
+        "wide_slope times half the width between them; up to widest_m wide.",
         unit="m",
         minimum=0.2,
         maximum=20.0,
     )
     regrowth_passes: int = parameter(
-        3, "How often what lies level with the ground beside it joins the ground.", minimum=0, maximum=10
+        3, "Number of passes in which cells level with the ground beside them join it.", minimum=0, maximum=10
     )
-    regrowth_m: int = parameter(3, "Half side of the square that is beside.", unit="m", minimum=1, maximum=10)
+    regrowth_m: int = parameter(3, "Half side of the square that counts as beside.", unit="m", minimum=1, maximum=10)
     regrowth_step_m: float = parameter(
         0.2, "Highest that a cell may lie above ground beside it.", unit="m", minimum=0.0, maximum=3.0
     )
     regrowth_share: float = parameter(
-        0.3, "Least share of the ground beside it above which it lies no higher.", minimum=0.0, maximum=1.0
+        0.3,
+        "Least share of the ground beside a cell that it does not exceed by more than regrowth_step_m.",
+        minimum=0.0,
+        maximum=1.0,
     )
     terrace_passes: int = parameter(
-        2, "How often wide objects join the ground after that, which are terraces then.", minimum=0, maximum=10
+        2, "Number of further passes in which wide objects may join the ground, as terraces do.", minimum=0, maximum=10
     )
     terrace_share: float = parameter(
-        0.7, "The share of the ground beside it that this asks for.", minimum=0.0, maximum=1.0
+        0.7, "The share that replaces regrowth_share in these passes.", minimum=0.0, maximum=1.0
     )
 
     @property
@@ -105,7 +108,7 @@ class MorphologicalFilterSettings(Parameters):
 
     @property
     def looks_for_wide(self) -> bool:
-        """Whether there are objects to cut off that max_window_m leaves."""
+        """Whether objects wider than the largest opening are searched."""
         return self.widest_m > 2 * self.max_window_m
 
     @property
@@ -126,7 +129,7 @@ class Level:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class HierarchicalFilterSettings(Parameters):
-    """The hierarchy of cells and the tests of a joining point; read only where the filter is hierarchical."""
+    """The hierarchy of cells and the tests of a joining point; used only with the hierarchical filter."""
 
     seed_cell_m: int = parameter(
         48,
@@ -136,17 +139,17 @@ class HierarchicalFilterSettings(Parameters):
         maximum=120,
     )
     level_ratio: int = parameter(
-        4, "Each level's cells are as many times smaller than those before; the last are of 1 m.", minimum=2, maximum=8
+        4, "Factor by which the cells shrink from level to level; the last are 1 m wide.", minimum=2, maximum=8
     )
     passes: int = parameter(
         4,
-        "How often each level after the first is gone through, each time on the TIN of the last.",
+        "Number of passes over each level after the first, each on the TIN of the pass before.",
         minimum=1,
         maximum=8,
     )
     min_reach_m: int = parameter(
         8,
-        "Least distance that a decision looks; coarse levels look one cell of their TIN far.",
+        "Least distance that a decision looks; coarse levels look as far as one cell of their TIN.",
         unit="m",
         minimum=3,
         maximum=40,
@@ -160,13 +163,13 @@ class HierarchicalFilterSettings(Parameters):
     )
     max_distance_m: float = parameter(
         0.6,
-        "Farthest that a joining point lies above its facet or plane, perpendicularly.",
+        "Largest perpendicular distance of a joining point above its facet or plane.",
         unit="m",
         minimum=0.05,
         maximum=5.0,
     )
     distance_rise: float = parameter(
-        0.1, "How much more that distance may be for each metre of the level's cells.", minimum=0.0, maximum=1.0
+        0.1, "Increase of that distance per metre of the level's cells.", minimum=0.0, maximum=1.0
     )
     noise_m: float = parameter(
         0.5, "Points this close to their facet join it at any angle.", unit="m", minimum=0.0, maximum=3.0
@@ -179,7 +182,7 @@ class HierarchicalFilterSettings(Parameters):
     )
     clump_m: int = parameter(
         3,
-        "Side of the cells in which pits are searched a second time, so that clumps of low outliers go too.",
+        "Side of the cells in which pits are searched a second time, to remove clumps of low outliers.",
         unit="m",
         minimum=1,
         maximum=12,

@@ -1,8 +1,8 @@
 """Ground and terrain on a lattice of lowest last returns.
 
-The lattice has cells of 1 m, anchored at the CRS's origin, and holds integer millimetres. A filter tells the cells that
-hold ground, the morphological one or the hierarchical one; the terrain is then drawn through them by local planes, and
-the points near it are the ground points. Everything looks a bounded distance far: no statistic of a whole tile decides.
+The lattice has cells of 1 m, anchored at the CRS's origin, and holds integer millimetres. The morphological or the
+hierarchical filter finds the cells that hold ground. Local planes through them make the terrain, and the points near it
+are the ground points. Every step looks a bounded distance far: no statistic of a whole tile decides.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from pipeline.terrain.settings import GroundSettings
 def _terrain(
     lowest: Elevations, is_ground: BoolArray, bridge: int, max_slope: float, drawn: tuple[int, int, int, int]
 ) -> Elevations:
-    """Draw local least-squares planes through the ground cells of the smallest box that holds enough.
+    """Terrain in mm (rows, columns): local least-squares planes through the ground of the smallest sufficient box.
 
-    Only the cells of `drawn`, first and one past the last column and row, get one.
+    Only the cells of `drawn`, first and one past the last column and row, get an elevation.
     """
     rows, columns = lowest.shape
     sums = plane_sums(lowest, is_ground)
@@ -59,7 +59,7 @@ def _terrain(
 
 @kernel
 def slopes_of(terrain: Elevations) -> Elevations:
-    """Steepest rise in mm over a metre: by central differences, one-sided beside the unknown."""
+    """Steepest rise in mm over a metre (rows, columns): central differences, one-sided beside unknown cells."""
     rows, columns = terrain.shape
     out = np.zeros((rows, columns), np.int32)
     for r in range(rows):
@@ -112,16 +112,16 @@ def ground_of(
     x_mm, y_mm, z_mm : (n,) int64
         Absolute coordinates in millimetres.
     usable : (n,) bool
-        The points that may be ground: last returns without outliers, or the file's own ground class.
+        The points that may be ground: last returns without outliers, or the ground class of the file.
     window : tuple of int
         column0, row0, columns, rows of the lattice.
     settings : GroundSettings
         Windows, slope and tolerances.
     trusted : bool
-        The usable points are ground by the file's classes: no filter, only interpolation.
+        The usable points are ground by the classes of the file: they are only interpolated.
     wanted : tuple of int, optional
-        column0, row0, columns, rows of the cells within which heights and slopes are asked for; all by default. The
-        rest of the window only serves them.
+        column0, row0, columns, rows of the cells whose heights and slopes are needed; all by default. The rest of the
+        window only serves them.
 
     Returns
     -------
@@ -156,7 +156,7 @@ def ground_of(
 
 
 def _part_with_data(lowest: Elevations, margin: int) -> tuple[slice, slice]:
-    """Rows and columns with data, and a margin around them: nothing else gets terrain."""
+    """Rows and columns with data and a margin around them: only these get terrain."""
     filled = lowest != NO_DATA
     rows, columns = np.flatnonzero(filled.any(axis=1)), np.flatnonzero(filled.any(axis=0))
     if len(rows) == 0:
@@ -204,10 +204,10 @@ def ground_points(
 ) -> BoolArray:
     """Which points lie on the ground.
 
-    A point is ground where it lies less than `tolerance_m`, and `tolerance_slope` times the terrain's rise over a
-    metre, above the terrain (the rule of SMRF: Pingel, Clarke and McBride 2013), or anywhere below it: the lattice
-    follows the lowest points, and steep ground within a cell rises far above them. Neither returns nor outliers are
-    looked at; points without terrain are no ground.
+    A point is ground if it lies less than `tolerance_m`, plus `tolerance_slope` times the terrain's rise over a metre,
+    above the terrain (the rule of SMRF: Pingel, Clarke and McBride 2013), or anywhere below it: the lattice follows the
+    lowest points, and steep ground rises far above them within a cell. Returns and outliers do not matter here; points
+    without terrain are not ground.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """The Z_avg height rule of one building, as it is printed (Shorter and Kasparis, section 3.1).
 
 Facets whose elevation difference reaches a threshold are walls; Z_avg is the mean of their highest vertices; a facet
-can be roof only where its centre lies above Z_avg. Taken so, the rule loses parts of a flat noisy roof, because roof
-facets scatter about the mean that the wall tops define, and it fails where the ground slopes or towers stand among
-houses. It is kept for the literal recipe on a single building.
+can be roof only if its centre lies above Z_avg. The printed rule loses parts of a flat noisy roof, because roof facets
+scatter about the mean of the wall tops, and it fails on slopes and for towers among houses. It serves the literal
+recipe on a single building.
 """
 
 from __future__ import annotations
@@ -38,10 +38,7 @@ def facet_z_highest(z_m: FloatArray, facets: LabelArray) -> FloatArray:
 
 
 def z_avg(z_highest_m: FloatArray, is_wall: BoolArray) -> float:
-    """Z_avg: mean of Z_mx over the wall facets.
-
-    The sum is one of whole millimetres, so that it does not depend on the order of the facets, and parts of it can
-    be added over tile borders.
+    """Z_avg: mean of Z_mx over the wall facets; a sum of whole millimetres, in any order of the facets.
 
     Parameters
     ----------
@@ -53,7 +50,7 @@ def z_avg(z_highest_m: FloatArray, is_wall: BoolArray) -> float:
     Returns
     -------
     float
-        Metres; minus infinity where there is no wall, so that the rule then lets everything pass.
+        Metres; minus infinity without walls: then every facet passes the rule.
     """
     count = int(np.count_nonzero(is_wall))
     if count == 0:
@@ -77,8 +74,8 @@ def facets_above_z_avg(z_m: FloatArray, facets: LabelArray, *, wall_height_m: fl
     Returns
     -------
     (m,) bool
-        True where the facet is no wall and its centre (mean of its vertices) lies above Z_avg; all facets that are
-        no walls where there is no wall at all.
+        True if the facet is not a wall and its centre (mean of its vertices) lies above Z_avg; all facets without
+        walls.
     """
     is_wall = facet_z_difference(z_m, facets) >= wall_height_m
     threshold_m = z_avg(facet_z_highest(z_m, facets), is_wall)

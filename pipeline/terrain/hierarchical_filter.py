@@ -1,9 +1,9 @@
 """The hierarchical ground filter: TIN densification and planar fitting, from coarse cells to fine ones.
 
-It stands for the "TIN filtering and planar-fitting filtering with the hierarchical filtering strategy" by which Zeng et
-al. (2008) prepare their scenes, whose own description is not public. The lowest point of every coarse cell is ground.
+It follows the "TIN filtering and planar-fitting filtering with the hierarchical filtering strategy" with which Zeng et
+al. (2008) prepare their scenes; their own description is not public. The lowest point of every coarse cell is ground.
 Level by level the lowest points of finer cells join it, judged by the TIN of the ground found so far, or by a plane
-through it where no facet decides. Every pass looks one reach far, so the whole filter looks as far as their sum.
+through it where no facet decides. Every pass looks one reach far, and the whole filter as far as their sum.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ from pipeline.terrain.planar_fitting import join_planes
 from pipeline.terrain.support import PIT_CELLS
 from pipeline.terrain.tin_densification import join_facets
 
+# Not settings: they guard against bad seeds, and pits, cells and steps themselves can be set.
 _CLUMP_MATES = 3
 """A clump no wider than a cell may lie in four of them."""
 
 _WHOLE_SHARE = 2 / 3
-"""A cell of seeds whose points extend over less of its side than this is cut by the data's edge."""
+"""The edge of the data cuts a cell of seeds if its points extend over less than this share of its side."""
 
 _WALL_CELLS = 2
 """Cells over which a wall's step is taken."""
 
 _CUT_SLOPE = 0.2
-"""Rise over run from the foot of a wall that is still no wall."""
+"""Rise over run of ground between the foot of a wall and the seed on it."""
 
 
 @kernel
 def _lowest_of_cells(lowest: Elevations, size: int, column0: int, row0: int) -> BoolArray:
-    """Mask of the lowest lattice cell of each cell of `size` anchored at the origin; of equal ones the first by row."""
+    """Mask of the lowest lattice cell in each cell of `size` anchored at the origin; of equal ones the first by row."""
     rows, columns = lowest.shape
     corner_c, corner_r = column0 // size, row0 // size
     coarse = np.full(((row0 + rows - 1) // size - corner_r + 1, (column0 + columns - 1) // size - corner_c + 1), -1)
@@ -91,7 +92,7 @@ def _stands_on_a_wall(lowest: Elevations, r: int, c: int, reach: int, step_mm: f
 
 @kernel
 def _without_cut_off(lowest: Elevations, seeds: BoolArray, size: int, corner: tuple[int, int], step_mm: float) -> None:
-    """Clear seeds on walls whose cells the data's edge cuts: what is left of such a cell may be all roof.
+    """Clear seeds on walls in cells that the edge of the data cuts: such a cell may hold nothing but roof.
 
     A wall is a step down of more than step_mm, at the seed's level, within one cell of seeds.
     """
@@ -106,7 +107,7 @@ def _without_cut_off(lowest: Elevations, seeds: BoolArray, size: int, corner: tu
 def _without_clumps(lowest: Elevations, size: int, column0: int, row0: int, depth_mm: int) -> Elevations:
     """Clear what lies deeper than depth_mm below all but three of the 24 cells of `size` around its own.
 
-    The test of `without_pits` on coarser cells; of a cell only the points that are too deep are cleared.
+    The test of `without_pits` on coarser cells; in a cell only the points that are too deep are cleared.
     """
     rows, columns = lowest.shape
     corner_c, corner_r = column0 // size, row0 // size

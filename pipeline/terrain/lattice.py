@@ -18,7 +18,7 @@ NO_DATA = np.int32(2**31 - 1)
 Elevations = npt.NDArray[np.int32]
 
 PIT_MATES = 2
-"""At most as many neighbours of a pit lie as deep."""
+"""At most this many neighbours of a pit are as deep: low outliers come alone or in small groups."""
 
 
 @kernel

@@ -1,11 +1,10 @@
 """The morphological ground filter: openings of growing size, first on elevations, then on heights above a trend.
 
-An object is what one step of a growing opening cuts off (Zhang et al. 2003; the rule that the step may take more the
-wider the opening, and the surface with its gaps closed, are those of SMRF: Pingel, Clarke and McBride 2013). On a slope
-an opening cannot see an object lower than the slope rises between two points. So the openings run twice: the first
-gives a provisional ground, and the second works on heights above its trend, where slopes are gone. Wide objects and
-decks between two walls are told apart beside that. What brows, crests and terraces lose comes back from the ground
-beside it on the same level.
+One step of a growing opening cuts off an object (Zhang et al. 2003). A step may remove more the wider the opening is,
+and gaps in the surface are closed first (SMRF: Pingel, Clarke and McBride 2013). On a slope an opening cannot see an
+object that is lower than the slope rises between two points. Therefore openings run twice: the first give a provisional
+ground, the second work on heights above its trend, without slopes. Wide objects and decks between two walls are found
+separately. Brows, crests and terraces that were lost rejoin the ground beside them on the same level.
 """
 
 from __future__ import annotations
@@ -23,16 +22,16 @@ from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS
 from pipeline.terrain.wide_objects import wide_objects, with_corners
 
 _STEEPEST = 1.5
-"""Rise over run from which on the trend's slope allows the second openings no more."""
+"""Rise over run beyond which a steeper trend does not allow the second openings more: ground is seldom steeper."""
 
 _CLUMP_SHARE = 0.1
 """A clump holds at most this share of the cells around it, or four."""
 
 _CLUMP_BAND_MM = 750
-"""Cells count as of the clump up to so far above the one in question."""
+"""Cells up to this far above the one in question belong to its clump."""
 
 _FEWEST_BESIDE = 2
-"""Ground cells on its level that a cell needs beside it to come back."""
+"""Ground cells on the same level that a cell needs beside it to rejoin: one may be an outlier."""
 
 
 @kernel

@@ -1,8 +1,8 @@
 """Openings of growing size by octagons, on surfaces with holes.
 
-An opening takes off a surface what is narrower than its structuring element. The elements here are sums of crosses and
-squares of three cells in the ratio that makes a regular octagon, and each is the one before with one piece more, so
-that an erosion goes on from the last.
+An opening removes from a surface what is narrower than its structuring element. The elements here are sums of crosses
+and squares of three cells in the ratio that makes a regular octagon. Each element is the one before with one more
+piece: an erosion continues from the last.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pipeline.model import ByteArray
 from pipeline.terrain.lattice import NO_DATA, Elevations
 
 _HIGH = np.int32(2**30)
+"""Above and below all elevations in mm, far enough from the ends of int32 for differences."""
 _LOW = np.int32(-(2**30))
 
 
@@ -25,7 +26,7 @@ def _is_square(number: int) -> bool:
 
 @kernel
 def _widened(values: Elevations, across: Elevations, is_square: bool, want_low: bool) -> None:
-    """Replace values, but for their frame of one cell, by the extreme over a square or cross of three cells."""
+    """Replace values, except their frame of one cell, by the extreme over a square or cross of three cells."""
     rows, columns = values.shape
     row = np.empty(columns, np.int32)
     for r in range(1, rows - 1):
@@ -56,7 +57,7 @@ def _widened(values: Elevations, across: Elevations, is_square: bool, want_low: 
 
 @kernel
 def framed(surface: Elevations) -> Elevations:
-    """The surface within a frame of one cell, what has no data above everything: ready to be eroded."""
+    """The surface in a frame of one cell, for erosion: cells without data are above everything."""
     rows, columns = surface.shape
     out = np.full((rows + 2, columns + 2), _HIGH, np.int32)
     for r in range(rows):
@@ -76,17 +77,17 @@ def erode_once(eroded: Elevations, scratch: Elevations, radius: int) -> None:
 def dilate_back(surface: Elevations, eroded: Elevations, opened: Elevations, scratch: Elevations, radius: int) -> None:
     """From an erosion to the opening, written to the framed array `opened`.
 
-    Elements are centred on cells with data only: beyond the data's edge an element would see nothing but the roof that
+    Elements are centred only on cells with data: beyond the edge of the data an element would see only the roof that
     the edge cuts.
 
     Parameters
     ----------
     surface : (rows, columns) int32
-        What is opened; tells where there is data.
+        The surface that is opened; NO_DATA in holes.
     eroded, opened, scratch : (rows + 2, columns + 2) int32
-        The erosion by the octagon of `radius`, the outcome, and room.
+        The erosion by the octagon of `radius`, the result, and scratch space.
     radius : int
-        Of the octagon, in cells.
+        Radius of the octagon in cells.
     """
     rows, columns = surface.shape
     opened[:] = _LOW
@@ -101,28 +102,28 @@ def dilate_back(surface: Elevations, eroded: Elevations, opened: Elevations, scr
 
 @kernel
 def cut_off(surface: Elevations, base_mm: Elevations, rise_mm: float, largest: int) -> ByteArray:
-    """The first radius of a growing opening that takes more off a cell than it may.
+    """The first radius of a growing opening that removes more from a cell than it may.
 
     Parameters
     ----------
     surface : (rows, columns) int32
         Elevations or heights in mm, NO_DATA in holes.
     base_mm : (rows, columns) int32
-        What the step to any radius may take of each cell.
+        Height that a step to any radius may remove from each cell.
     rise_mm : float
-        What it may take more for each cell of its radius.
+        Additional height per cell of the radius.
     largest : int
         Largest radius in cells; every radius from 1 on is tried.
 
     Returns
     -------
     (rows, columns) uint8
-        The radius; 0 where no step takes more, and in holes.
+        The radius; 0 where no step removes more, and in holes.
 
     Notes
     -----
     A planar slope loses nothing to an opening. A hilltop, crest or brow loses by each cell of radius no more than its
-    slope rises over a cell, an object all of its height at once when the element no longer fits into it.
+    slope rises over a cell; an object loses all of its height at once when the element no longer fits into it.
     """
     rows, columns = surface.shape
     found = np.zeros((rows, columns), np.uint8)

@@ -1,8 +1,7 @@
 """Gross outliers: points that are nearly alone in a wide neighbourhood of space.
 
-Birds, clouds and multipath echoes stand metres to hundreds of metres from everything else. A point
-is an outlier where the 27 cubes around it hold too few points; the decision looks 2 cubes far and no
-further, so that tiles agree on it.
+Birds, clouds and multipath echoes are metres to hundreds of metres away from everything else. A point is an outlier if
+the 27 cubes around it hold too few points. The decision looks two cubes far, and neighbouring tiles agree on it.
 """
 
 from __future__ import annotations
@@ -14,11 +13,12 @@ from pipeline.model import BoolArray, IntArray
 from pipeline.spatial_hash import slot_of_key
 from pipeline.terrain.settings import OutlierSettings
 
-# 21 bits a coordinate pack a cube into one key: 2^21 cubes are wider than any tile with its halo.
 _BITS = 21
+"""Bits per coordinate in the key of a cube: 2^21 cubes are wider than any tile with its halo."""
 _EMPTY = -1
+"""Key of a free slot of the table."""
 _CUBES_A_POINT = 4.0
-"""As many cubes as that for each point are held in an array; more, where strays lie far off, are looked up."""
+"""Up to this many cubes per point are held in an array; more are looked up in a table. A matter of speed."""
 
 
 @kernel
@@ -48,7 +48,7 @@ def _grown(keys: IntArray, counts: IntArray) -> tuple[IntArray, IntArray]:
 def _by_table(
     x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, cube_mm: int, min_neighbours: int, low: tuple[int, int, int]
 ) -> BoolArray:
-    """The points that are kept, by a table of the occupied cubes: wherever strays are, it holds no more of them."""
+    """The points that are kept, (n,) bool, from a table of the occupied cubes: strays far away do not make it larger."""
     n = x_mm.size
     keep = np.zeros(n, np.bool_)
     # far fewer cubes than points: the table starts small and grows
@@ -95,7 +95,7 @@ def _by_grid(
     low: tuple[int, int, int],
     shape: tuple[int, int, int],
 ) -> BoolArray:
-    """The same by an array of all cubes, with empty ones around them: many times faster than looking cubes up."""
+    """The same from an array of all cubes with empty ones around them: many times faster than a table."""
     n = x_mm.size
     x0, y0, z0 = low[0] * cube_mm, low[1] * cube_mm, low[2] * cube_mm
     cube_of = np.empty(n, np.int64)
@@ -126,7 +126,7 @@ def _by_grid(
 
 @kernel
 def _dense_enough(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, cube_mm: int, min_neighbours: int) -> BoolArray:
-    """Kernel: count points a cube, then sum the 27 cubes around each occupied cube once."""
+    """Kernel: count the points per cube, then sum the 27 cubes around each occupied one."""
     n = x_mm.size
     if n == 0:
         return np.zeros(0, np.bool_)
@@ -142,7 +142,7 @@ def _dense_enough(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, cube_mm: int, 
 
 
 def dense_enough(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: OutlierSettings) -> BoolArray:
-    """Mask of the points that are no gross outliers.
+    """Mask of the points that are not gross outliers.
 
     Parameters
     ----------

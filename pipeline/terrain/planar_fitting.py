@@ -3,7 +3,7 @@
 All sums are integers, and the moments are taken about the place in question: a plane does not depend on where the
 lattice's window begins, nor on the order of anything.
 
-Three stages stand on it: the terrain is drawn by such planes, they are the trend of the morphological filter
+Three stages use them: the terrain is drawn by such planes, they are the trend of the morphological filter
 (`leaning_planes`), and the hierarchical filter judges by them the points that no facet of its TIN holds
 (`join_planes`): beyond the hull of the ground found so far, and where facets are too wide.
 """
@@ -24,10 +24,10 @@ Sums = npt.NDArray[np.int64]
 """(9, rows + 1, columns + 1) integral images of 1, x, y, z, xx, xy, yy, xz, yz; x and y are cell indices, z in mm."""
 
 MIN_CELLS = 5
-"""Fewest cells of a plane."""
+"""Fewest cells of a plane: two more than determine it."""
 
 MIN_SPREAD = 0.05
-"""A plane needs det(scatter) above this times trace(scatter)^2: cells in a row carry none."""
+"""Numerical guard: det(scatter) over trace(scatter)^2 of a plane, 0 for cells in a row and 0.25 at most."""
 
 MAX_LEAN = 0.6
 """Farthest that the centroid of a trend's square may lie from its middle, in half sides: 0.5 at a straight edge."""

@@ -1,6 +1,6 @@
-"""The class of every point, once it is known which points are buildings: ground, building, vegetation, noise, other.
+"""The class of every point after buildings are known: ground, building, vegetation, noise, other.
 
-Decided by what lies within a few metres, on integer millimetres, so that tiles agree. Codes are those of ASPRS, LAS
+Decisions look a few metres far and use integer millimetres: tiles agree on them. Codes are those of ASPRS, LAS
 Specification 1.4 R15, table 17.
 """
 
@@ -22,40 +22,41 @@ from pipeline.terrain.vegetation import planarity
 
 
 class PointClass(IntEnum):
-    """The classes that are given."""
+    """The classes in the output."""
 
     OTHER = 1
-    """Cars, poles, wires, walls in gardens, bridges: nothing of the below."""
+    """None of the others: cars, poles, wires, garden walls, bridges."""
     GROUND = 2
     VEGETATION = 5
     BUILDING = 6
-    """Roofs, walls and what stands on roofs."""
+    """Roofs, walls and objects on roofs."""
     NOISE = 7
-    """Points nearly alone in space, and some few far below the terrain."""
+    """Points nearly alone in space, and a few far below the terrain."""
 
 
+# Not settings: dimensions of common objects on and beside buildings.
 WALL_REACH_MM = 1000
-"""A point so near to a building in plan, and no higher than it there, is its wall where it is not leafy."""
+"""A point this near to a building in plan, and no higher than it there, is its wall unless it is leafy."""
 UNDER_ROOF_MM = 500
-"""So near, it is wall or what lies under the roof whatever it looks like: eaves scatter pulses as leaves do."""
+"""This near, it is always wall or lies under the roof: eaves scatter pulses as leaves do."""
 ON_ROOF_MM = 2500
-"""Chimneys, antennas and parapets stand at most so high above the roof."""
+"""Largest height of chimneys, antennas and parapets above the roof."""
 TALL_MM = 2000
-"""Higher than cars and fences: what is no building and not smooth is taken for vegetation."""
+"""Higher than cars and fences: rough points that are not building are vegetation."""
 CELL_M = 0.5
 """Side of the cells of which one point each is judged for smoothness."""
 UNKNOWN, SMOOTH, LEAFY = -1, 0, 1
 AROUND_MM = 1000
 """Side of the cells over 3 x 3 of which the evidence of vegetation is summed."""
 DEEP_MM = 2000
-"""Points deeper than this below level terrain are noise where they are few: the lattice is drawn to half of it."""
+"""A few points deeper than this below level terrain are noise: twice as deep as a pit by default."""
 PIT_REACH_MM = 2000
 """Half side of the box in which points far below the terrain are counted."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PointEvidence:
-    """What is known of the points of a window; arrays of one length n."""
+    """Evidence on the points of a window; arrays of one length n."""
 
     x_mm: IntArray
     y_mm: IntArray
@@ -65,7 +66,7 @@ class PointEvidence:
     rise_mm: IntArray
     """Rise of the terrain over a metre."""
     ground: BoolArray
-    """Close enough to the terrain to be ground."""
+    """Close enough to the terrain for ground."""
     building: BoolArray
     """In a building's points."""
     outlier: BoolArray
@@ -209,7 +210,7 @@ def classes_of(evidence: PointEvidence, wanted: BoolArray, vegetation: Vegetatio
     Parameters
     ----------
     evidence : PointEvidence
-        Of the points of a window, which reaches `support_m` beyond the wanted ones.
+        The points of a window that reaches `support_m` beyond the wanted ones.
     wanted : (n,) bool
         The points to be classified.
     vegetation : VegetationSettings
@@ -252,7 +253,7 @@ def classes_of(evidence: PointEvidence, wanted: BoolArray, vegetation: Vegetatio
 
 
 def noise_of(x_mm: IntArray, y_mm: IntArray, height_mm: IntArray, rise_mm: IntArray, outlier: BoolArray) -> BoolArray:
-    """Mask of the noise: gross outliers, and points far below the terrain where they are few.
+    """Mask of the noise: gross outliers, and a few points far below the terrain.
 
     Parameters
     ----------
@@ -272,7 +273,7 @@ def noise_of(x_mm: IntArray, y_mm: IntArray, height_mm: IntArray, rise_mm: IntAr
 def leafiness(evidence: PointEvidence, among: BoolArray, tall: BoolArray, vegetation: VegetationSettings) -> KindArray:
     """Whether points are vegetation by what lies around them: pulses that go on, or a surface that is not smooth.
 
-    Of tall points either is enough, of low ones both are needed: cars and fences scatter pulses, too.
+    Tall points need one of them, low points both: cars and fences scatter pulses, too.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Planar patches of one candidate's roof, and the borders between them: what its units are told apart by.
+"""Planar patches of one candidate's roof and the borders between them, by which units are separated.
 
-Patches grow over a TIN of thinned points from the most planar places. What lies along the border of two patches is read
-off their planes, so a step is as sharp in sparse data as in dense data: a facet that is one point spacing wide is not.
-All sums are of whole millimetres or in one fixed order.
+Patches grow over a TIN of thinned points from the most planar places. Steps are measured between the planes of two
+patches, not on the facets at their border, which are one point spacing wide: so they are as sharp in sparse data as in
+dense data. All sums are of whole millimetres or in one fixed order.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pipeline.model import FloatArray, IntArray, LabelArray, Tin
 from pipeline.terrain.binning import points_by_cell
 from pipeline.terrain.vegetation import smallest_eigenvalue
 
-# Not settings: patches only serve to tell units apart, and the thresholds of units are settings.
+# Not settings: patches only serve to separate units, and the thresholds of units are settings.
 _MAX_RADIUS_M = 3.0
 """Facets with a wider circumcircle bridge a gap in the roof: nothing touches across them."""
 _TYPICAL_RADII = 3.0
@@ -80,7 +80,7 @@ class RoofVertices(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Borders:
-    """Borders between patches, one row a pair that touches; arrays of one length."""
+    """Borders between patches, one row per pair that touches; arrays of one length."""
 
     first: LabelArray
     """The patch with the smaller number."""
@@ -268,9 +268,9 @@ def grow_patches(vertices: RoofVertices, local: FloatArray, order: IntArray) -> 
 
 @kernel
 def fill_patches(vertices: RoofVertices, label: LabelArray, planes: FloatArray) -> int:
-    """Give the vertices that no patch took to the patch beside them whose plane is nearest; the number of patches.
+    """Add the vertices that no patch took to the adjacent patch with the nearest plane; returns the number of patches.
 
-    Round by round, all vertices of a round at once. What touches no patch becomes patches of its own, without a plane.
+    All vertices of a round join at once. Vertices that touch no patch become patches without a plane.
     """
     x, y, z, start, others = vertices
     n = x.size
@@ -419,7 +419,7 @@ def patches_of(
 
 
 def _tops(z: IntArray, label: LabelArray, count: int) -> FloatArray:
-    """Of each patch the elevation in metres below which nine tenths of its vertices lie."""
+    """Elevation in metres below which nine tenths of the vertices of each patch lie, (k,)."""
     order = np.lexsort((z, label))
     ends = np.cumsum(np.bincount(label, minlength=count))
     starts = np.concatenate(([0], ends[:-1]))

@@ -14,7 +14,7 @@ from pipeline.terrain.settings import (
 )
 
 APRON_M = 6
-"""Width of the terrain that a tile stores beyond its core."""
+"""Width in metres of the terrain that a tile stores beyond its core."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,21 +40,21 @@ class SceneSettings:
 
     @property
     def support_m(self) -> float:
-        """How far a tile looks beyond its core at most: to find fragments among points whose classes tell nothing."""
+        """Farthest that a tile looks beyond its core: to find fragments among points without usable classes."""
         return self.support_with(ClassesInUse(), footprints=False)
 
     def support_with(self, classes: ClassesInUse, *, footprints: bool) -> float:
-        """How far a tile looks beyond its core, by what is known beforehand.
+        """How far a tile looks beyond its core, given the classes and footprints in use.
 
-        Three lengths add up: how far off the terrain is wanted, how far a terrain elevation looks from there, and how
-        far it takes to tell whether a point that it looks at is an outlier.
+        Three lengths add up: how far from the core terrain is needed, how far a terrain elevation looks from there, and
+        how far the search for outliers looks.
 
-        - Terrain is stored for the core and its apron (`APRON_M`). Fragments want it at all points of the core and of
-          the facets and vertices around it. The points in given footprints are the core's own: no TIN is made for
-          them, no surroundings are judged, and each is asked only whether it lies in a footprint and above the ground.
-        - A terrain elevation looks as far as the filter that finds the ground; where class 2 is the ground none runs,
-          and `GroundSettings.trusted_support_m` is left.
-        - Class 6 narrows nothing: its points are judged one by one.
+        - Terrain is stored for the core and its apron (`APRON_M`). Fragments need it at all points of the core and at
+          the facets and vertices around it. With given footprints only points of the core count, without a TIN: each
+          must lie in a footprint and above the ground.
+        - A terrain elevation looks as far as the ground filter. With class 2 as ground no filter runs, which leaves
+          `GroundSettings.trusted_support_m`.
+        - Class 6 does not shorten the distance: its points are judged one by one.
 
         Parameters
         ----------
@@ -72,7 +72,7 @@ class SceneSettings:
         return self.outliers.support_m + ground_m + self.terrain_m(footprints=footprints)
 
     def terrain_m(self, *, footprints: bool) -> float:
-        """How far beyond a tile's core terrain is wanted, in metres; for the points in given footprints, or for all."""
+        """How far beyond the core terrain is needed, in metres: for points in given footprints, or for all points."""
         if footprints:
             return float(APRON_M)
         around_m = max(self.surfaces.support_m, self.vegetation.support_m) + self.vegetation.support_m

@@ -9,6 +9,7 @@ from pipeline.terrain.filter_settings import HierarchicalFilterSettings, Morphol
 from pipeline.terrain.support import PLANARITY_SCALES
 
 _MAX_SUPPORT_M = 500
+"""A filter that looks farther makes a tile nearly all halo."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,11 +31,11 @@ class OutlierSettings(Parameters):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
-    """How ground is told from objects."""
+    """How ground is separated from objects."""
 
     filter: str = parameter(
         "morphological",
-        "What tells ground from objects: openings of growing size, or TIN densification with planar fitting.",
+        "Separates ground from objects: openings of growing size, or TIN densification with planar fitting.",
         choices=("morphological", "hierarchical"),
     )
 
@@ -47,14 +48,14 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
     )
     bridge_m: int = parameter(
         24,
-        "Farthest that the terrain is drawn under objects, where the filter asks for no more.",
+        "Farthest that the terrain is drawn under objects, unless the filter needs more.",
         unit="m",
         minimum=4,
         maximum=80,
     )
     max_slope: float = parameter(
         1.0,
-        "Steepest that the terrain is drawn from the middle of the ground around a place to that place, rise over run.",
+        "Steepest slope, rise over run, at which the terrain is extended from the middle of the ground around a place.",
         minimum=0.01,
         maximum=2.0,
     )
@@ -63,39 +64,35 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
     )
     tolerance_slope: float = parameter(
         1.0,
-        "What that distance grows by, in metres, where the terrain rises by 45 degrees, and in proportion elsewhere; "
-        "0 with the hierarchical filter.",
+        "Increase of that distance in metres where the terrain rises by 45 degrees, in proportion elsewhere; "
+        "the hierarchical filter does not use it.",
         minimum=0.0,
         maximum=3.0,
     )
 
     def cross_faults(self) -> list[str]:
-        """A hierarchy of so many passes, or openings so large, that its tiles would be all halo."""
+        """A filter that looks so far that tiles would be nearly all halo."""
         if self.filter == "hierarchical":
             counts = [self.seed_cell_m, self.level_ratio, self.passes, self.min_reach_m, self.clump_m]
-            told = (
-                f"seed_cell_m {self.seed_cell_m}, level_ratio {self.level_ratio}, passes {self.passes}",
-                "use fewer passes or smaller cells",
-            )
+            cause = f"seed_cell_m {self.seed_cell_m}, level_ratio {self.level_ratio}, passes {self.passes}"
+            fix = "use fewer passes or smaller cells"
         else:
             counts = [self.max_window_m, self.trend_m, self.widest_m, self.regrowth_m]
             counts += [self.regrowth_passes, self.terrace_passes]
-            told = (
-                (
-                    f"max_window_m {self.max_window_m}, trend_m {self.trend_m}, widest_m {self.widest_m}, regrowth_m"
-                    f" {self.regrowth_m} in {self.regrowth_passes} and {self.terrace_passes} passes,"
-                    f" bridge_m {self.bridge_m}"
-                ),
-                "use smaller ones",
+            cause = (
+                f"max_window_m {self.max_window_m}, trend_m {self.trend_m}, widest_m {self.widest_m}, regrowth_m "
+                f"{self.regrowth_m} in {self.regrowth_passes} and {self.terrace_passes} passes, "
+                f"bridge_m {self.bridge_m}"
             )
+            fix = "use smaller ones"
         whole = all(isinstance(n, int) for n in (*counts, self.bridge_m))
         if not whole or self.level_ratio < 2 or self.support_m <= _MAX_SUPPORT_M:
             return []
-        return [f"filter looks {self.support_m:g} m far, by {told[0]}: {told[1]}, for at most {_MAX_SUPPORT_M} m"]
+        return [f"filter looks {self.support_m:g} m far, by {cause}: {fix}, for at most {_MAX_SUPPORT_M} m"]
 
     @property
     def reach_m(self) -> int:
-        """Farthest that the terrain is drawn under objects: at least to the middle of the widest that are cut off."""
+        """Farthest that the terrain is drawn under objects: at least to the middle of the widest object cut off."""
         if self.filter == "hierarchical":
             return max(self.bridge_m, 2 * self.seed_cell_m // 3)
         return max(self.bridge_m, self.max_window_m + 1, self.widest_m // 2 + 1 if self.looks_for_wide else 0)
@@ -109,10 +106,10 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
 
     @property
     def trusted_support_m(self) -> float:
-        """How far a terrain elevation looks where the ground is known by its class: no filter, and no pit test.
+        """How far a terrain elevation looks where the ground is known by its class: neither filter nor pit test runs.
 
-        A plane is drawn through the ground cells of a square that never reaches farther than `reach_m`, however wide
-        the gap: where there is no ground in it there is no terrain. The rest is as in `support_m`.
+        A plane is drawn through the ground cells of a square that never reaches farther than `reach_m`: without ground
+        in it there is no terrain. The rest is as in `support_m`.
         """
         return float(self.reach_m + 4)
 
@@ -138,14 +135,14 @@ class VegetationSettings(Parameters):
     )
     level_m: float = parameter(
         2.0,
-        "Points this far above or below a vertex lie across a wall and do not judge it.",
+        "Points this far above or below a vertex lie across a wall and do not count for it.",
         unit="m",
         minimum=0.5,
         maximum=20.0,
     )
     company_m: float = parameter(
         2.0,
-        "Radius of the sphere around a vertex whose verdicts say together whether it is roof or crown.",
+        "Radius of the sphere around a vertex; the verdicts in it decide together whether the vertex is roof or crown.",
         unit="m",
         minimum=0.5,
         maximum=5.0,
@@ -155,7 +152,7 @@ class VegetationSettings(Parameters):
     )
     pierced_share: float = parameter(
         0.1,
-        "Share of vertices from pulses of several returns in that sphere, above which it may be a crown's.",
+        "Share of vertices from pulses with several returns in that sphere, above which it may be part of a crown.",
         minimum=0.0,
         maximum=1.0,
     )
@@ -199,22 +196,22 @@ class SurfaceSettings(Parameters):
 
     @property
     def support_m(self) -> float:
-        """How far a fragment's facets look: two facets and their circumcircles."""
+        """How far the facets of a fragment look: two facets and their circumcircles."""
         return 4.0 * self.max_circumradius_m + 2.0 * self.thinning_m
 
     @property
     def far_mm(self) -> int:
-        """How far the vertices are that a point may refer to: a tile looks at all facets with one so near its core."""
+        """Farthest vertex that a point may refer to: a tile looks at all facets with a vertex this near its core."""
         return round(2 * self.thinning_m * 1000)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CandidateSettings(Parameters):
-    """What a surface must be to become a candidate."""
+    """Conditions that make a surface a candidate."""
 
     min_object_area_m2: float = parameter(
         4.0,
-        "Smaller surfaces are no objects: crowns fall apart into thousands of them; they are counted, not listed.",
+        "Smaller surfaces are counted, not listed: crowns fall apart into thousands of them.",
         unit="m2",
         minimum=0.5,
         maximum=100.0,
@@ -235,18 +232,18 @@ class CandidateSettings(Parameters):
         maximum=100.0,
     )
     doubtful_area_m2: float = parameter(
-        20.0, "Least plan area of a building's surface that is not.", unit="m2", minimum=1.0, maximum=1000.0
+        20.0, "Least plan area of a surface that is not surely a roof.", unit="m2", minimum=1.0, maximum=1000.0
     )
     min_height_m: float = parameter(
         2.0,
-        "Least height above the terrain, of a pitched roof that of its ridge, as the spread of its heights tells.",
+        "Least height above the terrain; for a pitched roof that of its ridge, estimated from the spread of heights.",
         unit="m",
         minimum=0.5,
         maximum=20.0,
     )
     min_width_m: float = parameter(
         2.0,
-        "Least mean width, twice the area over the outline; half of it for what is surely a roof.",
+        "Least mean width, twice the area over the outline; half of it for a surface that is surely a roof.",
         unit="m",
         minimum=0.0,
         maximum=20.0,
@@ -260,7 +257,7 @@ class CandidateSettings(Parameters):
     min_wall_share: float = parameter(0.15, "Least share of the outline that touches walls.", minimum=0.0, maximum=1.0)
     min_top_share: float = parameter(
         0.3,
-        "Least share of the touching walls at whose top the surface lies (the Z_avg rule by surface).",
+        "Least share of the adjacent walls whose top the surface lies at (the Z_avg rule by surface).",
         minimum=0.0,
         maximum=1.0,
     )
@@ -271,22 +268,22 @@ class CandidateSettings(Parameters):
         maximum=1.0,
     )
     unite_reach_m: float = parameter(
-        3.0, "Farthest that this roof may be, between the boxes around both.", unit="m", minimum=0.0, maximum=50.0
+        3.0, "Largest distance to this roof, between the bounding boxes of both.", unit="m", minimum=0.0, maximum=50.0
     )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class UnitSettings(Parameters):
-    """How touching buildings are told apart."""
+    """How touching buildings are separated."""
 
     split: str = parameter(
         "ridges",
-        "What separates units within a candidate: nothing, steps, or steps and valleys between parallel ridges.",
+        "Where a candidate is split into units: nowhere, at steps, or at steps and at valleys between parallel ridges.",
         choices=("nothing", "steps", "ridges"),
     )
     min_step_m: float = parameter(0.3, "Least step between the roofs of two units.", unit="m", minimum=0.1, maximum=5.0)
     min_area_m2: float = parameter(
-        25.0, "Least plan area of a unit; what is smaller joins its neighbour.", unit="m2", minimum=1.0, maximum=1000.0
+        25.0, "Least plan area of a unit; smaller ones join a neighbour.", unit="m2", minimum=1.0, maximum=1000.0
     )
     enclosed_share: float = parameter(
         0.5,

@@ -1,9 +1,8 @@
-"""Wall facets cut the TIN; what stays connected is a surface, or a fragment of one at a tile's border.
+"""Wall facets cut the TIN; facets that stay connected are a surface, or a fragment of one at a tile's border.
 
-Facets whose elevation difference MX_zdiff reaches 2 m are walls (Shorter and Kasparis, section 3.1).
-The facets that remain are united over shared edges, ground with ground and object with object, and
-each fragment carries integer sums that add up over tile borders. Only whole surfaces are judged
-(`terrain.candidates`), so the answer does not depend on the tiles.
+Facets whose elevation difference MX_zdiff reaches 2 m are walls (Shorter and Kasparis, section 3.1). The other facets
+are united over shared edges, ground with ground and object with object, and each fragment carries integer sums that add
+up over tile borders. Only whole surfaces are judged (`terrain.candidates`): the result does not depend on the tiles.
 """
 
 from __future__ import annotations

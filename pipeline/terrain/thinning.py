@@ -1,8 +1,8 @@
-"""Thinning a cloud to the density of the papers: one point a cell of a fine lattice.
+"""Thinning a cloud to the density of the papers: one point per cell of a fine lattice.
 
-A TIN of all points of a dense multi-return cloud shatters, because each wall becomes many small
-facets. The highest last return of each cell keeps roofs up to their edge, drops most of the façade,
-and lets trees fall apart. Sparse clouds pass unchanged: thinning adapts by itself.
+A TIN of all points of a dense multi-return cloud shatters, because each wall becomes many small facets. The highest
+last return of each cell keeps roofs up to their edge, drops most of the façade, and lets trees fall apart. Sparse
+clouds pass unchanged.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.spatial_hash import slot_of_key
 
 _BITS = 31
+"""Bits per column or row in one key: a lattice of millimetres fits."""
 
 
 @kernel
@@ -26,7 +27,7 @@ def _highest_per_cell(
     cell_mm: int,
     among_equals: KindArray,
 ) -> IntArray:
-    """Kernel: of each cell the point preferred most, highest, southernmost, westernmost, then first among equals."""
+    """Kernel: the point of each cell that is preferred most, highest, southernmost, westernmost, first among equals."""
     n = x_mm.size
     size = 2
     while size < 2 * n:
@@ -80,7 +81,7 @@ def highest_per_cell(
     cell_m: float,
     among_equals: KindArray | None = None,
 ) -> IntArray:
-    """Indices of one point a cell, ordered by (x, y).
+    """Indices of one point per cell, ordered by (x, y).
 
     Parameters
     ----------
@@ -93,13 +94,13 @@ def highest_per_cell(
     cell_m : float
         Side of a cell in metres.
     among_equals : (n,) int8, optional
-        Of points at one place in space the one with the greater number wins: whatever else is read of the chosen
-        points must not hang on the order of the points.
+        Of points at one place in space the one with the greater number wins: other attributes of the chosen points
+        must not depend on the order of the points.
 
     Returns
     -------
     (m,) int64
-        At most one index a cell, so all (x, y) differ; the order does not depend on that of the points.
+        At most one index per cell, so all (x, y) differ; the order does not depend on that of the points.
     """
     tie = preferred if among_equals is None else among_equals
     chosen = _highest_per_cell(x_mm, y_mm, z_mm, preferred, used, round(cell_m * 1000), tie)

@@ -1,15 +1,16 @@
-"""Units: touching buildings that stand in one candidate are told apart by their roofs.
+"""Units: separates touching buildings in one candidate by their roofs.
 
-A candidate is all that hangs together above the ground, so a row of houses comes as one. Its roof is taken apart into
-planar patches (`terrain.roof_patches`). Patches whose planes meet along their border (ridges, hips, valleys of L-shaped
-houses, dormers) are of one unit; those with a step between them are not. What is small, enclosed by one other part as
-dormers and towers are, or a lower annex of one, joins that part again. Two exceptions follow from how houses are built:
+A candidate is everything connected above the ground; a row of houses is one. Its roof is divided into planar patches
+(`terrain.roof_patches`). Patches whose planes meet along their border (ridges, hips, valleys of L-shaped houses,
+dormers) belong to one unit; patches with a step between them do not. A part that is small, enclosed by another one like
+dormers and towers, or a lower annex of another one joins that part again. Two exceptions follow from how houses are
+built:
 
 - a step along the contour lines of the roof, as in offset pent roofs and saw-tooth halls, lies within a house: party
   walls run up the slope;
 - a valley between two parallel ridges is the gutter between two houses.
 
-Where nothing of this can be seen, as under one ridge over houses of one height, they stay one unit.
+Houses of one height under one ridge show none of this and stay one unit.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from pipeline.terrain.settings import UnitSettings
 from pipeline.terrain.thinning import highest_per_cell
 from pipeline.tin.delaunay import MAX_WINDOW_MM, triangulate
 
+# Not settings: they define what a border, a ridge and a valley are. How units are split and joined can be set.
 THINNING_M = 0.5
 """Side of the cells of which one point each enters the TIN, as in the split of a scene."""
 _PART_M2 = 6.0
@@ -38,6 +40,7 @@ _SHORTEST_BORDER_M = 2.0
 _SHORTEST_GUTTER_M = 3.0
 """Shorter valleys lie between dormers."""
 _SLOPED = math.tan(math.radians(10.0))
+"""Rise over run from which a patch has a direction: flat roofs drain at less."""
 _ALONG = 0.5
 """Sine of 30 deg: a border closer than this to a contour line runs along it."""
 _OPPOSITE = -0.87
@@ -78,14 +81,14 @@ def _facing(patches: Patches, borders: Borders, row: int) -> _Facing | None:
 
 
 def units_of_patches(patches: Patches, borders: Borders, settings: UnitSettings) -> LabelArray:
-    """The unit of every patch, (k,) int32; numbers are those of patches.
+    """The unit of every patch, (k,) int32, numbered by one of its patches.
 
     Parameters
     ----------
     patches, borders : Patches, Borders
         The roof of one candidate.
     settings : UnitSettings
-        What separates units.
+        Where units are split.
     """
     count = len(patches.areas_m2)
     unit = np.arange(count)
@@ -192,7 +195,7 @@ def _absorbed(unit: IntArray, patches: Patches, borders: Borders, settings: Unit
 
 
 def _across_gaps(unit: LabelArray, borders: Borders) -> LabelArray:
-    """Join what hangs together across gaps in the data only: a gap tells nothing of buildings."""
+    """Join parts that are connected only across gaps in the data: a gap does not separate buildings."""
     part = united(len(unit), borders.first, borders.second)
     return _united_across(part, unit.astype(np.int64), borders.gap_pairs.astype(np.int64))
 
@@ -267,7 +270,7 @@ def smallest_points(x: IntArray, y: IntArray, z: IntArray, label: LabelArray) ->
 
 
 def units_of(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSettings) -> LabelArray:
-    """Tell apart the units of one candidate.
+    """Find the units of one candidate.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Evidence for vegetation: how planar the surroundings of a vertex are, and how much canopy hangs above it.
+"""Evidence for vegetation: how planar the surroundings of a vertex are, and whether its neighbours are crown.
 
-Roofs are locally planar; crowns are not, and pulses reach through them. Both measures look a fixed
-distance and use integer sums, so they are the same in every tile.
+Roofs are locally planar; crowns are not, and pulses reach through them. Both measures look a fixed distance and use
+integer sums: they are the same in every tile.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _in_order(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, members: LabelArra
 def _block_around(
     points: FloatArray, start: LabelArray, cell: tuple[int, int], shape: tuple[int, int], reach: int, block: FloatArray
 ) -> tuple[FloatArray, int]:
-    """The points (3, n) of the cells around one, in `block` or a larger array; and how many they are."""
+    """The points (3, n) of the cells around one, in `block` or a larger array; and their number."""
     (r, c), (rows, columns) = cell, shape
     west, east = max(c - reach, 0), min(c + reach, columns - 1)
     count = 0
@@ -75,7 +75,7 @@ def _block_around(
 def _nearest(
     block: FloatArray, count: int, at: tuple[float, float, float], limit: float, level: float, out: FloatArray
 ) -> int:
-    """Write the points of a block in a circle, and near in elevation, to `out`, about a place; how many they are."""
+    """Write the points of a block in a circle and near in elevation to `out`, relative to a place; their number."""
     found = 0
     for k in range(count):
         dx, dy, dz = block[0, k] - at[0], block[1, k] - at[1], block[2, k] - at[2]
@@ -275,10 +275,10 @@ def crowns(
 ) -> BoolArray:
     """Which vertices belong to crowns: most of the judged vertices near them in space are rough, and some are pierced.
 
-    A chimney on a roof is rough and stays with the roof; a flat patch in a crown is planar and stays with the crown;
-    and a crown that leans on a roof is cut from it. The sphere counts neighbours on the vertex's own level alone.
-    Rough roofs with superstructures return most pulses once, crowns do not. Where a file knows single returns only,
-    nothing is a crown, and whole surfaces are judged by their shape alone.
+    A chimney is rough and stays with its roof; a flat patch in a crown is planar and stays with the crown; a crown that
+    leans on a roof is cut from it. The sphere counts only neighbours on the level of the vertex. Rough roofs with
+    superstructures return most pulses once, crowns do not. In a file of single returns nothing is a crown, and whole
+    surfaces are judged by their shape alone.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Wide objects: halls and blocks too wide for the openings that tell the smaller objects.
+"""Wide objects: halls and blocks too wide for the openings that find smaller objects.
 
-On a coarse lattice, openings go on to grow. A step of one coarse cell takes off a hill no more than the hill rises over
-that cell, and of a flat roof the whole height: so a limit in metres a step tells halls from hills.
+Openings continue to grow on a coarse lattice. A step of one coarse cell removes from a hill no more than it rises over
+that cell, but from a flat roof the whole height: a limit in metres per step separates halls from hills.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from pipeline.terrain.openings import dilate_back, erode_once, framed
 from pipeline.terrain.support import COARSE, FILL, NARROW, RIM_CELLS
 
 _RIM_STEP_MM = 200
-"""A corner lies no deeper than this below the wide cells beside it."""
+"""A corner lies no deeper than this below the wide cells beside it: it is level with them."""
 
 _RIM_SHARE = 0.9
-"""But for a tenth of them."""
+"""Share of those cells for which this must hold."""
 
 
 @kernel
@@ -79,7 +79,7 @@ def _floors(surface: Elevations, first: int, last: int, rise_mm: float) -> Eleva
 
 @kernel
 def _on_fine(lowest: Elevations, floors: Elevations, column0: int, row0: int, above_mm: int) -> BoolArray:
-    """Mask of the cells that stand so far above the floor of a coarse cell beside them."""
+    """Mask of the cells that are this far above the floor of a coarse cell beside them."""
     rows, columns = lowest.shape
     coarse_rows, coarse_columns = floors.shape
     corner_r, corner_c = row0 // COARSE, column0 // COARSE
@@ -108,7 +108,7 @@ def wide_objects(lowest: Elevations, corner: tuple[int, int], narrower: int, rad
     narrower, radius : int
         Radii of the first and the last opening, in cells.
     rise_mm : float
-        What a step may take, for each cell of the radius: wider objects must be higher.
+        Height that a step may remove per cell of the radius: wider objects must be higher.
 
     Returns
     -------
@@ -129,8 +129,8 @@ def wide_objects(lowest: Elevations, corner: tuple[int, int], narrower: int, rad
 def with_corners(lowest: Elevations, wide: BoolArray, first: ByteArray) -> BoolArray:
     """Wide objects with the corners into which no octagon fits.
 
-    A narrower opening took the corner of a hall, by steps that are not those of wide objects. It is level with the
-    hall, and the first openings cut it off.
+    A narrower opening removed the corner of a hall in smaller steps. The corner is level with the hall, and the first
+    openings cut it off.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ def test_all_faults_are_reported_at_once() -> None:
         "tile_size_m is -5",
         "[ground] max_slope is 9",
         "[ground] windows is not a setting",
-        "[roofs] is no table of settings",
+        "[roofs] is not a table of settings",
         "[fuzzy-sart] vigilance is 'high'",
     ):
         assert part in text
