@@ -48,7 +48,7 @@ def _grown(keys: IntArray, counts: IntArray) -> tuple[IntArray, IntArray]:
 def _by_table(
     x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, cube_mm: int, min_neighbours: int, low: tuple[int, int, int]
 ) -> BoolArray:
-    """The points that are kept, (n,) bool, from a table of the occupied cubes: strays far away do not make it larger."""
+    """The points that are kept, (n,) bool, from a table of the occupied cubes: far strays do not enlarge it."""
     n = x_mm.size
     keep = np.zeros(n, np.bool_)
     # far fewer cubes than points: the table starts small and grows

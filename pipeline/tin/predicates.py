@@ -43,7 +43,7 @@ def orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float
 def lies_in_circumcircle(
     ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float
 ) -> bool:
-    """Whether d lies inside the circle through a, b, c, which turn left; exact, ties broken by simulation of simplicity.
+    """Whether d lies inside the circle through a, b, c, which turn left; exact, ties broken symbolically (see above).
 
     Parameters
     ----------
