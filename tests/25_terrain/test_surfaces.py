@@ -372,9 +372,7 @@ def test_points_inside_facets_are_assigned_as_a_slow_twin_does() -> None:
     random = np.random.default_rng(10)
     p, v = scene.points, scene.vertices
     z = p.z_mm + np.where(random.random(len(p.z_mm)) < 0.3, random.integers(-4000, 4000, len(p.z_mm)), 0)
-    scene = dataclasses.replace(
-        scene, points=dataclasses.replace(p, z_mm=z, height_mm=z, last=random.random(len(z)) < 0.5)
-    )
+    scene = dataclasses.replace(scene, points=p._replace(z_mm=z, height_mm=z, last=random.random(len(z)) < 0.5))
     fragments, labels = scene.cut()
     kinds = scene.facet_kinds()
     facet_label, _ = label_fragments(kinds, scene.tin.neighbours, np.ones(len(kinds), np.bool_))
@@ -416,13 +414,13 @@ def test_earlier_returns_above_a_surface_are_its_canopy_and_no_points_of_it() ->
     p = scene.points
     over = in_box(p.x_mm / 1000, p.y_mm / 1000, 14, 16, 26, 24) & (np.arange(len(p.x_mm)) >= len(scene.vertices.x_mm))
     z = np.where(over, 9000, p.z_mm)
-    raised = dataclasses.replace(p, z_mm=z, height_mm=z, last=~over)
+    raised = p._replace(z_mm=z, height_mm=z, last=~over)
     fragments, labels = dataclasses.replace(scene, points=raised).cut()
     (roof,) = of_kind(fragments, FacetKind.OBJECT)
     assert fragments.sums[roof, Sum.CANOPY] == over.sum()
     assert (labels[over] == -1).all()
     # last returns that high are no canopy
-    fragments, _ = dataclasses.replace(scene, points=dataclasses.replace(raised, last=np.ones_like(over))).cut()
+    fragments, _ = dataclasses.replace(scene, points=raised._replace(last=np.ones_like(over))).cut()
     assert fragments.sums[roof, Sum.CANOPY] == 0
 
 
@@ -441,7 +439,7 @@ def test_only_points_of_class_building_join_a_surface_of_that_class() -> None:
     kind = np.where(v.kind == VertexKind.OBJECT, VertexKind.BUILDING, v.kind).astype(np.int8)
     building = np.random.default_rng(13).random(len(scene.points.x_mm)) < 0.5
     points = scene.points._replace(allowed=np.where(building, 2, 1).astype(np.int8))
-    fragments, labels = dataclasses.replace(scene, vertices=dataclasses.replace(v, kind=kind), points=points).cut()
+    fragments, labels = dataclasses.replace(scene, vertices=v._replace(kind=kind), points=points).cut()
     (roof,) = of_kind(fragments, FacetKind.BUILDING)
     np.testing.assert_array_equal(labels == roof, building & (points.z_mm == 6000))
 
