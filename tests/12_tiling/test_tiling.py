@@ -69,7 +69,7 @@ def test_a_key_names_its_tile(column: int, row: int) -> None:
 
 
 @pytest.mark.parametrize("key", ["", "85_447", "x85_y", "x85y447", "x1.5_y2", "x85_y447/", " x85_y447", "x--1_y2"])
-def test_what_is_no_key_is_refused_by_name(key: str) -> None:
+def test_an_invalid_key_is_refused_by_name(key: str) -> None:
     with pytest.raises(ValueError, match="not a tile key: use one such as x85_y447"):
         Tile.from_key(key)
 

@@ -140,7 +140,7 @@ def test_a_crown_is_vegetation_whatever_its_figures() -> None:
     assert verdict.detail == "a crown: most of what surrounds its vertices is rough, planar share 0.95"
 
 
-def test_what_nothing_tells_about_planarity_is_not_called_vegetation() -> None:
+def test_surfaces_of_unknown_planarity_are_not_called_vegetation() -> None:
     assert judged({Sum.PLANAR: 0, Sum.ROUGH: 0}) is None
 
 

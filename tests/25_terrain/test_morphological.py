@@ -279,7 +279,7 @@ def test_hills_dams_and_cuttings_stay_ground() -> None:
     assert found.mean() > 0.99
 
 
-def test_a_house_and_low_bushes_on_a_slope_of_30_degrees_are_told_from_it() -> None:
+def test_a_house_and_low_bushes_on_a_slope_of_30_degrees_are_not_ground() -> None:
     random = np.random.default_rng(3)
     c, r = coordinates(150, 150)
     slope = math.tan(math.radians(30.0)) * c

@@ -128,7 +128,7 @@ def test_no_points_give_an_empty_mask() -> None:
     assert kept.dtype == np.bool_
 
 
-def test_a_single_point_is_an_outlier_unless_no_neighbour_is_asked_for() -> None:
+def test_a_single_point_is_an_outlier_unless_no_neighbour_is_required() -> None:
     point = np.array([[1, 2, 3]])
     assert not kept_of(point)[0]
     assert kept_of(point, OutlierSettings(min_neighbours=0))[0]

@@ -112,7 +112,7 @@ ROOF = (*grid(0, 0, 8, 8), 6.0, {"building": True})
 GROUND = (*grid(-10, -10, 18, 18, 0.8), 0.0, {})
 
 
-def test_roof_wall_chimney_and_ground_are_told_apart() -> None:
+def test_roof_wall_chimney_and_ground_get_their_classes() -> None:
     wall = np.full(10, -0.3), np.linspace(1, 7, 10), np.linspace(1.0, 5.5, 10), {}
     chimney = np.full(3, 4.1), np.array([4.0, 4.1, 4.2]), 7.2, {}
     assert classes(ROOF, GROUND, wall, chimney) == [[6], [2], [6], [6]]

@@ -1,4 +1,4 @@
-"""Roofs made by hand: what is told apart, what stays together, whatever the density, the turn and the order."""
+"""Roofs made by hand: where units are split and where not, at any density, turn and order of the points."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ def agreement(found: LabelArray, house: IntArray) -> float:
 
 @pytest.mark.parametrize("per_m2", [1.5, 6.0, 25.0])
 @pytest.mark.parametrize("name", TOLD_APART)
-def test_houses_with_a_step_or_a_gutter_between_them_are_told_apart(name: str, per_m2: float) -> None:
+def test_houses_with_a_step_or_a_gutter_between_them_are_separated(name: str, per_m2: float) -> None:
     cloud = cloud_of(TOLD_APART[name], per_m2=per_m2)
     found = cloud.units()
     assert found.max() == cloud.house.max()
@@ -282,7 +282,7 @@ def test_a_gap_in_sparse_data_parts_nothing_though_it_is_hardly_wider_than_the_p
     assert units_of(x, y, np.full(len(x), 8000), SETTINGS).max() == 0
 
 
-def test_an_annex_is_a_unit_of_its_own_where_asked() -> None:
+def test_an_annex_is_a_unit_of_its_own_where_the_settings_say_so() -> None:
     assert cloud_of(_lower_wing).units(UnitSettings(annex_share=0.0)).max() == 1
 
 

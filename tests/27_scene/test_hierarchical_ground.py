@@ -35,7 +35,7 @@ def inside(points: WindowPoints, window: Window) -> WindowPoints:
     return points.take(np.flatnonzero(window.contains(points.x_mm, points.y_mm)))
 
 
-def test_the_ground_of_a_town_is_told_from_its_roofs(town: Any) -> None:
+def test_the_ground_of_a_town_does_not_include_its_roofs(town: Any) -> None:
     points = town.points
     terrain, kept, _ = terrain_of(points, WHOLE, HIERARCHICAL, ClassesInUse())
     height = height_above(points.x_mm, points.y_mm, points.z_mm, terrain.elevation_mm, 0, 0)

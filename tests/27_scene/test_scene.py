@@ -214,7 +214,7 @@ def test_excluded_points_between_neutral_ones_do_not_enter_either(town: Any) -> 
     assert assigned[classification == 1].mean() > 0.5
 
 
-def test_what_is_excluded_as_a_whole_is_no_surface(town: Any) -> None:
+def test_a_wholly_excluded_area_is_not_a_surface(town: Any) -> None:
     classification = np.where(town.truth == BUILDING, 17, town.truth).astype(np.uint8)
     found = split_whole(changed(town.points, classification=classification), TRUSTED)
     assert not np.isin(found.fragments.kind, (FacetKind.OBJECT, FacetKind.BUILDING)).any()
