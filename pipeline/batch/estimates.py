@@ -95,8 +95,6 @@ def estimate(batch: Batch, read: int = 3, known: tuple[int, int] = (0, 0)) -> Es
 
     Parameters
     ----------
-    batch : Batch
-        The batch.
     read : int
         Inputs that are read completely to find the number of buildings.
     known : tuple of int
@@ -306,12 +304,6 @@ class BatchRefusedError(RunError):
 
 
 def refuse(refusals: Sequence[str]) -> None:
-    """End a run that cannot work.
-
-    Raises
-    ------
-    BatchRefusedError
-        Names all reasons.
-    """
+    """Raise BatchRefusedError, which names everything that cannot work."""
     if refusals:
         raise BatchRefusedError("; ".join(refusals))

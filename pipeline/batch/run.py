@@ -31,17 +31,6 @@ def run_batch(
 ) -> RunSummary:
     """Run a batch, or continue one that was cut off. Parts that did not change since an earlier run are not done again.
 
-    Parameters
-    ----------
-    batch : Batch
-        The batch to run.
-    on_event : callable
-        Gets an `Event` for every stage, step and warning.
-    executor : Executor, optional
-        Runs the tasks; by default the one that the batch file names.
-    cancelled : callable
-        Called several times per second, from another thread; once it returns True the run ends as soon as possible.
-
     Raises
     ------
     BatchRefusedError

@@ -67,13 +67,7 @@ class ScheduleRecord:
 
     @classmethod
     def from_dict(cls, found: Mapping[str, Any]) -> ScheduleRecord:
-        """The opposite of `as_dict`.
-
-        Raises
-        ------
-        ValueError
-            The values are damaged.
-        """
+        """The opposite of `as_dict`."""
         try:
             until, waiting, running = (_time(found[name]) for name in ("decided_until", "waiting", "running"))
             if until is None:
@@ -94,8 +88,6 @@ class FileBook:
 
     Parameters
     ----------
-    folder : Path
-        The work folder.
     now : datetime
         A new schedule begins here.
 
@@ -137,13 +129,7 @@ class FileBook:
         return dataclasses.replace(self.record, state=state) != stored
 
     def save(self) -> None:
-        """Write the file.
-
-        Raises
-        ------
-        OSError, RunError
-            It cannot be written.
-        """
+        """Write the file."""
         content = json.dumps(self.record.as_dict(), indent=1) + "\n"
         LocalStorage(root=self._folder).put(NAME, content.encode())
         self._stored = self.record

@@ -60,13 +60,6 @@ def start_run(batch: Batch, words: Sequence[str] = ()) -> Run:
     It has its own process group: an interrupt from the keyboard reaches it only through us. It holds `RUN_LOCK` from
     its first moment on: a later process of the schedule notices a run that outlived us. Its output is dropped, since
     the report and the status say the same.
-
-    Parameters
-    ----------
-    batch : Batch
-        The batch to run.
-    words : sequence of str
-        Further options of the command.
     """
     command = [sys.executable, "-m", "pipeline.cli", "batch", "run", str(batch.path), *words]
     lock = os.open(Path(batch.work_folder, RUN_LOCK), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -129,10 +122,6 @@ def keep_schedule(
         Ends it when set.
     on_event : callable
         Gets an `Event` for each entry of the history.
-    start : callable
-        Starts a run.
-    now : callable
-        Returns the present, with a time zone.
 
     Raises
     ------

@@ -74,10 +74,6 @@ class StatusWriter:
 
     Parameters
     ----------
-    work_folder : str
-        The folder of the file.
-    batch, out : str
-        The batch file, and the run directory.
     clock : callable
         Seconds, monotonic; replaced in tests.
     now : callable

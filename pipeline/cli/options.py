@@ -22,13 +22,6 @@ _MAX_WORKERS = 1024
 def count_or_auto(text: str, *, least: int) -> str:
     """The word of an option for workers: `auto`, or a number without leading zeros.
 
-    Parameters
-    ----------
-    text : str
-        As it was given.
-    least : int
-        The smallest number that is allowed.
-
     Raises
     ------
     BadParameter

@@ -39,8 +39,6 @@ def cityjson_lines(
         features without geometry.
     reference : SpatialReference
         Gives the units and, if it has an EPSG code, the referenceSystem.
-    title : str
-        Goes into the metadata.
     """
     digits = (
         decimals(reference.horizontal_unit_m),

@@ -54,8 +54,6 @@ def crs_coordinates(local: FloatArray, origin: tuple[float, float, float], refer
         Local metres.
     origin : tuple of float
         Absolute easting, northing, elevation of the local origin in metres.
-    reference : SpatialReference
-        Gives the units.
 
     Returns
     -------

@@ -102,8 +102,6 @@ def geo_table(table_name: str, rows: Sequence[Mapping[str, Any]], projjson: Mapp
 
     Parameters
     ----------
-    table_name : str
-        buildings, planes or rejected.
     rows : sequence of mapping
         As `pipeline.export.records` makes them; may be empty.
     projjson : mapping or None
@@ -142,13 +140,7 @@ def parquet_bytes(table: pa.Table) -> bytes:
 def table_files(
     run_dir: str, table_name: str, filesystem: pafs.FileSystem, tiles: Sequence[str] | None = None
 ) -> list[str]:
-    """The files of one table of a run, sorted; the arguments are those of `table_dataset`.
-
-    Raises
-    ------
-    RunError
-        Where the folder does not exist.
-    """
+    """The files of one table of a run, sorted; the arguments are those of `table_dataset`."""
     folder = f"{str(run_dir).rstrip('/')}/{table_name}"
     if tiles is not None:
         return [f"{folder}/tile={tile}/part-0.parquet" for tile in tiles]
@@ -185,8 +177,6 @@ def table_batches(
 
     Parameters
     ----------
-    run_dir, table_name, filesystem, tiles
-        As `table_dataset` has them.
     columns : sequence of str
         Columns that are stored, so not `tile`.
     rows : int
@@ -230,8 +220,6 @@ def table_dataset(
     ----------
     run_dir : str
         The run directory: a local path, or a path of `filesystem`.
-    table_name : str
-        buildings, planes or rejected.
     filesystem : pyarrow.fs.FileSystem, optional
         Where the run lies; local by default.
     tiles : sequence of str, optional

@@ -60,15 +60,7 @@ SCAN_ANGLE_UNIT_DEG = 0.006
 
 
 def record_dtype(point_format: int, size: int) -> np.dtype[np.void]:
-    """A record of one of the formats 0 to 3 and 6 to 8, its extra bytes in the field `extra`.
-
-    Parameters
-    ----------
-    point_format : int
-        Of the file.
-    size : int
-        Bytes of a record, with the extra bytes.
-    """
+    """A record of one of the formats 0 to 3 and 6 to 8, its extra bytes in the field `extra`."""
     base = np.dtype(_FIELDS[point_format]).itemsize
     return np.dtype([*_FIELDS[point_format], ("extra", "u1", (size - base,))])
 
@@ -83,8 +75,6 @@ def to_newer_format(raw: ByteArray, point_format: int, size: int) -> npt.NDArray
     ----------
     raw : (n * size,) uint8
         The file's records.
-    point_format, size : int
-        Format and bytes a record.
 
     Returns
     -------

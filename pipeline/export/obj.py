@@ -26,8 +26,6 @@ def obj_text(results: Iterable[BuildingResult], reference: SpatialReference, lod
     ----------
     results : iterable of BuildingResult
         Those without a solid are left out.
-    reference : SpatialReference
-        Gives the units of the coordinates.
     lod : str, optional
         A coarser level of detail in place of the records' own (`model_at`).
     """

@@ -46,13 +46,7 @@ class RasterLattice:
     """Rows of the area."""
 
     def __post_init__(self) -> None:
-        """Refuse what no file can hold.
-
-        Raises
-        ------
-        SettingsError
-            The cells are too small for the area.
-        """
+        """Refuse what no file can hold."""
         if max(self.columns, self.rows) > MAX_SIDE:
             raise SettingsError([f"raster cell is {self.cell:g}: {self.columns} by {self.rows} cells are too many"])
 
@@ -102,21 +96,13 @@ def write_cog(
 
     Parameters
     ----------
-    path : Path
-        The file to be written.
     working : Path
         A file that does not exist: holds the raster meanwhile and is removed.
-    lattice : RasterLattice
-        Where the cells are.
     windows : iterable of (column, row, cells)
         Pieces: first column and southernmost row on the lattice, and (rows, columns) float32 values with the
         southernmost row first, nan where there is none.
     crs_wkt : str or None
         The CRS, compound where the values are elevations in it.
-    description : str
-        Name of the band.
-    unit : str
-        Unit of the values.
     """
     import rasterio
     import rasterio.shutil

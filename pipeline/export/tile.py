@@ -56,14 +56,8 @@ def mesh_files(
 
     Parameters
     ----------
-    tile_key : str
-        The tile.
-    results : sequence of BuildingResult
-        What the OBJ files hold.
     lines : sequence of str
         The tile's CityJSONSeq, which the GLB files are made of.
-    context : RecordContext
-        Units, and the coarser levels of detail.
     meshes : str
         One of `pipeline.export.mesh_kinds.MESHES`.
     """
@@ -106,8 +100,6 @@ def write_tile(
         The buildings that the tile owns, in any order.
     rejected : sequence of RejectedObject
         The rejected objects that the tile owns, in any order.
-    context : RecordContext
-        Facts of the run.
     meshes : str
         One of `pipeline.export.mesh_kinds.MESHES`.
     put : callable, optional

@@ -54,10 +54,6 @@ def updated_tile(
 
     Parameters
     ----------
-    run_dir : str or Path
-        The local run directory.
-    tile_key : str
-        The tile.
     replaced : collection of str
         Ids whose rows go, in `buildings`, `planes` and `rejected` alike.
     results, rejected : sequences

@@ -57,13 +57,7 @@ class ObjectHandler(pafs.FSSpecHandler):  # type: ignore[misc]  # pyarrow has no
 
 
 def _tried(work: Callable[[], Result]) -> Result:
-    """What a request gives, tried again where that may help.
-
-    Raises
-    ------
-    OSError
-        As Arrow expects it.
-    """
+    """What a request gives, tried again where that may help."""
     try:
         return persistently(work)
     except GaveUpError as error:

@@ -62,8 +62,6 @@ class AsciiFile:
 
     Parameters
     ----------
-    path : Readable
-        The file.
     columns : str, optional
         Names of the columns, parted by spaces, such as `x y z - classification` or `x1 y1 z1 i1 x2 y2 z2 i2`;
         None to find out.
@@ -294,13 +292,7 @@ def _some_lines(stream: io.BufferedReader, size: int) -> list[bytes]:
 
 
 def _to_table(lines: list[bytes], width: int, separator: str | None) -> FloatArray:
-    """(n, width) numbers of lines; comments and blank lines give none.
-
-    Raises
-    ------
-    ValueError
-        If a line does not have so many numbers.
-    """
+    """(n, width) numbers of lines; comments and blank lines give none."""
     text = b"\n".join(lines)
     if b"#" in text or b"/" in text or b"%" in text or separator is not None:
         lines = [line for line in lines if not COMMENT.match(line) and not line.isspace()]

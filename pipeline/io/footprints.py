@@ -120,8 +120,6 @@ def read_footprints(
     ----------
     path : str or Path
         Path or URL of a GeoPackage, GeoJSON (WGS 84 unless it says otherwise), Shapefile or GeoParquet.
-    reference : SpatialReference
-        The run's CRS and units.
     layer : str, optional
         The layer; needed where a file has several with polygons. Of GeoParquet the geometry column.
     id_column : str, optional
@@ -382,13 +380,7 @@ def _plain(value: Any) -> Any:
 
 
 def read_area(path: str | Path, reference: SpatialReference) -> Polygon | MultiPolygon:
-    """The area of interest that the polygons of a vector file cover together, in the units of the run's CRS.
-
-    Raises
-    ------
-    InputError
-        As `read_footprints`.
-    """
+    """The area of interest that the polygons of a vector file cover together, in the units of the run's CRS."""
     polygons = list(read_footprints(path, reference).polygons)
     united = shapely.union_all(polygons)
     if reference.horizontal_unit_m != 1.0:

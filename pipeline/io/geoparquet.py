@@ -74,10 +74,6 @@ def read_geoparquet(
 
     Parameters
     ----------
-    path : Path
-        A GeoParquet file.
-    column : str, optional
-        The geometry column; None for the primary one.
     boxes : callable, optional
         Where features are wanted: as in `pipeline.io.vector_layer.read_layer`.
 

@@ -49,8 +49,6 @@ class LasFile:
 
     Parameters
     ----------
-    path : Readable
-        The file.
     facts : FileFacts, optional
         Those of the same file, opened before: then neither the points of its last chunk nor a sample is decoded again.
 
@@ -321,12 +319,6 @@ def _places(last: int) -> list[int]:
 
 
 def read_exactly(stream: io.BufferedReader, into: npt.NDArray[np.uint8]) -> None:
-    """Fill an array from a stream.
-
-    Raises
-    ------
-    EOFError
-        If the stream ends before.
-    """
+    """Fill an array from a stream; EOFError if the stream ends before."""
     if stream.readinto(into.data) != len(into):
         raise EOFError("the file ends")

@@ -38,13 +38,7 @@ class ObjectStorage:
     """How often and how long requests are made again."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be stored to.
-
-        Raises
-        ------
-        RunError
-            The scheme is unknown or for inputs only, or no bucket is named.
-        """
+        """Refuse what cannot be stored to."""
         if not scheme_of(self.url).stores:
             raise RunError(f"{shown(self.url)}: nothing can be stored there. Use a folder, or s3://bucket/prefix")
         scheme, _, path = self.url.partition("://")
@@ -63,13 +57,7 @@ class ObjectStorage:
 
     @contextlib.contextmanager
     def putting(self, key: str) -> Iterator[Path]:
-        """A temporary path on this machine, uploaded when the block ends; when it raises nothing is.
-
-        Raises
-        ------
-        RunError
-            If the block wrote nothing to the path, or the upload fails.
-        """
+        """A temporary path on this machine, uploaded when the block ends; when it raises nothing is."""
         path = self._path(key)
         with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
             temporary = Path(folder, "object")
@@ -164,13 +152,7 @@ class ObjectStorage:
     def _tried(
         self, done: str, key: str, work: Callable[[Any], Result], check: Callable[[], None] = lambda: None
     ) -> Result:
-        """What a request gives, tried again where that may help.
-
-        Raises
-        ------
-        RunError
-            Naming the key, the cause and the fix.
-        """
+        """What a request gives, tried again where that may help."""
         filesystem = filesystem_of(self.url)
         try:
             return persistently(lambda: work(filesystem), self.policy, check=check)
@@ -185,17 +167,7 @@ class _NotThereError(RunError):
 
 
 class _Window:
-    """Puts by some threads, with room for as many as there are threads.
-
-    Parameters
-    ----------
-    storage : ObjectStorage
-        Where to.
-    check : callable
-        Called before each attempt of each put.
-    threads : ThreadPoolExecutor
-        Who puts.
-    """
+    """Puts by some threads, with room for as many as there are threads."""
 
     def __init__(self, storage: ObjectStorage, check: Callable[[], None], threads: ThreadPoolExecutor) -> None:
         self._storage = storage

@@ -84,8 +84,6 @@ class PlyFile:
 
     Parameters
     ----------
-    path : Readable
-        The file.
     facts : FileFacts, optional
         Those of the same file, opened before: then it is not read through again.
 

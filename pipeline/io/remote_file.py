@@ -228,13 +228,7 @@ class RemoteFile:
         )
 
     def _tried(self, work: Callable[[], Any]) -> Any:
-        """The result of a request, repeated if that may help.
-
-        Raises
-        ------
-        UnreadableInputError
-            Naming the URL, what the server said and the fix.
-        """
+        """The result of a request, repeated if that may help."""
         try:
             return persistently(work, self._policy)
         except GaveUpError as error:
@@ -242,13 +236,7 @@ class RemoteFile:
 
 
 class _Ranges(io.RawIOBase):
-    """A remote file as a raw stream.
-
-    Parameters
-    ----------
-    file : RemoteFile
-        What is read.
-    """
+    """A remote file as a raw stream."""
 
     def __init__(self, file: RemoteFile) -> None:
         self._file = file
@@ -302,8 +290,6 @@ def on_this_machine(location: str | Path, folder: Path | None = None) -> Iterato
 
     Parameters
     ----------
-    location : str or Path
-        The file.
     folder : Path, optional
         Where a fetched copy lies while the block runs; a temporary folder by default.
 

@@ -40,10 +40,6 @@ class RetryPolicy:
 
         Parameters
         ----------
-        failures : int
-            Attempts that failed so far, at least 1.
-        elapsed_s : float
-            Seconds since the first attempt began.
         draw : float
             A random number from 0 to 1.
 
@@ -299,8 +295,6 @@ def persistently(
     ----------
     work : callable
         Idempotent: an attempt that timed out may have arrived.
-    policy : RetryPolicy
-        How often, how long.
     check : callable
         Called before each attempt; what it raises ends the work.
     clock, sleep, draw : callable

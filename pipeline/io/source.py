@@ -53,13 +53,7 @@ class ReadOptions:
     """Names of the columns of ASCII files, see `pipeline.io.ascii`; None to find out."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises
-        ------
-        SettingsError
-            Listing all faults at once.
-        """
+        """Check every field."""
         faults = []
         if self.bbox is not None:
             x_min, y_min, x_max, y_max = self.bbox
@@ -177,10 +171,6 @@ class Source:
 
     Parameters
     ----------
-    path : Readable
-        The file.
-    options : ReadOptions
-        What the user says and wants.
     known : SourceInfo, optional
         Of the same file by the same options, opened before; not believed where the file was changed since.
     """
@@ -265,13 +255,7 @@ class Source:
         return self._options.crs is not None and (own is None or own != used)
 
     def select(self, records: PointRecords) -> tuple[BoolArray, PointCloud]:
-        """Which of some records `chunks` keeps, (m,) bool, and these in metres, as `chunks` gives them.
-
-        Parameters
-        ----------
-        records : PointRecords
-            Of this file.
-        """
+        """Which of some records `chunks` keeps, (m,) bool, and these in metres, as `chunks` gives them."""
         classed = self._classed(records)
         keep = self._wanted(classed, self._options.window)
         return keep, _to_cloud(_select(classed, keep), self._factors)
@@ -329,10 +313,6 @@ def open_source(
 
     Parameters
     ----------
-    path : str, Path or Readable
-        The file, or its URL.
-    options : ReadOptions, optional
-        Overrides and limits.
     known : SourceInfo, optional
         What was found when the file was opened before, by the same options: what takes time is not done again.
 

@@ -112,13 +112,7 @@ class LocalStorage:
     """The folder; made when the first thing is put."""
 
     def path(self, key: str) -> Path:
-        """Where a thing is or would be.
-
-        Raises
-        ------
-        RunError
-            If the key is empty, absolute or leads out of the folder.
-        """
+        """Where a thing is or would be."""
         return self.root.joinpath(*parts_of_key(key))
 
     @property
@@ -127,13 +121,7 @@ class LocalStorage:
         return str(self.root)
 
     def make(self) -> None:
-        """Make the folder.
-
-        Raises
-        ------
-        OSError
-            It cannot be made.
-        """
+        """Make the folder; OSError if that fails."""
         self.root.mkdir(parents=True, exist_ok=True)
 
     @contextlib.contextmanager

@@ -57,15 +57,7 @@ class TileIndex:
     """Of the outlines, as the index has it; None where it is unknown."""
 
     def within(self, area: shapely.Geometry, reference: SpatialReference) -> tuple[str, ...]:
-        """The files whose tiles come near an area; of what has no outline all.
-
-        Parameters
-        ----------
-        area : Geometry
-            In the units of the inputs' CRS.
-        reference : SpatialReference
-            The inputs' CRS.
-        """
+        """The files whose tiles come near an area; of what has no outline all."""
         if self.outlines is None:
             return self.locations
         boxes = self._boxes_in(reference)
@@ -124,11 +116,6 @@ def _lines(text: str) -> list[str]:
 
 def read_tile_index(location: str) -> TileIndex:
     """The files that an index names.
-
-    Parameters
-    ----------
-    location : str
-        Path or URL of the index.
 
     Raises
     ------
@@ -208,13 +195,7 @@ def _names(values: Sequence[Any]) -> bool:
 
 
 def _whole(index: str, name: str) -> str:
-    """A name of an index as a path or URL.
-
-    Raises
-    ------
-    UnreadableInputError
-        An index from elsewhere names a file of this machine.
-    """
+    """A name of an index as a path or URL."""
     if is_url(name):
         return name
     if not is_url(index):

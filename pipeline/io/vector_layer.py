@@ -98,13 +98,7 @@ def _read(path: Path, layer: str | None, boxes: Boxes | None) -> VectorLayer:
 
 
 def _driver_of(path: Path, head: bytes) -> str:
-    """The path as GDAL is given it: with the one format that it may be.
-
-    Raises
-    ------
-    UnreadableInputError
-        If it is none of the three.
-    """
+    """The path as GDAL is given it: with the one format that it may be."""
     where = path.resolve().as_posix()
     if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
         return f"GeoJSON:{where}"

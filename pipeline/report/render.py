@@ -71,8 +71,6 @@ def render_run(
         A local run directory of true models, whose footprints are drawn as dashed lines.
     filesystem : pyarrow.fs.FileSystem, optional
         File system of the run; by default that of `run_dir`.
-    dpi : int
-        Pixels per inch of a picture of 20 by 10.5 inches.
 
     Raises
     ------

@@ -109,12 +109,7 @@ def classify(
 ) -> ClassifySummary:
     """Classify the points of all inputs and write each as LAZ 1.4.
 
-    Parameters
-    ----------
-    request : ClassifyRequest
-        What to classify, and how.
-    on_event, executor, cancelled
-        As in `pipeline.runtime.run.run`.
+    `on_event`, `executor` and `cancelled` are those of `pipeline.runtime.run.run`.
 
     Raises
     ------
@@ -304,14 +299,7 @@ def _bounds_of_boxes(boxes: Sequence[tuple[float, ...]]) -> tuple[float, float, 
 
 
 def _checked_folder(request: ClassifyRequest, paths: Sequence[str]) -> Path:
-    """The folder of the outcome, checked against all that would be written, and made.
-
-    Raises
-    ------
-    RunError
-        Two inputs would get the same name, an input would be replaced, a file exists already, a folder or file is in
-        the way, or the folder cannot be written.
-    """
+    """The folder of the outcome, checked against all that would be written, and made."""
     if "://" in request.out:
         raise RunError(f"{request.out} is no local path: this version writes local folders only")
     out = Path(request.out).resolve()

@@ -133,13 +133,7 @@ def compare(
     executor: Executor | None = None,
     cancelled: Callable[[], bool] = never,
 ) -> CompareSummary:
-    """Model the candidates of the inputs by several methods; arguments and errors as in `pipeline.runtime.run.run`.
-
-    Raises
-    ------
-    RunError
-        Also where the folder cannot be used.
-    """
+    """Model the candidates of the inputs by several methods; arguments and errors as in `pipeline.runtime.run.run`."""
     out = _checked(request.run)
     variants = [
         run_variant(request.run.settings, variant, str(out / RUNS / variant.label), request.tables)
@@ -168,12 +162,6 @@ def run_variant(
 
     Parameters
     ----------
-    settings : RunSettings
-        All settings except those of the method.
-    variant : Variant
-        The method and its preset.
-    out : str
-        The variant's run directory.
     tables : mapping
         Values that differ from the presets, by the method's name.
 
@@ -220,13 +208,7 @@ def own_tables(table: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 
 
 def _checked(request: RunRequest) -> Path:
-    """The comparison's folder, which may be written.
-
-    Raises
-    ------
-    RunError
-        It is not a comparison, or one that must not be replaced.
-    """
+    """The comparison's folder, which may be written."""
     if "://" in request.out:
         raise RunError(f"{request.out} is no local path: this version writes local folders only")
     out = Path(request.out).resolve()

@@ -26,8 +26,6 @@ def engine_of(resources: Resources, *, expected_cpu_s: float, at: int, models: b
 
     Parameters
     ----------
-    resources : Resources
-        What the job runs with.
     expected_cpu_s : float
         CPU seconds of the job.
     at : int
@@ -58,10 +56,6 @@ def workers_that_fit(at: int, memory: int, task_bytes: int) -> int:
 
     Parameters
     ----------
-    at : int
-        Number of cores.
-    memory : int
-        Memory in bytes.
     task_bytes : int
         Memory of the largest task, above the process's own size.
 
@@ -80,8 +74,6 @@ def executor_for(
 
     Parameters
     ----------
-    resources : Resources
-        What the run runs with.
     local_directory : str
         Where embedded workers spill.
     work : Expected, optional

@@ -210,8 +210,6 @@ def write_manifest(run_dir: str | Path, manifest: RunManifest, put: Put | None =
     ----------
     run_dir : str or Path
         The local run directory; unused where `put` is given.
-    manifest : RunManifest
-        What to write.
     put : callable, optional
         Stores a file elsewhere; `put_local(run_dir)` by default.
     """

@@ -76,15 +76,6 @@ def tile_size_m(density_per_m2: float, halo_m: float, area_m2: float) -> float:
 def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings) -> Plan:
     """Read every input's header and lay out the lattice.
 
-    Parameters
-    ----------
-    paths : sequence of str
-        Point files.
-    options : ReadOptions
-        CRS, units, area of interest.
-    settings : RunSettings
-        Tile size and the stages' support.
-
     Raises
     ------
     InputError
@@ -189,13 +180,7 @@ def without_far_files(plan: Plan, paths: Sequence[str]) -> tuple[Plan, list[str]
 
 
 def check_memory(plan: Plan, limit_bytes: int | None) -> None:
-    """Refuse a plan whose largest task does not fit into a worker with this memory limit, before the first task.
-
-    Raises
-    ------
-    InputError
-        The task does not fit; the message names the tile size and the fix.
-    """
+    """Refuse a plan whose largest task does not fit into a worker with this memory limit, before the first task."""
     if limit_bytes is None or plan.window_bytes <= limit_bytes:
         return
     raise InputError(
@@ -210,17 +195,6 @@ def split_grid(plan: Plan, settings: RunSettings, classes: ClassesInUse, *, foot
     """The plan's lattice with the halo that the split needs, given which classes are believed.
 
     Classes are known only after the points are read, so the plan assumes the widest halo. A halo set by the user stays.
-
-    Parameters
-    ----------
-    plan : Plan
-        The plan.
-    settings : RunSettings
-        How far the stages look.
-    classes : ClassesInUse
-        Which classes of the inputs are believed.
-    footprints : bool
-        Whether the footprints are given.
     """
     if settings.general.halo_m:
         return plan.grid
@@ -232,22 +206,6 @@ def check_windows(plan: Plan, grid: TileGrid, points_by_tile: Mapping[Tile, int]
     """Refuse tiles whose windows have more points than fit into a worker, now that the points are counted.
 
     Headers can claim wide bounds and hide dense corners, so the plan's own check does not suffice.
-
-    Parameters
-    ----------
-    plan : Plan
-        The plan.
-    grid : TileGrid
-        Its lattice from `split_grid`.
-    points_by_tile : mapping
-        Points of each tile.
-    limit_bytes : int or None
-        A worker's memory limit; None where there is none.
-
-    Raises
-    ------
-    InputError
-        Naming the tile, its points and the fix.
     """
     if limit_bytes is None:
         return

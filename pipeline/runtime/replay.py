@@ -39,8 +39,6 @@ def replay(bundle: Bundle, limits: IsolationLimits | None) -> Replayed:
 
     Parameters
     ----------
-    bundle : Bundle
-        The building.
     limits : IsolationLimits or None
         Limits of the child process that models it; None models it in this process, where a debugger sees it and a crash
         ends the process.

@@ -113,12 +113,7 @@ def rerun(
 ) -> RerunSummary:
     """Model again the buildings whose overrides changed, and those that are named.
 
-    Parameters
-    ----------
-    request : RerunRequest
-        Which buildings to model again.
-    on_event, executor, cancelled
-        As in `pipeline.runtime.run.run`.
+    `on_event`, `executor` and `cancelled` are those of `pipeline.runtime.run.run`.
 
     Raises
     ------

@@ -180,8 +180,6 @@ def run_variants(
         The inputs and how to run. Scratch goes to its `out`; its method does not count.
     variants : sequence of RunVariant
         At least one.
-    on_event, executor, cancelled
-        As in `run`. Progress of a stage counts all variants together.
     outdated : sequence of Path
         Files about an earlier run, removed together with its results.
 
@@ -481,13 +479,7 @@ def _with_tables(run_dir: str, joined: Joined, models: Models, published: Sequen
 
 
 def _checked(out: str, *, overwrite: bool, work: str | None = None) -> str:
-    """The run directory, a path or URL, made and checked.
-
-    Raises
-    ------
-    RunError
-        It is not empty and `overwrite` is not set, or it cannot be written.
-    """
+    """The run directory, a path or URL, made and checked."""
     check_out(out, overwrite=overwrite, work=work)
     storage = storage_at(out)
     try:

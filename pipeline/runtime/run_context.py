@@ -85,8 +85,6 @@ class RunContext:
 
         Parameters
         ----------
-        stage, function
-            As in `map`.
         tasks : mapping
             By the place of each one's outcome.
         brief : callable
@@ -137,20 +135,12 @@ def run_context(
 
     Parameters
     ----------
-    plan, progress : Plan, Progress
-        Of the run.
-    resources : Resources
-        What it runs with.
-    scratch : context manager
-        Opens its scratch.
     work : Expected
         What there is to do: decides which executor runs it.
     loads : sequence of str
         What child processes load, from `loads_of`.
     executor : Executor, optional
         Runs the tasks; by default the one that `resources` and `work` call for.
-    cancelled : callable
-        Asked several times a second, from another thread. Once it is true, the run ends as soon as it can.
 
     Yields
     ------
@@ -184,13 +174,7 @@ def run_context(
 
 @contextlib.contextmanager
 def _watching(scratch: Scratch, cancelled: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
-    """Watch for cancellation from a thread of its own, so that a task in this very process notices it too.
-
-    Yields
-    ------
-    callable
-        Whether the run was cancelled; then its scratch is marked.
-    """
+    """Watch for cancellation from a thread of its own, so that a task in this very process notices it too."""
     if cancelled is never:
         yield never
         return

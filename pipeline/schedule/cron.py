@@ -100,11 +100,6 @@ class Cron:
     def times(self, after: dt.datetime) -> Iterator[dt.datetime]:
         """All times after a time, in the time zone and in order.
 
-        Parameters
-        ----------
-        after : datetime
-            With a time zone.
-
         Raises
         ------
         ValueError

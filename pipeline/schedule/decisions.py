@@ -72,14 +72,8 @@ def decide(
     ----------
     passed : PassedSlots or None
         Slots that have passed since the last look.
-    rules : Rules
-        Not paused.
     waiting : datetime or None
         The slot that waits for a run to end.
-    is_busy : bool
-        Whether a run of this schedule is under way.
-    now : datetime
-        The present, with a time zone.
 
     >>> at = dt.datetime(2026, 1, 1, tzinfo=dt.UTC)
     >>> now = {"waiting": None, "is_busy": False, "now": at + dt.timedelta(hours=1)}

@@ -36,8 +36,6 @@ def passed_slots(cron: Cron, decided_until: dt.datetime, now: dt.datetime) -> Pa
 
     Parameters
     ----------
-    cron : Cron
-        The times of the schedule.
     decided_until : datetime
         All slots up to this time, inclusive, are decided. With a time zone.
     now : datetime

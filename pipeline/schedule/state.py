@@ -106,12 +106,6 @@ def look(state: ScheduleState, rules: Rules, now: dt.datetime, *, under_way: str
 
     Parameters
     ----------
-    state : ScheduleState
-        The state until now.
-    rules : Rules
-        The schedule.
-    now : datetime
-        The present, with a time zone.
     under_way : str or None
         The run of this schedule that is under way, in words for the history; None if there is none.
     """

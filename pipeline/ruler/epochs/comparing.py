@@ -70,8 +70,6 @@ def compare_epochs(old: Epoch, new: Epoch, settings: DiffSettings, on_part: OnPa
     ----------
     old, new : Epoch
         With one CRS, as `pipeline.ruler.epochs.agreement` checks.
-    settings : DiffSettings
-        The thresholds of a change.
     on_part : callable
         Called with the groups done and all groups after every part.
 

@@ -105,10 +105,6 @@ def diff(
 
     Parameters
     ----------
-    request : DiffRequest
-        The comparison.
-    on_part : callable
-        Called with the groups done and all groups after every part.
     take_in : sequence of callable
         Further consumers of the rows of every part, such as a map.
 

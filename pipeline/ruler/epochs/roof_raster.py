@@ -100,10 +100,6 @@ def compare_roofs(faces: RoofFaces, groups: RoofGroups, uniform_share: float, ve
 
     Parameters
     ----------
-    faces : RoofFaces
-        All faces that the groups name.
-    groups : RoofGroups
-        The groups.
     uniform_share : float
         Share of the common roof that must be higher (lower) for a shift of the whole.
     vertical_shift_m : float

@@ -72,8 +72,6 @@ def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws:
         Columns to sum over the units.
     statistic : callable
         From sums, each (draws,) or (draws, k), to the figure, (draws,); nan where it is undefined.
-    draws : int
-        Resamples.
 
     Returns
     -------

@@ -98,13 +98,7 @@ class Chapter:
 
 
 def definition_of(name: str, definitions: Mapping[str, Definition] = DEFINITIONS) -> Definition:
-    """The definition of a measure.
-
-    Raises
-    ------
-    KeyError
-        No module defines it: an error in the program.
-    """
+    """The definition of a measure."""
     if name not in definitions:
         raise KeyError(f"measure {name!r} has no definition: add it to DEFINITIONS of the module that measures it")
     return definitions[name]

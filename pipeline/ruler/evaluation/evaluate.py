@@ -73,8 +73,6 @@ def evaluate(
 
     Parameters
     ----------
-    models : ModelSet
-        From `pipeline.ruler.evaluation.reading.read_models`.
     reference : Reference, optional
         From `read_truth_reference` or `read_points_reference`; without one only delivery and validity are measured.
     blocks : bool, optional

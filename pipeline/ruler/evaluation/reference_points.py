@@ -57,10 +57,6 @@ def read_points_reference(
         Outlines of buildings. Those with at least 11 points of class 6 are the reference buildings. The file may cover
         only a part of the tiles, so nothing is known elsewhere. Without it, the buildings are the connected areas of
         the raster of class 6 (see `building_raster`).
-    crs, vertical_unit : str, optional
-        Override those of the files.
-    read_options : ReadOptions, optional
-        All other options of reading.
 
     Returns
     -------

@@ -44,8 +44,6 @@ def read_truth_reference(
     truth_dir : str or Path
         The folder `truth` that `simulate` wrote: models as a run directory, scene.json, labels, and optionally
         conditions.parquet. scene.json lists the point files; otherwise it is the one LAZ beside the folder.
-    read_models : callable
-        Reads the models.
     as_surveyed : bool
         Move each building by the mean shift of the strips of its points, to where the survey saw it.
 

@@ -119,8 +119,6 @@ def top_surface_of(
 
     Parameters
     ----------
-    models : sequence of RoofModel
-        The models.
     tolerance_m : float
         Narrower gaps between faces are closed.
     near : sequence of RoofModel, optional

@@ -68,14 +68,10 @@ def summed_over_units(
 
     Parameters
     ----------
-    subset : Subset
-        The subset.
     building : (n,) int64
         Reference building of each thing; -1 for none.
     model : (n,) int64
         Its model, which is its unit if it is on no building. Any number >= 0 otherwise.
-    columns : mapping of name to (n,) float64
-        Columns to sum.
 
     Returns
     -------
@@ -111,12 +107,8 @@ def measured_median(name: str, values: FloatArray, subset: Subset) -> Measure:
 
     Parameters
     ----------
-    name : str
-        Name of the measure.
     values : (n,) float64
         One finite value per building. Without values the result is nan, with one there is no interval.
-    subset : Subset
-        The subset of the buildings.
     """
     count = len(values)
     if count == 0:

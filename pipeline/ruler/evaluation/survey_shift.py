@@ -40,8 +40,6 @@ def mean_shifts(count: int, hits: Iterable[tuple[LabelArray, LabelArray]], shift
 
     Parameters
     ----------
-    count : int
-        Number of buildings.
     hits : iterable of (building, strip), each (n,) int32
         Index of the building and number of the strip, from 0, of points on roofs.
     shifts : (strips, 3) float64

@@ -44,11 +44,6 @@ def compare_files(
 
     `request.run.out` is the folder of all files. With a `reference`, every variant is evaluated against it; its
     `models` are not read. `on_event`, `executor` and `cancelled` are those of `pipeline.runtime.run.run`.
-
-    Raises
-    ------
-    InputError, SettingsError, RunError, RunCancelledError, ClusterError
-        As in `pipeline.runtime.run.run` and `evaluate_files`.
     """
 
     def step(name: str) -> None:

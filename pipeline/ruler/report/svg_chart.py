@@ -190,10 +190,6 @@ def rebinned(edges_low: FloatArray, edges_high: FloatArray, counts: FloatArray, 
     ----------
     edges_low, edges_high : (n,) float64
         Borders of the given bins, adjoining and ascending; the outermost may be infinite.
-    counts : (n,) float64
-        Their counts.
-    edges : (m + 1,) float64
-        Borders wanted.
 
     Returns
     -------

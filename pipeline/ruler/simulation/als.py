@@ -75,10 +75,6 @@ def scan(
 
     Parameters
     ----------
-    scene : Scene
-        What is scanned.
-    settings : ScannerSettings
-        The survey.
     seed : int
         Seed of the scanner. The content depends on scene, settings and seed alone.
     chunk_points : int

@@ -198,14 +198,6 @@ def scan_lines(
 
     Parameters
     ----------
-    scene : SceneArrays
-        What can be hit.
-    flight : FlightLine
-        The strip.
-    survey : Survey
-        The rest of the survey.
-    first_line, stop_line : int
-        Which lines.
     floats : ndarray (capacity, 5)
         Receives x, y, z (scene frame), GPS time, scan angle in degrees.
     integers : ndarray (capacity, COLUMNS) int32

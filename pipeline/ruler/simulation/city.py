@@ -82,14 +82,10 @@ class CityPlan:
 
     Parameters
     ----------
-    seed : int
-        Of the layout; not negative.
     size_m : tuple of float
         Extent east and north. A larger city contains the smaller one unchanged, except at the edge of the smaller one.
     settings : ScannerSettings
         The survey, which determines how far a tile can see.
-    name : str
-        Name of the scene, and of its buildings.
     terrain : Terrain, optional
         The ground; `city_terrain` by default.
     """

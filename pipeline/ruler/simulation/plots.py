@@ -55,8 +55,6 @@ def packed_plots(
         In the order in which rows are filled.
     strip_width_m : float
         Width of a strip; wide enough for any plot.
-    strips : int
-        Number of strips side by side.
     gap_m : float
         Kept free at both sides of a strip.
 

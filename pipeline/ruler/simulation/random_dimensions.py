@@ -50,10 +50,6 @@ def random_dimensions(
 
     Parameters
     ----------
-    shape : RoofShape
-        The shape.
-    random : numpy Generator
-        Source of the random numbers.
     area_m2 : float, optional
         Footprint, reached within 2 %. By default 60 to 400 m2; more for courtyards and flats of several levels.
     pitch_deg : float, optional

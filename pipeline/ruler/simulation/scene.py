@@ -279,18 +279,12 @@ def place_building(
 
     Parameters
     ----------
-    building_id : str
-        Unique name.
-    shape, dimensions : RoofShape, RoofDimensions
-        Its roof.
     at : tuple of float
         Middle of the main rectangle: easting and northing in the scene frame, metres.
     azimuth_deg : float
         Direction of the ridge, clockwise from north.
     eave_height_m : float
         Height of the eave above the *highest* terrain at the outline, so that no wall vanishes uphill.
-    terrain : Terrain
-        The ground.
     block_id : str, optional
         Shared by buildings that touch.
 

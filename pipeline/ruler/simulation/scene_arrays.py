@@ -92,8 +92,6 @@ def scene_arrays(scene: Scene, max_lean: float = 0.0, margin_m: float = 0.5, bea
 
     Parameters
     ----------
-    scene : Scene
-        What can be hit.
     max_lean : float
         Largest lean of the rays: objects are entered into all cells from whose terrain they can be hit.
     margin_m : float

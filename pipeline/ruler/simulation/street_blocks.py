@@ -33,8 +33,6 @@ class StreetBlock:
         Scene coordinates of its middle.
     azimuth_deg : float
         Direction of the long streets, clockwise from north.
-    terrain : Terrain
-        The ground.
     state : sequence of int
         Seed of its random numbers.
     """

@@ -143,18 +143,10 @@ def single_building(
 
     Parameters
     ----------
-    shape : RoofShape
-        What stands there.
-    seed : int
-        Not negative.
     size_m : tuple of float
         Extent east and north.
     dimensions : RoofDimensions, optional
         Its size; without one a house of about 110 m2 with 35 deg of pitch (pent: 15).
-    slope_deg : float
-        Slope of the terrain.
-    trees : int
-        Number of trees around it.
     """
     random = np.random.default_rng([seed, 0x1B])
     terrain = undulating_terrain(100.0, slope_deg, random.uniform(0, 360), 0.0, 100.0, random)

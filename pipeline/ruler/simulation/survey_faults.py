@@ -38,8 +38,6 @@ def move_faulty(places: FloatArray, lines: LabelArray, faults: FloatArray, seed:
         x, y, z in the scene frame. The place without any fault decides whether a return is affected.
     lines : ndarray (n,) int32
         Scan line of each return.
-    faults : ndarray (k, 11)
-        As made by `fault_rows`.
     seed, strip : int
         With the scan line they decide which rows are wrong.
     """

@@ -63,8 +63,6 @@ def two_epochs(scene: Scene, seed: int, *, share: float = 0.25, kinds: Sequence[
 
     Parameters
     ----------
-    scene : Scene
-        All buildings that stand in either epoch.
     seed : int
         Which buildings; not negative.
     share : float

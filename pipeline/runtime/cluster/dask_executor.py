@@ -96,13 +96,7 @@ class Cluster:
 
     @property
     def address(self) -> str:
-        """The scheduler's address.
-
-        Raises
-        ------
-        ClusterError
-            The embedded cluster was not started.
-        """
+        """The scheduler's address."""
         if self._scheduler is not None:
             return self._scheduler
         if self._embedded is None:
@@ -124,13 +118,7 @@ class Cluster:
         return None if self.tls is None else Security(**self.tls.security)
 
     def mend(self, workers: int) -> None:
-        """Restart embedded workers that their nanny gave up because they died during their start.
-
-        Parameters
-        ----------
-        workers : int
-            Number of workers that are there now.
-        """
+        """Restart embedded workers that their nanny gave up because they died during their start."""
         if self._embedded is None or workers >= self._workers or time.monotonic() - self._mended_s < _MEND_S:
             return
         from distributed import Status
@@ -164,13 +152,7 @@ class Cluster:
         return DaskExecutor(self, priority=priority_of(traffic, priority), performance_report=performance_report)
 
     def __enter__(self) -> Self:
-        """Start the embedded workers without connecting to them.
-
-        Raises
-        ------
-        ClusterError
-            The workers do not start.
-        """
+        """Start the embedded workers without connecting to them."""
         if self._scheduler is not None:
             return self
         import dask
@@ -313,8 +295,6 @@ class DaskExecutor:
             The scheduler is lost.
         VersionMismatchError
             A process runs other versions than this one.
-        RunCancelledError
-            The run was cancelled.
         """
         monitor = self._started()
         while not monitor.threads:
@@ -357,13 +337,7 @@ class DaskExecutor:
         return self._monitor
 
     def _ask(self, what: Callable[..., Any], **options: Any) -> Any:
-        """An answer of the scheduler.
-
-        Raises
-        ------
-        ClusterError
-            It does not answer.
-        """
+        """An answer of the scheduler."""
         try:
             return self._client.sync(what, callback_timeout=_ANSWER_S, **options)
         except (OSError, TimeoutError) as error:

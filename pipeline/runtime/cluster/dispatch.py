@@ -134,13 +134,7 @@ class ClusterMonitor:
         return ClusterError(f"the scheduler {self._address} was lost: {why}. Start it, then the run again")
 
     def look(self, stage: str, watch: Watch) -> None:
-        """Count the workers, at most once a second, and report when none are left, or when some are back.
-
-        Raises
-        ------
-        ClusterError
-            The scheduler is lost.
-        """
+        """Count the workers, at most once a second, and report when none are left, or when some are back."""
         self.check()
         now = self._clock()
         if now - self._checked_s < self._every_s:
@@ -205,17 +199,7 @@ class Dispatch(Generic[Task, Result]):
         self._submitted = 0
 
     def results(self) -> Generator[Measured[Result], None, None]:
-        """Results as they come.
-
-        Raises
-        ------
-        RunCancelledError
-            The run was cancelled.
-        ClusterError
-            The scheduler was lost.
-        RunError
-            One task killed its workers, also when it ran alone.
-        """
+        """Results as they come."""
         try:
             while self._large or self._waiting or self._suspects or self._in_flight:
                 self.watch.check_cancelled()

@@ -28,13 +28,6 @@ WINDOW_BASE_BYTES = 300 * 2**20
 def building_bytes(points: int, limit_bytes: int | None = None) -> int:
     """Estimated peak memory of a building's process.
 
-    Parameters
-    ----------
-    points : int
-        Points of the building.
-    limit_bytes : int, optional
-        Limit at which its process is ended.
-
     Examples
     --------
     >>> [round(building_bytes(points) / 2**30, 1) for points in (1_000, 50_000, 1_000_000)]

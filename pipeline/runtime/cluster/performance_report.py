@@ -76,13 +76,7 @@ class PerformanceReport:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Write the page.
-
-        Raises
-        ------
-        RunError
-            It cannot be written, and nothing else went wrong.
-        """
+        """Write the page."""
         self._ended_s = self._clock()
         unfinished = self.path.with_name(f".{self.path.name}.{os.getpid()}")
         try:

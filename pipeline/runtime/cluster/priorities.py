@@ -20,8 +20,6 @@ def priority_of(traffic: Traffic, wish: int = 0) -> int:
 
     Parameters
     ----------
-    traffic : {'interactive', 'batch'}
-        Kind of the run.
     wish : int
         The user's priority; compared only with that of other runs of the same kind.
 

@@ -105,13 +105,7 @@ class RunMetrics(Collector):
 
 
 class TallyMetrics(Collector):
-    """The tallies of a process as metrics.
-
-    Parameters
-    ----------
-    tallies : Tallies
-        Counts of the process.
-    """
+    """The tallies of a process as metrics."""
 
     def __init__(self, tallies: Tallies = TALLIES) -> None:
         self._tallies = tallies

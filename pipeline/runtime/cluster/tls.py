@@ -149,15 +149,6 @@ def given_tls(ca: str | None = None, cert: str | None = None, key: str | None = 
 def check_address(address: str, tls: TlsFiles | None, *, configured: bool) -> None:
     """Refuse an address that does not match the files, before any connection.
 
-    Parameters
-    ----------
-    address : str
-        The scheduler's address, with or without a protocol.
-    tls : TlsFiles or None
-        The given files.
-    configured : bool
-        Whether Dask's own configuration names a CA.
-
     Raises
     ------
     ClusterError
@@ -175,15 +166,7 @@ def check_address(address: str, tls: TlsFiles | None, *, configured: bool) -> No
 
 
 def explain_failure(address: str, tls: TlsFiles | None) -> str:
-    """Probe the scheduler's port after a failed connection; returns the reason, or an empty text if unknown.
-
-    Parameters
-    ----------
-    address : str
-        The scheduler's address.
-    tls : TlsFiles or None
-        The files of the failed connection.
-    """
+    """Probe the scheduler's port after a failed connection; returns the reason, or an empty text if unknown."""
     import ssl  # as above
 
     parts = urlsplit(address if "://" in address else f"tcp://{address}")

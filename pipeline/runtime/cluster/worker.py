@@ -64,13 +64,7 @@ class WorkerOptions:
 
     @property
     def memory_bytes(self) -> int | None:
-        """The memory limit, of which tasks declare their share; None without a limit.
-
-        Raises
-        ------
-        SettingsError
-            It is not a number of bytes.
-        """
+        """The memory limit, of which tasks declare their share; None without a limit."""
         try:
             limit = parse_memory_limit(self.memory_limit, self.threads, logger=logging.getLogger("distributed.worker"))
         except (ValueError, TypeError, AssertionError) as error:
@@ -106,8 +100,6 @@ def serve_worker(options: WorkerOptions, say: Callable[[str], None]) -> None:
 
     Parameters
     ----------
-    options : WorkerOptions
-        How it runs.
     say : callable
         Gets one line of text at every change.
 

@@ -47,15 +47,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def serve_parent(parent: int, loads: Sequence[str]) -> None:
-    """Process batches from standard input until the parent is gone.
-
-    Parameters
-    ----------
-    parent : int
-        Process id of the parent.
-    loads : sequence of str
-        Run before this process is ready, as in `main`.
-    """
+    """Process batches from standard input until the parent is gone."""
     incoming, outgoing = _private_pipes()
     end_with_parent(parent)
     name_process(NAME)

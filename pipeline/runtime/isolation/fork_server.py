@@ -90,10 +90,6 @@ def serve_forked(owner: int, orders: socket.socket, stderr: int, loads: Sequence
 
     Parameters
     ----------
-    owner : int
-        Its process id.
-    orders : socket
-        Connected to it.
     stderr : int
         Descriptor for the standard error of this process.
     loads : sequence of str

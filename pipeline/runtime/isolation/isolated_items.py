@@ -92,10 +92,6 @@ def supervise(
     ----------
     function : callable
         Takes one item; both are pickled.
-    items : sequence
-        Its arguments.
-    limits : IsolationLimits
-        Limits of each item.
     cancelled : callable
         Polled four times a second; the child is killed once it is true.
     second_chance : bool

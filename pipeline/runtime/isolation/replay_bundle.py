@@ -72,19 +72,7 @@ class Bundle:
 
 
 def write_bundle(folder: str, bundle: Bundle) -> str:
-    """Write `<folder>/<building_id>.bundle` atomically, replacing an existing one.
-
-    Parameters
-    ----------
-    folder : str
-        A path or URL.
-    bundle : Bundle
-        Its content.
-
-    Returns
-    -------
-    str
-        Path or URL of the file.
+    """Write `<folder>/<building_id>.bundle`, whole or not at all; replaces an earlier one and returns its path or URL.
 
     Raises
     ------

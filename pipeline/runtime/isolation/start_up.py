@@ -37,13 +37,7 @@ class _Blocker(MetaPathFinder):
     """Hides the packages of `NOT_OURS`."""
 
     def find_spec(self, name: str, *_: object) -> None:
-        """Leave a module to the other finders.
-
-        Raises
-        ------
-        ModuleNotFoundError
-            The module is one of `NOT_OURS`.
-        """
+        """Leave a module to the other finders."""
         if name in NOT_OURS:
             raise ModuleNotFoundError(f"No module named {name!r} in a process of gablework", name=name)
 

@@ -126,11 +126,6 @@ class SupervisedChild:
         -------
         str or None
             Why it will never be ready; None if it is ready.
-
-        Raises
-        ------
-        RunCancelledError
-            `cancelled` turned true.
         """
         if self._ready:
             return None
@@ -156,13 +151,6 @@ class SupervisedChild:
         """Process items; yields each result as it comes, and finally a `ChildEnd` if the child died or was ended.
 
         `one` is the word for an item in messages.
-
-        Raises
-        ------
-        RunCancelledError
-            `cancelled` turned true.
-        Exception
-            `function` raised it.
         """
         batch = Batch(function=function, items=items, data_limit_bytes=memory_bytes + _DATA_MARGIN_BYTES)
         with contextlib.suppress(BrokenPipeError):  # its end is handled below

@@ -60,12 +60,6 @@ class Watch:
     """Gets events that do not come with a result: workers are missing or back."""
 
     def check_cancelled(self) -> None:
-        """Raise an error if the run was cancelled.
-
-        Raises
-        ------
-        RunCancelledError
-            It was cancelled.
-        """
+        """Raise RunCancelledError if the run was cancelled."""
         if self.cancelled():
             raise RunCancelledError("the run was called off")

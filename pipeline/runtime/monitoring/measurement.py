@@ -88,13 +88,7 @@ def measure(function: Callable[[Task], Result], task: Task, stage: str = "") -> 
 
 
 def measure_in_child(work: tuple[Callable[[Task], Result], Task, str]) -> Measured[Result]:
-    """Run one task in a child process; an unexpected error carries its traceback as a note.
-
-    Parameters
-    ----------
-    work : tuple
-        Function, task and stage.
-    """
+    """Run one task in a child process; an unexpected error carries its traceback as a note."""
     try:
         return measure(*work)
     except GableworkError:

@@ -112,13 +112,6 @@ def own_modelling(override: Override, base: RunSettings) -> OwnModelling:
     What the override does not name is as in the run: the method's own settings too, where neither method nor preset
     is another.
 
-    Parameters
-    ----------
-    override : Override
-        What the user says.
-    base : RunSettings
-        The settings of the run.
-
     Raises
     ------
     SettingsError
@@ -155,8 +148,6 @@ def read_overrides(path: str | Path, reference: SpatialReference, base: RunSetti
         A TOML file; vector files that it names are sought beside it.
     reference : SpatialReference
         The run's CRS: `point` and WKT are in its coordinates.
-    base : RunSettings
-        The settings of the run.
 
     Raises
     ------
@@ -180,13 +171,7 @@ def overrides_of(
     source: str = "overrides",
     folder: Path | None = None,
 ) -> tuple[Override, ...]:
-    """The entries of a parsed overrides file; the arguments are those of `read_overrides`.
-
-    Raises
-    ------
-    SettingsError
-        All faults at once.
-    """
+    """The entries of a parsed overrides file; the arguments are those of `read_overrides`."""
     faults = [f"{source}: {name} is no table of overrides: use [[{TABLE}]]" for name in document if name != TABLE]
     entries = document.get(TABLE, [])
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):

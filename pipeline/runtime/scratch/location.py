@@ -48,13 +48,6 @@ def check_scratch(run_dir: str, scratch: str | None, scheduler: str | None) -> N
 def run_scratch(run_dir: str, scratch: str | None) -> Iterator[Scratch]:
     """Scratch for the duration of a run.
 
-    Parameters
-    ----------
-    run_dir : str
-        The run directory, a path or URL.
-    scratch : str or None
-        The folder that the user names.
-
     Raises
     ------
     RunError

@@ -174,8 +174,6 @@ def run_and_store(work: OutcomeTask[Task, Result, Brief]) -> StoredOutcome[Brief
 
     Raises
     ------
-    RunCancelledError
-        The run was cancelled.
     RunError
         Scratch or results cannot be read or written; earlier outcomes stay.
     """

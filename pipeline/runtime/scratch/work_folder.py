@@ -94,13 +94,7 @@ def boot_id() -> str:
 
 
 def make_work(root: Path) -> None:
-    """Make a work folder where it does not exist.
-
-    Raises
-    ------
-    RunError
-        The folder is not a work folder, or cannot be written.
-    """
+    """Make a work folder where it does not exist."""
     try:
         root.mkdir(parents=True, exist_ok=True)
         _check_mark(root)
@@ -110,13 +104,7 @@ def make_work(root: Path) -> None:
 
 @contextlib.contextmanager
 def locked_file(root: Path, name: str) -> Iterator[None]:
-    """Lock a file in a work folder until the block ends.
-
-    Raises
-    ------
-    RunError
-        Another process has locked it, or the folder cannot be written or has no locks.
-    """
+    """Lock a file in a work folder until the block ends."""
     try:
         handle = os.open(root / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError as error:

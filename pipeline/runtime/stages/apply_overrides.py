@@ -126,17 +126,7 @@ def _redrawn(
 def outcomes_of(
     overrides: Sequence[Override], joined: Joined, scratch: Scratch, grid: TileGrid
 ) -> tuple[EntryOutcome, ...]:
-    """Find the building of each entry, and which part of the entry takes effect.
-
-    Parameters
-    ----------
-    overrides : sequence of Override
-        The entries.
-    joined : Joined
-        The candidates and rejected objects before overrides.
-    scratch, grid : Scratch, TileGrid
-        Where the points are, for entries that name a place.
-    """
+    """Find the building of each entry, and which part of the entry takes effect."""
     candidates: Sites = {site.building_id: site for site in joined.candidates}
     rejected: Sites = {site.object_id: site for site in joined.rejected}
     by_source = {site.source_id: site.building_id for site in joined.candidates if site.source_id is not None}

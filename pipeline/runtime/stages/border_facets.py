@@ -46,8 +46,6 @@ def united_by_name(count: int, names: npt.NDArray[np.uint64], holders: IntArray)
 
     Parameters
     ----------
-    count : int
-        Number of elements.
     names : (j, 2) uint64
         Names.
     holders : (j,) int
@@ -76,10 +74,6 @@ def shared_facets(
         Their names.
     kinds : (j,) int8
         Their FacetKind: only facets of one kind are connected.
-    tile, grid : Tile, TileGrid
-        The tile and its lattice.
-    settings : SurfaceSettings
-        The settings that made the facets.
 
     Returns
     -------

@@ -46,8 +46,6 @@ def tidy(scratch: Scratch, joined: Joined, models: Collection[str], run_dirs: Se
 
     Parameters
     ----------
-    scratch, joined : Scratch, Joined
-        Scratch and candidates of the run.
     models : collection of str
         Stages under which its models are stored.
     run_dirs : sequence of str

@@ -47,8 +47,6 @@ def finished(surfaces: Surfaces, ranges: IntArray, settings: CandidateSettings) 
         One or more complete sets; no step connects them with any other surface.
     ranges : (p, 4) int64
         Surface, tile, start, stop of runs of their points.
-    settings : CandidateSettings
-        What makes a surface a candidate.
     """
     leader = unite_levels(surfaces, judge_surfaces(surfaces, settings), settings)
     points = surfaces.lowest_point_mm

@@ -145,10 +145,6 @@ def gather(
 
     Parameters
     ----------
-    scratch, grid : Scratch, TileGrid
-        Points and terrain of the tiles.
-    site : CandidateSite
-        Which points.
     gps_kind : GpsTimeKind
         Whether GPS times can be converted to dates.
     beside : bool

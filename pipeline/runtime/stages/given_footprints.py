@@ -43,8 +43,6 @@ def given_footprints(path: str, plan: Plan) -> GivenFootprints:
 
     Parameters
     ----------
-    path : str
-        A vector file.
     plan : Plan
         Bounds the data: those of the inputs, cut by --bbox and --aoi.
 

@@ -153,8 +153,6 @@ def ingest_file(task: IngestTask) -> Ingested:
     ------
     InputError
         The file cannot be used.
-    RunCancelledError
-        The run was cancelled.
     """
     task.scratch.check_cancelled()
     if not is_url(task.path):

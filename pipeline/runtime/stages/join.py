@@ -210,19 +210,7 @@ def _joined(task: JoinTask, settings: CandidateSettings) -> Joined:
 
 
 def join_tiles(splits: Iterable[Split], grid: TileGrid, settings: CandidateSettings, crs_name: str) -> Joined:
-    """Finish the surfaces that several tiles see, and find where each candidate's points lie.
-
-    Parameters
-    ----------
-    splits : iterable of Split
-        All tiles, in any order; only one is in memory at a time.
-    grid : TileGrid
-        The lattice, for the owners.
-    settings : CandidateSettings
-        What makes a surface a candidate; the same as in the splits.
-    crs_name : str
-        Goes into the ids.
-    """
+    """Finish the surfaces that several tiles see, and find where each candidate's points lie."""
     waiting, tiles, small = _Waiting(), list[Tile](), 0
     sites = _Sites(grid=grid, settings=settings, crs_name=crs_name)
     for split in splits:
@@ -255,8 +243,6 @@ def join_footprints(
     ----------
     splits : iterable of Split
         All tiles, in any order.
-    grid : TileGrid
-        The lattice, for the owners.
     numbers : mapping
         By tile, the numbers of its footprints; its split numbers them from 0.
     footprints, source_ids : sequences

@@ -76,11 +76,6 @@ def label(task: LabelTask) -> Labelled:
     -------
     Labelled
         Counts; the classes are in scratch under `classes/<tile>/<input>.bin`, one byte per point of the bucket.
-
-    Raises
-    ------
-    RunCancelledError
-        The run was cancelled.
     """
     task.scratch.check_cancelled()
     window = neighbourhood(task.tile, task.grid, task.settings)

@@ -132,8 +132,6 @@ def model_batch(task: BatchTask) -> Batch:
 
     Raises
     ------
-    RunCancelledError
-        The run was cancelled.
     OSError
         Scratch cannot be read or written.
     RunError
@@ -313,13 +311,7 @@ def _lost(
 
 
 def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
-    """The record of a building that ended its process, and its bundle in the quarantine.
-
-    Raises
-    ------
-    MemoryError, OSError
-        Its points cannot be gathered.
-    """
+    """The record of a building that ended its process, and its bundle in the quarantine."""
     from pipeline.reconstruct import failed_building  # as above
 
     task = task.way_of(site)
@@ -400,13 +392,7 @@ def load_once(method: str) -> None:
 
 
 def load(*methods: str) -> None:
-    """Load the libraries and compiled kernels for modelling, by modelling roofs of many and of few points.
-
-    Parameters
-    ----------
-    *methods : str
-        Their names; all methods by default.
-    """
+    """Load the libraries and compiled kernels for modelling, by modelling roofs of many and of few points."""
     from pipeline.reconstruct import reconstruct_building  # as above
 
     lattice = np.arange(-4.5, 15.0)

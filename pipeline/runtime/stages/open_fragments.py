@@ -77,18 +77,10 @@ def open_fragments(
 
     Parameters
     ----------
-    fragments : Fragments
-        All fragments of the tile.
     keys : (n,) int64
         Fragments with points, ascending.
     starts : (n + 1,) int64
         Where the points of each start in the tile's sorted points.
-    tile, grid : Tile, TileGrid
-        The tile and its lattice.
-    cut : SurfaceSettings
-        The settings that made the fragments.
-    settings : CandidateSettings
-        What makes a surface a candidate.
     """
     kind, count = fragments.kind, len(fragments.kind)
     opened, holders, names = _shared_facets(fragments, tile, grid, cut)

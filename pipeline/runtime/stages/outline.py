@@ -110,8 +110,6 @@ def draw_outlines(task: OutlineTask) -> DrawnOutlines:
 
     Raises
     ------
-    RunCancelledError
-        The run was cancelled.
     MemoryError, OSError
         Scratch cannot be read, or does not fit into memory.
     """

@@ -152,11 +152,6 @@ def publish_tile(task: PublishTask) -> Published:
     """Write one tile's tables, meshes and city objects, then its state; may run twice.
 
     A tile that fails harms only itself: its state says so, and why. A tile that owns nothing has a state and no files.
-
-    Raises
-    ------
-    RunCancelledError
-        The run was cancelled, or is over: so late a task must not touch what another run may have written.
     """
     storage = storage_at(task.run_dir)
     task.scratch.check_cancelled()

@@ -94,11 +94,6 @@ def draw_tile(task: RasterTask) -> Tile:
     -------
     Tile
         The tile; its cells are in scratch under `rasters/<tile>/<block>/`.
-
-    Raises
-    ------
-    RunCancelledError
-        The run was called off.
     """
     task.scratch.check_cancelled()
     core, lattice = task.grid.core(task.tile), task.lattice
@@ -164,13 +159,7 @@ def _draw_block(
 
 
 def write_mosaic(task: MosaicTask) -> str:
-    """Write one raster of all tiles; its path.
-
-    Raises
-    ------
-    RunCancelledError
-        The run was called off.
-    """
+    """Write one raster of all tiles; its path."""
     reference = task.reference
     crs = reference.crs
     if task.name == "height" and crs is not None:

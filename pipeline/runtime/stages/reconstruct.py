@@ -56,12 +56,6 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
 
     Parameters
     ----------
-    context : RunContext
-        The run.
-    settings : RunSettings
-        Method and settings of the models.
-    joined : Joined
-        The candidates.
     compared : bool
         Whether seconds are compared with those of other methods.
     """

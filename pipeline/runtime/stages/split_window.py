@@ -103,11 +103,6 @@ def split_window(task: SplitTask, settings: SceneSettings) -> Split:
     -------
     Split
         Descriptors; the arrays are in scratch under `<folder>/<tile>/`.
-
-    Raises
-    ------
-    RunCancelledError
-        The run was cancelled.
     """
     task.scratch.check_cancelled()
     loaded = load_window(task.scratch, task.grid, task.tile)

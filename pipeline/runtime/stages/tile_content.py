@@ -97,12 +97,8 @@ def content_of_window(sums: Mapping[Tile, ZoneSums], grid: TileGrid, window: Win
     ----------
     sums : mapping
         Sums of all tiles with points, over all inputs; made with the halo of `grid`.
-    grid : TileGrid
-        The lattice of the plan.
     window : Window
         The tile's core and a halo at most as wide as that of the lattice.
-    tile : Tile
-        The tile.
     """
     found: list[object] = []
     apart = are_apart(grid)

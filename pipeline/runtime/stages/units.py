@@ -68,13 +68,7 @@ def unit_tasks(
 
 
 def divide(task: UnitTask) -> tuple[CandidateSite, ...]:
-    """The units of some candidates; those that are one unit stay as they are.
-
-    Raises
-    ------
-    RunCancelledError
-        The run was cancelled.
-    """
+    """The units of some candidates; those that are one unit stay as they are."""
     found: list[CandidateSite] = []
     for site in task.sites:
         task.scratch.check_cancelled()

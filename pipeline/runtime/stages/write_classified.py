@@ -99,13 +99,7 @@ def output_name(path: str) -> str:
 
 
 def check_writable(info: SourceInfo) -> None:
-    """Refuse a file that cannot be written anew without loss, before any work.
-
-    Raises
-    ------
-    UnreadableInputError
-        Its points carry waveforms.
-    """
+    """Refuse a file that cannot be written anew without loss, before any work."""
     if info.format not in _LAS_FORMATS:
         return
     frame = read_frame(Path(info.path))
@@ -156,13 +150,7 @@ class _Labels:
         return found
 
     def check_all_given(self) -> None:
-        """Refuse a file that ended early.
-
-        Raises
-        ------
-        InconsistentInputError
-            It holds fewer points than when ingest read it.
-        """
+        """Refuse a file that ended early."""
         given = self._done.total()
         if given < self._task.used:
             raise InconsistentInputError(
@@ -177,8 +165,6 @@ def write_classified(task: ClassifiedTask) -> ClassifiedFile:
     ------
     InputError
         The file cannot be read any more.
-    RunCancelledError
-        The run was called off.
     """
     task.scratch.check_cancelled()
     source = open_source(task.path, task.options)

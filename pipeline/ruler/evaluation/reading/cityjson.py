@@ -53,13 +53,7 @@ class Frame:
     """(t, 3) float64."""
 
     def places(self, vertices: Sequence[Sequence[float]]) -> Places:
-        """Vertices of a file or feature in metres.
-
-        Raises
-        ------
-        ValueError
-            They are not finite triples.
-        """
+        """Vertices of a file or feature in metres."""
         with np.errstate(over="ignore", invalid="ignore"):
             metres = (_triples(vertices) * self.scale + self.translate) * self.units_m
         return Places(
@@ -136,8 +130,6 @@ def features(
 
     Parameters
     ----------
-    path : Readable
-        The file. Further lines of metadata apply from there on.
     into : Collected
         Receives the coordinate reference system.
     units_m : tuple of float, optional
@@ -189,13 +181,7 @@ def _broken(path: Readable, where: str, fault: Exception) -> InputError:
 
 
 def _triples(vertices: Any) -> FloatArray:
-    """(n, 3) float64.
-
-    Raises
-    ------
-    ValueError
-        They are not finite triples of numbers.
-    """
+    """(n, 3) float64; ValueError if they are not finite triples of numbers."""
     array = np.array(vertices, np.float64) if len(vertices) else np.empty((0, 3))
     if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
         raise ValueError("vertices are not triples of finite numbers")
@@ -205,13 +191,7 @@ def _triples(vertices: Any) -> FloatArray:
 def _frame(
     path: Readable, where: str, header: Any, into: Collected, units_m: tuple[float, float] | None = None
 ) -> Frame:
-    """The frame of a header.
-
-    Raises
-    ------
-    InputError
-        It has another type or version, is broken, or its coordinate reference system has no lengths.
-    """
+    """The frame of a header."""
     kind = header.get("type") if isinstance(header, dict) else type(header).__name__
     if kind != "CityJSON":
         raise _unreadable(path, f"{where}type is {kind!r}, not CityJSON")
@@ -239,13 +219,7 @@ def _frame(
 
 
 def _reference(path: Readable, metadata: Object, into: Collected) -> SpatialReference:
-    """The coordinate reference system and its units; metres without one.
-
-    Raises
-    ------
-    CrsError
-        It is geographic or not understood.
-    """
+    """The coordinate reference system and its units; metres without one."""
     text = metadata.get("referenceSystem")
     if not text:
         into.note("no referenceSystem in the file: coordinates are taken as metres")

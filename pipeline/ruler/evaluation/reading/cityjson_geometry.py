@@ -129,13 +129,7 @@ def has_inner_shells(geometry: Object, places: Places) -> bool:
 
 
 def _index(value: Any, count: int, what: str) -> int:
-    """A whole number that is one of so many.
-
-    Raises
-    ------
-    ValueError
-        It is not.
-    """
+    """A whole number from 0 to count - 1; ValueError if it is not."""
     if not isinstance(value, int) or not 0 <= value < count:
         raise ValueError(f"{what} {value!r} is not one of {count}")
     return value

@@ -157,8 +157,6 @@ def coplanar_regions(
         Area vectors; their direction does not matter.
     planes : (f,) int64
         Faces with different numbers stay apart.
-    distance_m, angle_deg : float
-        As `DISTANCE_M` and `ANGLE_DEG`.
 
     Returns
     -------

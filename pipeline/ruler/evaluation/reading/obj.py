@@ -145,13 +145,7 @@ def _touching(parts: Sequence[RawPart]) -> list[list[RawPart]]:
 
 
 def _read(path: Path) -> _Mesh:
-    """The faces of a file.
-
-    Raises
-    ------
-    InputError
-        A line is broken.
-    """
+    """The faces of a file."""
     mesh = _Mesh()
     number = 0
     try:
