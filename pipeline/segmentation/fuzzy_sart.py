@@ -215,7 +215,7 @@ class _Learning(NamedTuple):
 
 
 @kernel
-def _learn(
+def _learn(  # noqa: C901 - the paper's algorithm in one piece: parts would be compiled apart and pass its state around
     vectors: FloatArray,
     order: npt.NDArray[np.int64],
     learning: _Learning,
