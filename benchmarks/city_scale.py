@@ -190,7 +190,7 @@ def stage_table(rows: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def sizes_told(trace: Mapping[str, Any]) -> str:
+def sizes_reported(trace: Mapping[str, Any]) -> str:
     """Bytes of tasks and results as they travel."""
     kept: dict[str, dict[str, list[int]]] = {}
     for size in trace["sizes"]:
@@ -248,7 +248,7 @@ def report(seen: Mapping[str, Any], trace: Mapping[str, Any] | None, run_dir: Pa
             f"CPU of task bodies {cpu_s:.1f} s.  \n"
             f"Scratch {figures['scratch_bytes_a_point']:.1f} bytes a point at most."
         )
-        lines += ["", reported, "", stage_table(figures["stages"]), sizes_told(trace)]
+        lines += ["", reported, "", stage_table(figures["stages"]), sizes_reported(trace)]
     lines += [
         "",
         markdown_table(

@@ -231,7 +231,7 @@ def interval_table(found: Mapping[str, Outcomes], *, good_only: bool) -> str:
     lines = []
     for label, outcomes in found.items():
         estimates = [outcomes.correct(kind, good_only=good_only) for kind in _rows()]
-        lines.append([label, *("" if np.isnan(one.value) else told_share(one) for one in estimates)])
+        lines.append([label, *("" if np.isnan(one.value) else reported_share(one) for one in estimates)])
     return markdown_table(["percent correct (95 % interval)", *_rows()], lines)
 
 
@@ -247,7 +247,7 @@ def _count(value: float) -> str:
     return f"{value:.1f}".removesuffix(".0")
 
 
-def told_share(estimate: Estimate, sign: str = "") -> str:
+def reported_share(estimate: Estimate, sign: str = "") -> str:
     """A share in percent with its interval."""
     value, low, high = (100.0 * end for end in (estimate.value, estimate.low, estimate.high))
     return f"{value:{sign}.0f} ({low:{sign}.0f} to {high:{sign}.0f})"
@@ -262,7 +262,7 @@ def pattern(flat: Outcomes, full: Outcomes) -> list[tuple[str, bool, str]]:
 
     def beside(kind: str, gain: Estimate) -> str:
         two, three = flat.correct(kind, good_only=False), full.correct(kind, good_only=False)
-        return f"2D {told_share(two)}, 3D {told_share(three)}, difference {told_share(gain, '+')}"
+        return f"2D {reported_share(two)}, 3D {reported_share(three)}, difference {reported_share(gain, '+')}"
 
     return [
         (
@@ -273,19 +273,19 @@ def pattern(flat: Outcomes, full: Outcomes) -> list[tuple[str, bool, str]]:
         (
             f"hips: about none in 3D ({100 * ABOUT_NONE:.0f} % or fewer; paper 0 of 18)",
             hips.value <= ABOUT_NONE,
-            f"3D {told_share(hips)}, 2D {told_share(flat.correct('hip', good_only=False))}",
+            f"3D {reported_share(hips)}, 2D {reported_share(flat.correct('hip', good_only=False))}",
         ),
         ("pent: worse in 3D than in 2D (paper 65 to 35 %)", pents.value < 0.0, beside("pent", pents)),
         (
             f"flat: by accident (in neither space {100 * RELIABLE:.0f} %; paper 2 and 1 of 3)",
             all(one.value < RELIABLE for one in flats.values()),
-            ", ".join(f"{name} {told_share(one)}" for name, one in flats.items()),
+            ", ".join(f"{name} {reported_share(one)}" for name, one in flats.items()),
         ),
         ("all: 3D better than 2D (paper 30 to 49 %)", whole.low > 0.0, beside(ALL, whole)),
         (
             "3D: better where nothing makes it hard (paper 49 to 63 %)",
             good.value > everything.value,
-            f"all {told_share(everything)}, good {told_share(good)}",
+            f"all {reported_share(everything)}, good {reported_share(good)}",
         ),
     ]
 
@@ -323,7 +323,7 @@ def terrain_table(found: Mapping[str, Outcomes]) -> str:
             else None
             for mask in masks
         ]
-        rows.append([label, *("" if one is None else told_share(one) for one in estimates)])
+        rows.append([label, *("" if one is None else reported_share(one) for one in estimates)])
     return markdown_table(["percent correct by slope of the terrain", *heads], rows)
 
 

@@ -95,12 +95,12 @@ def held_ranges(
     return ranges
 
 
-def told_ranges(ranges: Sequence[HeldRange]) -> str:
+def reported_ranges(ranges: Sequence[HeldRange]) -> str:
     """The ranges as a cell of a table.
 
     Examples
     --------
-    >>> told_ranges([HeldRange(low=0.9, high=12.0), HeldRange(low=30.0, high=math.inf)])
+    >>> reported_ranges([HeldRange(low=0.9, high=12.0), HeldRange(low=30.0, high=math.inf)])
     '0.90 to 12, from 30'
     """
     reported = []
@@ -108,15 +108,15 @@ def told_ranges(ranges: Sequence[HeldRange]) -> str:
         if math.isinf(one.low) and math.isinf(one.high):
             return "always"
         if math.isinf(one.high):
-            reported.append(f"from {_told(one.low)}")
+            reported.append(f"from {_reported(one.low)}")
         elif math.isinf(one.low):
-            reported.append(f"to {_told(one.high)}")
+            reported.append(f"to {_reported(one.high)}")
         else:
-            reported.append(f"{_told(one.low)} to {_told(one.high)}")
+            reported.append(f"{_reported(one.low)} to {_reported(one.high)}")
     return ", ".join(reported) or "never"
 
 
-def _told(value: float) -> str:
+def _reported(value: float) -> str:
     """Two digits that say something."""
     digits = max(0, 1 - math.floor(math.log10(value)))
     return f"{value:.{digits}f}"
@@ -141,7 +141,7 @@ def density_table(found: Mapping[str, Qualities]) -> str:
     rows = []
     for label, qualities in found.items():
         cells = [
-            told_ranges(held_ranges(*along_density(qualities, noise), level, logarithmic=True))
+            reported_ranges(held_ranges(*along_density(qualities, noise), level, logarithmic=True))
             for level in LEVELS
             for noise in noises
         ]
@@ -158,7 +158,7 @@ def noise_table(found: Mapping[str, Qualities]) -> str:
             cells = []
             for density in densities:
                 noises, values = along_noise(qualities, density)
-                cells.append(told_ranges(held_ranges(noises, values, level, logarithmic=False)) if noises else "")
+                cells.append(reported_ranges(held_ranges(noises, values, level, logarithmic=False)) if noises else "")
             rows.append([label, f"{100 * level:.0f} %", *cells])
     return markdown_table(["m of noise at which it holds", "level", *(f"{one:g} a m2" for one in densities)], rows)
 

@@ -59,8 +59,8 @@ def raw_request(url: str, line: str, body: bytes = b"", **headers: str) -> Itera
     """A connection over which a request was sent byte by byte as it is written here: no client tidies it."""
     parts = urlsplit(url)
     with socket.create_connection((parts.hostname, parts.port), timeout=DEADLINE_S) as link:
-        told = {"Host": parts.netloc} | {name.replace("_", "-"): value for name, value in headers.items()}
-        head = "".join(f"{name}: {value}\r\n" for name, value in told.items())
+        reported = {"Host": parts.netloc} | {name.replace("_", "-"): value for name, value in headers.items()}
+        head = "".join(f"{name}: {value}\r\n" for name, value in reported.items())
         link.sendall(f"{line} HTTP/1.1\r\n{head}\r\n".encode() + body)
         yield link
 

@@ -1,4 +1,4 @@
-"""The join as the science tells it, slowly: all fragments of all tiles at once, each surface judged on its own."""
+"""The join as the science defines it, slowly: all fragments of all tiles at once, each surface judged on its own."""
 
 from __future__ import annotations
 

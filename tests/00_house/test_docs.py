@@ -76,7 +76,7 @@ def test_every_option_explains_itself(generator: ModuleType) -> None:
     assert silent == []
 
 
-def test_the_reference_tells_defaults_that_are_words_and_all_values_of_numbers_that_may_be_a_word() -> None:
+def test_the_reference_says_defaults_that_are_words_and_all_values_of_numbers_that_may_be_a_word() -> None:
     lines = (DOCS / "reference" / "command_line.md").read_text().splitlines()
     workers = {line.split(" | ")[1] for line in lines if line.startswith("| `--workers` N\\|auto | ")}
     # commands of the pipeline have a default of their own, those of the service take what the environment says
@@ -92,13 +92,13 @@ def test_every_setting_of_every_stage_is_in_the_reference(generator: ModuleType)
     assert missing == []
 
 
-def test_the_method_page_tells_every_setting_of_its_recipe() -> None:
+def test_the_method_page_says_every_setting_of_its_recipe() -> None:
     text = (DOCS / "methods" / "fuzzy_sart.md").read_text()
     missing = [f.name for f in dataclasses.fields(FuzzySartSettings) if f"`{f.name}" not in text]
     assert missing == []
 
 
-def test_the_page_of_solids_tells_every_setting_of_roof_and_roof_type() -> None:
+def test_the_page_of_solids_says_every_setting_of_roof_and_roof_type() -> None:
     text = (DOCS / "methods" / "solids.md").read_text()
     fields = [*dataclasses.fields(RoofSettings), *dataclasses.fields(RoofTypeSettings)]
     assert [field.name for field in fields if f"`{field.name}" not in text] == []
@@ -177,7 +177,7 @@ def test_the_overrides_files_of_the_docs_are_valid() -> None:
 
 
 @pytest.mark.parametrize("table", list(SCHEMAS))
-def test_every_column_is_told_with_its_type_in_order(table: str) -> None:
+def test_every_column_is_reported_with_its_type_in_order(table: str) -> None:
     text = (DOCS / "reference" / "records.md").read_text()
     section = re.search(rf"^## {table}\n(.*?)(?=^## )", text, re.MULTILINE | re.DOTALL)
     assert section is not None
@@ -188,7 +188,7 @@ def test_every_column_is_told_with_its_type_in_order(table: str) -> None:
         assert re.sub(r"list<\w+: ", "list<", real).split("[")[0] == kind, name
 
 
-def test_every_reason_status_and_roof_type_is_told() -> None:
+def test_every_reason_status_and_roof_type_is_reported() -> None:
     text = (DOCS / "reference" / "records.md").read_text()
     reasons = text.split("## Reasons")[1]
     assert re.findall(r"^\| `(\w+)` \|", reasons, re.MULTILINE) == [reason.value for reason in Reason]
@@ -262,6 +262,6 @@ def test_a_command_of_the_docs_is_one_that_exists(generator: ModuleType, page: s
     assert context.params
 
 
-def test_the_readme_tells_the_two_commands_first() -> None:
+def test_the_readme_says_the_two_commands_first() -> None:
     lines = [line for page, line in shell_lines() if page == "README.md"]
     assert lines[:2] == ["make demo", "make test"]

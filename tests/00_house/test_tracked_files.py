@@ -110,7 +110,7 @@ def test_the_version_is_one() -> None:
     assert pipeline.__version__ == project["version"]
 
 
-def test_the_supported_pythons_are_told_alike() -> None:
+def test_the_supported_pythons_are_reported_alike() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     versions = [c.rsplit(" ", 1)[1] for c in project["classifiers"] if re.fullmatch(r".*Python :: 3\.\d+", c)]
     low, high = re.fullmatch(r">=3\.(\d+),<3\.(\d+)", project["requires-python"]).groups()  # type: ignore[union-attr]

@@ -74,7 +74,7 @@ def test_named_columns_fill_the_fields(tmp_path):
     assert (source.info.has_returns, source.info.has_classes, source.info.has_gps_time) == (True, True, True)
 
 
-def test_told_columns_stand_above_all(tmp_path):
+def test_reported_columns_stand_above_all(tmp_path):
     path = write(tmp_path / "a.xyz", "6 1 2 3 99\n2 2 3 4 99\n")
     (cloud,) = open_source(path, ReadOptions(ascii_columns="classification x y z -")).chunks()
     assert cloud.xyz.tolist() == [[1, 2, 3], [2, 3, 4]]

@@ -132,7 +132,7 @@ def test_a_large_chunk_size_of_few_points_is_read_all_the_same(tmp_path, points,
     assert (done.returncode, done.stdout.strip()) == (0, "1000")
 
 
-def test_text_and_archives_named_las_are_told_for_what_they_are(tmp_path):
+def test_text_and_archives_named_las_are_reported_for_what_they_are(tmp_path):
     text = tmp_path / "a.las"
     text.write_text("1.0 2.0 3.0\n" * 100)
     with pytest.raises(UnreadableInputError, match=r"not a LAS file.*LAS and LAZ.*PLY.*ASCII"):
@@ -191,7 +191,7 @@ def test_a_geographic_crs_names_the_fix_and_a_projected_override_helps(tmp_path,
         assert any("replaces the header's" in warning for warning in info.warnings)
 
 
-def test_counts_that_contradict_each_other_in_las_14_are_told(tmp_path, points, write_las):
+def test_counts_that_contradict_each_other_in_las_14_are_reported(tmp_path, points, write_las):
     path = write_las(tmp_path / "a.las", points(100), version="1.4", point_format=1)
     patch(path, "<I", COUNT_AT, 90)
     source = open_source(path)
@@ -231,7 +231,7 @@ def test_a_chunk_whose_own_count_is_another_is_refused(tmp_path, points, write_l
 
 @pytest.mark.parametrize(("version", "point_format"), FORMATS)
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_a_file_that_ends_while_it_is_read_is_told(tmp_path, points, write_las, version, point_format, suffix):
+def test_a_file_that_ends_while_it_is_read_is_reported(tmp_path, points, write_las, version, point_format, suffix):
     path = write_las(tmp_path / f"a{suffix}", points(120_000), version=version, point_format=point_format)
     source = open_source(path)
     raw = path.read_bytes()
@@ -259,7 +259,7 @@ def test_no_single_damaged_byte_of_a_header_escapes_as_another_error(tmp_path, p
     assert all(fault.fix and fault.path == str(bad) for fault in refusals)
 
 
-def test_a_file_that_may_not_be_read_is_told(tmp_path, points, write_las, monkeypatch):
+def test_a_file_that_may_not_be_read_is_reported(tmp_path, points, write_las, monkeypatch):
     path = write_las(tmp_path / "a.las", points(10))
     original = Path.open
 
@@ -273,7 +273,7 @@ def test_a_file_that_may_not_be_read_is_told(tmp_path, points, write_las, monkey
         open_source(path)
 
 
-def test_trailing_bytes_that_are_no_records_are_told_and_the_points_used(tmp_path, points, write_las):
+def test_trailing_bytes_that_are_no_records_are_reported_and_the_points_used(tmp_path, points, write_las):
     path = write_las(tmp_path / "a.las", points(100))
     with path.open("ab") as stream:
         stream.write(b"\0" * 5)

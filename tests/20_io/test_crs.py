@@ -57,7 +57,7 @@ def test_the_order_of_precedence_of_the_vertical_unit():
     assert resolve("EPSG:2992", crs="EPSG:28992", header_vertical_unit_m=FOOT_M)[0].vertical_unit_m == 1.0
 
 
-def test_no_crs_is_unknown_and_told_with_its_fix():
+def test_no_crs_is_unknown_and_reported_with_its_fix():
     reference, reported = resolve()
     assert reference == SpatialReference()
     assert (reference.wkt, reference.epsg, reference.projjson, reference.crs) == (None, None, None, None)
@@ -75,7 +75,7 @@ def test_degrees_geocentric_and_vertical_only_are_refused_with_the_fix(crs):
 
 
 @pytest.mark.parametrize("crs", ["EPSG:99999999", "nonsense", "PROJCS[broken"])
-def test_a_crs_that_nobody_knows_is_refused(crs):
+def test_a_crs_that_no_one_knows_is_refused(crs):
     with pytest.raises(CrsError, match=r"not understood.*EPSG:28992"):
         resolve(None, crs=crs)
 
@@ -155,7 +155,7 @@ def test_a_user_defined_projection_in_keys_is_unknown_with_its_unit_and_not_geog
     assert any("user-defined" in warning for warning in info.warnings)
 
 
-def test_broken_wkt_is_told_and_the_crs_unknown(tmp_path):
+def test_broken_wkt_is_reported_and_the_crs_unknown(tmp_path):
     info = write_keys(tmp_path / "a.las", {}, "PROJCS[broken")
     assert info.reference.wkt is None
     assert any("WKT is not understood" in warning for warning in info.warnings)

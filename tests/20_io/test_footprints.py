@@ -44,7 +44,7 @@ def test_three_formats_give_the_same_polygons(tmp_path, suffix):
     assert len(found) == 2
 
 
-def test_geojson_in_degrees_is_reprojected_and_told(tmp_path):
+def test_geojson_in_degrees_is_reprojected_and_reported(tmp_path):
     path = tmp_path / "a.geojson"
     write(path, np.array(geopandas.GeoSeries(HOUSES, crs="EPSG:28992").to_crs("EPSG:4326")), crs="EPSG:4326")
     found = read_footprints(path, reference())
@@ -95,7 +95,7 @@ def test_attributes_are_plain_values(tmp_path):
     json.dumps([first, second])
 
 
-def test_invalid_polygons_are_repaired_and_told(tmp_path):
+def test_invalid_polygons_are_repaired_and_reported(tmp_path):
     bow_tie = Polygon([(0, 0), (10, 10), (10, 0), (0, 10)])
     spike = Polygon([(0, 0), (10, 0), (10, 10), (10, 20), (10, 10), (0, 10)])
     flat = Polygon([(0, 0), (5, 5), (10, 10)])
@@ -137,7 +137,7 @@ def test_elevations_holes_and_several_parts_are_kept_in_plan(tmp_path):
     assert not found.polygons[1].has_z
 
 
-def test_other_geometries_are_left_out_and_told(tmp_path):
+def test_other_geometries_are_left_out_and_reported(tmp_path):
     mixed = [Point(0, 0), LineString([(0, 0), (1, 1)]), HOUSES[0], None, Polygon()]
     found = read_footprints(write(tmp_path / "a.geojson", mixed, crs="EPSG:28992", id=[1, 2, 3, 4, 5]), reference())
     assert found.ids == ("3",)
@@ -170,7 +170,7 @@ def test_a_layer_of_points_beside_does_not_disturb(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:'crs' was not provided")
-def test_footprints_without_crs_are_assumed_to_be_the_run_s_and_told(tmp_path):
+def test_footprints_without_crs_are_assumed_to_be_the_run_s_and_reported(tmp_path):
     path = write(tmp_path / "a.shp", crs=None)
     found = read_footprints(path, reference())
     assert found.polygons[0].equals(HOUSES[0])
@@ -261,7 +261,7 @@ def test_off_all_footprints_none_are_read_and_they_are_counted(tmp_path, suffix)
 
 
 @pytest.mark.parametrize("suffix", [".gpkg", ".parquet", ".geojson"])
-def test_faults_without_a_place_are_told_wherever_the_area_is(tmp_path, suffix):
+def test_faults_without_a_place_are_reported_wherever_the_area_is(tmp_path, suffix):
     path = write_town(tmp_path / f"a{suffix}", [*TOWN[:3], None, Polygon(), Point(85_000, 447_000), Point(0, 0)])
     found = read_footprints(path, reference(), area=box(85_000, 447_000, 85_001, 447_001))
     assert (found.ids, found.elsewhere) == (("h0",), 2)

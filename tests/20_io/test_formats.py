@@ -1,4 +1,4 @@
-"""Formats are told by content, and paths, folders and patterns become a sorted list of files."""
+"""Formats are recognised by content, and paths, folders and patterns become a sorted list of files."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_file_that_is_named_like_a_pattern_is_a_file(folder):
     assert find_inputs([odd]) == [os.path.realpath(odd)]
 
 
-def test_an_empty_folder_and_one_without_points_are_told_apart(tmp_path):
+def test_an_empty_folder_and_one_without_points_are_separated(tmp_path):
     with pytest.raises(UnreadableInputError, match="the folder is empty"):
         find_inputs([tmp_path])
     (tmp_path / "notes.txt").write_text("nothing here\n")
@@ -60,7 +60,7 @@ def test_an_empty_folder_and_one_without_points_are_told_apart(tmp_path):
         find_inputs([tmp_path])
 
 
-def test_a_missing_file_an_empty_pattern_and_no_input_are_told(tmp_path):
+def test_a_missing_file_an_empty_pattern_and_no_input_are_reported(tmp_path):
     with pytest.raises(UnreadableInputError, match="no such file"):
         find_inputs([tmp_path / "missing.laz"])
     with pytest.raises(UnreadableInputError, match="meets no files"):
@@ -71,7 +71,7 @@ def test_a_missing_file_an_empty_pattern_and_no_input_are_told(tmp_path):
         find_inputs([])
 
 
-def test_an_unreadable_folder_is_told(tmp_path, monkeypatch):
+def test_an_unreadable_folder_is_reported(tmp_path, monkeypatch):
     def refuse(self):
         raise PermissionError(13, "Permission denied", str(self))
 
@@ -80,7 +80,7 @@ def test_an_unreadable_folder_is_told(tmp_path, monkeypatch):
         find_inputs([tmp_path])
 
 
-def test_a_folder_given_as_a_file_is_told(tmp_path):
+def test_a_folder_given_as_a_file_is_reported(tmp_path):
     with pytest.raises(UnreadableInputError, match="a folder, not a file"):
         open_source(tmp_path)
 

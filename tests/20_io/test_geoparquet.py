@@ -148,7 +148,7 @@ def test_attributes_that_python_cannot_hold_stop_nothing(tmp_path):
     assert [row["year"] for row in read_footprints(path, reference()).attributes] == [1, 2]
 
 
-def test_rows_without_geometry_are_told_one_by_one(tmp_path):
+def test_rows_without_geometry_are_reported_one_by_one(tmp_path):
     broken = pa.array([shapely.to_wkb(HOUSES[0]), None, b"\x01\x02", shapely.to_wkb(shapely.Point(1, 2))], pa.binary())
     path = by_hand(tmp_path / "a.parquet", {"id": ["a", "b", "c", "d"], "geometry": broken}, encoding="WKB", crs=None)
     found = read_footprints(path, reference())
@@ -160,7 +160,7 @@ def test_rows_without_geometry_are_told_one_by_one(tmp_path):
     ]
 
 
-def test_rows_without_geometry_in_nested_lists_are_told_too(tmp_path):
+def test_rows_without_geometry_in_nested_lists_are_reported_too(tmp_path):
     frame([HOUSES[0], None, RING], id=["a", "b", "c"]).to_parquet(tmp_path / "a.parquet", geometry_encoding="geoarrow")
     found = read_footprints(tmp_path / "a.parquet", reference())
     assert found.ids == ("a", "c")

@@ -64,7 +64,7 @@ def test_points_in_a_text_file_are_points(folder):
     assert names(find_inputs([folder / "points.txt", folder / "table.csv"])) == ["points.txt", "table.csv"]
 
 
-def test_a_line_that_names_no_point_file_is_told(folder):
+def test_a_line_that_names_no_point_file_is_reported(folder):
     (folder / "tiles.txt").write_text("a.laz\nreadme.html\n")
     with pytest.raises(UnreadableInputError, match=r"tiles\.txt: the line 'readme\.html' names no point file"):
         find_inputs([folder / "tiles.txt"])
@@ -149,7 +149,7 @@ def test_an_object_that_is_named_like_a_pattern_is_a_file(bucket):
     assert find_inputs([f"{bucket}/tile[1].laz"]) == [f"{bucket}/tile[1].laz"]
 
 
-def test_what_is_not_in_a_bucket_is_told(bucket):
+def test_what_is_not_in_a_bucket_is_reported(bucket):
     put(f"{bucket}/t/notes.txt", b"no points\n")
     for entry, reported in (
         (f"{bucket}/t/missing.laz", "there is no such thing"),
@@ -188,7 +188,7 @@ def test_an_index_of_a_web_server_names_its_neighbours(s3, bucket):
     )
 
 
-def test_a_broken_index_is_told_by_its_name(folder):
+def test_a_broken_index_is_reported_by_its_name(folder):
     (folder / "index.geojson").write_text(json.dumps({"type": "FeatureCollection"})[:-4])
     with pytest.raises(UnreadableInputError, match=r"index\.geojson: cannot be read as vector data"):
         find_inputs([folder / "index.geojson"])

@@ -110,7 +110,7 @@ def test_feet_become_metres_in_plan_and_elevation_apart(tmp_path, points, write_
     np.testing.assert_allclose(in_metres_up, xyz * [0.3048, 0.3048, 1.0], atol=1e-6)
 
 
-def test_header_bounds_that_cannot_be_are_measured_and_told(tmp_path, points, write_las):
+def test_header_bounds_that_cannot_be_are_measured_and_reported(tmp_path, points, write_las):
     xyz = points(500)
     for suffix in (".las", ".laz"):
         path = write_las(tmp_path / f"a{suffix}", xyz)
@@ -122,7 +122,7 @@ def test_header_bounds_that_cannot_be_are_measured_and_told(tmp_path, points, wr
         assert any("bounds" in warning for warning in info.warnings)
 
 
-def test_points_beyond_the_header_bounds_are_used_and_told(tmp_path, points, write_las):
+def test_points_beyond_the_header_bounds_are_used_and_reported(tmp_path, points, write_las):
     xyz = points(500)
     path = write_las(tmp_path / "a.las", xyz)
     raw = bytearray(path.read_bytes())

@@ -70,14 +70,14 @@ def test_an_upload_of_a_file_is_made_again(storage, s3):
     assert s3.count(method="PUT") == 3
 
 
-def test_after_the_last_attempt_the_key_the_cause_and_the_fix_are_told(storage, s3):
+def test_after_the_last_attempt_the_key_the_cause_and_the_fix_are_reported(storage, s3):
     s3.script = lambda _: "busy"
     with pytest.raises(RunError, match=r"run/state/a\.json cannot be written: the server is busy at all of 4 attempts"):
         storage.put("state/a.json", b"")
     assert len(s3.seen) == 4
 
 
-def test_what_is_not_allowed_is_told_at_once(storage, s3):
+def test_what_is_not_allowed_is_reported_at_once(storage, s3):
     s3.script = lambda _: "denied"
     with pytest.raises(RunError, match=r"run\.json cannot be written: access is denied .*Check the credentials"):
         storage.put("run.json", b"")
@@ -91,7 +91,7 @@ def test_a_fault_is_not_taken_for_an_absence(storage, s3):
             ask()
 
 
-def test_a_bucket_that_is_not_there_is_told(s3):
+def test_a_bucket_that_is_not_there_is_reported(s3):
     storage = storage_at("s3://no-such-bucket/run")
     for ask in (storage.names, storage.keys, lambda: storage.put("a", b""), lambda: storage.has("a")):
         with pytest.raises(RunError, match="there is no such bucket"):

@@ -89,7 +89,7 @@ def test_return_fields_and_times_are_used(tmp_path):
     assert source.info.has_gps_time
 
 
-def test_single_precision_that_is_too_coarse_is_told(tmp_path):
+def test_single_precision_that_is_too_coarse_is_reported(tmp_path):
     dtype = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
     rows = np.array([(513_000, 5_402_000, 300), (513_010, 5_402_010, 310)], dtype=dtype)
     head = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n"

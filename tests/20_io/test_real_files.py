@@ -55,7 +55,7 @@ def test_every_real_file_is_read_to_its_last_point(shared_data):
         assert sum(map(len, source.chunks(200_000))) == source.info.point_count, path
 
 
-def test_the_oregon_survey_is_in_feet_both_ways_and_told(shared_data):
+def test_the_oregon_survey_is_in_feet_both_ways_and_reported(shared_data):
     info = open_source(shared_data / "oregon" / "autzen_trim.las").info
     assert info.reference.wkt is not None
     assert any("no vertical unit" in warning and "0.3048 m" in warning for warning in info.warnings)

@@ -26,7 +26,7 @@ class Site:
     def __init__(self) -> None:
         self.content = CONTENT
         self.ranges = True
-        self.tells_size = True
+        self.says_size = True
         self.faults: list[int] = []
         self.etag = '"1"'
         self.asked: list[tuple[str, str | None]] = []
@@ -55,7 +55,7 @@ class Site:
                     body, status = body[first : last + 1], 206
                 self.send_response(status)
                 self.send_header("ETag", site.etag)
-                if site.tells_size:
+                if site.says_size:
                     self.send_header("Content-Length", str(len(body)))
                     self.send_header("Accept-Ranges", "bytes" if site.ranges else "none")
                 else:
@@ -94,7 +94,7 @@ def test_a_part_is_read_without_the_rest(site):
     assert all(asked is not None for asked in ranges)
 
 
-def test_whoever_reads_on_reads_larger_pieces_and_each_byte_once(site):
+def test_anyone_who_reads_on_reads_larger_pieces_and_each_byte_once(site):
     with file_at(site.url).open("rb") as stream:
         parts = list(iter(lambda: stream.read(10_000), b""))
     assert b"".join(parts) == CONTENT
@@ -112,9 +112,9 @@ def test_memory_is_bounded_however_much_is_read(site):
             assert sum(map(len, file._blocks.values())) <= BLOCKS_KEPT * BLOCK_BYTES
 
 
-@pytest.mark.parametrize(("ranges", "tells_size"), [(True, True), (False, True), (False, False)])
-def test_a_file_is_fetched_from_servers_that_know_ranges_and_others(site, tmp_path, ranges, tells_size):
-    site.ranges, site.tells_size = ranges, tells_size
+@pytest.mark.parametrize(("ranges", "says_size"), [(True, True), (False, True), (False, False)])
+def test_a_file_is_fetched_from_servers_that_know_ranges_and_others(site, tmp_path, ranges, says_size):
+    site.ranges, site.says_size = ranges, says_size
     file = RemoteFile(site.url, QUICK)
     file.fetch(tmp_path / "copy")
     assert (tmp_path / "copy").read_bytes() == CONTENT
@@ -141,7 +141,7 @@ def test_attempts_do_not_multiply_where_ranges_are_not_known(site):
     assert len(site.asked) <= 2 * QUICK.attempts
 
 
-def test_what_cannot_be_fetched_is_told_by_url_status_and_fix_without_its_secrets(site):
+def test_what_cannot_be_fetched_is_reported_by_url_status_and_fix_without_its_secrets(site):
     site.faults = [404] * 9
     with pytest.raises(UnreadableInputError, match=r"a\.laz\?query-.*: cannot be fetched: .*404.*Check the name"):
         RemoteFile(f"{site.url}?token=hidden", QUICK).stat()
@@ -152,7 +152,7 @@ def test_what_cannot_be_fetched_is_told_by_url_status_and_fix_without_its_secret
     assert reported.value.__cause__ is None
 
 
-def test_a_server_that_is_not_there_is_told():
+def test_a_server_that_is_not_there_is_reported():
     with pytest.raises(UnreadableInputError, match="the connection broke at all of 3 attempts"):
         RemoteFile("http://127.0.0.1:9/a.laz", QUICK).stat()
 

@@ -10,7 +10,7 @@ from pipeline.io.retries import CODES, STATUSES, GaveUpError, RetryPolicy, cause
 
 
 class AnswerError(Exception):
-    """As botocore tells of an answer."""
+    """An answer as botocore reports it."""
 
     def __init__(self, code: str, status: int) -> None:
         self.response = {"Error": {"Code": code}, "ResponseMetadata": {"HTTPStatusCode": status}}
@@ -18,7 +18,7 @@ class AnswerError(Exception):
 
 
 class Clock:
-    """Time that passes only where somebody sleeps, or works."""
+    """Time that passes only during sleep or work."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -61,7 +61,7 @@ def test_work_that_recovers_is_done_and_was_waited_for():
     assert clock.waits == [1.0, 2.0]
 
 
-def test_the_number_of_attempts_is_bounded_and_told():
+def test_the_number_of_attempts_is_bounded_and_reported():
     gave_up, clock = attempts(RetryPolicy(attempts=3, first_wait_s=1.0), [TimeoutError("late")] * 9)
     assert gave_up.attempts == 3
     assert clock.waits == [1.0, 2.0]
@@ -75,7 +75,7 @@ def test_no_attempt_begins_when_patience_is_over():
     assert clock.now_s - 100.0 <= 130.0 + 60.0
 
 
-def test_what_another_attempt_cannot_mend_is_told_at_once():
+def test_what_another_attempt_cannot_mend_is_reported_at_once():
     for error in (AnswerError("AccessDenied", 403), FileNotFoundError("x"), ValueError("a fault of ours")):
         gave_up, clock = attempts(RetryPolicy(), [error])
         assert (gave_up.attempts, clock.waits) == (1, [])

@@ -56,7 +56,7 @@ def test_a_bbox_is_in_the_units_of_the_crs(tmp_path, points, write_las):
     assert xyz[:, 0].max() <= 84_050.0 * 0.3048 + 1e-6
 
 
-def test_all_faults_of_the_options_are_told_at_once():
+def test_all_faults_of_the_options_are_reported_at_once():
     bow_tie = Polygon([(0, 0), (1, 1), (1, 0), (0, 1)])
     with pytest.raises(SettingsError) as caught:
         ReadOptions(bbox=(1.0, 0.0, 0.0, 1.0), aoi=bow_tie, drop_classes=(7, 300))

@@ -157,14 +157,14 @@ def test_keys_that_lead_out_of_the_storage_are_refused(make, key, tmp_path):
         make(tmp_path).put(key, b"")
 
 
-def test_what_is_not_there_is_told_with_its_key(storage):
+def test_what_is_not_there_is_reported_with_its_key(storage):
     with pytest.raises(RunError, match=r"a\.bin"):
         storage.get("a.bin")
     with pytest.raises(RunError, match=r"'a\.bin' is not in "):
         storage.size("a.bin")
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path):
+def test_a_folder_that_cannot_be_made_is_reported(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(RunError, match="cannot be made"):
         LocalStorage(root=tmp_path / "file").put("a/b", b"")

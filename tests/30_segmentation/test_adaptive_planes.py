@@ -94,7 +94,7 @@ def test_the_ends_of_a_hip_roof_are_planes_of_their_own(density_per_m2: float) -
 
 @pytest.mark.parametrize("noise_m", [0.03, 0.06, 0.10])
 @pytest.mark.parametrize("density_per_m2", [4.0, 40.0])
-def test_the_noise_is_told(density_per_m2: float, noise_m: float) -> None:
+def test_the_noise_is_reported(density_per_m2: float, noise_m: float) -> None:
     cosine = 1 / math.hypot(1, 0.7)
     assert detected(gable(density_per_m2, noise_m)).sigma_m == pytest.approx(noise_m * cosine, rel=0.15)
 

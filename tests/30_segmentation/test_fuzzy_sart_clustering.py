@@ -183,7 +183,7 @@ def test_a_zero_vector_is_an_outlier_and_no_vectors_give_no_clusters() -> None:
     assert nothing.templates.shape == (0, 3)
 
 
-def test_more_work_than_allowed_is_told_as_too_complex() -> None:
+def test_more_work_than_allowed_is_reported_as_too_complex() -> None:
     normals, areas = noisy_normals(1, count=500)
     with pytest.raises(BuildingError, match="clustering_work_limit is 1000") as caught:
         cluster(normals, areas, FuzzySartClusteringSettings(clustering_work_limit=1000))

@@ -280,7 +280,7 @@ def test_every_plane_has_points_and_every_label_a_plane(seed: int) -> None:
         ).tolist()
 
 
-def test_too_few_visible_points_are_told_with_their_number() -> None:
+def test_too_few_visible_points_are_reported_with_their_number() -> None:
     with pytest.raises(BuildingError, match="5 of 5 points are visible from above, min_points is 6") as caught:
         segment(candidate_of(np.array([[0.0, 0, 5], [1, 0, 5], [0, 1, 5], [1, 1, 5], [2, 2, 5]])), FuzzySartSettings())
     assert caught.value.reason is Reason.TOO_FEW_POINTS

@@ -123,7 +123,7 @@ def test_sloping_terrain_spoils_a_pent_roof_in_two_dimensions_and_not_in_three()
     assert RECIPES["3d faithful"](candidate).roof_type is RoofType.PENT
 
 
-def test_parallel_gables_are_told_apart_in_three_dimensions_alone() -> None:
+def test_parallel_gables_are_separated_in_three_dimensions_alone() -> None:
     candidate = two_gables(density=1.5)
     flat, deep = RECIPES["2d faithful"](candidate), RECIPES["3d faithful"](candidate)
     assert (flat.roof_type, len(flat.planes)) == (RoofType.GABLE, 2)
@@ -131,7 +131,7 @@ def test_parallel_gables_are_told_apart_in_three_dimensions_alone() -> None:
 
 
 @pytest.mark.parametrize("recipe", ROBUST)
-def test_region_growing_tells_parallel_gables_apart_in_any_case(recipe: str) -> None:
+def test_region_growing_says_parallel_gables_apart_in_any_case(recipe: str) -> None:
     found = RECIPES[recipe](two_gables(density=1.5))
     assert len(found.planes) == 4
     assert {round(plane.slope_deg / 35) for plane in found.planes} == {1}
@@ -250,7 +250,7 @@ def test_every_plane_has_points_and_every_label_a_plane(recipe: str, seed: int) 
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_too_few_visible_points_are_told_with_their_number(recipe: str) -> None:
+def test_too_few_visible_points_are_reported_with_their_number(recipe: str) -> None:
     with pytest.raises(BuildingError, match="3 of 3 points are visible from above, at least 4") as caught:
         RECIPES[recipe](candidate_of(np.array([[0.0, 0, 5], [1, 0, 5], [0, 1, 5]])))
     assert caught.value.reason is Reason.TOO_FEW_POINTS
@@ -306,7 +306,7 @@ def test_contradicting_settings_of_all_stages_are_named_at_once() -> None:
     assert len(caught.value.faults) == 4
 
 
-def test_the_page_of_the_methods_tells_every_setting_and_the_literal_forms() -> None:
+def test_the_page_of_the_methods_says_every_setting_and_the_literal_forms() -> None:
     page = (Path(__file__).resolve().parents[2] / "docs" / "methods" / "parameter_space.md").read_text()
     for name in ("parameter-space-2d", "parameter-space-3d"):
         fields = dataclasses.fields(METHODS[name].settings_type)

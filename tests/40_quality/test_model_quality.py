@@ -79,7 +79,7 @@ def test_a_part_of_the_roof_that_points_contradict_is_unexplained_but_no_hole() 
     assert quality.largest_hole_m < 1.0
 
 
-def test_a_hole_in_the_data_is_told_by_its_diameter_and_its_area() -> None:
+def test_a_hole_in_the_data_is_reported_by_its_diameter_and_its_area() -> None:
     points = flat_points(20, 20, 5.0)
     points = points[np.hypot(points[:, 0] - 10.0, points[:, 1] - 10.0) > 4.0]
     quality = measured(points, modelled([shapely.box(0, 0, 20, 20)], [level(5.0)]))
@@ -97,7 +97,7 @@ def test_ground_seen_through_a_hole_in_the_roof_fills_it_with_points_but_explain
     assert quality.unexplained_m2 == pytest.approx(math.pi * (4.0 - 0.75) ** 2, rel=0.15)
 
 
-def test_a_roof_away_from_all_points_tells_nothing() -> None:
+def test_a_roof_away_from_all_points_says_nothing() -> None:
     quality = measured(
         flat_points(5, 5, 5.0) + np.array([50.0, 0.0, 0.0]), modelled([shapely.box(0, 0, 5, 5)], [level(5.0)])
     )

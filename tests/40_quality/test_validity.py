@@ -139,7 +139,7 @@ def test_tolerances_decide_what_is_planar(valid_solid: Solid) -> None:
     assert check_solid(solid, ValidityTolerances(planarity_m=0.1, normals_deg=0.01)) == (204,)
 
 
-def test_tolerances_out_of_range_are_told_all_at_once() -> None:
+def test_tolerances_out_of_range_are_reported_all_at_once() -> None:
     with pytest.raises(SettingsError, match=r"snap_m is -1.*normals_deg is 120"):
         ValidityTolerances(snap_m=-1.0, normals_deg=120.0)
 

@@ -46,7 +46,7 @@ def test_thirty_points_tell_a_hip_roof_with_its_ridge(seed: int) -> None:
     assert sum(face.polygon.area for face in result.faces) == pytest.approx(HOUSE.area, rel=1e-3)
 
 
-def test_the_record_tells_by_how_much_the_template_was_better() -> None:
+def test_the_record_says_by_how_much_the_template_was_better() -> None:
     assert modelled(candidate(hip_points(30))).quality.bic_margin > 0.0
 
 

@@ -106,7 +106,7 @@ def test_two_buildings_of_one_candidate_are_two_solids() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 3, 9])
-def test_too_few_points_are_told(n: int) -> None:
+def test_too_few_points_are_reported(n: int) -> None:
     points = np.column_stack((np.arange(n), np.arange(n) ** 2, np.full(n, 5.0)))
     result = reconstruct_building(candidate(points), "fuzzy-sart", DEFAULTS)
     assert (result.status, result.reason, result.lod) == (Status.FAILED, Reason.TOO_FEW_POINTS, "")
@@ -171,7 +171,7 @@ def test_nothing_invalid_is_delivered_even_where_no_block_passes(monkeypatch: py
     assert (result.status, result.reason, result.solids) == (Status.FAILED, Reason.NO_FOOTPRINT, ())
 
 
-def test_an_unexpected_error_is_told_with_its_place(
+def test_an_unexpected_error_is_reported_with_its_place(
     stub: Install,
 ) -> None:
     def break_down(c: Any) -> Segmentation:
@@ -227,7 +227,7 @@ def test_a_steep_plane_that_dips_under_the_floor_becomes_level(
     assert result.solids[0].vertices[:, 2].min() == 0.0
 
 
-def test_an_empty_footprint_is_told() -> None:
+def test_an_empty_footprint_is_reported() -> None:
     result = reconstruct_building(gable(footprint=shapely.Polygon()), "fuzzy-sart", DEFAULTS)
     assert (result.status, result.reason) == (Status.FAILED, Reason.NO_FOOTPRINT)
 
@@ -240,7 +240,7 @@ def test_a_footprint_away_from_the_points_gives_a_record() -> None:
 
 
 @pytest.mark.parametrize("method", ["arrangement", "fuzzy-sart", "parameter-space-2d", "parameter-space-3d", "kmeans"])
-def test_a_part_of_a_footprint_without_points_is_left_out_and_its_share_told(method: str) -> None:
+def test_a_part_of_a_footprint_without_points_is_left_out_and_its_share_reported(method: str) -> None:
     house, empty = shapely.box(0, 0, 12, 8), shapely.box(30, 0, 36, 8)
     whole, part = (
         reconstruct_building(gable(footprint=given), method, DEFAULTS)

@@ -140,7 +140,7 @@ def test_a_gap_of_less_than_the_tolerance_is_none() -> None:
     assert math.isnan(within[2])
 
 
-def test_a_plan_index_tells_which_polygon_holds_a_place_parts_and_all() -> None:
+def test_a_plan_index_says_which_polygon_holds_a_place_parts_and_all() -> None:
     two_parts = shapely.MultiPolygon([shapely.box(0, 0, 1, 1), shapely.box(5, 0, 6, 1)])
     index = plan_index([two_parts, shapely.box(1, 0, 3, 1), shapely.box(2, 0, 5, 1)])
     x = np.array([0.5, 5.5, 1.0, 2.5, 4.0, 9.0])

@@ -56,11 +56,11 @@ class Glb:
 
     @property
     def place(self) -> dict[str, Any]:
-        """What the asset tells of its place."""
+        """The place stored in the asset."""
         return self.document["asset"]["extras"]
 
     def crs_coordinates(self, node: Node, xyz: np.ndarray) -> np.ndarray:
-        """Points of a node as easting, northing, elevation in the CRS's units, as `axes` tells."""
+        """Points of a node as easting, northing, elevation in the CRS's units, as `axes` says."""
         x, y, z = np.moveaxis(xyz + node.translation, -1, 0)
         east, north, up = self.place["origin_m"]
         plan, vertical = self.place["horizontal_unit_m"], self.place["vertical_unit_m"]
@@ -129,7 +129,7 @@ def _tree(document: dict[str, Any]) -> set[int]:
 
 
 def _accessor(accessor: dict[str, Any], views: list[dict[str, Any]], binary: bytes) -> np.ndarray:
-    """The values of an accessor (3.6.2): aligned, inside its view, within its told bounds."""
+    """The values of an accessor (3.6.2): aligned, inside its view, within its stated bounds."""
     view, width = views[accessor["bufferView"]], WIDTHS[accessor["type"]]
     kind = np.dtype(COMPONENTS[accessor["componentType"]])
     stride = view.get("byteStride", width * kind.itemsize)

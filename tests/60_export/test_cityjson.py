@@ -159,7 +159,7 @@ def test_attributes_are_the_record_without_what_is_unknown(contexts: Contexts) -
     assert "ridge_z" not in by_id["failed"]
 
 
-def test_the_reference_system_is_told_where_it_is_known(contexts: Contexts) -> None:
+def test_the_reference_system_is_reported_where_it_is_known(contexts: Contexts) -> None:
     codes = {"compound": "7415", "feet and metres": "2992", "US feet": "2225"}
     for crs, code in codes.items():
         system = sequence(contexts[crs])[0]["metadata"]["referenceSystem"]

@@ -78,7 +78,7 @@ def test_the_validator_would_find_a_fault(contexts: Contexts, rejected_objects: 
 
 
 @pytest.mark.parametrize("table", list(SCHEMAS))
-def test_an_unknown_crs_is_told_as_null_and_a_known_one_as_projjson(
+def test_an_unknown_crs_is_reported_as_null_and_a_known_one_as_projjson(
     contexts: Contexts, rejected_objects: RejectedObjects, table: str
 ) -> None:
     for crs in CRSES:

@@ -1,4 +1,4 @@
-"""GLB files, read by an independent reader: whole by the rules, closed, oriented, placed to the millimetre, told."""
+"""GLB files, read by an independent reader: whole by the rules, closed, oriented, placed to the millimetre."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_roofs_look_up_the_ground_looks_down_and_walls_stand_upright(glb: Glb) -
 
 
 @pytest.mark.parametrize("crs", CRSES)
-def test_the_told_origin_leads_back_to_the_coordinates_of_the_crs(contexts: Contexts, crs: str) -> None:
+def test_the_reported_origin_leads_back_to_the_coordinates_of_the_crs(contexts: Contexts, crs: str) -> None:
     results = [build() for build in BUILT]
     reference = contexts[crs].reference
     units = [reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m]
@@ -144,7 +144,7 @@ def test_a_node_a_building_holds_its_record_and_a_primitive_its_part(contexts: C
     assert [glb.nodes[name].extras["lod"] for name in ("gable", "courtyard")] == ["2.2", "1.2"]
 
 
-def test_roof_planes_are_told_a_vertex_and_nothing_else_has_one(glb: Glb) -> None:
+def test_roof_planes_are_reported_a_vertex_and_nothing_else_has_one(glb: Glb) -> None:
     planes = {}
     for primitive in glb.nodes["two_parts"].primitives:
         reported = set(primitive.planes[primitive.indices].ravel().tolist())
@@ -177,7 +177,7 @@ def test_buildings_without_a_solid_are_left_out_and_without_any_there_is_no_file
     assert written([], contexts["compound"]) == b""
 
 
-def test_texts_of_any_language_are_told_as_they_are(contexts: Contexts) -> None:
+def test_texts_of_any_language_are_reported_as_they_are(contexts: Contexts) -> None:
     context = contexts["compound"]
     row = {**building_row(small.gable(), context), "source_attributes": '{"straat":"Één \\"hofje\\" 路"}'}
     data = glb_bytes(cityjson_lines([(small.gable(), row)], context.reference, "Zürich"))
@@ -207,7 +207,7 @@ def test_the_rules_would_find_a_fault(contexts: Contexts) -> None:
     with pytest.raises(AssertionError):
         read_glb(data[:-4])
     start = len(data) - len(binary)
-    with pytest.raises(AssertionError):  # a vertex beyond the told bounds
+    with pytest.raises(AssertionError):  # a vertex beyond the stated bounds
         read_glb(data[:start] + np.float32(1e3).tobytes() + data[start + 4 :])
     indices = start + document["bufferViews"][3]["byteOffset"]
     with pytest.raises(AssertionError):  # an index of no vertex
@@ -227,7 +227,7 @@ def test_a_tile_is_published_with_one_file_that_its_rows_name(tmp_path: Path, co
     assert not any(path.startswith("meshes/") for path in nothing.digests)
 
 
-def test_a_file_holds_one_level_of_detail_and_tells_it(contexts: Contexts) -> None:
+def test_a_file_holds_one_level_of_detail_and_says_it(contexts: Contexts) -> None:
     lines = lines_of([small.levelled(), small.courtyard(), small.gable()], contexts["compound"])
     volumes = {}
     for lod in (None, "1.3", "1.2"):

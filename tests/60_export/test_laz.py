@@ -127,7 +127,7 @@ def test_the_old_overlap_class_becomes_the_overlap_flag(point_format: int) -> No
     assert np.asarray(new.overlap).any()
 
 
-def test_the_header_tells_bounds_and_counts_as_laspy_would(tmp_path: Any) -> None:
+def test_the_header_says_bounds_and_counts_as_laspy_would(tmp_path: Any) -> None:
     las = full_cloud(7)
     new = written(las)
     path = tmp_path / "twin.laz"

@@ -78,7 +78,7 @@ def test_a_directory_without_manifest_is_no_run(tmp_path: Path) -> None:
         ('{"format": 1, "status": "dreaming"}', "dreaming"),
     ],
 )
-def test_a_damaged_manifest_is_told_with_what_is_wrong(tmp_path: Path, text: str, reported: str) -> None:
+def test_a_damaged_manifest_is_reported_with_what_is_wrong(tmp_path: Path, text: str, reported: str) -> None:
     (tmp_path / "run.json").write_text(text)
     with pytest.raises(RunError, match=reported):
         read_manifest(tmp_path)

@@ -57,12 +57,12 @@ def test_a_gable_in_metres_reads_as_built(contexts: Contexts) -> None:
     assert shapely.from_wkb(row["geometry"]).equals(shapely.box(85_000, 447_000, 85_010, 447_008))
 
 
-def test_the_share_of_a_given_footprint_is_told_and_null_without_one(contexts: Contexts) -> None:
+def test_the_share_of_a_given_footprint_is_reported_and_null_without_one(contexts: Contexts) -> None:
     assert building_row(small.gable(footprint_share=2.0 / 3.0), contexts["US feet"])["footprint_share"] == 0.6667
     assert building_row(small.gable(), contexts["US feet"])["footprint_share"] is None
 
 
-def test_the_quality_of_a_model_is_told_as_it_was_measured(contexts: Contexts) -> None:
+def test_the_quality_of_a_model_is_reported_as_it_was_measured(contexts: Contexts) -> None:
     row = building_row(small.gable(), contexts["US feet"])
     supported = [row[name] for name in ("point_spacing_m", "noise_m", "share_within_0_2m", "unexplained_m2")]
     assert supported == [0.48, 0.029, 0.981, 1.25]

@@ -36,7 +36,7 @@ def table_of(context: RecordContext, *builders: Builder) -> bytes:
 
 
 def solids_again(columns: dict[str, Any], units_m: tuple[float, float]) -> list[Solid]:
-    """The solids that a row tells, in metres from the origin of the small buildings."""
+    """The solids in a row, in metres from the origin of the small buildings."""
     polygons = shapely.get_parts(shapely.from_wkb(columns["solid"]))
     faces: dict[int, list[SolidFace]] = {}
     places: dict[int, dict[tuple[float, ...], int]] = {}

@@ -31,7 +31,7 @@ def files_of(folder: Path) -> dict[str, str]:
     }
 
 
-def test_a_tile_writes_the_designed_files_and_tells_their_digests(
+def test_a_tile_writes_the_designed_files_and_says_their_digests(
     tmp_path: Path, contexts: Contexts, rejected_objects: RejectedObjects
 ) -> None:
     reported = write_tile(tmp_path, "x85_y447", [build() for build in BUILT], rejected_objects, contexts["compound"])

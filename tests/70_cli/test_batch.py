@@ -49,7 +49,7 @@ def rows(text: str) -> dict[str, str]:
     return {name.strip(): value.strip() for name, value in lines}
 
 
-def test_a_batch_is_planned_run_and_told(folder: Path) -> None:
+def test_a_batch_is_planned_run_and_reported(folder: Path) -> None:
     file = folder / "city.toml"
     code, reported, _ = call("plan", file)
     assert code == 0
@@ -145,7 +145,7 @@ def test_a_batch_of_other_points_is_looked_at_again(folder: Path, tmp_path: Path
     assert estimate(batch, 1, (count, points + 1)).buildings_from.startswith("raised objects in 1 of 1")
 
 
-def test_times_are_told_before_the_first_run(folder: Path, tmp_path: Path) -> None:
+def test_times_are_reported_before_the_first_run(folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "city.toml"
     text = (folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/")
     file.write_text(text + '[schedule]\ncron = "30 2 * * *"\ntime_zone = "Europe/Amsterdam"\n')
@@ -171,7 +171,7 @@ def test_a_schedule_ends_by_signals_and_under_nohup_outlives_its_terminal(hangup
     assert len(reported) == times
 
 
-def test_a_batch_that_somebody_runs_is_refused(folder: Path, tmp_path: Path) -> None:
+def test_a_batch_that_someone_runs_is_refused(folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "city.toml"
     file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
     with locked_work(str(tmp_path / "city.work")):
@@ -264,7 +264,7 @@ def test_a_tile_that_no_worker_can_hold_is_refused(
     assert "Set a smaller tile_size_m, or give the workers more memory" in error
 
 
-def test_a_limit_that_the_largest_tile_may_exceed_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_limit_that_the_largest_tile_may_exceed_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     need = json.loads(call("plan", folder / "city.toml", "--json")[1])["worker_bytes"]
 
     def tight(**_: object) -> tuple[int, int | None]:
@@ -290,7 +290,7 @@ def test_the_disk_that_work_and_results_share_must_hold_both(
     assert "of one disk" in " ".join(error.split())
 
 
-def test_kernels_that_are_yet_to_be_compiled_are_told_with_their_time(
+def test_kernels_that_are_yet_to_be_compiled_are_reported_with_their_time(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ends = []
@@ -318,7 +318,7 @@ def test_a_window_is_planned_by_its_share(folder: Path, tmp_path: Path) -> None:
     assert part["buildings"] < whole["buildings"]
 
 
-def test_what_is_odd_in_every_input_is_told_once(folder: Path, tmp_path: Path) -> None:
+def test_what_is_odd_in_every_input_is_reported_once(folder: Path, tmp_path: Path) -> None:
     (laz,) = (folder / "tiles").glob("*.laz")
     for name in ("a.laz", "b.laz", "c.laz"):
         shutil.copy(laz, tmp_path / name)

@@ -51,7 +51,7 @@ def test_every_command_has_help(command: str) -> None:
     assert command in said
 
 
-def test_the_version_is_told() -> None:
+def test_the_version_is_reported() -> None:
     assert invoke("--version") == (0, f"{__version__}\n", "")
 
 
@@ -97,7 +97,7 @@ def test_errors_for_machines_are_json(tmp_path: Path) -> None:
     assert json.loads(said)["error"]["exit_code"] == code == 4
 
 
-def test_inspect_tells_what_a_tile_holds(tmp_path: Path) -> None:
+def test_inspect_says_what_a_tile_holds(tmp_path: Path) -> None:
     code, said, _ = invoke("inspect", str(ascii_tile(tmp_path)), "--crs", "EPSG:28992")
     assert code == 0
     assert "3600 used of 3600" in said

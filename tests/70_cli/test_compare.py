@@ -114,7 +114,7 @@ def test_bad_variants_are_refused_before_anything_is_written(scene: Path, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
-def test_a_reference_that_cannot_be_read_is_told_before_the_runs(scene: Path, tmp_path: Path) -> None:
+def test_a_reference_that_cannot_be_read_is_reported_before_the_runs(scene: Path, tmp_path: Path) -> None:
     nowhere = ("--truth", str(tmp_path / "nowhere"), "--workers", "0")
     methods = ("--methods", "fuzzy-sart,fuzzy-sart:faithful")
     code, _, reported = invoke("compare", str(scene / "suburb.laz"), *methods, "--out", str(tmp_path / "out"), *nowhere)

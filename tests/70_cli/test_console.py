@@ -73,7 +73,7 @@ def test_an_input_error_is_one_line_without_a_traceback(capsys: pytest.CaptureFi
     assert capsys.readouterr().err == "error: a.laz: has the geographic CRS EPSG:4326. Reproject it to a metric CRS\n"
 
 
-def test_all_faults_of_the_settings_are_told_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_faults_of_the_settings_are_reported_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(typer.Exit), Console():
         raise SettingsError(["vigilance is 7: use 0 to 1", "tau is -1: use 1 to 100"])
     assert capsys.readouterr().err.splitlines() == [
@@ -105,7 +105,7 @@ def test_an_exit_asked_for_passes_unchanged(capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr() == ("", "")
 
 
-def test_log_lines_of_progress_are_throttled_and_the_last_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_log_lines_of_progress_are_throttled_and_the_last_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
     console = Console(clock=clock)
     for done in range(1, 101):
@@ -152,7 +152,7 @@ def test_a_terminal_gets_bars(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "no vertical unit" in text
 
 
-def test_a_terminal_is_told_that_a_run_waits_for_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_is_reported_that_a_run_waits_for_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
     with Console() as console:

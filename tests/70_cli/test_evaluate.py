@@ -63,7 +63,7 @@ def test_the_class_of_the_points_can_be_the_reference(scene: ScenePaths) -> None
     assert not any(name.startswith(("faces.", "roof_types.")) for name in measured)
 
 
-def test_without_a_reference_only_what_was_delivered_is_told(scene: ScenePaths) -> None:
+def test_without_a_reference_only_what_was_delivered_is_reported(scene: ScenePaths) -> None:
     measured = figures(evaluated(scene.truth))
     assert {name.split(".")[0] for name in measured} == {"delivery", "validity"}
     assert measured["delivery.records_ok"] == 1.0

@@ -75,7 +75,7 @@ def test_levels_of_detail_are_written_side_by_side(
     assert "lods is '2.1': use one of 1.2, 1.3, 2.2" in said
 
 
-def test_the_stages_are_told_in_order(run: tuple[Path, Any, list[dict[str, Any]]]) -> None:
+def test_the_stages_are_reported_in_order(run: tuple[Path, Any, list[dict[str, Any]]]) -> None:
     stages = [event["stage"] for event in run[2] if event["kind"] == "stage"]
     assert stages == ["ingest", "split", "join", "outline", "reconstruct", "publish"]
 
@@ -105,7 +105,7 @@ def test_a_building_is_overridden_and_the_run_brought_in_line(
     assert invoke("rerun", out, "--workers", "0")[0] == invoke(*whole, "--overwrite")[0] == 2
 
 
-def test_digest_prints_what_the_run_told(run: tuple[Path, dict[str, Any], Any]) -> None:
+def test_digest_prints_what_the_run_reported(run: tuple[Path, dict[str, Any], Any]) -> None:
     folder, summary, _ = run
     assert invoke("digest", str(folder)) == (0, f"{summary['digest']}\n", "")
 

@@ -79,7 +79,7 @@ def test_a_name_that_is_not_known_is_exit_code_2_with_the_choices(
     assert compiled == []
 
 
-def test_all_names_that_are_not_known_are_told_at_once(compiled: list[list[Listed]]) -> None:
+def test_all_names_that_are_not_known_are_reported_at_once(compiled: list[list[Listed]]) -> None:
     reported = invoke("magic", "spells")[2]
     assert "'magic'" in reported
     assert "'spells'" in reported

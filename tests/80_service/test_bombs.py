@@ -194,7 +194,7 @@ def geopackage(path: Path, *statements: str) -> Path:
 ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT"
 
 
-def test_a_plain_geopackage_is_told_by_its_tables(tmp_path: Path) -> None:
+def test_a_plain_geopackage_is_reported_by_its_tables(tmp_path: Path) -> None:
     told = examine(geopackage(tmp_path / "a.gpkg"), max_points=MOST)
     assert (told["format"], told["featureCount"], told["layers"]) == ("geopackage", 1, ["houses"])
     assert told["crs"] == {"name": "Amersfoort / RD New", "epsg": 28992}
@@ -230,7 +230,7 @@ def test_a_geopackage_is_only_read(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
-def test_a_geopackage_with_two_layers_is_taken_and_told_to_be_unusable(tmp_path: Path) -> None:
+def test_a_geopackage_with_two_layers_is_taken_and_reported_to_be_unusable(tmp_path: Path) -> None:
     second = (
         "CREATE TABLE barns (fid INTEGER PRIMARY KEY, geom BLOB);"
         "INSERT INTO gpkg_contents VALUES ('barns', 'features', 'barns', 28992);"
@@ -535,6 +535,6 @@ def test_the_child_knows_none_of_the_services_secrets(
     assert b"GABLEWORK_" not in environment.read_bytes()
 
 
-def test_an_empty_file_is_told_to_be_empty(tmp_path: Path) -> None:
+def test_an_empty_file_is_reported_to_be_empty(tmp_path: Path) -> None:
     with pytest.raises(EmptyInputError, match="0 bytes"):
         examine(written(tmp_path, "a.laz", b""), max_points=MOST)

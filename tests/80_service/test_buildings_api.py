@@ -223,7 +223,7 @@ def test_what_means_nothing_is_refused_with_the_fix(
     assert told in refused(client, job_id, **{name: value})
 
 
-def test_all_wrong_words_are_told_at_once(client: TestClient, job_id: str) -> None:
+def test_all_wrong_words_are_reported_at_once(client: TestClient, job_id: str) -> None:
     detail = refused(client, job_id, status="fine", roof_type="onion")
     assert '"fine"' in detail
     assert '"onion"' in detail
@@ -331,7 +331,7 @@ def test_any_text_is_a_window_or_refused(text: str) -> None:
 # --- one building ----------------------------------------------------------------------------------------------------
 
 
-def test_a_building_is_told_with_all_columns_and_its_planes(client: TestClient, job_id: str) -> None:
+def test_a_building_is_reported_with_all_columns_and_its_planes(client: TestClient, job_id: str) -> None:
     answer = client.get(f"/jobs/{job_id}/buildings/{TWO_PARTS}")
     assert answer.headers["content-type"] == "application/geo+json"
     found = answer.json()
@@ -450,7 +450,7 @@ def test_a_building_is_had_in_each_level_of_detail_that_was_made(
     assert [geometry["lod"] for geometry in part["geometry"]] == ["2.2", "1.3", "1.2"]
 
 
-def test_a_glb_that_is_gone_or_another_is_told(client: TestClient, service: runs.Service) -> None:
+def test_a_glb_that_is_gone_or_another_is_reported(client: TestClient, service: runs.Service) -> None:
     job = service.finished(lambda run_dir: runs.write_run(run_dir, meshes="glb"), meshes="glb")
     (path,) = service.folder.run(job, 1).glob("meshes/x851_y4470/*.glb")
     (other,) = service.folder.run(job, 1).glob("meshes/x850_y4470/*.glb")

@@ -118,7 +118,7 @@ def test_jobs_are_listed_by_their_process(local_service) -> None:
         ({"methods": TWO, "classes": "audit", "settings": {"classes": "trust"}}, "classes is audit"),
     ],
 )
-def test_what_cannot_be_compared_is_told(local_service, inputs: dict[str, Any], words: str) -> None:
+def test_what_cannot_be_compared_is_reported(local_service, inputs: dict[str, Any], words: str) -> None:
     assert words in faults_of(execute(local_service, **inputs))
     assert local_service.client.get("/jobs").json()["jobs"] == []
 
@@ -162,7 +162,7 @@ def test_jobs_from_before_there_were_comparisons_are_read() -> None:
 # --- what a driver makes of it
 
 
-def test_a_driver_compares_and_tells_how_it_goes(bench: Bench) -> None:
+def test_a_driver_compares_and_says_how_it_goes(bench: Bench) -> None:
     job = bench.submit(COMPARISON, priority=4)
     bench.driver()
     done = bench.over(job)
@@ -304,7 +304,7 @@ def test_buildings_are_those_of_the_first_method_unless_another_is_named(client:
     assert [feature["id"] for feature in only["features"]] == [runs.ident("gable")]
 
 
-def test_one_building_is_told_by_every_method(client: TestClient, job_id: str) -> None:
+def test_one_building_is_reported_by_every_method(client: TestClient, job_id: str) -> None:
     place = f"/jobs/{job_id}/buildings/{runs.ident('gable')}"
     for label in runs.LABELS:
         found = client.get(place, params={"method": label})
@@ -320,7 +320,7 @@ def test_one_building_is_told_by_every_method(client: TestClient, job_id: str) -
     runs.problem(client.get(other, params={"method": FAITHFUL}), 404, "no-such-building")
 
 
-def test_a_method_that_was_not_compared_is_told_with_those_that_were(
+def test_a_method_that_was_not_compared_is_reported_with_those_that_were(
     service: runs.Service, client: TestClient, job_id: str
 ) -> None:
     alone = service.finished()

@@ -36,7 +36,7 @@ def finished(service) -> str:
     return job.job_id
 
 
-def test_the_stream_of_a_finished_job_tells_all_and_ends(local_service) -> None:
+def test_the_stream_of_a_finished_job_says_all_and_ends(local_service) -> None:
     job_id = finished(local_service)
     answer = local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM)
     assert answer.headers["content-type"].startswith("text/event-stream")
@@ -55,7 +55,7 @@ def test_a_broken_stream_goes_on_where_it_broke(local_service) -> None:
     assert list(parsed(rest.text)) == whole[2:]
 
 
-def test_who_knows_all_of_a_job_that_is_over_is_told_not_to_come_again(local_service) -> None:
+def test_who_knows_all_of_a_job_that_is_over_is_reported_not_to_come_again(local_service) -> None:
     job_id = finished(local_service)
     answer = local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM | {"Last-Event-ID": "999"})
     assert answer.status_code == 204

@@ -174,7 +174,7 @@ def test_a_path_with_blanks_is_replaced_by_its_name() -> None:
     assert scrub("/my state/uploads/0b") == "0b"
 
 
-def test_the_outcome_is_told_honestly() -> None:
+def test_the_outcome_is_reported_honestly() -> None:
     from pipeline.runtime.run import RunSummary
 
     summary = RunSummary(
@@ -220,7 +220,7 @@ def test_the_outcome_is_told_honestly() -> None:
         (MemoryError(), Fault.INTERNAL, "MemoryError"),
     ],
 )
-def test_every_exception_has_its_kind_and_tells_no_path_and_no_secret(
+def test_every_exception_has_its_kind_and_says_no_path_and_no_secret(
     error: Exception, fault: Fault, words: str
 ) -> None:
     told = failure_of(error, scrub=Scrubber(), reference="ab12", attempts=2)
@@ -277,7 +277,7 @@ def test_the_page_names_settings_that_exist_with_their_defaults() -> None:
         assert fields[name.lower()].default == float(value)
 
 
-def test_the_page_tells_the_shares_of_the_stages_and_every_cause() -> None:
+def test_the_page_says_the_shares_of_the_stages_and_every_cause() -> None:
     text = " ".join(PAGE.read_text().split())
     assert ", ".join(f"{stage} {weight}" for stage, weight in WEIGHTS.items()) in text
     assert {fault for fault in Fault if f"`{fault}`" in text} == set(Fault)

@@ -271,7 +271,7 @@ def test_status_has_the_fields_of_both_versions_of_the_standard(local_service) -
     assert {"self", "monitor"} <= {link["rel"] for link in told["links"]}
 
 
-def test_a_failed_job_tells_why_as_a_problem(local_service) -> None:
+def test_a_failed_job_says_why_as_a_problem(local_service) -> None:
     job = local_service.running()
     local_service.store.fail(job, JobFailure(fault=Fault.INPUT, detail="tile.laz: no points. Get it again"))
     told = local_service.client.get(f"/jobs/{job.job_id}").json()
@@ -290,23 +290,23 @@ def test_a_job_that_waits_is_dismissed_at_once(local_service) -> None:
 def test_dismissing_a_running_job_waits_until_its_driver_lets_go(local_service, monkeypatch) -> None:
     monkeypatch.setattr(jobs_routes, "DISMISSAL_S", 60.0)
     job = local_service.running()
-    told_to_stop = threading.Event()
+    reported_to_stop = threading.Event()
 
     def drive() -> None:
         while not local_service.store.renew(job, lease_s=3600.0):
-            told_to_stop.wait(0.01)
-        told_to_stop.set()
+            reported_to_stop.wait(0.01)
+        reported_to_stop.set()
         local_service.store.dismissed(job)
 
     driver = threading.Thread(target=drive)
     driver.start()
     answer = local_service.client.delete(f"/jobs/{job.job_id}")
     driver.join(60.0)
-    assert told_to_stop.is_set()
+    assert reported_to_stop.is_set()
     assert (answer.status_code, answer.json()["status"]) == (200, "dismissed")
 
 
-def test_a_driver_that_does_not_let_go_is_told_honestly(local_service, monkeypatch) -> None:
+def test_a_driver_that_does_not_let_go_is_reported_honestly(local_service, monkeypatch) -> None:
     monkeypatch.setattr(jobs_routes, "DISMISSAL_S", 0.05)
     job = local_service.running()
     answer = local_service.client.delete(f"/jobs/{job.job_id}")

@@ -53,7 +53,7 @@ def written(folder: Path, content: bytes, name: str = "a.parquet") -> Path:
 
 
 @pytest.mark.parametrize("name", ["a.parquet", "b.geoparquet", "C.PARQUET"])
-def test_a_plain_file_is_told_by_its_metadata(tmp_path: Path, name: str) -> None:
+def test_a_plain_file_is_reported_by_its_metadata(tmp_path: Path, name: str) -> None:
     told = examine(written(tmp_path, outlines(), clean_filename(name)), max_points=MOST)
     assert (told["kind"], told["format"], told["featureCount"], told["usable"]) == ("footprints", "geoparquet", 2, True)
     assert told["crs"] == {"name": "Amersfoort / RD New", "epsg": 28992}

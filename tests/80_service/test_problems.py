@@ -60,12 +60,12 @@ def test_an_error_has_its_status(error: Exception, status: int) -> None:
     assert answer_error(error, "/here").status_code == status
 
 
-def test_what_is_not_the_clients_business_is_not_told() -> None:
+def test_what_is_not_the_clients_business_is_not_reported() -> None:
     for error in (ZeroDivisionError("secret"), sql.OperationalError("secret", {}, Exception("secret"))):
         assert b"secret" not in answer_error(error, "/here").body
 
 
-def test_who_is_to_come_again_is_told_when() -> None:
+def test_who_is_to_come_again_is_reported_when() -> None:
     assert answer_error(errors.TooManyRequestsError("x", 2.4), "/").headers["retry-after"] == "3"
     assert int(answer_error(errors.StoreError("x"), "/").headers["retry-after"]) > 0
     assert answer_error(errors.UnauthorizedError("x"), "/").headers["www-authenticate"].startswith("Bearer")
@@ -104,7 +104,7 @@ def test_a_fault_of_ours_is_a_problem_document_without_a_trace(local_service, mo
     assert "secret" not in answer.text
 
 
-def test_a_request_without_a_key_is_told_how_to_send_one(local_service) -> None:
+def test_a_request_without_a_key_is_reported_how_to_send_one(local_service) -> None:
     from service.keys import Scope
 
     local_service.key(Scope.READ)
@@ -125,7 +125,7 @@ def test_open_pages_need_no_key(local_service) -> None:
         assert local_service.client.get(path).status_code == 401, path
 
 
-def test_a_client_that_asks_too_often_is_told_when_to_come_again(starting) -> None:
+def test_a_client_that_asks_too_often_is_reported_when_to_come_again(starting) -> None:
     client = starting(rate_limit="3/minute").client
     answers = [client.get(path) for path in ("/jobs", "/conformance", "/processes", "/jobs")]
     assert [answer.status_code for answer in answers] == [200, 200, 200, 429]

@@ -98,7 +98,7 @@ def test_the_list_of_processes_has_pages(local_service) -> None:
     assert local_service.client.get("/processes?limit=0").status_code == 400
 
 
-def test_an_unknown_process_is_told_with_those_that_there_are(local_service) -> None:
+def test_an_unknown_process_is_reported_with_those_that_there_are(local_service) -> None:
     for answer in (
         local_service.client.get("/processes/paint"),
         local_service.client.post("/processes/paint/execution", json={"inputs": {}}),
@@ -136,7 +136,7 @@ def test_a_job_of_an_upload_waits_as_soon_as_the_answer_is_there(local_service) 
     assert told["request"]["inputs"]["title"] == "Straße 1"
 
 
-def test_the_request_that_a_job_tells_can_be_sent_again(local_service) -> None:
+def test_the_request_that_a_job_says_can_be_sent_again(local_service) -> None:
     first = execute(
         local_service, {"tiles": {"href": f"/uploads/{local_service.upload()}"}, "crs": "EPSG:28992", "priority": -3}
     ).json()
@@ -173,7 +173,7 @@ def test_footprints_by_value_are_geojson(local_service) -> None:
         assert json.loads(path.read_text()) == outlines
 
 
-def test_all_faults_of_a_request_are_told_at_once(local_service) -> None:
+def test_all_faults_of_a_request_are_reported_at_once(local_service) -> None:
     answer = execute(
         local_service,
         {
@@ -287,7 +287,7 @@ def test_a_rectangle_in_another_crs_is_refused(local_service) -> None:
         assert "bbox" in faults_of(execute(local_service, {"tiles": tile, "crs": "EPSG:28992", "bbox": box | more}))
 
 
-def test_an_upload_that_is_not_there_is_told(local_service) -> None:
+def test_an_upload_that_is_not_there_is_reported(local_service) -> None:
     answer = execute(local_service, {"tiles": {"href": f"/uploads/{'0' * 32}"}, "crs": "EPSG:28992"})
     assert answer.status_code in {400, 404}
     assert "0" * 32 in answer.json()["detail"]
@@ -314,7 +314,7 @@ def test_a_high_priority_needs_the_scope_admin(local_service) -> None:
     assert send(admin, 1) == 201
 
 
-def test_a_full_line_is_told_with_when_to_come_again(starting) -> None:
+def test_a_full_line_is_reported_with_when_to_come_again(starting) -> None:
     service = starting(max_queued=2)
     tile = {"href": f"/uploads/{service.upload()}"}
     answers = [execute(service, {"tiles": tile, "crs": "EPSG:28992"}) for _ in range(3)]

@@ -42,7 +42,7 @@ def test_an_ipv6_client_is_its_network_and_cannot_be_many() -> None:
     assert taken(limits, "2001:db8:1:3::1", 10) == 5
 
 
-def test_the_refusal_tells_the_limit_and_when_to_come_again() -> None:
+def test_the_refusal_says_the_limit_and_when_to_come_again() -> None:
     limits = limiter("1/minute")
     limits.check("a")
     with pytest.raises(TooManyRequestsError, match="more than 1 requests in 60 s") as caught:

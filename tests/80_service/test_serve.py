@@ -211,7 +211,7 @@ def test_the_embedded_cluster_has_a_worker_per_core_with_memory_for_each_unless_
     assert counts == [started]
 
 
-def test_port_0_takes_a_free_port_and_a_taken_one_is_told(tmp_path: Path) -> None:
+def test_port_0_takes_a_free_port_and_a_taken_one_is_reported(tmp_path: Path) -> None:
     from service.errors import StartUpError
 
     first, url = listen(ServiceSettings(state=tmp_path, port=0))
@@ -304,7 +304,7 @@ def test_serve_refuses_other_addresses_without_keys(tmp_path: Path) -> None:
     assert "Traceback" not in found.stderr
 
 
-def test_settings_that_cannot_be_are_told_together(tmp_path: Path) -> None:
+def test_settings_that_cannot_be_are_reported_together(tmp_path: Path) -> None:
     environment = os.environ | {"GABLEWORK_MAX_POINTS": "-1", "GABLEWORK_LEASE_S": "soon"}
     found = gablework("serve", "--state", str(tmp_path), env=environment)
     assert found.returncode == 2

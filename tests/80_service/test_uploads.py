@@ -150,7 +150,7 @@ def test_whatever_is_sent_the_name_stays_in_its_folder(stem: str, suffix: str) -
 # --- whole or not at all ---------------------------------------------------------------------------------------------
 
 
-def test_an_upload_is_stored_under_its_id_with_its_hash_and_what_its_header_tells(tmp_path: Path) -> None:
+def test_an_upload_is_stored_under_its_id_with_its_hash_and_what_its_header_says(tmp_path: Path) -> None:
     content, store = las_bytes(500), FakeTable()
     upload = take(tmp_path, content, "../x/Tile 1.laz", store=store)
     assert store.held == [upload]
@@ -215,7 +215,7 @@ def test_a_record_that_cannot_be_kept_takes_its_file_with_it(tmp_path: Path) -> 
     assert list((tmp_path / "uploads").iterdir()) == []
 
 
-def test_a_full_disk_is_told_as_such_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_as_such_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(self: object, block: bytes) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -232,7 +232,7 @@ def test_a_file_that_cannot_be_used_is_refused_by_its_name_without_its_folder(tm
     assert list((tmp_path / "uploads").iterdir()) == []
 
 
-def test_a_geographic_crs_is_taken_and_told_for_a_job_may_name_another(tmp_path: Path) -> None:
+def test_a_geographic_crs_is_taken_and_reported_for_a_job_may_name_another(tmp_path: Path) -> None:
     upload = take(tmp_path, las_bytes(10, crs="EPSG:4326"))
     assert upload.preflight["usable"] is False
     assert "is geographic" in upload.preflight["problems"][0]
@@ -397,7 +397,7 @@ def test_an_encoded_body_is_refused_for_it_could_grow(client: httpx.Client, enco
     assert "send the file as it is" in problem(answer)
 
 
-def test_a_body_without_a_name_or_with_another_ending_is_told_what_is_taken(client: httpx.Client) -> None:
+def test_a_body_without_a_name_or_with_another_ending_is_reported_what_is_taken(client: httpx.Client) -> None:
     assert "?filename=" in problem(client.post("/uploads", content=las_bytes(10)))
     answer = client.post("/uploads?filename=a.zip", content=b"PK\x03\x04")
     assert answer.status_code == 400
@@ -514,7 +514,7 @@ def test_a_path_with_dots_is_sent_as_it_is_and_finds_nothing(url: str) -> None:
         assert b"ServiceSettings" not in answer
 
 
-def test_half_a_character_in_a_request_is_refused_and_told(client: httpx.Client) -> None:
+def test_half_a_character_in_a_request_is_refused_and_reported(client: httpx.Client) -> None:
     body = b'{"inputs": {"tiles": [], "settings": {"\\ud800": 1}, "\\udfff": "\\ud800"}}'
     answer = client.post("/processes/reconstruct/execution", content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code == 400
@@ -541,7 +541,7 @@ def test_keys_see_their_own_uploads_and_an_admin_all(tmp_path: Path) -> None:
         assert client.delete(place, headers=headers["admin"]).status_code == 204
 
 
-def test_a_refused_client_is_told_before_its_body_is_stored(tmp_path: Path) -> None:
+def test_a_refused_client_is_reported_before_its_body_is_stored(tmp_path: Path) -> None:
     settings = settings_in(tmp_path)
     add_key(settings, Scope.SUBMIT)
     with serving(settings) as url:

@@ -1,4 +1,4 @@
-"""A real service and a real Chromium: the page is built where it is not, programs that are missing are told."""
+"""A real service and a real Chromium. The page is built if missing; missing programs are named."""
 
 from __future__ import annotations
 

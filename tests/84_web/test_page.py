@@ -59,8 +59,8 @@ def _finished_job(service: str, tile: Path) -> str:
         job = client.post("processes/reconstruct/execution", json={"inputs": inputs}).raise_for_status().json()["jobID"]
 
         def over() -> dict[str, Any] | None:
-            told: dict[str, Any] = client.get(f"jobs/{job}").raise_for_status().json()
-            return told if told["status"] not in {"accepted", "running"} else None
+            reported: dict[str, Any] = client.get(f"jobs/{job}").raise_for_status().json()
+            return reported if reported["status"] not in {"accepted", "running"} else None
 
         status = wait_for(over, "the end of the job", JOB_S)
         assert status["status"] == "successful", status
@@ -101,11 +101,11 @@ def test_a_dropped_tile_becomes_models_and_a_click_on_one_shows_its_record(
     record = page.locator(".record")
     expect(record.get_by_role("heading", name="Gable roof")).to_be_visible()
     building = page.url.rsplit("/", 1)[1]
-    told = httpx.get(f"{service}jobs/{job[1]}/buildings/{building}").json()["properties"]
-    assert told["roof_type"] == "gable"
+    reported = httpx.get(f"{service}jobs/{job[1]}/buildings/{building}").json()["properties"]
+    assert reported["roof_type"] == "gable"
     ridge = record.locator("dt", has_text="Ridge above floor").locator("xpath=following-sibling::dd[1]")
-    expect(ridge).to_have_text(f"{told['height_m']:.2f}\u202fm")
-    expect(record.locator("tbody tr")).to_have_count(told["n_planes"])
+    expect(ridge).to_have_text(f"{reported['height_m']:.2f}\u202fm")
+    expect(record.locator("tbody tr")).to_have_count(reported["n_planes"])
     page.screenshot(path=tmp_path / "record.png")
     assert (opened.pixels() != seen).any(axis=2).mean() > 0.0005, "the chosen building is not marked"
 
@@ -206,9 +206,9 @@ def test_a_comparison_shows_each_method_and_the_page_of_all(
     opened.wait_for_models()
     found = re.search(r"#/jobs/(\w{32})$", page.url)
     assert found is not None
-    told = httpx.get(f"{service}jobs/{found[1]}").json()
+    reported = httpx.get(f"{service}jobs/{found[1]}").json()
     labels = ["fuzzy-sart", "fuzzy-sart-faithful", "kmeans"]
-    assert (told["processID"], list(told["summary"]["runs"])) == ("compare", labels)
+    assert (reported["processID"], list(reported["summary"]["runs"])) == ("compare", labels)
 
     page.locator(".building").first.click()
     building = page.locator(".record-id").inner_text()
@@ -294,7 +294,7 @@ def test_levels_of_detail_are_chosen_for_the_job_and_in_the_view(
     expect(page.get_by_role("button", name="LoD2.2")).to_have_count(0)
 
 
-def test_a_refused_file_is_told_with_what_to_do(visit: Open, service: str, tmp_path: Path) -> None:
+def test_a_refused_file_is_reported_with_what_to_do(visit: Open, service: str, tmp_path: Path) -> None:
     broken = tmp_path / "broken.laz"
     broken.write_bytes(b"LASF" + bytes(500))
     opened = visit(service)

@@ -65,7 +65,7 @@ def test_tiles_that_are_there_are_kept(tmp_path: Path) -> None:
     assert path.stat().st_mtime_ns == written
 
 
-def test_processes_are_told_apart_by_what_they_run() -> None:
+def test_processes_are_separated_by_what_they_run() -> None:
     assert role_of("gablework-child", ["python", "-m", "pipeline.runtime.isolation.fork_server", "12"], {}, 3) == CHILD
     assert role_of("gablework-work", ["python", "-c", "from multiprocessing.forkserver import main"], {}, 3) == WORKER
     assert role_of("gablework-fork", ["python", "-c", "from multiprocessing.forkserver import main"], {}, 3) == FORKING
@@ -139,7 +139,7 @@ def small_trace() -> dict[str, object]:
     }
 
 
-def test_idle_time_is_told_by_where_it_lies() -> None:
+def test_idle_time_is_reported_by_where_it_lies() -> None:
     plan, split = stage_rows(small_trace())
     assert (plan["tasks"], plan["wall_s"], plan["idle_s"]) == (0, 1.0, 2.0)
     assert split["wall_s"] == 10.0

@@ -105,7 +105,7 @@ def test_an_entry_is_measured_once_and_ground_is_the_same_for_all_methods(tmp_pa
 
 
 @pytest.mark.slow
-def test_a_fault_of_one_entry_is_told_and_costs_no_other(tmp_path) -> None:
+def test_a_fault_of_one_entry_is_reported_and_costs_no_other(tmp_path) -> None:
     broken = Entry(name="broken", tiles=(tmp_path / "not_there.laz",))
     sound = Entry(name="cube", scene=SimulatedScene(suite="cube", seed=1000), has_page=False)
     place = Workplace(root=tmp_path / "w")

@@ -111,7 +111,7 @@ def test_the_document_holds_both_subsets_and_all_misprints() -> None:
     assert reported.count("- table ") == sum(len(misprints(table)) for table in PAPER.values()) + len(contradictions())
 
 
-def test_buildings_are_told_by_the_slope_of_their_terrain() -> None:
+def test_buildings_are_reported_by_the_slope_of_their_terrain() -> None:
     outcomes = outcomes_of({**PAPER_3D, "pent": (8, 0, 9)})
     outcomes = dataclasses.replace(
         outcomes, terrain_deg=np.where(outcomes.is_outcome("correct"), 3.0, np.where(outcomes.good, 7.0, 6.9))
@@ -128,7 +128,7 @@ def test_the_printed_tables_are_wrong_where_the_paper_is() -> None:
     assert misprints(PAPER["4-2"]) == ["gable: 8 of 157 false is 5 %, not 6 %"]
 
 
-def test_a_table_that_does_not_add_up_is_told() -> None:
+def test_a_table_that_does_not_add_up_is_reported() -> None:
     sound = {
         "gable": PrintedRow(number=4, counts=(1, 1, 2), percent=(25, 25, 50)),
         ALL: PrintedRow(number=4, counts=(1, 1, 2), percent=(25, 25, 50)),

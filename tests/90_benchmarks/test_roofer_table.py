@@ -115,7 +115,7 @@ def test_a_full_share_keeps_all_points_and_different_places_have_different_hashe
         assert (place_hash(moved) != place_hash(places)).all()
 
 
-def test_a_thinned_file_has_the_same_points_with_all_that_is_told_of_them(tmp_path) -> None:
+def test_a_thinned_file_has_the_same_points_with_all_that_is_reported_of_them(tmp_path) -> None:
     places = survey(tmp_path / "a.laz")
     (written,) = write_changed([tmp_path / "a.laz"], tmp_path / "thin", thinned(0.3))
     whole, thin = laspy.read(tmp_path / "a.laz"), laspy.read(written)
@@ -196,7 +196,7 @@ print("nothing to read")
 """
 
 
-def test_the_report_of_val3dity_tells_the_valid_features() -> None:
+def test_the_report_of_val3dity_says_the_valid_features() -> None:
     assert valid_features(REPORT) == {"a"}
     with pytest.raises(RuntimeError, match="901"):
         valid_features({**REPORT, "dataset_errors": [{"code": 901}]})
@@ -257,7 +257,7 @@ def test_the_page_has_a_part_for_the_table_of_every_survey() -> None:
     assert re.findall(r"<!-- begin (\S+) -->", page) == re.findall(r"<!-- end (\S+) -->", page) == wanted
 
 
-def test_a_run_that_fails_is_told_with_its_message(tmp_path) -> None:
+def test_a_run_that_fails_is_reported_with_its_message(tmp_path) -> None:
     entry = Entry(name="missing", tiles=(tmp_path / "not_there.laz",))
     with pytest.raises(RuntimeError, match="no such file"):
         run_survey(entry, FUZZY, tmp_path / "run")

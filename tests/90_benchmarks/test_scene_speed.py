@@ -47,7 +47,7 @@ def test_the_profile_names_the_kernels(suburb: Path, tmp_path: Path) -> None:
     assert "ingest.py" in reported
 
 
-def test_a_tile_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_tile_that_is_not_there_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["clock", "--out", str(tmp_path), "--data", str(tmp_path), "--tile", "none.laz"]) == 1
     assert "none.laz is not there" in capsys.readouterr().err
 

@@ -165,7 +165,7 @@ def test_scenes_have_names_of_their_own_and_strangers_are_named() -> None:
         list(scenes_named(["atlantis"]))
 
 
-def test_absent_data_are_told_and_nothing_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_absent_data_are_reported_and_nothing_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["real", "--out", str(tmp_path), "--data", str(tmp_path / "nowhere"), "--tiles", "hdf"]) == 1
     assert "hdf: ign/hdf_870000_6617100.laz is not in" in capsys.readouterr().err
 

@@ -15,7 +15,7 @@ from benchmarks.sweep_limits import (
     draw,
     held_ranges,
     noise_table,
-    told_ranges,
+    reported_ranges,
 )
 
 DENSITIES = [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 50.0]
@@ -43,8 +43,8 @@ def test_a_level_that_is_met_exactly_at_a_cell_is_held_there() -> None:
 
 
 def test_one_cell_alone_is_always_or_never() -> None:
-    assert told_ranges(held_ranges([4.0], [0.9], 0.8, logarithmic=True)) == "always"
-    assert told_ranges(held_ranges([4.0], [0.7], 0.8, logarithmic=True)) == "never"
+    assert reported_ranges(held_ranges([4.0], [0.9], 0.8, logarithmic=True)) == "always"
+    assert reported_ranges(held_ranges([4.0], [0.7], 0.8, logarithmic=True)) == "never"
 
 
 @pytest.mark.parametrize(
@@ -58,8 +58,8 @@ def test_one_cell_alone_is_always_or_never() -> None:
         ([0.9, 0.8, 0.9], "always"),
     ],
 )
-def test_limits_are_told_in_words(qualities: list[float], reported: str) -> None:
-    assert told_ranges(held_ranges(NOISES, qualities, 0.8, logarithmic=False)) == reported
+def test_limits_are_reported_in_words(qualities: list[float], reported: str) -> None:
+    assert reported_ranges(held_ranges(NOISES, qualities, 0.8, logarithmic=False)) == reported
 
 
 def test_the_tables_have_a_row_a_method_and_each_its_own_cells() -> None:
