@@ -121,7 +121,7 @@ def test_the_page_lists_every_outcome_and_policy_with_the_defaults_of_the_code(p
 
 
 def test_the_expressions_of_the_page_do_what_it_says(page: str) -> None:
-    table = page.split("goes as in Debian's cron:")[1].split("So a nightly run", maxsplit=1)[0]
+    table = page.split("rules are those of Debian's cron:")[1].split("A nightly run therefore", maxsplit=1)[0]
     rows = re.findall(r"^\| `([^`]+)`[^|]* \| ([^|]+) \| ([^|]+) \|$", table, re.MULTILINE)
 
     def night(expression: str, day: int, month: int) -> list[str]:
