@@ -40,7 +40,7 @@ FETCH_S = 3600.0
 PIECE_BYTES = 1 << 18
 
 Cancel = Callable[[], bool]
-"""Whether the job was called off."""
+"""Whether the job was cancelled."""
 
 
 def pause_s(attempt: int, *, status: int | None, retry_after: str | None = None) -> float | None:
@@ -117,7 +117,7 @@ def download(text: str, *, settings: ServiceSettings, target: Path, cancelled: C
     UnreadableInputError
         The server does not give it.
     RunCancelledError
-        The job was called off.
+        The job was cancelled.
     """
     url = checked_url(text, settings)
     place = target / hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -153,7 +153,7 @@ def _pause(wait_s: float, cancelled: Cancel) -> None:
 
 def _check_cancelled(cancelled: Cancel) -> None:
     if cancelled():
-        raise RunCancelledError("the job was called off while its inputs were fetched")
+        raise RunCancelledError("the job was cancelled while its inputs were fetched")
 
 
 def _try(client: httpx.Client, url: httpx.URL, path: Path, settings: ServiceSettings, cancelled: Cancel) -> str:

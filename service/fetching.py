@@ -230,7 +230,7 @@ def materialise(
     InputError
         It cannot be fetched or read.
     RunCancelledError
-        The job was called off.
+        The job was cancelled.
     """
     digest = None
     if reference.kind == "upload":

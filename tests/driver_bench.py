@@ -137,14 +137,14 @@ class Script:
         self.steps.append(step)
 
     def waits(self, on_event: Event | None = None) -> None:
-        """The next run goes on until the test says so, or until it is called off."""
+        """The next run goes on until the test says so, or until it is cancelled."""
 
         def step(request: Any, tell: Callable[[Event], None], cancelled: Callable[[], bool]) -> None:
             if on_event is not None:
                 tell(on_event)
             while not self.go_on.wait(0.01):
                 if cancelled():
-                    raise RunCancelledError("the run was called off")
+                    raise RunCancelledError("the run was cancelled")
 
         self.steps.append(step)
 

@@ -267,4 +267,4 @@ def compare_request(
 
 def _check(held: LeasedJob) -> None:
     if held.cancelled():
-        raise RunCancelledError("the job was called off")
+        raise RunCancelledError("the job was cancelled")

@@ -45,7 +45,7 @@ class Attempts:
         with held:
             try:
                 if held.cancelled():
-                    raise RunCancelledError("the job was called off")  # noqa: TRY301
+                    raise RunCancelledError("the job was cancelled")  # noqa: TRY301
                 message, summary = perform(held, self._shop)
             except BaseException as error:  # noqa: BLE001 - whatever ends an attempt must become the job's end
                 self._end_early(held, error)
@@ -65,7 +65,7 @@ class Attempts:
         """Write the outcome of an attempt that did not succeed: dismissed, given back, tried again or failed."""
         job, reason = held.job, held.stopped_for
         if reason is not None:
-            level = "called off" if isinstance(error, RunCancelledError) else f"ended with {type(error).__name__}"
+            level = "cancelled" if isinstance(error, RunCancelledError) else f"ended with {type(error).__name__}"
             LOG.info("the attempt was %s: %s", level, reason.name.lower(), extra=held.facts)
         if reason is Stop.DISMISSED:
             self._forget(held, whole=True)

@@ -114,7 +114,7 @@ class SharedCluster:
                 LOG.warning("the scheduler %s does not answer", self._scheduler, extra=held.facts)
                 held.record(Event(kind="waiting", message=message))
             if held.wait(_AGAIN_S) or held.cancelled():
-                raise RunCancelledError("the job was called off")
+                raise RunCancelledError("the job was cancelled")
 
 
 def answers(address: str) -> bool:

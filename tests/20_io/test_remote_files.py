@@ -184,7 +184,7 @@ def test_a_file_that_changes_once_is_fetched_again_and_one_that_never_rests_is_r
 
 def test_fetching_stops_when_the_run_is_called_off(site, tmp_path):
     def check() -> None:
-        raise InterruptedError("called off")
+        raise InterruptedError("cancelled")
 
     with pytest.raises(InterruptedError):
         RemoteFile(site.url).fetch(tmp_path / "copy", check)

@@ -87,7 +87,7 @@ def test_the_check_before_each_attempt_ends_the_work():
     def check() -> None:
         asked.append(1)
         if len(asked) == 2:
-            raise InterruptedError("called off")
+            raise InterruptedError("cancelled")
 
     def fail() -> None:
         raise TimeoutError

@@ -123,14 +123,14 @@ def test_what_the_check_raises_ends_several_puts(storage):
     def check() -> None:
         left[0] -= 1
         if left[0] < 0:
-            raise InterruptedError("called off")
+            raise InterruptedError("cancelled")
 
     def put_many() -> None:
         with storage.several(check) as puts:
             for k in range(100):
                 puts.put(str(k), b"x")
 
-    with pytest.raises(InterruptedError, match="called off"):
+    with pytest.raises(InterruptedError, match="cancelled"):
         put_many()
     assert len(storage.keys()) <= 5
 

@@ -1,4 +1,4 @@
-"""A run that is called off ends soon and leaves nothing; tasks may die half way, run twice, or come too late."""
+"""A run that is cancelled ends soon and leaves nothing; tasks may die half way, run twice, or come too late."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def results_of(folder: Path) -> dict[str, bytes]:
     return {name: content for name, content in files_below(folder).items() if name != "run.json"}
 
 
-# --- called off ------------------------------------------------------------------------------------------------------
+# --- cancelled ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("stage", STAGES)

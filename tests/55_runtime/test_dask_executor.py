@@ -180,7 +180,7 @@ def test_the_content_is_that_of_children_of_this_process(cluster: Cluster, subur
     assert (near.digest, near.statuses, near.reasons) == (far.digest, far.statuses, far.reasons)
 
 
-# --- called off ------------------------------------------------------------------------------------------------------
+# --- cancelled ------------------------------------------------------------------------------------------------------
 
 
 def test_a_cancelled_run_stops_its_tasks_and_waits_for_them(cluster: Cluster, tmp_path: Path) -> None:
@@ -193,13 +193,13 @@ def test_a_cancelled_run_stops_its_tasks_and_waits_for_them(cluster: Cluster, tm
             way = thread.submit(list, running)
             wait_for(lambda: list(tmp_path.glob("started-*")), "a task that runs")
             off.set()
-            with pytest.raises(RunCancelledError, match="called off"):
+            with pytest.raises(RunCancelledError, match="cancelled"):
                 way.result(LONG_S)
     begun = len(list(tmp_path.glob("started-*")))
     assert begun < len(tasks)
     with cluster.executor() as executor:
         assert [m.result for m in executor.map("double", chores.double, [4], Watch())] == [8]
-    assert len(list(tmp_path.glob("started-*"))) == begun, "a task of the run that was called off began later"
+    assert len(list(tmp_path.glob("started-*"))) == begun, "a task of the run that was cancelled began later"
 
 
 def test_tasks_of_a_map_that_is_closed_do_not_begin(cluster: Cluster, tmp_path: Path) -> None:

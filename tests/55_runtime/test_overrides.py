@@ -564,7 +564,7 @@ def test_the_bundle_of_a_building_that_meets_a_fault_comes_with_the_other_files_
         raise ZeroDivisionError
 
     def called_off(*_: Any) -> Any:
-        raise RunCancelledError("called off")
+        raise RunCancelledError("cancelled")
 
     with monkeypatch.context() as patch:
         patch.setattr(pipeline.reconstruct, "reconstruct_building", faulty)

@@ -167,7 +167,7 @@ def test_a_task_that_fails_logs_its_run_stage_and_tile(lines: io.StringIO) -> No
 
 
 def test_a_fault_of_the_input_has_no_traceback_and_a_run_that_is_cancelled_no_line(lines: io.StringIO) -> None:
-    for error in (RunError("disk full: make room"), RunCancelledError("called off")):
+    for error in (RunError("disk full: make room"), RunCancelledError("cancelled")):
 
         def broken(_: object, error: Exception = error) -> None:
             raise error

@@ -82,7 +82,7 @@ def test_several_jobs_run_at_once_in_one_driver(bench: Bench) -> None:
     assert {bench.over(job).status for job in jobs} == {JobStatus.SUCCESSFUL}
 
 
-# --- called off
+# --- cancelled
 
 
 def test_a_running_job_that_is_dismissed_stops_and_leaves_no_file(bench: Bench) -> None:

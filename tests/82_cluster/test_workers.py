@@ -101,7 +101,7 @@ class Bench:
         return self.programs.start(name, [*command, *options], env={"PYTHONPATH": str(CHORES)})
 
     def run(self, out: str, cancelled: Callable[[], bool] | None = None) -> RunSummary:
-        """Reconstruct the tile on the workers; called off where the test is over before."""
+        """Reconstruct the tile on the workers; cancelled where the test is over before."""
         settings = RunSettings.from_mapping({"tile_size_m": 40.0})
         request = RunRequest(
             inputs=(str(self.tile),),
@@ -224,7 +224,7 @@ def test_a_scheduler_killed_under_a_run_ends_it_with_a_clear_error(bench: Bench)
     assert not (bench.folder / "run" / "scratch").exists()
 
 
-# --- called off ------------------------------------------------------------------------------------------------------
+# --- cancelled ------------------------------------------------------------------------------------------------------
 
 
 def test_a_run_that_is_called_off_leaves_a_cluster_that_serves_the_next(bench: Bench, digest: str) -> None:

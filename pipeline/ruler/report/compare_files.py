@@ -48,7 +48,7 @@ def compare_files(
 
     def step(name: str) -> None:
         if cancelled():
-            raise RunCancelledError("the comparison was called off")
+            raise RunCancelledError("the comparison was cancelled")
         on_event(Event(kind="stage", stage=name))
 
     measured_against = None if reference is None else read_reference(reference)

@@ -224,7 +224,7 @@ class _Stage(Generic[Task, Result]):
         try:
             found = self._in_child(task)
         except RunCancelledError:
-            outcome = "called off"
+            outcome = "cancelled"
             raise
         else:
             outcome = "done" if isinstance(found, Measured) else "failed"

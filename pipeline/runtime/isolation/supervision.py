@@ -251,7 +251,7 @@ class SupervisedChild:
             if now >= cancel_at:
                 cancel_at = now + _CANCEL_TICK_S
                 if cancelled():
-                    raise RunCancelledError("the run was called off")
+                    raise RunCancelledError("the run was cancelled")
 
     def _how_it_ended(self) -> str:
         """Signal or exit code of a process whose pipe is closed."""

@@ -62,4 +62,4 @@ class Watch:
     def check_cancelled(self) -> None:
         """Raise RunCancelledError if the run was cancelled."""
         if self.cancelled():
-            raise RunCancelledError("the run was called off")
+            raise RunCancelledError("the run was cancelled")

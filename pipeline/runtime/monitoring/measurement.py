@@ -68,7 +68,7 @@ def measure(function: Callable[[Task], Result], task: Task, stage: str = "") -> 
             try:
                 result = function(task)
             except RunCancelledError:
-                outcome = "called off"
+                outcome = "cancelled"
                 raise
             except GableworkError as error:
                 LOG.error("the task failed: %s", error)

@@ -23,7 +23,7 @@ class Tallies:
         self.landed: Counter[tuple[str, str]] = Counter()
         """Tasks that came back, by stage and outcome: done, suspect (its workers died), sent again, taken back."""
         self.worked: Counter[tuple[str, str]] = Counter()
-        """Tasks run in this process, by stage and outcome: done, failed, called off."""
+        """Tasks run in this process, by stage and outcome: done, failed, cancelled."""
         self.seconds: defaultdict[str, float] = defaultdict(float)
         """Their wall-clock seconds, by stage."""
         self.busy = 0

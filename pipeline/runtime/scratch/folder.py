@@ -190,4 +190,4 @@ class Scratch:
     def check_cancelled(self) -> None:
         """Raise `RunCancelledError` in a task of a run that was cancelled."""
         if self.cancelled:
-            raise RunCancelledError("the run was called off")
+            raise RunCancelledError("the run was cancelled")

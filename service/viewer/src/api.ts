@@ -156,7 +156,7 @@ export interface UploadInfo {
 /**
  * Sends a file as it is; `onProgress` gets the share that has left this machine, 0 to 1.
  *
- * @throws Problem when it is refused, AbortError when it is called off.
+ * @throws Problem when it is refused, AbortError when it is cancelled.
  */
 export function upload(file: File, onProgress: (share: number) => void, signal: AbortSignal): Promise<UploadInfo> {
   // fetch tells no progress of what it sends
@@ -177,7 +177,7 @@ export function upload(file: File, onProgress: (share: number) => void, signal: 
       resolve({ href: serviceUrl(`uploads/${uploadID}`), preflight });
     };
     sending.onerror = () => reject(unreachable());
-    sending.onabort = () => reject(new DOMException("called off", "AbortError"));
+    sending.onabort = () => reject(new DOMException("cancelled", "AbortError"));
     signal.addEventListener("abort", () => sending.abort());
     sending.send(file);
   });

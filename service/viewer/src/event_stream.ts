@@ -50,7 +50,7 @@ export class EventStreamReader {
  *
  * EventSource would do the same, but sends no Authorization header.
  *
- * @throws Problem when the service refuses the stream for good, AbortError when called off.
+ * @throws Problem when the service refuses the stream for good, AbortError when cancelled.
  */
 export async function follow(
   path: string,
@@ -93,7 +93,7 @@ function waited(milliseconds: number, signal: AbortSignal): Promise<void> {
     const timer = setTimeout(resolve, milliseconds);
     signal.addEventListener("abort", () => {
       clearTimeout(timer);
-      reject(new DOMException("called off", "AbortError"));
+      reject(new DOMException("cancelled", "AbortError"));
     });
   });
 }

@@ -30,7 +30,7 @@ export type FromLoading =
  * The page fetches, since a worker's own requests are bound by the policy that its script was sent with.
  *
  * @returns The levels of detail that can be chosen from, coarse to fine; none where each building has one.
- * @throws Problem when they cannot be had, Error when they cannot be read, AbortError when called off.
+ * @throws Problem when they cannot be had, Error when they cannot be read, AbortError when cancelled.
  */
 export async function loadModels(
   path: string,
@@ -49,7 +49,7 @@ export async function loadModels(
         else if (!signal.aborted) onMessage(data);
       };
       worker.onerror = (event) => reject(new Error(event.message || "the reader of the models could not start"));
-      signal.addEventListener("abort", () => reject(new DOMException("called off", "AbortError")));
+      signal.addEventListener("abort", () => reject(new DOMException("cancelled", "AbortError")));
     });
     const [levels] = await Promise.all([read, send(response.body, reading, worker)]);
     return levels;
