@@ -25,7 +25,7 @@ from pipeline.errors import (
     VersionMismatchError,
 )
 from pipeline.runtime.monitoring.logs import formatter
-from service.driver.failures import failure_of, pause_s, tried_again
+from service.driver.failures import failure_of, is_tried_again, pause_s
 from service.driver.messages import Scrubber, outcome
 from service.driver.progress import WEIGHTS, WORDS, percent
 from service.errors import (
@@ -231,11 +231,11 @@ def test_every_exception_has_its_kind_and_says_no_path_and_no_secret(
 
 
 def test_only_a_lost_cluster_and_an_absent_database_are_tried_again() -> None:
-    assert tried_again(ClusterError("x"), job(), max_attempts=3)
-    assert not tried_again(ClusterError("x"), job(lost_attempts=2), max_attempts=3)
-    assert not tried_again(VersionMismatchError("x"), job(), max_attempts=3)
-    assert tried_again(StoreError("x"), job(lost_attempts=2), max_attempts=3)
-    assert not tried_again(RunError("x"), job(), max_attempts=3)
+    assert is_tried_again(ClusterError("x"), job(), max_attempts=3)
+    assert not is_tried_again(ClusterError("x"), job(lost_attempts=2), max_attempts=3)
+    assert not is_tried_again(VersionMismatchError("x"), job(), max_attempts=3)
+    assert is_tried_again(StoreError("x"), job(lost_attempts=2), max_attempts=3)
+    assert not is_tried_again(RunError("x"), job(), max_attempts=3)
 
 
 def test_pauses_grow_and_stay_bounded() -> None:
