@@ -1,4 +1,4 @@
-"""The application: the one place that binds settings, store, limits and routes."""
+"""The application: binds settings, store, limits and routes."""
 
 from __future__ import annotations
 
@@ -37,19 +37,12 @@ ROUTERS: tuple[APIRouter, ...] = (
 
 
 def create_app(settings: ServiceSettings, store: JobStore | None = None) -> FastAPI:
-    """The application.
-
-    Parameters
-    ----------
-    settings : ServiceSettings
-        All settings.
-    store : JobStore, optional
-        Where jobs are kept; by default what the settings name, migrated when the application starts.
+    """The application. By default its store is the one that the settings name, migrated at start.
 
     Raises
     ------
     StartUpError
-        At start: the address can be reached from elsewhere, and there are no keys.
+        At start: other machines can reach the address, and there are no keys.
     """
     kept = JobStore(settings.database) if store is None else store
     streams = Streams()
@@ -99,13 +92,13 @@ def start(settings: ServiceSettings, store: JobStore) -> None:
     Raises
     ------
     StartUpError
-        The address can be reached from elsewhere, and there are no keys.
+        Other machines can reach the address, and there are no keys.
     StoreError
         The database does not answer.
     """
     folder = StateFolder(settings.state)
     for path in (folder.root, folder.uploads, folder.jobs):
-        # others on this machine have no business with tiles, results and digests of keys
+        # other users of this machine must not read tiles, results and digests of keys
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
     store.migrate()
     settings.check_address(has_keys=store.has_keys())

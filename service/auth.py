@@ -1,7 +1,7 @@
-"""Who asks: from the `Authorization` header to a principal with scopes.
+"""From the `Authorization` header to a principal with scopes.
 
-Where no key was ever made, and the service listens on loopback (or was told to stay open), everybody may do
-everything. As soon as there is a key, everybody needs one; revoking the last one does not open the door again.
+If no key was ever made, and the service listens on loopback (or `open_without_keys` is set), every client may do
+everything. As soon as there is a key, every client needs one, even after the last key was revoked.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from service.keys import Key, Scope, digest_of, looks_like_key
 from service.settings import ServiceSettings
 
 TRUST_S = 2.0
-"""Seconds for which an answer of the key table is used again: a revoked key works no longer than this."""
+"""Seconds for which an answer of the key table is reused: a revoked key works for at most this time."""
 REMEMBERED = 4096
 """Most keys remembered at once."""
 FIX = "Send the header `Authorization: Bearer gw_…` with a key from `gablework keys create --name NAME`"
 
 
 class KeyTable(Protocol):
-    """What is asked of the store."""
+    """The part of the store that is used here."""
 
     def keys(self) -> list[Key]:
         """All keys that were ever made, revoked ones included."""
@@ -36,20 +36,20 @@ class KeyTable(Protocol):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Principal:
-    """Who asks, and what they may do."""
+    """The caller and its scopes."""
 
     key_id: str | None
-    """Id of the key; None where keys are not used."""
+    """Id of the key; None if keys are not used."""
     scopes: frozenset[Scope]
-    """What they may do."""
+    """The scopes."""
 
     @property
     def owner(self) -> str | None:
-        """Whose jobs and uploads they see: their own; None where they see all (admin, or no keys)."""
+        """The key whose jobs and uploads the caller sees; None for all (admin, or no keys)."""
         return None if Scope.ADMIN in self.scopes else self.key_id
 
     def require(self, scope: Scope) -> None:
-        """Let nobody pass who lacks the scope.
+        """Refuse a caller without the scope.
 
         Raises
         ------
@@ -64,7 +64,7 @@ class Principal:
 
 
 KEYLESS = Principal(key_id=None, scopes=frozenset(Scope))
-"""Whoever asks where keys are not used."""
+"""Every caller if keys are not used."""
 
 
 class _Memory:
@@ -76,7 +76,7 @@ class _Memory:
         self._has_keys: tuple[bool, float] = (False, float("-inf"))
 
     def key(self, digest: str, table: KeyTable, now_s: float) -> Key | None:
-        """The key, from memory where that is fresh."""
+        """The key, from memory if that is fresh."""
         with self._lock:
             held = self._keys.get(digest)
         if held is not None and now_s - held[1] < TRUST_S:
@@ -113,18 +113,7 @@ def _memory_of(table: KeyTable) -> _Memory:
 def authenticate(
     authorization: str | None, store: KeyTable, settings: ServiceSettings, *, now_s: float | None = None
 ) -> Principal:
-    """The principal that a request's header stands for.
-
-    Parameters
-    ----------
-    authorization : str or None
-        The header's value; None where there is none.
-    store : KeyTable
-        The job store, which keeps the keys.
-    settings : ServiceSettings
-        Whether the address can do without keys.
-    now_s : float, optional
-        Seconds of a clock that only goes forward; the machine's by default.
+    """The principal of a request, from its header (None without one). `now_s` is a monotonic time.
 
     Raises
     ------

@@ -24,19 +24,19 @@ from service.input_policy import checked_url, shown
 from service.settings import ServiceSettings
 
 ATTEMPTS = 4
-"""Times that a fetch is tried."""
+"""Attempts to fetch a file."""
 FIRST_PAUSE_S = 1.0
-"""Seconds before the second try; each further pause is four times the one before."""
+"""Seconds before the second attempt; each further pause is four times the one before."""
 LONGEST_PAUSE_S = 60.0
 PASSING = frozenset({408, 425, 429, 500, 502, 503, 504})
-"""Status codes after which another try may help."""
+"""Status codes after which another attempt may help."""
 REDIRECTS = frozenset({301, 302, 303, 307, 308})
 MAX_REDIRECTS = 3
 CONNECT_S = 10.0
 READ_S = 30.0
-"""Seconds without a byte after which a server is taken for silent."""
+"""Seconds without a byte after which a server counts as silent."""
 FETCH_S = 3600.0
-"""Seconds for one file in all, so that a server cannot hold a job by a byte now and then."""
+"""Seconds for one whole file; a slow server cannot hold a job for longer."""
 PIECE_BYTES = 1 << 18
 
 Cancel = Callable[[], bool]
@@ -44,16 +44,16 @@ Cancel = Callable[[], bool]
 
 
 def pause_s(attempt: int, *, status: int | None, retry_after: str | None = None) -> float | None:
-    """Seconds to wait after a failed try; None when another one is of no use.
+    """Seconds to wait after a failed attempt; None if another one cannot help.
 
     Parameters
     ----------
     attempt : int
-        The try that failed, from 1.
+        The attempt that failed, from 1.
     status : int or None
-        What the server answered; None where it did not.
+        Status of the answer; None without an answer.
     retry_after : str, optional
-        What it asked for; dates are not read.
+        The header; dates are not read.
 
     >>> [pause_s(attempt, status=503) for attempt in (1, 2, 3, 4)]
     [1.0, 4.0, 16.0, None]
@@ -67,7 +67,7 @@ def pause_s(attempt: int, *, status: int | None, retry_after: str | None = None)
 
 
 class _PassingError(Exception):
-    """A try that failed, and may do better next time."""
+    """An attempt that failed and may succeed next time."""
 
     def __init__(self, problem: str, status: int | None, retry_after: str | None = None) -> None:
         self.problem = problem
@@ -77,34 +77,20 @@ class _PassingError(Exception):
 
 
 def name_of(url: httpx.URL) -> str:
-    """The file's name that a URL ends in, cleaned.
+    """The file's name at the end of a URL, cleaned.
 
     Raises
     ------
     RequestError
-        It ends in none of a file that is read.
+        It does not end in the name of a file that is read.
     """
     return clean_filename(unquote(url.path.rsplit("/", 1)[-1]))
 
 
 def download(text: str, *, settings: ServiceSettings, target: Path, cancelled: Cancel) -> tuple[Path, str]:
-    """Fetch a file.
+    """Fetch a file into a folder of its own below `target`, since two URLs may end in the same name.
 
-    Parameters
-    ----------
-    text : str
-        The URL.
-    settings : ServiceSettings
-        Listed hosts, and the most bytes.
-    target : Path
-        Folder for the file; each URL has a folder of its own in it, since two may end in the same name.
-    cancelled : callable
-        Asked often.
-
-    Returns
-    -------
-    tuple of Path and str
-        The file, and its SHA-256, hexadecimal.
+    The result is the file and its SHA-256, hexadecimal; `cancelled` is called often.
 
     Raises
     ------
@@ -123,7 +109,7 @@ def download(text: str, *, settings: ServiceSettings, target: Path, cancelled: C
     place = target / hashlib.sha256(text.encode()).hexdigest()[:16]
     place.mkdir(parents=True, exist_ok=True)
     path = place / name_of(url)
-    # No proxies, cookies or .netrc of the environment: what is reached is what was checked.
+    # No proxies, cookies or .netrc of the environment: they could lead elsewhere than the checked URL.
     timeout = httpx.Timeout(READ_S, connect=CONNECT_S)
     with httpx.Client(timeout=timeout, trust_env=False, verify=httpx.create_ssl_context()) as client:
         attempt = 1
@@ -144,7 +130,7 @@ def download(text: str, *, settings: ServiceSettings, target: Path, cancelled: C
 
 
 def _pause(wait_s: float, cancelled: Cancel) -> None:
-    """Wait, and listen meanwhile."""
+    """Wait, unless the job is cancelled."""
     until_s = time.monotonic() + wait_s
     while (left_s := until_s - time.monotonic()) > 0.0:
         _check_cancelled(cancelled)
@@ -157,7 +143,7 @@ def _check_cancelled(cancelled: Cancel) -> None:
 
 
 def _try(client: httpx.Client, url: httpx.URL, path: Path, settings: ServiceSettings, cancelled: Cancel) -> str:
-    """One try: follow redirects within the list, stream the body to the file; its SHA-256."""
+    """One attempt: follow redirects within the list, stream the body to the file; its SHA-256."""
     try:
         for _ in range(MAX_REDIRECTS + 1):
             _check_cancelled(cancelled)
@@ -175,7 +161,7 @@ def _try(client: httpx.Client, url: httpx.URL, path: Path, settings: ServiceSett
 
 
 def _check_answer(url: httpx.URL, response: httpx.Response) -> None:
-    """Refuse what is no plain file."""
+    """Refuse an answer that is not a plain file."""
     status = response.status_code
     if status in PASSING:
         raise _PassingError(f"the server answers {status}", status, response.headers.get("retry-after"))
@@ -212,7 +198,7 @@ def _stream_to(
 
 @contextlib.contextmanager
 def _removed_on_failure(path: Path) -> Iterator[None]:
-    """Leave no half file."""
+    """Leave no partial file."""
     try:
         yield
     except BaseException:

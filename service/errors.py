@@ -10,13 +10,13 @@ ServiceError
 │   ├── TooLargeError        an upload or a body with too many bytes or points
 │   ├── NoSpaceError         the disk of the state folder is full
 │   ├── QueueFullError       too many jobs wait
-│   ├── TooManySchedulesError a key has all the schedules that it may have
+│   ├── TooManySchedulesError a key has reached its limit of schedules
 │   └── TooManyRequestsError too many requests of one client
 ├── UnauthorizedError        no key, or one that is not known
 ├── ForbiddenError           a key without the scope
-├── UploadInUseError         an upload that jobs which are not over still need
-├── ScheduleBusyError        a run was asked for while a job of the schedule is under way
-├── ChangedMeanwhileError    what is to be changed is not any more what the client saw
+├── UploadInUseError         an upload that unfinished jobs need
+├── ScheduleBusyError        a job of the schedule is under way, so it cannot be run now
+├── ChangedMeanwhileError    the record has changed since the client read it
 ├── LeaseLostError           a driver's claim on a job has passed to another
 ├── StoreError               the database does not answer, or is not migrated
 └── StartUpError             settings with which the service must not start
@@ -49,7 +49,7 @@ class NoSuchBuildingError(ServiceError):
 
 
 class NoSuchOutputError(ServiceError):
-    """The process has no such output, or the job was asked not to make it."""
+    """The process has no such output, or the request left it out."""
 
 
 class NoSuchScheduleError(ServiceError):
@@ -66,7 +66,7 @@ class RequestError(ServiceError):
     Parameters
     ----------
     faults : sequence of str
-        One sentence a fault, each naming the input, its value and what is allowed.
+        One sentence per fault with the input, its value and what is allowed.
     """
 
     def __init__(self, faults: Sequence[str]) -> None:
@@ -95,19 +95,11 @@ class QueueFullError(LimitError):
 
 
 class TooManySchedulesError(LimitError):
-    """A key has all the schedules that it may have."""
+    """A key has reached its limit of schedules."""
 
 
 class TooManyRequestsError(LimitError):
-    """Too many requests of one client.
-
-    Parameters
-    ----------
-    message : str
-        What was counted, and the limit.
-    retry_after_s : float
-        Seconds until the next request is taken.
-    """
+    """Too many requests of one client."""
 
     def __init__(self, message: str, retry_after_s: float) -> None:
         self.retry_after_s = retry_after_s
@@ -123,19 +115,11 @@ class ForbiddenError(ServiceError):
 
 
 class UploadInUseError(ServiceError):
-    """An upload that jobs which are not over still need; the message names how many."""
+    """An upload that unfinished jobs need; the message names how many."""
 
 
 class ScheduleBusyError(ServiceError):
-    """A run was asked for while a job of the schedule is under way.
-
-    Parameters
-    ----------
-    message : str
-        What runs.
-    job_id : str
-        The job that is under way.
-    """
+    """A job of the schedule is under way, so it cannot be run now."""
 
     def __init__(self, message: str, job_id: str) -> None:
         self.job_id = job_id
@@ -144,7 +128,7 @@ class ScheduleBusyError(ServiceError):
 
 
 class ChangedMeanwhileError(ServiceError):
-    """What is to be changed is not any more what the client saw; the message names both versions."""
+    """The record has changed since the client read it; the message names both versions."""
 
 
 class StoreError(ServiceError):

@@ -1,4 +1,4 @@
-"""Inputs of a job: checked when it is submitted, and again when it runs, for the world changes in between."""
+"""Inputs of a job: checked when it is submitted, and again when it runs, because they may change in between."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.vectors import VECTOR_SUFFIXES
 
 
 class UploadTable(Protocol):
-    """What is asked of the store."""
+    """The part of the store that is used here."""
 
     def upload(self, upload_id: str, *, owner: str | None = None) -> Upload:
         """One upload, with an owner only its own."""
@@ -32,7 +32,7 @@ class Fetched:
     reference: InputReference
     """As it was named."""
     path: Path
-    """Where it lies."""
+    """Its place on disk."""
     points: int
     """Points of a point cloud, by its header; 0 for footprints."""
     sha256: str | None
@@ -42,30 +42,17 @@ class Fetched:
 def resolve_inputs(
     request: JobRequest, *, store: UploadTable, folder: StateFolder, settings: ServiceSettings, owner: str | None
 ) -> None:
-    """Check the inputs of a job before it is taken.
+    """Check the inputs of a job before it is accepted.
 
-    Uploads are there, belong to the key and hold what they are named for; paths are files below a root; URLs lead to
-    listed hosts; and the points known by now are not too many.
-
-    Parameters
-    ----------
-    request : JobRequest
-        What was submitted.
-    store : UploadTable
-        The uploads.
-    folder : StateFolder
-        Their files.
-    settings : ServiceSettings
-        Roots, hosts and limits.
-    owner : str or None
-        Whose uploads may be used; None for all.
+    Uploads exist, belong to `owner` (None for any) and have the right kind; paths are files below a root; URLs lead to
+    listed hosts; and the points known so far are not too many.
 
     Raises
     ------
     RequestError
         Listing all faults.
     InputRefusedError
-        All that is wrong is that inputs are not allowed.
+        The only faults are inputs that are not allowed.
     TooLargeError
         Too many inputs or points.
     """
@@ -115,7 +102,7 @@ def _check_upload(
 
 
 def _upload_path(upload: Upload, folder: StateFolder) -> Path:
-    """The file of an upload, which is there and whole."""
+    """The file of an upload; it must be complete."""
     path = folder.upload(upload.upload_id) / upload.filename
     try:
         size = path.stat().st_size
@@ -130,13 +117,13 @@ def _check_suffix(source: InputReference, name: str, suffixes: tuple[str, ...]) 
     """Refuse points as footprints and the other way round, by the ending that decides how a file is read."""
     if not name.lower().endswith(suffixes):
         what = "point cloud" if suffixes is POINT_SUFFIXES else "file of footprints"
-        raise RequestError([f"{source.kind} {name[:80]!r} is no {what}: its name must end in {', '.join(suffixes)}"])
+        raise RequestError([f"{source.kind} {name[:80]!r} is not a {what}: its name must end in {', '.join(suffixes)}"])
 
 
 def _check_sum(points: int, settings: ServiceSettings) -> None:
     if points > settings.max_points:
         raise TooLargeError(
-            f"the inputs have {points} points together, this service takes {settings.max_points} a job: "
+            f"the inputs have {points} points together, this service takes {settings.max_points} per job: "
             "submit several jobs, or raise GABLEWORK_MAX_POINTS"
         )
 
@@ -150,32 +137,7 @@ def gather(
     target: Path,
     cancelled: Cancel,
 ) -> tuple[list[Fetched], Fetched | None]:
-    """All inputs of a job on this machine's disk, within the limits.
-
-    Parameters
-    ----------
-    request : JobRequest
-        What is to be done.
-    store : UploadTable
-        The uploads.
-    folder : StateFolder
-        Their files.
-    settings : ServiceSettings
-        Roots, hosts and limits.
-    target : Path
-        Folder for what is fetched; made when it is needed.
-    cancelled : callable
-        Asked often.
-
-    Returns
-    -------
-    tuple of list of Fetched, and Fetched or None
-        Tiles and footprints.
-
-    Raises
-    ------
-    As `materialise`.
-    """
+    """Tiles and footprints of a job on this machine's disk, within the limits; raises as `materialise`."""
     tiles, points = [], 0
     for tile in dict.fromkeys(request.tiles):
         tiles.append(
@@ -200,22 +162,9 @@ def materialise(
     target: Path,
     cancelled: Cancel,
 ) -> Fetched:
-    """One input on this machine's disk, checked again and examined.
+    """One input on this machine's disk, checked again and examined; `cancelled` is called often.
 
-    Parameters
-    ----------
-    reference : InputReference
-        What the job names. Whose upload it is was checked when the job was submitted.
-    store : UploadTable
-        The uploads.
-    folder : StateFolder
-        Their files.
-    settings : ServiceSettings
-        Roots, hosts and limits.
-    target : Path
-        Folder for what is fetched; made when it is needed.
-    cancelled : callable
-        Asked often.
+    The owner of an upload was checked when the job was submitted.
 
     Raises
     ------
@@ -240,5 +189,5 @@ def materialise(
         path = checked_path(reference.value, settings)
     else:
         path, digest = download(reference.value, settings=settings, target=target, cancelled=cancelled)
-    told = preflight(path, settings.max_points)
-    return Fetched(reference=reference, path=path, points=int(told.get("pointCount") or 0), sha256=digest)
+    facts = preflight(path, settings.max_points)
+    return Fetched(reference=reference, path=path, points=int(facts.get("pointCount") or 0), sha256=digest)

@@ -1,4 +1,4 @@
-"""Names of files that strangers give, made safe; and which endings are read."""
+"""Makes the file names of clients safe, and lists the endings that are read."""
 
 from __future__ import annotations
 
@@ -13,29 +13,24 @@ GEOJSON_SUFFIXES = (".geojson", ".json")
 PARQUET_SUFFIXES = (".parquet", ".geoparquet")
 """Endings of GeoParquet."""
 FOOTPRINT_SUFFIXES = (".gpkg", *GEOJSON_SUFFIXES, *PARQUET_SUFFIXES)
-"""Endings of footprints in one file; a Shapefile is several, and is taken by path only."""
+"""Endings of footprints in one file; a Shapefile is several files and is accepted by path only."""
 SUFFIXES = (*POINT_SUFFIXES, *FOOTPRINT_SUFFIXES)
-"""Endings of the files that are taken."""
+"""Endings of the files that are accepted."""
 NAME_LIMIT = 120
 """Bytes of a file's name; a longer one loses the end of its stem, not its ending."""
 DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
-"""Names that Windows keeps for itself, with any ending."""
+"""Names that Windows reserves, with any ending."""
 FORBIDDEN = re.compile(r'[<>:"|?*]')
-"""What Windows takes in no name."""
+"""Characters that Windows allows in no name."""
 
 
 def clean_filename(name: str) -> str:
-    r"""A name that is a file's own on every system: no path, no control characters, not too long.
-
-    Parameters
-    ----------
-    name : str
-        As the client sent it.
+    r"""A name that is safe on every system: no path, no control characters, not too long.
 
     Raises
     ------
     RequestError
-        Nothing is left, or the ending is none of a format that is read.
+        Nothing is left, or the ending does not belong to a format that is read.
 
     >>> clean_filename("../../etc/passwd.laz")
     'passwd.laz'

@@ -1,8 +1,8 @@
-"""What stands before all routes: who may address the service, how large a body may be, what browsers may do with it.
+"""Checks before all routes: the host and origin of a request, and the size of its body; headers for browsers.
 
-A service on loopback without keys trusts whoever reaches it. A web page that a browser on the same machine shows must
-not: so the `Host` must be one of ours (else a page could name this address as its own, "DNS rebinding"), and what
-changes anything must not come from another origin.
+A service on loopback without keys trusts every client that reaches it, but must not trust web pages in a browser on
+the same machine. Therefore the `Host` must be one of ours (else a page could give its own name to this address, "DNS
+rebinding"), and a request that changes anything must not come from another origin.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from service.problems import FOREIGN, KINDS, answer
 from service.settings import ServiceSettings
 
 STREAMED = frozenset({("POST", "/jobs"), ("POST", "/uploads")})
-"""Where files come in: their routes count for themselves."""
+"""Requests with files: their routes count the bytes."""
 
 READING = frozenset({"GET", "HEAD", "OPTIONS"})
 """Methods that change nothing; without CORS another site cannot read their answers."""
@@ -35,20 +35,11 @@ PAGE_POLICY = (
 """Content security policy of the web page."""
 
 DATA_POLICY = "default-src 'none'; frame-ancestors 'none'"
-"""Content security policy of all else, unless its route names another: whatever a file claims to be, a browser runs
-nothing of it."""
+"""Content security policy of all else, unless its route names another: a browser runs nothing from a file."""
 
 
 class Guard:
-    """Checks every request before a route sees it; adds the headers that protect browsers.
-
-    Parameters
-    ----------
-    app : ASGI application
-        What is guarded.
-    settings : ServiceSettings
-        Address, public URL, largest body.
-    """
+    """Checks every request before a route sees it; adds the headers that protect browsers."""
 
     def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
         self.app = app
@@ -73,15 +64,15 @@ class Guard:
             await self.app(scope, receive, guarded_send)
             return
         most = self.settings.max_body_bytes
-        told = headers.get("content-length", "0")
-        if told.isdigit() and int(told) > most:
+        length = headers.get("content-length", "0")
+        if length.isdigit() and int(length) > most:
             kind = KINDS[TooLargeError]
             await answer(kind, _too_large(most), scope["path"])(scope, receive, guarded_send)
             return
         await self.app(scope, _counted(receive, most), guarded_send)
 
     def _foreign(self, method: str, scheme: str, headers: Headers) -> str | None:
-        """Why a request is refused as that of another site; None where it is not."""
+        """Why a request is refused as one from another site; None if it is accepted."""
         host = headers.get("host", "")
         if self.settings.is_loopback and _hostname(host) not in self._hosts:
             return (
@@ -104,7 +95,7 @@ class Guard:
             is_page = headers.get("content-type", "").startswith("text/html")
             headers["X-Content-Type-Options"] = "nosniff"
             headers["Referrer-Policy"] = "no-referrer"
-            # a page among the results is told less than the service's own
+            # a page among the results may do less than the service's own
             headers.setdefault("Content-Security-Policy", PAGE_POLICY if is_page else DATA_POLICY)
             headers["Cross-Origin-Resource-Policy"] = "same-origin"
         await send(message)
@@ -123,7 +114,7 @@ def _hostname(host: str) -> str:
 
 
 def _counted(receive: Receive, most: int) -> Callable[[], Awaitable[Message]]:
-    """The body as it comes, refused at the first byte too many."""
+    """The body as it arrives, refused at the first byte too many."""
     seen = 0
 
     async def counting() -> Message:
@@ -131,7 +122,7 @@ def _counted(receive: Receive, most: int) -> Callable[[], Awaitable[Message]]:
         message = await receive()
         seen += len(message.get("body", b""))
         if seen > most:
-            # an HTTPException passes the framework's parser of bodies, which makes anything else a 400
+            # the framework's parser of bodies turns every exception except HTTPException into a 400
             raise HTTPException(413, _too_large(most))
         return message
 

@@ -1,12 +1,12 @@
-"""Which paths, URLs and CRS a job may name. Pure but for looking at the path itself.
+"""Which paths, URLs and CRS a job may name. Pure, except that paths are looked up.
 
-Hosts are listed in the setting `input_hosts`, each as the origin that it stands for:
+Hosts are listed in the setting `input_hosts`, each as an origin:
 
 - `data.example.org` means `https://data.example.org`, its usual port and no other;
 - `data.example.org:8443` means https on that port;
-- `http://10.0.0.7:9000` means plain http there, for networks where that is meant.
+- `http://10.0.0.7:9000` means plain http, for networks that use it on purpose.
 
-A listed host is trusted: where its name resolves to, and what it redirects to within the list, is its business.
+A listed host is trusted, also in what its name resolves to and in its redirects within the list.
 """
 
 from __future__ import annotations
@@ -43,24 +43,17 @@ CRS_FORMS = (
 )
 """Authority and code, URN, WKT, the OGC's URI, PROJJSON, and PROJ strings without places of files."""
 CRS_FILES = re.compile(r"grids|\+init|PARAMETERFILE", re.IGNORECASE)
-"""What makes PROJ open files that a text names."""
+"""Words that make PROJ open files."""
 
 Origin = tuple[str, str, int]
 """Scheme, host in lower case, port."""
 
 
 def checked_crs(text: str, *, path: str) -> pyproj.CRS:
-    """The CRS that a stranger names.
+    """The CRS that a client names, as authority and code, URN, WKT, PROJJSON or PROJ string; `path` is for messages.
 
-    PROJ takes any text for a name and looks through its whole database for the nearest one, which stops everything
-    else meanwhile; and some texts name files to be opened. Such texts do not get there.
-
-    Parameters
-    ----------
-    text : str
-        Authority and code, URN, WKT, PROJJSON or a PROJ string.
-    path : str
-        The input, for messages.
+    PROJ takes any other text as a name and searches its whole database for the nearest one, which blocks everything
+    else; and some texts make it open files. Such texts are refused here.
 
     Raises
     ------
@@ -71,19 +64,19 @@ def checked_crs(text: str, *, path: str) -> pyproj.CRS:
     if not any(form.fullmatch(text) for form in CRS_FORMS) or CRS_FILES.search(text):
         raise CrsError(
             path,
-            f"{text[:80]!r} is no code, WKT, PROJJSON or plain PROJ string of a CRS",
+            f"{text[:80]!r} is not a code, WKT, PROJJSON or plain PROJ string of a CRS",
             "Give one such as EPSG:28992",
         )
     return parse_crs(text, path=path)
 
 
 def origin_of(entry: str) -> Origin:
-    """The origin that an entry of `input_hosts` stands for.
+    """The origin of an entry of `input_hosts`.
 
     Raises
     ------
     StartUpError
-        It is no host.
+        It is not a host.
 
     >>> origin_of("Data.Example.org")
     ('https', 'data.example.org', 443)
@@ -101,26 +94,19 @@ def origin_of(entry: str) -> Origin:
 
 
 def _origin(url: httpx.URL) -> Origin | None:
-    """The origin of a URL; None where it has no host or another scheme."""
+    """The origin of a URL; None if it has no host or another scheme."""
     if url.scheme not in PORTS or not url.host:
         return None
     return url.scheme, url.host.lower(), url.port or PORTS[url.scheme]
 
 
 def checked_url(text: str, settings: ServiceSettings) -> httpx.URL:
-    """The URL, when it leads to a listed host.
-
-    Parameters
-    ----------
-    text : str
-        As the client, or a redirect, gives it.
-    settings : ServiceSettings
-        The listed hosts.
+    """The URL, if it leads to a listed host.
 
     Raises
     ------
     InputRefusedError
-        It does not, or it is no such URL. The message does not repeat passwords or queries.
+        It does not, or it is not a URL. The message does not repeat passwords or queries.
     """
     try:
         url = httpx.URL(text) if len(text) <= LONGEST_URL and text.isprintable() else None
@@ -128,9 +114,9 @@ def checked_url(text: str, settings: ServiceSettings) -> httpx.URL:
         url = None
     origin = None if url is None else _origin(url)
     if url is None or origin is None:
-        # what stands before an @ or after a ? may be secret
-        told = text.rpartition("@")[2].partition("?")[0]
-        raise InputRefusedError(f"{told[:80]!r} is no URL that is fetched: give https://host/path")
+        # text before an @ or after a ? may be secret
+        public = text.rpartition("@")[2].partition("?")[0]
+        raise InputRefusedError(f"{public[:80]!r} is not a URL that can be fetched: give https://host/path")
     if url.userinfo:
         raise InputRefusedError(f"{shown(url)} carries a user or password: give a URL without")
     allowed = {origin_of(entry) for entry in settings.input_hosts}
@@ -144,7 +130,7 @@ def checked_url(text: str, settings: ServiceSettings) -> httpx.URL:
 
 
 def shown(url: httpx.URL) -> str:
-    """The URL without what may be secret.
+    """The URL without its secret parts.
 
     >>> shown(httpx.URL("https://me:pass@example.org/a.laz?token=1"))
     'https://example.org/a.laz'
@@ -153,9 +139,9 @@ def shown(url: httpx.URL) -> str:
 
 
 def checked_path(text: str, settings: ServiceSettings) -> Path:
-    """The path with its links resolved, when it is a file below one of the roots.
+    """The path with its links resolved, if it is a file below one of the roots.
 
-    Outside the roots nothing is told of what is there.
+    Nothing is revealed about paths outside the roots.
 
     Raises
     ------
@@ -165,7 +151,7 @@ def checked_path(text: str, settings: ServiceSettings) -> Path:
         Below a root, but not a file that can be opened.
     """
     if "\0" in text or not text.startswith("/"):
-        raise InputRefusedError(f"{text[:200]!r} is no absolute path")
+        raise InputRefusedError(f"{text[:200]!r} is not an absolute path")
     resolved = Path(os.path.realpath(text))
     roots = [Path(os.path.realpath(root)) for root in settings.input_roots]
     if not any(resolved != root and resolved.is_relative_to(root) for root in roots):
@@ -175,7 +161,7 @@ def checked_path(text: str, settings: ServiceSettings) -> Path:
             "GABLEWORK_INPUT_ROOTS"
         )
     try:
-        # Opening is the only honest test; without waiting, since a pipe would wait for its writer.
+        # only opening it shows whether it can be read; without waiting, since a pipe would wait for its writer
         handle = os.open(resolved, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError as fault:
         raise UnreadableInputError(text[:200], f"cannot be read ({fault.strerror})", "Check the path") from fault
@@ -189,7 +175,7 @@ def checked_path(text: str, settings: ServiceSettings) -> Path:
 
 
 def _check_same(text: str, handle: int, resolved: Path) -> None:
-    """Refuse a path that leads elsewhere than it did a moment ago."""
+    """Refuse a path whose target has just changed."""
     opened, now = os.fstat(handle), resolved.stat()
     if (opened.st_dev, opened.st_ino) != (now.st_dev, now.st_ino) or Path(os.path.realpath(resolved)) != resolved:
-        raise InputRefusedError(f"{text[:200]!r} changes while it is looked at")
+        raise InputRefusedError(f"{text[:200]!r} changes while it is checked")

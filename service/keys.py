@@ -1,15 +1,15 @@
-"""Keys: what a client sends to be known, and what it may do. No SQL, no HTTP; time is an argument.
+"""Keys identify clients and limit what they may do. No SQL, no HTTP; time is an argument.
 
 A key is the text `gw_` and 256 random bits. It is shown once, when it is made; only its SHA-256 is stored. (The hash
-needs no salt and need not be slow: what it hides is random, there is nothing to guess.)
+needs no salt and need not be slow, because a random key cannot be guessed.)
 
-Scopes are steps, each includes those before it:
+Each scope includes those before it:
 
 | scope | may |
 |---|---|
 | read | see the service's own pages, and its own jobs, schedules, uploads, results and events |
 | submit | also send and remove its own uploads, submit, dismiss and remove its own jobs; its own schedules |
-| admin | all of this with everybody's jobs, schedules and uploads |
+| admin | all of this with the jobs, schedules and uploads of all keys |
 
 Keys are made, listed and revoked on the machine itself (`gablework keys`), never over HTTP.
 """
@@ -25,20 +25,20 @@ import uuid
 from enum import StrEnum
 
 PREFIX = "gw_"
-"""How every key starts, so that a leaked one is recognised by those who search for them."""
+"""Prefix of every key, so scanners recognise a leaked one."""
 
 _KEY = re.compile(r"gw_[A-Za-z0-9_-]{43}")
 
 
 class Scope(StrEnum):
-    """What a key may do; each includes those before it."""
+    """The permissions of a key; each includes those before it."""
 
     READ = "read"
     """See its own jobs, uploads, results and events."""
     SUBMIT = "submit"
     """Also send uploads, submit jobs, dismiss and remove its own."""
     ADMIN = "admin"
-    """All of this with everybody's."""
+    """All of this with the data of all keys."""
 
     @property
     def included(self) -> frozenset[Scope]:
@@ -53,7 +53,7 @@ class Scope(StrEnum):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Key:
-    """A key as it is stored: the key itself is not in it."""
+    """A key as it is stored, without the key itself."""
 
     key_id: str
     """32 hexadecimal digits; the owner of jobs and uploads. No secret."""
@@ -66,7 +66,7 @@ class Key:
     created_at: dt.datetime
     """With a time zone."""
     revoked_at: dt.datetime | None = None
-    """Since when it counts no more; None while it does."""
+    """When it was revoked; None if it is valid."""
 
     def __post_init__(self) -> None:
         if not self.scopes:
@@ -75,29 +75,14 @@ class Key:
 
 
 def new_key(name: str, scope: Scope, *, now: dt.datetime) -> tuple[Key, str]:
-    """Make a key.
-
-    Parameters
-    ----------
-    name : str
-        The user's words for it.
-    scope : Scope
-        The highest scope; those before it are included.
-    now : datetime
-        With a time zone.
-
-    Returns
-    -------
-    tuple of Key and str
-        What is stored, and the key itself, to be shown once.
-    """
+    """Make a key with a scope and those before it: the stored record, and the key itself, which is shown once."""
     secret = PREFIX + secrets.token_urlsafe(32)
     key = Key(key_id=uuid.uuid4().hex, name=name, digest=digest_of(secret), scopes=scope.included, created_at=now)
     return key, secret
 
 
 def digest_of(secret: str) -> str:
-    """SHA-256 of a key, hexadecimal: under what it is stored."""
+    """SHA-256 of a key, hexadecimal, as it is stored."""
     return hashlib.sha256(secret.encode()).hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""What Prometheus reads: requests, their duration, jobs by status, the oldest one's wait, schedules, event streams."""
+"""Metrics for Prometheus: requests and durations, jobs by status and longest wait, schedules, event streams."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0
 
 
 class _Jobs(Collector):
-    """Asks the store when Prometheus asks."""
+    """Counts in the store on each scrape."""
 
     def __init__(self, store: JobStore, streams: Callable[[], int]) -> None:
         self._store = store
@@ -33,7 +33,7 @@ class _Jobs(Collector):
         yield jobs
         yield GaugeMetricFamily(
             "gablework_oldest_waiting_job_seconds",
-            "Since when the job that waits longest waits; 0 where none does.",
+            "Longest wait of a job in the queue; 0 if none waits.",
             value=self._oldest_s(counts.get(JobStatus.ACCEPTED, 0)),
         )
         states, slots = self._store.schedules.counts()
@@ -41,10 +41,10 @@ class _Jobs(Collector):
         for state, count in states.items():
             schedules.add_metric([state], count)
         yield schedules
-        # a gauge: what a schedule counts goes when it is removed
+        # a gauge: the counts of a schedule are removed with it
         fates = GaugeMetricFamily(
             "gablework_schedule_slots",
-            "Slots of the schedules that are there, by what became of them.",
+            "Slots of the existing schedules, by outcome.",
             labels=["outcome"],
         )
         for outcome, count in slots.items():
@@ -62,15 +62,7 @@ class _Jobs(Collector):
 
 
 class Metrics:
-    """The figures of one application.
-
-    Parameters
-    ----------
-    store : JobStore
-        Where jobs are counted.
-    streams : callable
-        How many event streams are open.
-    """
+    """The figures of one application."""
 
     def __init__(self, store: JobStore, streams: Callable[[], int]) -> None:
         self.registry = CollectorRegistry()
@@ -94,11 +86,11 @@ class Metrics:
 
 
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
-"""Methods that are told by name; a client may send any word."""
+"""Methods that are counted by name; a client may send any word."""
 
 
 class Measured:
-    """Counts what goes through an application; by the path's template, so that ids do not become labels."""
+    """Counts requests by the template of their path, so ids do not become labels."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self.app = app

@@ -1,7 +1,7 @@
-"""Forms with files (multipart/form-data), part by part as they come in: nothing is held, nothing is spooled.
+"""Forms with files (multipart/form-data), part by part while they arrive, without temporary files.
 
 The framework's own parser writes every file to a temporary one before a route sees it; here a route passes the bytes
-on to where they belong, and stops at the first one that is too many.
+to their destination and stops at the first one too many.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from service.errors import RequestError, TooLargeError
 
 
 class Part:
-    """One part of a form; what is not read of it is passed over when the next one is asked for."""
+    """One part of a form; its unread rest is skipped when the next part is read."""
 
     def __init__(self, form: Form, headers: dict[bytes, bytes]) -> None:
         kind, options = parse_options_header(headers.get(b"content-disposition", b""))
@@ -28,10 +28,10 @@ class Part:
         """Name of the field."""
         filename = options.get(b"filename")
         self.filename = None if filename is None else filename.decode("utf-8", "replace")
-        """As the client calls the file; None for a plain field."""
+        """The client's name of the file; None for a plain field."""
 
     async def chunks(self) -> AsyncIterator[bytes]:
-        """The content as it comes."""
+        """The content as it arrives."""
         while not self._over:
             data = await self._form.following()
             assert not isinstance(data, dict)
@@ -48,7 +48,7 @@ class Part:
         TooLargeError
             It is longer than `max_bytes`.
         RequestError
-            It is no UTF-8.
+            It is not UTF-8.
         """
         held = bytearray()
         async for chunk in self.chunks():
@@ -58,11 +58,11 @@ class Part:
         try:
             return held.decode("utf-8")
         except UnicodeDecodeError:
-            raise RequestError([f"the field {self.name[:80]!r} is no UTF-8"]) from None
+            raise RequestError([f"the field {self.name[:80]!r} is not UTF-8"]) from None
 
 
 class Form:
-    """A form that comes in.
+    """A form that arrives.
 
     Parameters
     ----------
@@ -76,15 +76,15 @@ class Form:
     Raises
     ------
     RequestError
-        The header is none of a form.
+        The header is not one of a form.
     """
 
     def __init__(self, stream: AsyncIterator[bytes], content_type: str, *, max_parts: int) -> None:
         kind, options = parse_options_header(content_type)
         boundary = options.get(b"boundary", b"")
         if kind != b"multipart/form-data" or not boundary:
-            told = f"is {content_type[:80]!r}" if content_type else "is missing"
-            raise RequestError([f"the content type {told}: send multipart/form-data with a boundary"])
+            state = f"is {content_type[:80]!r}" if content_type else "is missing"
+            raise RequestError([f"the content type {state}: send multipart/form-data with a boundary"])
         self._stream = stream
         self._max_parts = max_parts
         self._field = self._value = b""
@@ -115,10 +115,10 @@ class Form:
         Raises
         ------
         RequestError
-            The body is no form, ends too early, or has too many parts.
+            The body is not a form, ends too early, or has too many parts.
         """
         count = 0
-        # every part takes its own end: another one is that of the form
+        # each part consumes its own end, so another end is that of the form
         while isinstance(seen := await self.following(), dict):
             count += 1
             if count > self._max_parts:
@@ -134,7 +134,7 @@ class Form:
         Raises
         ------
         RequestError
-            The body is no form, or ends too early.
+            The body is not a form, or ends too early.
         """
         while not self._seen:
             if self._complete:
@@ -146,7 +146,7 @@ class Form:
                 try:
                     self._parser.write(chunk)
                 except FormParserError as error:
-                    raise RequestError([f"the body is no form: {error}"]) from error
+                    raise RequestError([f"the body is not a form: {error}"]) from error
         return self._seen.popleft()
 
     # --- what the parser calls

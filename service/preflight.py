@@ -1,8 +1,8 @@
-"""What a file is, from its header, before anybody works on it. Bombs are refused here.
+"""Examines the header of a file before any work on it, and refuses bombs.
 
-`examine` does it; `Examiner` has it done by a child process with little memory and little time, because the bytes come
-from strangers and the readers are native code. The child also keeps the readers out of the API's own process. It is
-started by the first file, serves one file after the other, and ends with its parent.
+`examine` does the work. `Examiner` runs it in a child process with limited memory and time, because the bytes come from
+strangers and the readers are native code. The child also keeps the readers out of the API's own process. It starts with
+the first file, serves one file after the other, and ends with its parent.
 """
 
 from __future__ import annotations
@@ -39,14 +39,7 @@ REFUSED = "Get the file again, or rewrite it with another tool"
 
 
 def examine(path: Path, *, max_points: int) -> dict[str, Any]:
-    """What the header tells, in this very process.
-
-    Parameters
-    ----------
-    path : Path
-        The file; its name's ending tells whether it holds points or footprints.
-    max_points : int
-        More points are refused before any is decoded.
+    """The content of a file's header, read in this process; more than `max_points` points are refused.
 
     Returns
     -------
@@ -121,29 +114,29 @@ def _examine_points(path: Path, max_points: int) -> dict[str, Any]:
 
 
 def _check_facts(path: Path, count: int, bounds: Iterable[float], max_points: int) -> None:
-    """Refuse too many points, and bounds that are no numbers."""
+    """Refuse too many points, and bounds that are not numbers."""
     _check_count(path, count, max_points)
     if not all(map(math.isfinite, bounds)):
-        raise UnreadableInputError(str(path), f"the bounds {tuple(bounds)} are no numbers", REFUSED)
+        raise UnreadableInputError(str(path), f"the bounds {tuple(bounds)} are not numbers", REFUSED)
 
 
 def _points(kind: str, count: int, **known: Any) -> dict[str, Any]:
-    """What is told of points; None for what is not known."""
+    """The facts of points; None if unknown."""
     names = ("crs", "horizontalUnitM", "verticalUnitM", "bounds", "densityPerM2", "hasReturns", "hasClasses")
-    told: dict[str, Any] = {"kind": "points", "format": kind, "pointCount": count}
-    told |= dict.fromkeys((*names, "acquiredFrom", "acquiredTo"))
-    told |= {"warnings": [], "problems": []} | known
-    return told | {"usable": not told["problems"]}
+    facts: dict[str, Any] = {"kind": "points", "format": kind, "pointCount": count}
+    facts |= dict.fromkeys((*names, "acquiredFrom", "acquiredTo"))
+    facts |= {"warnings": [], "problems": []} | known
+    return facts | {"usable": not facts["problems"]}
 
 
 def _only_counted(path: Path, name: str) -> dict[str, Any]:
-    """What is told of text and PLY that are too large to be read through beforehand."""
-    told = f"the file has no header with bounds and more than {PASS_BYTES >> 20} MiB: the job reads it through"
-    return _points(name, _count_before_reading(path, name), warnings=[told])
+    """The facts of text and PLY that are too large to be read through beforehand."""
+    warning = f"the file has no header with bounds and more than {PASS_BYTES >> 20} MiB: the job reads it through"
+    return _points(name, _count_before_reading(path, name), warnings=[warning])
 
 
 def _check_count(path: Path, count: int, max_points: int) -> None:
-    """Refuse what is too much."""
+    """Refuse too many points."""
     if count > max_points:
         raise TooLargeError(
             f"{path.name} has {count} points, this service takes {max_points}: cut it into tiles, or raise "
@@ -152,7 +145,7 @@ def _check_count(path: Path, count: int, max_points: int) -> None:
 
 
 def promised_points(path: Path) -> int | None:
-    """Points that the header of a LAS, LAZ or PLY file promises; None for text, which has none. Reads no more.
+    """The number of points in the header of a LAS, LAZ or PLY file; None for text, which has no header.
 
     Raises
     ------
@@ -164,7 +157,7 @@ def promised_points(path: Path) -> int | None:
 
 
 def _count_before_reading(path: Path, name: str) -> int:
-    """Points that the file claims, or for text the most that it can have, without parsing any."""
+    """Points by the header, or for text the largest possible number, without parsing any."""
     if name == "las":
         from pipeline.io.las_header import read_header_block
 
@@ -181,15 +174,7 @@ def _count_before_reading(path: Path, name: str) -> int:
 
 
 class Examiner:
-    """Has files examined by a child process. Any number of threads may ask; they are served in turn.
-
-    Parameters
-    ----------
-    timeout_s : float
-        Seconds for one file.
-    memory_bytes : int
-        Address space of the child.
-    """
+    """Examines files in a child process. Any number of threads may call; they are served in turn."""
 
     def __init__(self, *, timeout_s: float = CHILD_S, memory_bytes: int = CHILD_BYTES) -> None:
         self._timeout_s = timeout_s
@@ -199,7 +184,7 @@ class Examiner:
         self._served = 0
 
     def examine(self, path: Path, *, max_points: int) -> dict[str, Any]:
-        """As the function `examine`; what ends the child or takes too long is an unreadable file.
+        """As the function `examine`; a file that ends the child or takes too long is unreadable.
 
         Raises
         ------
@@ -212,12 +197,12 @@ class Examiner:
             try:
                 answer = self._ask({"path": str(path), "max_points": max_points})
             except BaseException:
-                # an answer that is still to come would be taken for that of the next file
+                # a late answer would be taken for that of the next file
                 self._end()
                 raise
-        if "told" in answer:
-            told: dict[str, Any] = answer["told"]
-            return told
+        if "facts" in answer:
+            facts: dict[str, Any] = answer["facts"]
+            return facts
         kind = _FAULTS.get(answer["kind"])
         if kind is None:
             raise TooLargeError(answer["problem"])
@@ -254,7 +239,7 @@ class Examiner:
         return _unreadable("reading its header ends the reader")
 
     def _running(self) -> subprocess.Popen[bytes]:
-        """The child, fresh where there is none or it served enough."""
+        """The child; a new one if there is none or it has served enough files."""
         if self._child is not None and (self._child.poll() is not None or self._served >= CHILD_FILES):
             self._end()
         if self._child is None:
@@ -290,7 +275,7 @@ atexit.register(_examiner.close)
 
 
 def preflight(path: Path, max_points: int) -> Mapping[str, Any]:
-    """What the header of a file tells, by this process's child; see `examine`.
+    """The content of a file's header, read by this process's child; see `examine`.
 
     Raises
     ------
@@ -316,7 +301,7 @@ def _unreadable(problem: str) -> dict[str, Any]:
 
 
 def _line_of(stream: IO[bytes], deadline_s: float) -> bytes:
-    """What the child writes up to the end of the line, or up to its own end.
+    """The child's output up to the end of the line, or to its own end.
 
     Raises
     ------
@@ -324,7 +309,7 @@ def _line_of(stream: IO[bytes], deadline_s: float) -> bytes:
         Not before the deadline.
     """
     line = bytearray()
-    # not select: it takes no file descriptor above 1023, and a service has many connections
+    # select fails for file descriptors above 1023, and a service has many connections
     poll = select.poll()
     poll.register(stream, select.POLLIN)
     while not line.endswith(b"\n"):
@@ -341,7 +326,7 @@ def _answer(request: Mapping[str, Any]) -> dict[str, Any]:
     """The child's answer to one request."""
     path = Path(request["path"])
     try:
-        return {"told": examine(path, max_points=request["max_points"])}
+        return {"facts": examine(path, max_points=request["max_points"])}
     except TooLargeError as fault:
         return {"kind": TooLargeError.__name__, "problem": str(fault)}
     except InputError as fault:
@@ -354,7 +339,7 @@ def _answer(request: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """The child: a request a line in, an answer a line out, until the parent closes the pipe."""
+    """The child: one request per line in, one answer per line out, until the parent closes the pipe."""
     import resource
 
     memory_bytes = int(sys.argv[1])

@@ -1,4 +1,4 @@
-"""How many requests a client may make: counted in memory, for each process of the API by itself."""
+"""Limits the requests of each client; each process of the API counts in its own memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from service.settings import ServiceSettings
 
 
 class RateLimiter:
-    """Counts requests of each client over a sliding window. Any number of threads may ask.
+    """Counts requests of each client over a sliding window. Any number of threads may call.
 
     Parameters
     ----------
@@ -39,17 +39,12 @@ class RateLimiter:
         self._strategy = SlidingWindowCounterRateLimiter(MemoryStorage())
 
     def check(self, client: str) -> None:
-        """Count one request.
-
-        Parameters
-        ----------
-        client : str
-            Id of the key, or the client's address where there is none.
+        """Count one request of a key (by its id), or of an address if there is no key.
 
         Raises
         ------
         TooManyRequestsError
-            The client has used up its requests; tells when the next is taken.
+            The client has used up its requests; the error says when the next one is accepted.
         """
         client = _counted_as(client)
         for limit in self._limits:
@@ -62,7 +57,7 @@ class RateLimiter:
 
 
 def _counted_as(client: str) -> str:
-    """The client as it is counted: of an IPv6 address its network, since one client has 2^64 of them.
+    """The client as it is counted: an IPv6 address by its network, since one client has 2^64 addresses.
 
     >>> _counted_as("2001:db8::1234"), _counted_as("192.0.2.1"), _counted_as("::ffff:192.0.2.1")
     ('2001:db8::/64', '192.0.2.1', '192.0.2.1')

@@ -1,7 +1,7 @@
-"""Uploads: a client's bytes to a file in the state folder, counted, hashed and examined on the way.
+"""Uploads: a client's bytes go to a file in the state folder, counted, hashed and examined.
 
-An upload has its name only when it is whole: the bytes go to a folder `.tmp-<id>` beside the others, which is renamed
-when the last one is on the disk. Whatever goes wrong before, the folder is removed.
+The bytes go to a folder `.tmp-<id>`, which gets its final name when the last byte is on the disk. If anything fails
+before, the folder is removed.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ WRITERS = 4
 """Threads that write uploads: few, so that the other requests keep theirs."""
 TEMPORARY = ".tmp-"
 STALE_S = 24 * 3600.0
-"""Seconds after which a temporary folder that nobody writes to was left behind by a process that died."""
+"""Seconds without a byte after which a temporary folder counts as left behind by a dead process."""
 _writers = ThreadPoolExecutor(max_workers=WRITERS, thread_name_prefix="uploads")
 _examining = ThreadPoolExecutor(max_workers=1, thread_name_prefix="preflight")
 
 
 class UploadTable(Protocol):
-    """What is asked of the store."""
+    """The part of the store that is used here."""
 
     def now(self) -> dt.datetime:
         """The time, with a time zone."""
@@ -49,7 +49,7 @@ class UploadTable(Protocol):
 
 
 class _Sink:
-    """The file of one upload while it comes in. Its methods run in threads, one after the other."""
+    """The file of one upload while it arrives. Its methods run in threads, one after the other."""
 
     def __init__(self, folder: StateFolder, upload_id: str, filename: str) -> None:
         self._lock = threading.Lock()
@@ -71,14 +71,14 @@ class _Sink:
                     view = view[self._stream.write(view) :]
 
     def sync(self) -> str:
-        """Bring all to the disk; the SHA-256."""
+        """Write everything to the disk; the SHA-256."""
         with self._lock:
             os.fsync(self._stream.fileno())
             self._stream.close()
             return self._digest.hexdigest()
 
     def keep(self, upload: Upload, store: UploadTable) -> None:
-        """Give the folder its name, then the store its record."""
+        """Give the folder its final name, then store the record."""
         with self._lock:
             if self._over:
                 return
@@ -109,29 +109,14 @@ async def receive(
     owner: str | None,
     sha256: str | None = None,
 ) -> Upload:
-    """Take an upload: to the disk while it comes, then preflight, then the record.
+    """Receive an upload: write it to the disk while it arrives, examine it, then store the record.
 
-    Parameters
-    ----------
-    stream : asynchronous iterator of bytes
-        The file's content.
-    filename : str
-        As the client sent it.
-    store : UploadTable
-        Where the record is kept.
-    folder : StateFolder
-        Where the file is kept.
-    settings : ServiceSettings
-        Limits, and how long it is kept.
-    owner : str or None
-        Id of the key; None where keys are not used.
-    sha256 : str, optional
-        Hexadecimal, as the client promises.
+    `sha256`, hexadecimal, is the digest that the client promised.
 
     Raises
     ------
     RequestError
-        A name that cannot be, or bytes that are not those promised.
+        The name cannot be used, or the bytes differ from the promised digest.
     TooLargeError
         More bytes or points than allowed.
     NoSpaceError
@@ -150,7 +135,7 @@ async def receive(
             await loop.run_in_executor(_writers, sink.write, block)
         found = await loop.run_in_executor(_writers, sink.sync)
         _check_digest(name, found, sha256)
-        told = await loop.run_in_executor(_examining, preflight, sink.path, settings.max_points)
+        facts = await loop.run_in_executor(_examining, preflight, sink.path, settings.max_points)
         now = await loop.run_in_executor(_writers, store.now)
         upload = Upload(
             upload_id=upload_id,
@@ -160,7 +145,7 @@ async def receive(
             sha256=found,
             created_at=now,
             expires_at=now + dt.timedelta(days=settings.upload_days),
-            preflight=told,
+            preflight=facts,
         )
         await loop.run_in_executor(_writers, sink.keep, upload, store)
     except BaseException as fault:
@@ -183,7 +168,7 @@ def _check_size(name: str, size: int, limit: int) -> None:
 
 
 def _check_digest(name: str, found: str, promised: str | None) -> None:
-    """Refuse bytes that are not those that the client promised."""
+    """Refuse bytes that differ from the promised digest."""
     if promised is not None and promised != found:
         raise RequestError([f"the SHA-256 of {name} is {found}, not {promised} as promised: send it again"])
 
@@ -203,27 +188,12 @@ async def _blocks(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
 
 
 def remove_file(upload_id: str, folder: StateFolder) -> None:
-    """Remove an upload's folder; its record is the store's business, and goes first."""
+    """Remove an upload's folder, after its record was removed from the store."""
     shutil.rmtree(folder.upload(upload_id), ignore_errors=True)
 
 
 def remove_leftovers(folder: StateFolder, *, now_s: float, stale_s: float = STALE_S) -> list[Path]:
-    """Remove the temporary folders that a process left behind when it died.
-
-    Parameters
-    ----------
-    folder : StateFolder
-        The state folder.
-    now_s : float
-        Seconds since the epoch.
-    stale_s : float
-        Seconds without a byte after which nobody writes any more.
-
-    Returns
-    -------
-    list of Path
-        What was removed.
-    """
+    """Remove the temporary folders that a dead process left behind; returns them. `now_s` counts from the epoch."""
     removed = []
     for path in folder.uploads.glob(f"{TEMPORARY}*"):
         with contextlib.suppress(FileNotFoundError):

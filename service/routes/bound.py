@@ -1,7 +1,7 @@
-"""What routes depend on: settings, store, state folder and the caller, as `create_app` bound them to the application.
+"""Dependencies of routes: settings, store, state folder and the caller, as `create_app` bound them.
 
 A route names what it needs by type: `def job(job_id: str, store: Store, reader: Reader) -> …`. `Reader`, `Submitter`
-and `Admin` are the caller with that scope; `caller.owner` is what the store wants as `owner`.
+and `Admin` are the caller with that scope; `caller.owner` is the `owner` of the store's methods.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from service.store import JobStore
 _bearer = HTTPBearer(
     scheme_name="key",
     bearerFormat="gw_…",
-    description="A key made by `gablework keys create`. Not needed where the service listens on loopback and has none.",
+    description="A key made by `gablework keys create`. Not needed if the service listens on loopback and has none.",
     auto_error=False,
 )
 
 
-# Coroutines, since they neither wait nor compute: a plain function would cost a thread each.
+# Coroutines, because each plain function would cost a thread.
 async def _settings(request: Request) -> ServiceSettings:
     settings: ServiceSettings = request.app.state.settings
     return settings
@@ -57,17 +57,17 @@ Settings_ = Annotated[ServiceSettings, Depends(_settings)]
 """The settings."""
 
 Store = Annotated[JobStore, Depends(_store)]
-"""Where jobs, uploads and keys are kept."""
+"""The store of jobs, uploads and keys."""
 
 Folder = Annotated[StateFolder, Depends(_folder)]
-"""Where files are kept."""
+"""The folder of files."""
 
 Base = Annotated[str, Depends(_base_url)]
-"""The service's own URL without a slash at its end, for links."""
+"""The service's own URL without a final slash, for links."""
 
 
 def address_of(request: Request) -> str:
-    """The client's address, as the limit of its requests knows it."""
+    """The client's address, for the limit of requests."""
     return "unknown" if request.client is None else request.client.host
 
 
@@ -89,16 +89,16 @@ def caller(
     limiter: Annotated[RateLimiter, Depends(_limiter)],
     credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Principal:
-    """Who asks; counted against the key, or the address where there is none.
+    """The caller; the request counts against its key, or its address without a key.
 
     Raises
     ------
     UnauthorizedError
-        No key although one is needed, or one that is not known.
+        A key is needed and missing, or it is not known.
     TooManyRequestsError
         Above the limit.
     """
-    del credentials  # only tells the OpenAPI document
+    del credentials  # only for the OpenAPI document
     try:
         principal = authenticate(request.headers.get("authorization"), store, settings)
     except UnauthorizedError:
@@ -110,7 +110,7 @@ def caller(
 
 
 Caller = Annotated[Principal, Depends(caller)]
-"""Who asks, whatever its scopes."""
+"""The caller with any scopes."""
 
 
 async def _reader(principal: Caller) -> Principal:
@@ -135,4 +135,4 @@ Submitter = Annotated[Principal, Depends(_submitter)]
 """The caller, who may submit, dismiss and remove."""
 
 Admin = Annotated[Principal, Depends(_admin)]
-"""The caller, who may see and do what concerns everybody."""
+"""The caller, who may see and change the data of all keys."""

@@ -149,21 +149,7 @@ class EventStream(StreamingResponse):
 async def follow(
     store: JobStore, job_id: str, after: int, poll_s: float, is_closing: Callable[[], bool]
 ) -> AsyncIterator[bytes]:
-    """Events of a job as they come, until the job is over or removed, or the process ends.
-
-    Parameters
-    ----------
-    store : JobStore
-        Where the events are.
-    job_id : str
-        The job.
-    after : int
-        Number of the last event that the client has.
-    poll_s : float
-        Seconds between looks after an event.
-    is_closing : callable
-        Whether the process ends.
-    """
+    """Events of a job as they come, until the job is over or removed, or the process ends."""
     yield format_sse_event(retry=RECONNECT_MS)
     pause_s, quiet_s = poll_s, 0.0
     while not is_closing():

@@ -1,4 +1,4 @@
-"""Content negotiation: which of the media types that there are a client would rather have."""
+"""Content negotiation: the media type that a client prefers."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ _SAME = {
     "application/city+json": ("application/json",),
     "application/json": (),
 }
-"""What a client may call a type as well; the answer carries the type itself."""
+"""Other names under which a client may request a type; the answer carries the type itself."""
 _BYTES = ("application/octet-stream",)
 
 
 def _weights(accept: str) -> dict[str, float]:
-    """Weight by media range; what cannot be understood is left out."""
+    """Weight by media range; entries that cannot be parsed are left out."""
     found: dict[str, float] = {}
     for entry in accept.split(","):
         name, *parameters = (part.strip().lower() for part in entry.split(";"))
@@ -42,19 +42,19 @@ def _weight(media_type: str, weights: dict[str, float]) -> float:
 
 
 def preferred(accept: str | None, offers: Sequence[str]) -> str:
-    """The type that a client would rather have.
+    """The type that a client prefers.
 
     Parameters
     ----------
     accept : str or None
-        The header; None or an empty one takes anything.
+        The header; None or an empty one accepts anything.
     offers : sequence of str
-        Media types; the first counts among equals.
+        Media types; the first wins among equals.
 
     Raises
     ------
     HTTPException
-        406: the client takes none of them.
+        406: the client accepts none of them.
 
     Examples
     --------
@@ -68,5 +68,7 @@ def preferred(accept: str | None, offers: Sequence[str]) -> str:
     weights = _weights(accept)
     best = max(offers, key=lambda offer: _weight(offer, weights))
     if _weight(best, weights) <= 0.0:
-        raise HTTPException(406, f"this is there as {', '.join(offers)}: name one of them in the header Accept")
+        raise HTTPException(
+            406, f"the answer is available as {', '.join(offers)}: name one of them in the header Accept"
+        )
     return best

@@ -239,17 +239,7 @@ def schedule_runs(
 
 
 def schedule_document(found: Schedule, base: str, *, with_request: bool = True) -> wire.Schedule:
-    """A schedule as clients see it.
-
-    Parameters
-    ----------
-    found : Schedule
-        As stored.
-    base : str
-        The service's own URL.
-    with_request : bool
-        Whether the request is included; lists leave it out.
-    """
+    """A schedule as clients see it; lists leave the request out."""
     definition = found.definition
     place = f"{base}/schedules/{found.schedule_id}"
     times: list[dt.datetime] = []

@@ -13,17 +13,7 @@ from service.wire.jobs import Event, StatusInfo
 
 
 def status_info(job: Job, base: str, *, with_request: bool = True) -> StatusInfo:
-    """The statusInfo of a job.
-
-    Parameters
-    ----------
-    job : Job
-        As stored.
-    base : str
-        The service's own URL.
-    with_request : bool
-        Whether the request is included; lists leave it out.
-    """
+    """The statusInfo of a job; lists leave the request out."""
     return StatusInfo(
         jobID=job.job_id,
         id=job.job_id,

@@ -87,14 +87,7 @@ class Submission:
         return await self.checked(draft, create)
 
     async def checked(self, draft: Draft, write: Callable[[JobRequest], Made]) -> Made:
-        """Check a request, then write what is made from it.
-
-        Parameters
-        ----------
-        draft : Draft
-            The request; its files are not stored yet.
-        write : callable
-            Writes a job or a schedule of jobs; runs in one of the threads that write.
+        """Check a request, then write a job or a schedule from it in one of the threads that write.
 
         Raises
         ------

@@ -69,19 +69,7 @@ def link(href: str, rel: str, title: str, media_type: str = "application/json") 
 
 
 def page_links(place: str, given: Sequence[tuple[str, object]], found: int, limit: int, offset: int) -> list[Link]:
-    """Links from a page of a list to itself and the pages beside it.
-
-    Parameters
-    ----------
-    place : str
-        Address of the list.
-    given : sequence of pair
-        The other query parameters, by name; None if not given.
-    found : int
-        Entries that were found; one more than `limit` was requested.
-    limit, offset : int
-        Largest number of entries on a page, and the number of entries before this page.
-    """
+    """Links from a page of a list to itself and its neighbours; `found` may be `limit` + 1."""
     query = [(name, value) for name, value in given if value is not None]
 
     def page(start: int) -> str:

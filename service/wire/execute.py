@@ -55,14 +55,7 @@ class Execute(Request):
             raise FaultsError(["subscriber is given: this service does not call back, follow the job's events"])
 
     def draft(self, process_id: str, max_inputs: int | None = None) -> Draft:
-        """The draft of a job of a process.
-
-        Parameters
-        ----------
-        process_id : str
-            The process.
-        max_inputs : int, optional
-            Most point clouds; any number by default.
+        """The draft of a job of a process with at most `max_inputs` point clouds.
 
         Raises
         ------

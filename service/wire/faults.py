@@ -32,13 +32,7 @@ FIXES: Mapping[str, str] = {
 
 
 class FaultsError(ValueError):
-    """What a validator raises to report several faults, or whole sentences instead of a fix for one value.
-
-    Parameters
-    ----------
-    faults : sequence of str
-        One sentence per fault, with its path.
-    """
+    """Raised by validators for several faults, each a sentence with its path, instead of a fix for one value."""
 
     def __init__(self, faults: Sequence[str]) -> None:
         self.faults = tuple(faults)
@@ -46,16 +40,7 @@ class FaultsError(ValueError):
 
 
 def sentences(errors: Sequence[Mapping[str, Any]]) -> list[str]:
-    """One sentence per fault.
-
-    Parameters
-    ----------
-    errors : sequence of mapping
-        As pydantic lists them. The framework puts the part of the request (body, query, ...) before each path.
-
-    >>> sentences([{"type": "less_than_equal", "loc": ("query", "limit"), "input": "5", "ctx": {"le": 4}, "msg": ""}])
-    ['query limit is "5": use at most 4']
-    """
+    """One sentence per fault."""
     found: list[str] = []
     for error in errors:
         context = error.get("ctx") or {}

@@ -179,15 +179,7 @@ class Inputs(Request):
         return {name: value for name, value in plain.items() if value is not None and (value or name not in _LISTS)}
 
     def draft(self, process_id: str, outputs: tuple[str, ...] | None) -> Draft:
-        """The draft of a job.
-
-        Parameters
-        ----------
-        process_id : str
-            The process.
-        outputs : tuple of str or None
-            Ids of the wanted outputs; None for all.
-        """
+        """The draft of a job; outputs are None for all."""
         tiles = tuple(
             dataclasses.replace(tile, filename=tile.filename.replace("tiles", f"tiles-{n}", 1))
             if isinstance(tile, Inline) and len(self.tiles) > 1

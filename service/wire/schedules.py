@@ -16,7 +16,7 @@ from service.wire.faults import FaultsError
 from service.wire.inputs import Text
 
 LONGEST_GRACE_S = 30 * 86_400
-"""A month; whoever accepts a later start wants every slot to run."""
+"""A month; a client that accepts a later start wants every slot to run."""
 
 ProcessId = Literal["reconstruct", "compare"]
 Missed = Annotated[

@@ -35,6 +35,11 @@ def test_a_serial_run_imports_no_engine_and_nothing_for_child_processes() -> Non
     assert modules_after("import pipeline.runtime.run") & unused == set()
 
 
+def test_the_api_knows_all_settings_without_the_science() -> None:
+    unused = {"numba", "scipy", "dask", "distributed", "matplotlib", "pyogrio", "laspy", "pandas"}
+    assert modules_after("import service.app, service.run_settings") & unused == set()
+
+
 def test_the_check_sees_a_heavy_import() -> None:
     assert "pandas" in modules_after("import pandas")
 

@@ -167,7 +167,7 @@ def test_an_upload_whose_file_is_gone_or_cut_is_reported_to_be_gone(world: World
 def test_points_are_no_footprints_and_footprints_no_points(world: World) -> None:
     points, outlines = world.add_upload("a.laz"), world.add_upload("b.gpkg")
     world.resolve(upload(points), footprints=upload(outlines))
-    with pytest.raises(RequestError, match=r"b\.gpkg' is no point cloud.*a\.laz' is no file of footprints"):
+    with pytest.raises(RequestError, match=r"b\.gpkg' is not a point cloud.*a\.laz' is not a file of footprints"):
         world.resolve(upload(outlines), footprints=upload(points))
 
 
@@ -184,7 +184,7 @@ def test_points_of_all_inputs_together_are_limited(tmp_path: Path) -> None:
     world.resolve(*uploads[:2])
     # The same tile twice is one tile.
     world.resolve(*uploads[:2], uploads[0])
-    with pytest.raises(TooLargeError, match="300 points together, this service takes 250 a job"):
+    with pytest.raises(TooLargeError, match="300 points together, this service takes 250 per job"):
         world.resolve(*uploads)
     with pytest.raises(TooLargeError):
         world.resolve(*uploads[:2], path(world.add_file("b.laz")))
@@ -257,7 +257,7 @@ def test_a_path_that_leads_out_of_the_roots_is_refused_and_nothing_is_reported_o
 
 @pytest.mark.parametrize("value", ["a.laz", "../a.laz", "", "~/a.laz", "file:///etc/passwd", "/tiles/a\0.laz"])
 def test_a_path_that_is_not_absolute_is_refused(world: World, value: str) -> None:
-    world.refuses(path(value), InputRefusedError, "is no absolute path")
+    world.refuses(path(value), InputRefusedError, "is not an absolute path")
 
 
 def test_without_roots_no_path_is_read(tmp_path: Path) -> None:
@@ -310,7 +310,7 @@ def test_a_file_that_is_swapped_while_it_is_looked_at_is_refused(world: World, m
         return handle
 
     monkeypatch.setattr(os, "open", swap_then_open)
-    with pytest.raises(InputRefusedError, match="changes while it is looked at"):
+    with pytest.raises(InputRefusedError, match="changes while it is checked"):
         checked_path(str(file), world.settings)
 
 
