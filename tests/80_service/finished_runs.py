@@ -236,7 +236,7 @@ def problem(response: Any, status: int, word: str) -> str:
     """The detail of an answer that must be this problem."""
     assert response.status_code == status, response.text
     assert response.headers["content-type"] == "application/problem+json"
-    told = response.json()
-    assert told["status"] == status
-    assert told["type"].endswith(word), told
-    return str(told["detail"])
+    reported = response.json()
+    assert reported["status"] == status
+    assert reported["type"].endswith(word), reported
+    return str(reported["detail"])

@@ -194,10 +194,10 @@ def geopackage(path: Path, *statements: str) -> Path:
 ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT"
 
 
-def test_a_plain_geopackage_is_reported_by_its_tables(tmp_path: Path) -> None:
-    told = examine(geopackage(tmp_path / "a.gpkg"), max_points=MOST)
-    assert (told["format"], told["featureCount"], told["layers"]) == ("geopackage", 1, ["houses"])
-    assert told["crs"] == {"name": "Amersfoort / RD New", "epsg": 28992}
+def test_a_plain_geopackage_is_described_by_its_tables(tmp_path: Path) -> None:
+    reported = examine(geopackage(tmp_path / "a.gpkg"), max_points=MOST)
+    assert (reported["format"], reported["featureCount"], reported["layers"]) == ("geopackage", 1, ["houses"])
+    assert reported["crs"] == {"name": "Amersfoort / RD New", "epsg": 28992}
 
 
 @pytest.mark.parametrize(
@@ -236,9 +236,9 @@ def test_a_geopackage_with_two_layers_is_taken_and_reported_to_be_unusable(tmp_p
         "INSERT INTO gpkg_contents VALUES ('barns', 'features', 'barns', 28992);"
         "INSERT INTO gpkg_geometry_columns VALUES ('barns', 'geom', 'POLYGON', 28992, 0, 0);"
     )
-    told = examine(geopackage(tmp_path / "a.gpkg", second), max_points=MOST)
-    assert told["usable"] is False
-    assert sorted(told["layers"]) == ["barns", "houses"]
+    reported = examine(geopackage(tmp_path / "a.gpkg", second), max_points=MOST)
+    assert reported["usable"] is False
+    assert sorted(reported["layers"]) == ["barns", "houses"]
 
 
 @pytest.mark.parametrize(
@@ -321,8 +321,8 @@ def test_brackets_are_counted_as_a_parser_does_wherever_blocks_end(
 
 
 def test_geojson_with_quotes_and_brackets_in_its_texts_is_taken(tmp_path: Path) -> None:
-    told = examine(written(tmp_path, "a.geojson", json.dumps(COLLECTION).encode()), max_points=MOST)
-    assert (told["featureCount"], told["usable"], told["crs"]["name"]) == (1, True, "WGS 84 (CRS84)")
+    reported = examine(written(tmp_path, "a.geojson", json.dumps(COLLECTION).encode()), max_points=MOST)
+    assert (reported["featureCount"], reported["usable"], reported["crs"]["name"]) == (1, True, "WGS 84 (CRS84)")
     assert DEPTH_LIMIT > 12
 
 
@@ -411,11 +411,11 @@ def test_a_damaged_header_is_understood_or_refused_by_an_error_that_is_meant(
     suffix, content = whole_files[number]
     path = written(tmp_path, f"a{suffix}", edited(content, changes, head))
     try:
-        told = examine(path, max_points=MOST)
+        reported = examine(path, max_points=MOST)
     except (InputError, LimitError):
         return
-    json.dumps(told, allow_nan=False)
-    assert told["kind"] in {"points", "footprints"}
+    json.dumps(reported, allow_nan=False)
+    assert reported["kind"] in {"points", "footprints"}
 
 
 # --- the child -------------------------------------------------------------------------------------------------------
@@ -535,6 +535,6 @@ def test_the_child_knows_none_of_the_services_secrets(
     assert b"GABLEWORK_" not in environment.read_bytes()
 
 
-def test_an_empty_file_is_reported_to_be_empty(tmp_path: Path) -> None:
+def test_an_empty_file_is_reported_as_empty(tmp_path: Path) -> None:
     with pytest.raises(EmptyInputError, match="0 bytes"):
         examine(written(tmp_path, "a.laz", b""), max_points=MOST)

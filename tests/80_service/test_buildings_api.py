@@ -196,7 +196,7 @@ def test_words_filter_alone_repeated_and_with_commas(client: TestClient, job_id:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "told"),
+    ("name", "value", "reported"),
     [
         ("bbox", "1,2,3", "give four numbers"),
         ("bbox", "1,2,3,4,5,6", "give four numbers"),
@@ -218,9 +218,9 @@ def test_words_filter_alone_repeated_and_with_commas(client: TestClient, job_id:
     ],
 )
 def test_what_means_nothing_is_refused_with_the_fix(
-    client: TestClient, job_id: str, name: str, value: str, told: str
+    client: TestClient, job_id: str, name: str, value: str, reported: str
 ) -> None:
-    assert told in refused(client, job_id, **{name: value})
+    assert reported in refused(client, job_id, **{name: value})
 
 
 def test_all_wrong_words_are_reported_at_once(client: TestClient, job_id: str) -> None:
@@ -311,8 +311,8 @@ def test_pages_are_what_a_look_at_every_building_finds(
         expected = twin(features, query)
         found = building_page(out_dir, query)
         assert found.matched == len(expected)
-        told = [json.loads(text)["id"] for text in found.features()]
-        assert told == expected[query.offset : query.offset + query.limit]
+        reported = [json.loads(text)["id"] for text in found.features()]
+        assert reported == expected[query.offset : query.offset + query.limit]
 
     check()
 
@@ -322,16 +322,16 @@ def test_any_text_is_a_window_or_refused(text: str) -> None:
     try:
         west, south, east, north = parsed_bbox(text, native=False)
     except RequestError as error:
-        told = str(error)
+        reported = str(error)
     else:
-        told = "bbox" if west <= east and south <= north else "a window that is none"
-    assert "bbox" in told
+        reported = "bbox" if west <= east and south <= north else "a window that is none"
+    assert "bbox" in reported
 
 
 # --- one building ----------------------------------------------------------------------------------------------------
 
 
-def test_a_building_is_reported_with_all_columns_and_its_planes(client: TestClient, job_id: str) -> None:
+def test_a_building_has_all_columns_and_its_planes(client: TestClient, job_id: str) -> None:
     answer = client.get(f"/jobs/{job_id}/buildings/{TWO_PARTS}")
     assert answer.headers["content-type"] == "application/geo+json"
     found = answer.json()
@@ -515,7 +515,7 @@ def test_the_city_object_is_a_document_of_its_own(client: TestClient, job_id: st
 
 @pytest.mark.parametrize(
     "name",
-    [runs.ident("nobody"), "x", "A" * 24, "a" * 25, "..", "%2e%2e%2frun.json", "..%2f..%2frun.json", "%00", "' OR 1"],
+    [runs.ident("unknown"), "x", "A" * 24, "a" * 25, "..", "%2e%2e%2frun.json", "..%2f..%2frun.json", "%00", "' OR 1"],
 )
 def test_any_other_id_is_no_building(client: TestClient, job_id: str, name: str) -> None:
     for form in ("json", "obj", "glb", "cityjson"):
@@ -580,8 +580,8 @@ def test_the_openapi_document_describes_pages_and_buildings(client: TestClient) 
     }
     text = (Path(__file__).resolve().parents[2] / "docs/how_to/results_by_rest.md").read_text()
     rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
-    told = {word.strip(" `") for row in rows for word in row.split(",")}
-    assert {entry["name"] for entry in listed["parameters"]} - {"jobID"} <= told
+    reported = {word.strip(" `") for row in rows for word in row.split(",")}
+    assert {entry["name"] for entry in listed["parameters"]} - {"jobID"} <= reported
     one = described["/jobs/{jobID}/buildings/{buildingID}"]["get"]["responses"]
     assert set(one["200"]["content"]) == {
         "application/geo+json",

@@ -79,11 +79,11 @@ def test_every_method_that_the_description_names_can_be_run(local_service) -> No
 def test_a_comparison_waits_as_what_it_is_and_can_be_sent_again(local_service) -> None:
     first = execute(local_service, methods=["fuzzy-sart:robust", TWO[1]], title="both", outputs={"page": {}})
     assert first.status_code == 201, first.text
-    told = first.json()
-    assert (told["processID"], told["status"]) == ("compare", "accepted")
-    assert told["request"]["inputs"]["methods"] == TWO
-    again = local_service.client.post(f"/processes/{told['processID']}/execution", json=told["request"]).json()
-    one, other = (local_service.store.get(job["jobID"]).request for job in (told, again))
+    reported = first.json()
+    assert (reported["processID"], reported["status"]) == ("compare", "accepted")
+    assert reported["request"]["inputs"]["methods"] == TWO
+    again = local_service.client.post(f"/processes/{reported['processID']}/execution", json=reported["request"]).json()
+    one, other = (local_service.store.get(job["jobID"]).request for job in (reported, again))
     assert one == other
     assert (one.process_id, one.methods, one.outputs, one.settings) == ("compare", tuple(TWO), ("page",), {})
 
@@ -118,7 +118,7 @@ def test_jobs_are_listed_by_their_process(local_service) -> None:
         ({"methods": TWO, "classes": "audit", "settings": {"classes": "trust"}}, "classes is audit"),
     ],
 )
-def test_what_cannot_be_compared_is_reported(local_service, inputs: dict[str, Any], words: str) -> None:
+def test_faults_of_a_comparison_are_reported(local_service, inputs: dict[str, Any], words: str) -> None:
     assert words in faults_of(execute(local_service, **inputs))
     assert local_service.client.get("/jobs").json()["jobs"] == []
 
@@ -180,8 +180,8 @@ def test_a_driver_compares_and_says_how_it_goes(bench: Bench) -> None:
     events = bench.store.events(job.job_id)
     stages = [event.message for event in events if event.kind == "stage" and event.stage == "reconstruct"]
     assert stages == [f"{label}: buildings are modelled" for label in (ROBUST, FAITHFUL)]
-    told = [event.progress for event in events[1:]]
-    assert told == sorted(told)
+    reported = [event.progress for event in events[1:]]
+    assert reported == sorted(reported)
     assert str(bench.folder.root) not in str([*events, done.summary, done.message])
 
 
@@ -304,7 +304,7 @@ def test_buildings_are_those_of_the_first_method_unless_another_is_named(client:
     assert [feature["id"] for feature in only["features"]] == [runs.ident("gable")]
 
 
-def test_one_building_is_reported_by_every_method(client: TestClient, job_id: str) -> None:
+def test_one_building_has_a_record_by_every_method(client: TestClient, job_id: str) -> None:
     place = f"/jobs/{job_id}/buildings/{runs.ident('gable')}"
     for label in runs.LABELS:
         found = client.get(place, params={"method": label})
@@ -320,28 +320,28 @@ def test_one_building_is_reported_by_every_method(client: TestClient, job_id: st
     runs.problem(client.get(other, params={"method": FAITHFUL}), 404, "no-such-building")
 
 
-def test_a_method_that_was_not_compared_is_reported_with_those_that_were(
+def test_the_answer_to_a_method_that_was_not_compared_names_those_that_were(
     service: runs.Service, client: TestClient, job_id: str
 ) -> None:
     alone = service.finished()
     for path in ("results", "results/report", "buildings", f"buildings/{runs.ident('gable')}"):
-        told = runs.problem(client.get(f"/jobs/{job_id}/{path}?method=../x"), 400, "invalid-request")
-        assert f"use one of {ROBUST}, {FAITHFUL}" in told
-        told = runs.problem(client.get(f"/jobs/{alone}/{path}?method={ROBUST}"), 400, "invalid-request")
-        assert "this job ran one method" in told
+        reported = runs.problem(client.get(f"/jobs/{job_id}/{path}?method=../x"), 400, "invalid-request")
+        assert f"use one of {ROBUST}, {FAITHFUL}" in reported
+        reported = runs.problem(client.get(f"/jobs/{alone}/{path}?method={ROBUST}"), 400, "invalid-request")
+        assert "this job ran one method" in reported
 
 
 def test_an_output_of_a_run_says_how_to_ask_for_it(client: TestClient, job_id: str) -> None:
     for path in ("results/cityjson", "results?outputs=cityjson"):
-        told = runs.problem(client.get(f"/jobs/{job_id}/{path}"), 404, "no-such-output")
-        assert f"add ?method= and one of {ROBUST}, {FAITHFUL}" in told
+        reported = runs.problem(client.get(f"/jobs/{job_id}/{path}"), 404, "no-such-output")
+        assert f"add ?method= and one of {ROBUST}, {FAITHFUL}" in reported
     runs.problem(client.get(f"/jobs/{job_id}/results/page?method={ROBUST}"), 404, "no-such-output")
 
 
 def test_the_status_leads_to_the_page(service: runs.Service, client: TestClient, job_id: str) -> None:
-    told = client.get(f"/jobs/{job_id}").json()
-    assert told["processID"] == "compare"
-    (page,) = [link["href"] for link in told["links"] if link["type"] == "text/html"]
+    reported = client.get(f"/jobs/{job_id}").json()
+    assert reported["processID"] == "compare"
+    (page,) = [link["href"] for link in reported["links"] if link["type"] == "text/html"]
     assert client.get(page).text.startswith("<!doctype html>")
     without = client.get(f"/jobs/{service.compared(outputs=('table',))}").json()
     assert [link for link in without["links"] if link["type"] == "text/html"] == []
@@ -378,8 +378,8 @@ def test_the_archive_holds_the_whole_comparison_and_no_folder_of_the_server(
         assert f"runs/{label}/run.json" in names
         assert any(name.startswith(f"runs/{label}/buildings/tile=") for name in names)
     assert not [name for name in names if "quarantine" in name]
-    told = {f"/jobs/{job_id}/results/{name}" for name in ("page", "summary")}
-    for text in [*texts.values(), *(client.get(path).text for path in told)]:
+    reported = {f"/jobs/{job_id}/results/{name}" for name in ("page", "summary")}
+    for text in [*texts.values(), *(client.get(path).text for path in reported)]:
         assert runs.SERVER_FOLDER not in text
         assert "uploads/0f0f" not in text
         assert runs.LINKED_FOLDER not in text

@@ -23,10 +23,10 @@ def parsed(text: str) -> Iterator[dict]:
     for block in text.split("\n\n"):
         fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith((":", "retry")))
         if "data" in fields:
-            told = json.loads(fields["data"])
-            assert fields["event"] == told["kind"]
-            assert fields["id"] == str(told["id"])
-            yield told
+            reported = json.loads(fields["data"])
+            assert fields["event"] == reported["kind"]
+            assert fields["id"] == str(reported["id"])
+            yield reported
 
 
 def finished(service) -> str:
@@ -41,11 +41,11 @@ def test_the_stream_of_a_finished_job_says_all_and_ends(local_service) -> None:
     answer = local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM)
     assert answer.headers["content-type"].startswith("text/event-stream")
     assert answer.text.startswith("retry: ")
-    told = list(parsed(answer.text))
-    assert [entry["kind"] for entry in told] == ["status", "status", "stage", "warning", "status"]
-    assert [entry.get("status") for entry in told] == ["accepted", "running", None, None, "successful"]
-    assert told[3]["message"] == "two\nlines"
-    assert [entry["id"] for entry in told] == sorted({entry["id"] for entry in told})
+    reported = list(parsed(answer.text))
+    assert [entry["kind"] for entry in reported] == ["status", "status", "stage", "warning", "status"]
+    assert [entry.get("status") for entry in reported] == ["accepted", "running", None, None, "successful"]
+    assert reported[3]["message"] == "two\nlines"
+    assert [entry["id"] for entry in reported] == sorted({entry["id"] for entry in reported})
 
 
 def test_a_broken_stream_goes_on_where_it_broke(local_service) -> None:
@@ -55,7 +55,7 @@ def test_a_broken_stream_goes_on_where_it_broke(local_service) -> None:
     assert list(parsed(rest.text)) == whole[2:]
 
 
-def test_who_knows_all_of_a_job_that_is_over_is_reported_not_to_come_again(local_service) -> None:
+def test_a_client_with_all_events_of_a_finished_job_gets_204(local_service) -> None:
     job_id = finished(local_service)
     answer = local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM | {"Last-Event-ID": "999"})
     assert answer.status_code == 204
@@ -79,10 +79,10 @@ def test_a_stream_follows_a_job_that_runs_until_it_is_over(starting) -> None:
 
     driver = threading.Thread(target=drive)
     driver.start()
-    told = list(parsed(service.client.get(f"/jobs/{job.job_id}/events", headers=STREAM).text))
+    reported = list(parsed(service.client.get(f"/jobs/{job.job_id}/events", headers=STREAM).text))
     driver.join(60.0)
-    assert [entry["message"] for entry in told if entry["kind"] == "warning"] == [f"number {n}" for n in range(20)]
-    assert told[-1]["status"] == JobStatus.SUCCESSFUL
+    assert [entry["message"] for entry in reported if entry["kind"] == "warning"] == [f"number {n}" for n in range(20)]
+    assert reported[-1]["status"] == JobStatus.SUCCESSFUL
 
 
 def test_a_stream_without_events_shows_that_it_lives_and_ends_when_the_job_is_gone(starting, monkeypatch) -> None:

@@ -71,7 +71,7 @@ class World:
         chosen: dict[str, Any] = {"state": self.folder.root, "input_roots": (self.root,)} | values
         self.settings = ServiceSettings(**chosen)
 
-    def add_upload(self, filename: str = "a.laz", content: bytes = b"", *, owner: str = MINE, **told: Any) -> str:
+    def add_upload(self, filename: str = "a.laz", content: bytes = b"", *, owner: str = MINE, **reported: Any) -> str:
         upload_id = f"{len(self.store.held) + 10:032x}"
         place = self.folder.upload(upload_id)
         place.mkdir(parents=True)
@@ -85,7 +85,7 @@ class World:
             sha256=hashlib.sha256(content).hexdigest(),
             created_at=NOW,
             expires_at=NOW + dt.timedelta(days=7),
-            preflight={"kind": "points", "pointCount": 100, "problems": []} | told,
+            preflight={"kind": "points", "pointCount": 100, "problems": []} | reported,
         )
         return upload_id
 
@@ -152,7 +152,7 @@ def test_an_upload_of_another_key_does_not_exist(world: World) -> None:
     world.resolve(upload(upload_id), owner=None)
 
 
-def test_an_upload_whose_file_is_gone_or_cut_is_reported_to_be_gone(world: World) -> None:
+def test_an_upload_whose_file_is_gone_or_cut_counts_as_gone(world: World) -> None:
     upload_id = world.add_upload()
     file = world.folder.upload(upload_id) / "a.laz"
     file.write_bytes(file.read_bytes()[:-1])
@@ -171,7 +171,7 @@ def test_points_are_no_footprints_and_footprints_no_points(world: World) -> None
         world.resolve(upload(outlines), footprints=upload(points))
 
 
-def test_a_problem_that_a_crs_heals_is_reported_unless_there_is_one(world: World) -> None:
+def test_a_problem_that_a_crs_heals_is_reported_unless_a_crs_is_given(world: World) -> None:
     upload_id = world.add_upload(problems=["the CRS is geographic. Give crs"])
     with pytest.raises(RequestError, match=r"a\.laz\): the CRS is geographic"):
         world.resolve(upload(upload_id))
@@ -243,7 +243,7 @@ def test_a_file_below_a_root_is_read_in_place(world: World) -> None:
         "{root}/no/../../such/a.laz",
     ],
 )
-def test_a_path_that_leads_out_of_the_roots_is_refused_and_nothing_is_reported_of_it(world: World, value: str) -> None:
+def test_a_path_that_leads_out_of_the_roots_is_refused_without_a_word_about_it(world: World, value: str) -> None:
     secret = world.add_file("a.laz", outside=True)
     (world.root / "deep").mkdir()
     (world.root / "link").symlink_to(world.outside)
@@ -522,7 +522,7 @@ def test_a_busy_server_is_asked_again_and_a_refusing_one_is_not(web: World, serv
     assert len(server[1].seen) == 1
 
 
-def test_an_answer_that_breaks_off_is_asked_for_again_and_then_reported(
+def test_an_answer_that_breaks_off_is_requested_again_and_then_reported(
     web: World, server: tuple[str, type[Answers]]
 ) -> None:
     with pytest.raises(UnreadableInputError, match=r"does not answer .* \(tried 4 times\)"):
@@ -531,9 +531,7 @@ def test_an_answer_that_breaks_off_is_asked_for_again_and_then_reported(
     assert left_of(web) == []
 
 
-def test_a_server_that_is_not_there_is_reported_without_the_secrets_in_the_url(
-    tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_an_absent_server_is_reported_without_the_secrets_in_the_url(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(downloads, "FIRST_PAUSE_S", 0.01)
     world = World(tmp_path, input_hosts=("http://127.0.0.1:9",))
     with pytest.raises(UnreadableInputError, match="does not answer") as caught:

@@ -111,10 +111,10 @@ def test_a_lost_job_waits_again_until_it_was_lost_too_often(
 
 
 def test_a_loss_names_the_number_the_stage_and_the_fix() -> None:
-    told = loss(job(lost_attempts=2, stage="split"))
-    assert told.fault is Fault.LOST
-    assert told.detail.startswith("3 drivers were lost over this job (the last one at stage split)")
-    assert "smaller tiles" in told.detail
+    reported = loss(job(lost_attempts=2, stage="split"))
+    assert reported.fault is Fault.LOST
+    assert reported.detail.startswith("3 drivers were lost over this job (the last one at stage split)")
+    assert "smaller tiles" in reported.detail
 
 
 def test_a_duration_runs_from_the_first_claim() -> None:
@@ -223,11 +223,11 @@ def test_the_outcome_is_reported_honestly() -> None:
 def test_every_exception_has_its_kind_and_says_no_path_and_no_secret(
     error: Exception, fault: Fault, words: str
 ) -> None:
-    told = failure_of(error, scrub=Scrubber(), reference="ab12", attempts=2)
-    assert told.fault is fault
-    assert words in told.detail
-    assert "/" not in told.detail
-    assert "hunter2" not in told.detail
+    reported = failure_of(error, scrub=Scrubber(), reference="ab12", attempts=2)
+    assert reported.fault is fault
+    assert words in reported.detail
+    assert "/" not in reported.detail
+    assert "hunter2" not in reported.detail
 
 
 def test_only_a_lost_cluster_and_an_absent_database_are_tried_again() -> None:
@@ -271,9 +271,9 @@ def test_the_page_names_settings_that_exist_with_their_defaults() -> None:
     fields = ServiceSettings.model_fields
     for name in re.findall(r"GABLEWORK_([A-Z_]+)", text):
         assert name.lower() in fields
-    told = dict(re.findall(r"`GABLEWORK_([A-Z_]+)` \((\d+)", text))
-    assert set(told) == {"LEASE_S", "MAX_ATTEMPTS", "DRIVER_JOBS", "DRAIN_S"}
-    for name, value in told.items():
+    reported = dict(re.findall(r"`GABLEWORK_([A-Z_]+)` \((\d+)", text))
+    assert set(reported) == {"LEASE_S", "MAX_ATTEMPTS", "DRIVER_JOBS", "DRAIN_S"}
+    for name, value in reported.items():
         assert fields[name.lower()].default == float(value)
 
 

@@ -202,9 +202,9 @@ def test_jobs_are_filtered_by_status_and_process(local_service) -> None:
 
 def test_jobs_are_filtered_by_when_they_were_created(local_service) -> None:
     job = local_service.waiting()
-    told = local_service.client.get(f"/jobs/{job.job_id}").json()["created"]
-    assert listed(local_service, f"?datetime={told}") == [job.job_id]
-    for interval in (f"{told}/..", "../2100-01-01T00:00:00Z", "2000-01-01/2100-01-01", f"{told}/"):
+    reported = local_service.client.get(f"/jobs/{job.job_id}").json()["created"]
+    assert listed(local_service, f"?datetime={reported}") == [job.job_id]
+    for interval in (f"{reported}/..", "../2100-01-01T00:00:00Z", "2000-01-01/2100-01-01", f"{reported}/"):
         assert listed(local_service, f"?datetime={interval}") == [job.job_id], interval
     last = "9999-12-31T23:59:59.999999Z"
     for interval in ("../2000-01-01T00:00:00Z", "2100-01-01T00:00:00+02:00/..", "2000-01-01T00:00:00Z", last):
@@ -261,24 +261,24 @@ def test_a_key_sees_its_own_jobs_and_an_admin_all(local_service) -> None:
 
 def test_status_has_the_fields_of_both_versions_of_the_standard(local_service) -> None:
     job = local_service.running()
-    told = local_service.client.get(f"/jobs/{job.job_id}").json()
-    assert told["jobID"] == told["id"] == job.job_id
-    assert told["type"] == "process"
-    assert told["processingEntityType"] == "ogc-api-processes"
-    assert (told["status"], told["progress"]) == ("running", 0)
-    assert {"created", "started", "updated", "message", "request"} <= set(told)
-    assert "finished" not in told
-    assert {"self", "monitor"} <= {link["rel"] for link in told["links"]}
+    reported = local_service.client.get(f"/jobs/{job.job_id}").json()
+    assert reported["jobID"] == reported["id"] == job.job_id
+    assert reported["type"] == "process"
+    assert reported["processingEntityType"] == "ogc-api-processes"
+    assert (reported["status"], reported["progress"]) == ("running", 0)
+    assert {"created", "started", "updated", "message", "request"} <= set(reported)
+    assert "finished" not in reported
+    assert {"self", "monitor"} <= {link["rel"] for link in reported["links"]}
 
 
 def test_a_failed_job_says_why_as_a_problem(local_service) -> None:
     job = local_service.running()
     local_service.store.fail(job, JobFailure(fault=Fault.INPUT, detail="tile.laz: no points. Get it again"))
-    told = local_service.client.get(f"/jobs/{job.job_id}").json()
-    assert (told["status"], told["exception"]["status"]) == ("failed", 422)
-    assert told["exception"]["detail"] == "tile.laz: no points. Get it again"
-    results = next(link for link in told["links"] if link["rel"].endswith("exceptions"))
-    assert local_service.client.get(results["href"]).json()["type"] == told["exception"]["type"]
+    reported = local_service.client.get(f"/jobs/{job.job_id}").json()
+    assert (reported["status"], reported["exception"]["status"]) == ("failed", 422)
+    assert reported["exception"]["detail"] == "tile.laz: no points. Get it again"
+    results = next(link for link in reported["links"] if link["rel"].endswith("exceptions"))
+    assert local_service.client.get(results["href"]).json()["type"] == reported["exception"]["type"]
 
 
 def test_a_job_that_waits_is_dismissed_at_once(local_service) -> None:

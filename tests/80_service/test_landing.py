@@ -40,7 +40,7 @@ def test_the_parameter_f_stands_above_the_header(local_service) -> None:
     assert local_service.client.get("/", headers={"Accept": "image/png"}).status_code == 406
 
 
-def test_without_a_built_page_browsers_are_reported_how_to_build_it(starting, monkeypatch, tmp_path: Path) -> None:
+def test_without_a_built_page_browsers_learn_how_to_build_it(starting, monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setattr(landing, "VIEWER", tmp_path / "nothing")
     page = starting().client.get("/?f=html")
     assert page.status_code == 200

@@ -53,11 +53,16 @@ def written(folder: Path, content: bytes, name: str = "a.parquet") -> Path:
 
 
 @pytest.mark.parametrize("name", ["a.parquet", "b.geoparquet", "C.PARQUET"])
-def test_a_plain_file_is_reported_by_its_metadata(tmp_path: Path, name: str) -> None:
-    told = examine(written(tmp_path, outlines(), clean_filename(name)), max_points=MOST)
-    assert (told["kind"], told["format"], told["featureCount"], told["usable"]) == ("footprints", "geoparquet", 2, True)
-    assert told["crs"] == {"name": "Amersfoort / RD New", "epsg": 28992}
-    assert told["layers"] == ["geometry"]
+def test_a_plain_file_is_described_by_its_metadata(tmp_path: Path, name: str) -> None:
+    reported = examine(written(tmp_path, outlines(), clean_filename(name)), max_points=MOST)
+    assert (reported["kind"], reported["format"], reported["featureCount"], reported["usable"]) == (
+        "footprints",
+        "geoparquet",
+        2,
+        True,
+    )
+    assert reported["crs"] == {"name": "Amersfoort / RD New", "epsg": 28992}
+    assert reported["layers"] == ["geometry"]
 
 
 def test_its_crs_may_be_unknown_missing_or_a_code(tmp_path: Path) -> None:
@@ -81,7 +86,7 @@ def no_geometry() -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "reported"),
     [
         (b"PK\x03\x04" * 10, "not Parquet"),
         (b"PAR1", "truncated"),
@@ -93,8 +98,8 @@ def no_geometry() -> bytes:
     ],
     ids=["another format", "four bytes", "cut off", "footer", "empty footer", "no geometry", "encoding"],
 )
-def test_a_file_that_is_none_is_refused_with_the_reason(tmp_path: Path, content: bytes, told: str) -> None:
-    with pytest.raises(UnreadableInputError, match=told):
+def test_a_file_that_is_none_is_refused_with_the_reason(tmp_path: Path, content: bytes, reported: str) -> None:
+    with pytest.raises(UnreadableInputError, match=reported):
         examine(written(tmp_path, content), max_points=MOST)
 
 

@@ -26,10 +26,10 @@ def test_every_error_of_the_service_that_a_client_can_meet_is_a_kind_of_its_own(
 
 
 def test_types_are_different_for_different_problems() -> None:
-    told: dict[str, set[tuple[int, str]]] = {}
+    reported: dict[str, set[tuple[int, str]]] = {}
     for kind in (*KINDS.values(), *FAILURES.values(), INTERNAL):
-        told.setdefault(kind.type_uri, set()).add((kind.status, kind.title))
-    assert all(len(words) == 1 for words in told.values())
+        reported.setdefault(kind.type_uri, set()).add((kind.status, kind.title))
+    assert all(len(words) == 1 for words in reported.values())
 
 
 def test_every_cause_of_a_failed_job_has_its_answer() -> None:
@@ -60,12 +60,12 @@ def test_an_error_has_its_status(error: Exception, status: int) -> None:
     assert answer_error(error, "/here").status_code == status
 
 
-def test_what_is_not_the_clients_business_is_not_reported() -> None:
+def test_internal_details_are_not_reported() -> None:
     for error in (ZeroDivisionError("secret"), sql.OperationalError("secret", {}, Exception("secret"))):
         assert b"secret" not in answer_error(error, "/here").body
 
 
-def test_who_is_to_come_again_is_reported_when() -> None:
+def test_an_answer_to_try_again_says_when() -> None:
     assert answer_error(errors.TooManyRequestsError("x", 2.4), "/").headers["retry-after"] == "3"
     assert int(answer_error(errors.StoreError("x"), "/").headers["retry-after"]) > 0
     assert answer_error(errors.UnauthorizedError("x"), "/").headers["www-authenticate"].startswith("Bearer")
@@ -104,7 +104,7 @@ def test_a_fault_of_ours_is_a_problem_document_without_a_trace(local_service, mo
     assert "secret" not in answer.text
 
 
-def test_a_request_without_a_key_is_reported_how_to_send_one(local_service) -> None:
+def test_the_answer_to_a_request_without_a_key_says_how_to_send_one(local_service) -> None:
     from service.keys import Scope
 
     local_service.key(Scope.READ)
@@ -125,7 +125,7 @@ def test_open_pages_need_no_key(local_service) -> None:
         assert local_service.client.get(path).status_code == 401, path
 
 
-def test_a_client_that_asks_too_often_is_reported_when_to_come_again(starting) -> None:
+def test_the_answer_to_too_many_requests_says_when_to_try_again(starting) -> None:
     client = starting(rate_limit="3/minute").client
     answers = [client.get(path) for path in ("/jobs", "/conformance", "/processes", "/jobs")]
     assert [answer.status_code for answer in answers] == [200, 200, 200, 429]
@@ -136,11 +136,11 @@ def test_a_client_that_asks_too_often_is_reported_when_to_come_again(starting) -
 # --- the guard
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_a_body_that_is_too_large_is_refused_whether_it_says_so_or_not(starting, told: bool) -> None:
+@pytest.mark.parametrize("reported", [True, False])
+def test_a_body_that_is_too_large_is_refused_whether_it_says_so_or_not(starting, reported: bool) -> None:
     client = starting(max_body_bytes=1000).client
     content = b'{"inputs": {"title": "' + b"x" * 5000 + b'"}}'
-    body = content if told else iter([content[:600], content[600:]])
+    body = content if reported else iter([content[:600], content[600:]])
     answer = client.post("/processes/reconstruct/execution", content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code == 413
     assert answer.headers["content-type"] == "application/problem+json"

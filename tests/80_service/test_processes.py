@@ -1,4 +1,4 @@
-"""The processes: descriptions that hold for the code, and requests of which every fault is told."""
+"""The processes: descriptions that hold for the code, and requests of which every fault is reported."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_the_list_of_processes_has_pages(local_service) -> None:
     assert local_service.client.get("/processes?limit=0").status_code == 400
 
 
-def test_an_unknown_process_is_reported_with_those_that_there_are(local_service) -> None:
+def test_the_answer_to_an_unknown_process_names_the_known_ones(local_service) -> None:
     for answer in (
         local_service.client.get("/processes/paint"),
         local_service.client.post("/processes/paint/execution", json={"inputs": {}}),
@@ -125,15 +125,15 @@ def test_a_job_of_an_upload_waits_as_soon_as_the_answer_is_there(local_service) 
     )
     assert answer.status_code == 201
     assert answer.headers["preference-applied"] == "respond-async"
-    told = answer.json()
-    assert answer.headers["location"].endswith(f"/jobs/{told['jobID']}")
-    assert (told["status"], told["type"], told["processID"]) == ("accepted", "process", "reconstruct")
-    job = local_service.store.get(told["jobID"])
+    reported = answer.json()
+    assert answer.headers["location"].endswith(f"/jobs/{reported['jobID']}")
+    assert (reported["status"], reported["type"], reported["processID"]) == ("accepted", "process", "reconstruct")
+    job = local_service.store.get(reported["jobID"])
     assert job.request.tiles == (InputReference(kind="upload", value=upload),)
     assert job.request.settings == {"candidates": {"min_area_m2": 15}, "method": "fuzzy-sart"}
     assert job.request.bbox == (0.0, 0.0, 10.0, 10.0)
     assert job.request.outputs == ("buildings", "report")
-    assert told["request"]["inputs"]["title"] == "Straße 1"
+    assert reported["request"]["inputs"]["title"] == "Straße 1"
 
 
 def test_the_request_that_a_job_says_can_be_sent_again(local_service) -> None:
@@ -141,7 +141,7 @@ def test_the_request_that_a_job_says_can_be_sent_again(local_service) -> None:
         local_service, {"tiles": {"href": f"/uploads/{local_service.upload()}"}, "crs": "EPSG:28992", "priority": -3}
     ).json()
     second = local_service.client.post("/processes/reconstruct/execution", json=first["request"]).json()
-    one, other = (local_service.store.get(told["jobID"]) for told in (first, second))
+    one, other = (local_service.store.get(reported["jobID"]) for reported in (first, second))
     assert (one.request, one.priority) == (other.request, other.priority)
     assert one.priority == -3
 
@@ -190,7 +190,7 @@ def test_all_faults_of_a_request_are_reported_at_once(local_service) -> None:
         },
         outputs={"pictures": {}},
     )
-    told = faults_of(answer)
+    reported = faults_of(answer)
     for words in (
         "tiles[0].href",
         "tiles[1]",
@@ -205,7 +205,7 @@ def test_all_faults_of_a_request_are_reported_at_once(local_service) -> None:
         "colour",
         "pictures",
     ):
-        assert words in told
+        assert words in reported
     assert local_service.client.get("/jobs").json()["jobs"] == []
 
 
@@ -287,7 +287,7 @@ def test_a_rectangle_in_another_crs_is_refused(local_service) -> None:
         assert "bbox" in faults_of(execute(local_service, {"tiles": tile, "crs": "EPSG:28992", "bbox": box | more}))
 
 
-def test_an_upload_that_is_not_there_is_reported(local_service) -> None:
+def test_a_missing_upload_is_named(local_service) -> None:
     answer = execute(local_service, {"tiles": {"href": f"/uploads/{'0' * 32}"}, "crs": "EPSG:28992"})
     assert answer.status_code in {400, 404}
     assert "0" * 32 in answer.json()["detail"]
@@ -314,7 +314,7 @@ def test_a_high_priority_needs_the_scope_admin(local_service) -> None:
     assert send(admin, 1) == 201
 
 
-def test_a_full_line_is_reported_with_when_to_come_again(starting) -> None:
+def test_the_answer_of_a_full_queue_says_when_to_try_again(starting) -> None:
     service = starting(max_queued=2)
     tile = {"href": f"/uploads/{service.upload()}"}
     answers = [execute(service, {"tiles": tile, "crs": "EPSG:28992"}) for _ in range(3)]

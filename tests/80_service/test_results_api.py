@@ -67,12 +67,12 @@ def test_outputs_can_be_chosen(client: TestClient, job_id: str) -> None:
     assert list(chosen) == list(again) == ["geojson", "report"]
 
 
-def test_an_unknown_output_in_the_choice_is_reported_with_the_known_ones(client: TestClient, job_id: str) -> None:
+def test_the_answer_to_an_unknown_output_names_the_known_ones(client: TestClient, job_id: str) -> None:
     answer = client.get(f"/jobs/{job_id}/results", params={"outputs": "report,colours"})
     assert "'colours': use buildings, planes" in runs.problem(answer, 400, "invalid-request")
 
 
-def test_an_output_that_was_not_asked_for_is_reported_with_those_that_are_there(service: runs.Service) -> None:
+def test_the_answer_to_an_output_that_was_not_made_names_those_that_were(service: runs.Service) -> None:
     job_id = service.finished(outputs=("report", "meshes"))
     assert list(service.client.get(f"/jobs/{job_id}/results").json()) == ["meshes", "report"]
     for path in (f"/jobs/{job_id}/results?outputs=planes", f"/jobs/{job_id}/results/planes"):
@@ -107,7 +107,7 @@ def test_head_says_the_size_and_sends_nothing(client: TestClient, job_id: str) -
         assert head.headers[name] == whole.headers[name]
 
 
-def test_a_client_that_has_the_file_is_reported_so(client: TestClient, job_id: str) -> None:
+def test_a_client_that_has_the_file_gets_304(client: TestClient, job_id: str) -> None:
     path = f"/jobs/{job_id}/results/report"
     etag = client.get(path).headers["etag"]
     for known in (etag, f'"other", W/{etag}', "*"):
@@ -197,7 +197,7 @@ def test_a_client_that_takes_the_type_gets_it(client: TestClient, job_id: str, a
 
 
 @pytest.mark.parametrize("accept", ["text/html", "application/json", "application/vnd.apache.parquet;q=0, image/*"])
-def test_a_client_that_does_not_is_reported_what_there_is(client: TestClient, job_id: str, accept: str) -> None:
+def test_a_client_that_does_not_gets_the_list_of_types(client: TestClient, job_id: str, accept: str) -> None:
     answer = client.get(f"/jobs/{job_id}/results/buildings", headers={"Accept": accept})
     assert "application/vnd.apache.parquet" in runs.problem(answer, 406, "about:blank")
 
@@ -240,14 +240,14 @@ def test_no_job_is_no_job(client: TestClient) -> None:
         runs.problem(client.get(path), 404, f"{OGC}no-such-job")
 
 
-def test_results_whose_files_are_gone_are_reported_so(service: runs.Service) -> None:
+def test_results_whose_files_are_gone_are_not_found(service: runs.Service) -> None:
     job_id = service.finished()
     shutil.rmtree(service.folder.job(job_id))
     for path in paths(job_id):
         assert "no longer in the state folder" in runs.problem(service.client.get(path), 404, "no-such-output")
 
 
-def test_a_building_whose_job_is_being_removed_is_reported_so(service: runs.Service) -> None:
+def test_a_building_whose_job_is_being_removed_is_not_found(service: runs.Service) -> None:
     job_id = service.finished()
     (service.folder.outputs(job_id, 1) / "buildings.geojson").unlink()
     answer = service.client.get(f"/jobs/{job_id}/buildings/{runs.ident('gable')}")
@@ -292,8 +292,8 @@ def test_the_openapi_document_declares_every_answer_with_its_type(client: TestCl
 def test_the_page_on_results_says_every_output_with_its_type_and_file() -> None:
     page = Path(__file__).resolve().parents[2] / "docs/how_to/results_by_rest.md"
     rows = [line.split("|")[1:4] for line in page.read_text().splitlines() if line.startswith("| `")]
-    told = [tuple(cell.strip().strip("`") for cell in row) for row in rows]
+    reported = [tuple(cell.strip().strip("`") for cell in row) for row in rows]
     of_a_run = [(kind.output_id, kind.media_type, kind.filename) for kind in OUTPUTS.values()]
     of_a_comparison = [(kind.output_id, kind.media_type, kind.filename) for kind in COMPARISON_OUTPUTS.values()]
-    assert told[: len(of_a_run)] == of_a_run
-    assert [row for row in told if row in of_a_comparison] == of_a_comparison
+    assert reported[: len(of_a_run)] == of_a_run
+    assert [row for row in reported if row in of_a_comparison] == of_a_comparison

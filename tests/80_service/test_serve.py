@@ -60,12 +60,12 @@ class Served:
             text=True,
         )
         assert self.process.stdout is not None
-        told = ""
-        while not told.rstrip().endswith("}"):
+        reported = ""
+        while not reported.rstrip().endswith("}"):
             line = self.process.stdout.readline()
             assert line, f"serve ended with {self.process.wait()}"
-            told += line
-        self.url = json.loads(told)["url"]
+            reported += line
+        self.url = json.loads(reported)["url"]
 
     def driver(self) -> psutil.Process:
         """The driver's process."""
@@ -184,11 +184,11 @@ def test_numbers_of_workers_that_cannot_be_are_refused_as_option_and_in_the_envi
 
 
 @pytest.mark.parametrize(
-    ("told", "gib", "started"),
+    ("reported", "gib", "started"),
     [("auto", 64, 7), (None, 64, 7), ("3", 64, 3), ("auto", 15, 5), ("auto", 1, 2), ("7", 1, 7)],
 )
 def test_the_embedded_cluster_has_a_worker_per_core_with_memory_for_each_unless_a_number_is_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str | None, gib: int, started: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reported: str | None, gib: int, started: int
 ) -> None:
     from service.driver import shared_cluster
 
@@ -202,8 +202,8 @@ def test_the_embedded_cluster_has_a_worker_per_core_with_memory_for_each_unless_
             return self
 
     monkeypatch.delenv("GABLEWORK_WORKERS", raising=False)
-    if told is not None:
-        monkeypatch.setenv("GABLEWORK_WORKERS", told)
+    if reported is not None:
+        monkeypatch.setenv("GABLEWORK_WORKERS", reported)
     monkeypatch.setattr(shared_cluster, "cores", lambda: 7)
     monkeypatch.setattr(shared_cluster, "memory_bytes", lambda: gib * 2**30)
     monkeypatch.setattr(shared_cluster, "Cluster", Engine)
@@ -304,7 +304,7 @@ def test_serve_refuses_other_addresses_without_keys(tmp_path: Path) -> None:
     assert "Traceback" not in found.stderr
 
 
-def test_settings_that_cannot_be_are_reported_together(tmp_path: Path) -> None:
+def test_faults_of_settings_are_reported_together(tmp_path: Path) -> None:
     environment = os.environ | {"GABLEWORK_MAX_POINTS": "-1", "GABLEWORK_LEASE_S": "soon"}
     found = gablework("serve", "--state", str(tmp_path), env=environment)
     assert found.returncode == 2

@@ -42,7 +42,7 @@ NOW = dt.datetime(2026, 3, 1, tzinfo=dt.UTC)
 
 
 class FakeTable:
-    """Keeps the records; fails when it is told to."""
+    """Keeps the records; fails on demand."""
 
     def __init__(self, fault: Exception | None = None) -> None:
         self.held: list[Upload] = []
@@ -324,14 +324,14 @@ def test_a_body_is_stored_answered_with_its_place_and_found_there(client: httpx.
     content = las_bytes(300)
     answer = client.post("/uploads", params={"filename": "a b.laz"}, content=content)
     assert answer.status_code == 201
-    told = answer.json()
-    assert told["filename"] == "a b.laz"
-    assert told["bytes"] == len(content)
-    assert told["sha256"] == hashlib.sha256(content).hexdigest()
-    assert told["preflight"]["pointCount"] == 300
-    assert dt.datetime.fromisoformat(told["created"]) < dt.datetime.fromisoformat(told["expires"])
-    assert client.get(answer.headers["location"]).json() == told
-    assert told in client.get("/uploads").json()["uploads"]
+    reported = answer.json()
+    assert reported["filename"] == "a b.laz"
+    assert reported["bytes"] == len(content)
+    assert reported["sha256"] == hashlib.sha256(content).hexdigest()
+    assert reported["preflight"]["pointCount"] == 300
+    assert dt.datetime.fromisoformat(reported["created"]) < dt.datetime.fromisoformat(reported["expires"])
+    assert client.get(answer.headers["location"]).json() == reported
+    assert reported in client.get("/uploads").json()["uploads"]
     assert client.delete(answer.headers["location"]).status_code == 204
     assert client.get(answer.headers["location"]).status_code == 404
 
@@ -397,7 +397,9 @@ def test_an_encoded_body_is_refused_for_it_could_grow(client: httpx.Client, enco
     assert "send the file as it is" in problem(answer)
 
 
-def test_a_body_without_a_name_or_with_another_ending_is_reported_what_is_taken(client: httpx.Client) -> None:
+def test_the_answer_to_a_body_without_a_name_or_with_another_ending_names_what_is_accepted(
+    client: httpx.Client,
+) -> None:
     assert "?filename=" in problem(client.post("/uploads", content=las_bytes(10)))
     answer = client.post("/uploads?filename=a.zip", content=b"PK\x03\x04")
     assert answer.status_code == 400
@@ -541,7 +543,7 @@ def test_keys_see_their_own_uploads_and_an_admin_all(tmp_path: Path) -> None:
         assert client.delete(place, headers=headers["admin"]).status_code == 204
 
 
-def test_a_refused_client_is_reported_before_its_body_is_stored(tmp_path: Path) -> None:
+def test_a_client_is_refused_before_its_body_is_stored(tmp_path: Path) -> None:
     settings = settings_in(tmp_path)
     add_key(settings, Scope.SUBMIT)
     with serving(settings) as url:

@@ -4,7 +4,7 @@ import { counted } from "./numbers";
 
 const KEY = "gablework.key";
 
-/** An error that the service told as application/problem+json, or that the network had. */
+/** An error from the service as application/problem+json, or from the network. */
 export class Problem extends Error {
   constructor(
     readonly status: number,
@@ -105,7 +105,7 @@ export function unreachable(): Problem {
   return new Problem(0, "The service does not answer", "", "Check that it runs and that this machine can reach it, then try again.");
 }
 
-/** A problem from an answer; bodies that are no problem document give what the status line tells. */
+/** A problem from an answer; for another body the text of the status line. */
 export function problemOf(status: number, reason: string, body: string, retryAfter: string | null): Problem {
   let document: { title?: unknown; detail?: unknown } = {};
   try {
@@ -159,7 +159,7 @@ export interface UploadInfo {
  * @throws Problem when it is refused, AbortError when it is cancelled.
  */
 export function upload(file: File, onProgress: (share: number) => void, signal: AbortSignal): Promise<UploadInfo> {
-  // fetch tells no progress of what it sends
+  // fetch reports no progress of uploads
   return new Promise((resolve, reject) => {
     const sending = new XMLHttpRequest();
     sending.open("POST", serviceUrl(`uploads?filename=${encodeURIComponent(file.name)}`));

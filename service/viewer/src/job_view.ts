@@ -6,7 +6,7 @@ import { titleOf } from "./job_list";
 import { announce, asProblem, problemNotice, warningNotice } from "./notices";
 import { count, duration } from "./numbers";
 
-/** What a job's view tells the page. */
+/** What a job's view reports to the page. */
 export interface Hooks {
   /** The job is not what the list shows any more. */
   onChange: () => void;
@@ -117,7 +117,7 @@ class ProgressView {
   private readonly warnings = el("div");
   private readonly elapsed = el("span", { class: "elapsed" });
   private readonly stages = el("ol", { class: "stages" });
-  private readonly told: string[] = [];
+  private readonly shown: string[] = [];
   private readonly rows = new Map<string, { row: HTMLElement; figure: HTMLElement }>();
   private readonly started: number;
 
@@ -172,8 +172,8 @@ class ProgressView {
     const event = JSON.parse(data) as JobEvent;
     this.waiting.replaceChildren(...(event.kind === "waiting" ? [warningNotice(event.message)] : []));
     if (event.kind === "warning") {
-      if (!this.told.includes(event.message)) this.told.push(event.message);
-      this.warnings.replaceChildren(warningNotice(...this.told));
+      if (!this.shown.includes(event.message)) this.shown.push(event.message);
+      this.warnings.replaceChildren(warningNotice(...this.shown));
       return false;
     }
     this.set(event.progress, event.message);

@@ -16,7 +16,7 @@ export interface ToLoading {
 /** How the models are read. */
 export type Reading = Omit<ToLoading, "bytes">;
 
-/** What the worker tells. */
+/** Messages of the worker. */
 export type FromLoading =
   | { kind: "frame"; origin: [number, number, number] }
   | { kind: "buildings"; listed: Listed[]; batches: Batch[] }

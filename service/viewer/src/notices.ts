@@ -1,7 +1,7 @@
 import { Problem } from "./api";
 import { el } from "./elements";
 
-/** An error as the service told it, with what to do about it. */
+/** An error as the service reported it, with the fix. */
 export function problemNotice(problem: Problem, again?: () => void): HTMLElement {
   return el(
     "div",

@@ -239,13 +239,13 @@ class ResultsView {
     ]
       .filter((fact) => fact !== null)
       .join(" · ");
-    const told = el(
+    const notice = el(
       "details",
       { class: "menu menu-warnings" },
       el("summary", {}, counted(warnings.length, "warning")),
       el("div", { class: "menu-list" }, warningNotice(...warnings)),
     );
-    this.facts.replaceChildren(facts, warnings.length === 0 ? "" : " · ", warnings.length === 0 ? "" : told);
+    this.facts.replaceChildren(facts, warnings.length === 0 ? "" : " · ", warnings.length === 0 ? "" : notice);
   }
 
   /** An empty result says what to try. */

@@ -128,7 +128,7 @@ export class ModelScene {
     this.resize();
   }
 
-  /** Draw more buildings; until somebody moves the view it keeps showing all of them. */
+  /** Draw more buildings; until the user moves the view it keeps showing all of them. */
   add(batches: readonly Batch[]): void {
     this.put(batches);
     if (batches.length > 0 && !this.touched) this.fit(false);

@@ -211,7 +211,7 @@ export class Submission {
     this.draw();
   }
 
-  /** Begin to send a file; its row tells how far it is and what the service makes of it. */
+  /** Begin to send a file; its row shows the progress and the result of the examination. */
   private send(file: File, forget: () => void): Sent {
     const sent: Sent = {
       file,
@@ -320,7 +320,7 @@ export class Submission {
     this.levelsHint.textContent = comparison ? "Comparisons are made at LoD2.2." : "One or several; the records tell the finest.";
     const chosen = this.chosen();
     for (const box of this.others.querySelectorAll("input")) box.disabled = box.value === chosen;
-    // not `disabled`: the button keeps its place in the tab order and its name tells why it waits
+    // not `disabled`: the button keeps its place in the tab order and its name says why it waits
     this.go.setAttribute("aria-disabled", String(!ready));
     this.go.textContent = this.starting
       ? "Submitting…"
@@ -358,18 +358,18 @@ function drawRow(sent: Sent, remove: () => void): void {
 }
 
 /** What the service read in the header. */
-function preflight(told: Record<string, unknown>): HTMLElement[] {
-  const crs = told["crs"] as { name?: string; epsg?: number | null } | null | undefined;
+function preflight(facts: Record<string, unknown>): HTMLElement[] {
+  const crs = facts["crs"] as { name?: string; epsg?: number | null } | null | undefined;
   const crsText = crs == null ? "no CRS" : crs.epsg == null ? (crs.name ?? "CRS without a code") : `EPSG:${crs.epsg}`;
   const facts =
-    told["kind"] === "footprints"
-      ? [typeof told["featureCount"] === "number" ? `${count(told["featureCount"])} outlines` : null, crsText]
+    facts["kind"] === "footprints"
+      ? [typeof facts["featureCount"] === "number" ? `${count(facts["featureCount"])} outlines` : null, crsText]
       : [
-          typeof told["pointCount"] === "number" ? `${count(told["pointCount"])} points` : null,
-          typeof told["densityPerM2"] === "number" ? measure(told["densityPerM2"], 1, "per m²") : null,
+          typeof facts["pointCount"] === "number" ? `${count(facts["pointCount"])} points` : null,
+          typeof facts["densityPerM2"] === "number" ? measure(facts["densityPerM2"], 1, "per m²") : null,
           crsText,
         ];
-  const notes = [...texts(told["problems"]), ...texts(told["warnings"])];
+  const notes = [...texts(facts["problems"]), ...texts(facts["warnings"])];
   return [
     el("p", { class: "facts", title: crs?.name ?? null }, facts.filter((fact) => fact !== null).join(" · ")),
     ...(notes.length === 0 ? [] : [warningNotice(...notes)]),

@@ -12,7 +12,7 @@ export function welcome(): HTMLElement {
       "ol",
       { class: "steps" },
       step("Drop a tile", "LAS, LAZ, COPC, PLY or plain x y z. Its header is checked at once."),
-      step("Reconstruct", "Ground, roofs and walls are found; every step is told."),
+      step("Reconstruct", "Ground, roofs and walls are found; every step is shown."),
       step("Look and take", "Models in 3D by roof type, each with its record; GeoParquet, CityJSON, OBJ, GeoJSON."),
     ),
   );

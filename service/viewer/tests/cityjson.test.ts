@@ -73,7 +73,7 @@ test("a building without a model is a feature without faces", () => {
   expect(building?.attributes["status"]).toBe("failed");
 });
 
-test("what is no CityJSONSeq is told", () => {
+test("a file that is not CityJSONSeq is reported", () => {
   expect(() => read(GABLE)).toThrow("does not begin with its metadata");
   expect(() => read({ type: "Feature" })).toThrow("type Feature");
   expect(() => new SequenceReader().read("{")).toThrow(SyntaxError);

@@ -26,6 +26,6 @@ test("the server's wish for a pause is kept", () => {
   expect(reader.retryMs).toBe(1500);
 });
 
-test("an event that is not finished is not told", () => {
+test("an unfinished event is not reported", () => {
   expect(eventsOf("data: half\n", 100)).toEqual([]);
 });

@@ -16,7 +16,7 @@ test("numbers are grouped and carry their unit", () => {
   expect(duration(200)).toBe("3\u202fmin 20\u202fs");
 });
 
-test("a building that is not ok is told by its status, whatever its roof type", () => {
+test("a building that is not ok is described by its status, whatever its roof type", () => {
   expect(categoryOf("ok", "hip")).toBe("hip");
   expect(categoryOf("fallback", "flat")).toBe("fallback");
   expect(categoryOf("failed", "none")).toBe("failed");
