@@ -129,13 +129,7 @@ class Form:
                 pass
 
     async def following(self) -> dict[bytes, bytes] | bytes | None:
-        """The next thing in the form; None at the end of a part and of the form.
-
-        Raises
-        ------
-        RequestError
-            The body is not a form, or ends too early.
-        """
+        """The next thing in the form; None at the end of a part and of the form."""
         while not self._seen:
             if self._complete:
                 return None

@@ -275,15 +275,7 @@ atexit.register(_examiner.close)
 
 
 def preflight(path: Path, max_points: int) -> Mapping[str, Any]:
-    """The content of a file's header, read by this process's child; see `examine`.
-
-    Raises
-    ------
-    InputError
-        As `examine`; it names the file, not its folder.
-    TooLargeError
-        More points than allowed.
-    """
+    """The content of a file's header, read by this process's child; as `examine`, but errors name only the file."""
     try:
         return _examiner.examine(path, max_points=max_points)
     except InputError as fault:
@@ -301,13 +293,7 @@ def _unreadable(problem: str) -> dict[str, Any]:
 
 
 def _line_of(stream: IO[bytes], deadline_s: float) -> bytes:
-    """The child's output up to the end of the line, or to its own end.
-
-    Raises
-    ------
-    TimeoutError
-        Not before the deadline.
-    """
+    """The child's output up to the end of the line, or to its own end."""
     line = bytearray()
     # select fails for file descriptors above 1023, and a service has many connections
     poll = select.poll()

@@ -75,13 +75,7 @@ class Process:
         return described
 
     def draft(self, execute: Execute, settings: ServiceSettings) -> Draft:
-        """A request for a job, checked.
-
-        Raises
-        ------
-        RequestError
-            Naming every fault.
-        """
+        """The draft of a job; raises as `Execute.draft`."""
         return execute.draft(self.process_id, settings.max_inputs)
 
 

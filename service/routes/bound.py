@@ -72,13 +72,7 @@ def address_of(request: Request) -> str:
 
 
 async def visitor(request: Request, limiter: Annotated[RateLimiter, Depends(_limiter)]) -> None:
-    """Count a request that needs no key against its address.
-
-    Raises
-    ------
-    TooManyRequestsError
-        Above the limit.
-    """
+    """Count a request that needs no key against its address."""
     limiter.check(address_of(request))
 
 
@@ -89,15 +83,7 @@ def caller(
     limiter: Annotated[RateLimiter, Depends(_limiter)],
     credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Principal:
-    """The caller; the request counts against its key, or its address without a key.
-
-    Raises
-    ------
-    UnauthorizedError
-        A key is needed and missing, or it is not known.
-    TooManyRequestsError
-        Above the limit.
-    """
+    """The caller; the request counts against its key, or its address without a key."""
     del credentials  # only for the OpenAPI document
     try:
         principal = authenticate(request.headers.get("authorization"), store, settings)

@@ -34,15 +34,7 @@ class FinishedJob:
     """The requested run of a comparison; None for the whole comparison, and for other jobs."""
 
     def run(self, label: str) -> FinishedJob:
-        """One run of a comparison, as if it were a job of its own.
-
-        Raises
-        ------
-        RequestError
-            There is no such run.
-        NoSuchOutputError
-            Its files are gone.
-        """
+        """One run of a comparison, as if it were a job of its own."""
         if label not in self.catalogue.runs:
             if not self.catalogue.runs:
                 raise RequestError([f"query method is {label[:80]!r}: this job ran one method, leave it out"])
@@ -59,19 +51,7 @@ class FinishedJob:
 
 
 def _finished(job_id: JobId, store: Store, folder: Folder, caller: Reader) -> FinishedJob:
-    """The job with its results.
-
-    Raises
-    ------
-    NoSuchJobError
-        There is none, or it belongs to another key.
-    ResultNotReadyError
-        It is not over, or was dismissed.
-    JobFailedError
-        It failed.
-    NoSuchOutputError
-        Its files are gone.
-    """
+    """The job with its results; refused if it is not successful or its files are gone."""
     job = store.get(job_id, owner=caller.owner)
     if job.status is JobStatus.FAILED and job.failure is not None:
         raise JobFailedError(job.failure)

@@ -82,13 +82,7 @@ async def submit(request: Request, base: Base, submitting: Submitting) -> Respon
 
 
 async def _read(request: Request, submission: Submission) -> Execute:
-    """The request in a form; its files are stored on the way.
-
-    Raises
-    ------
-    RequestError
-        It is not a form, or its fields cannot be read.
-    """
+    """The request in a form; its files are stored on the way."""
     settings = submission.settings
     content_type = request.headers.get("content-type", "")
     form = Form(aiter(request.stream()), content_type, max_parts=settings.max_inputs + OTHER_PARTS)

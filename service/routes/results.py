@@ -165,13 +165,7 @@ def _is_known(if_none_match: str, etag: str) -> bool:
 
 
 def _check_range(request: Request, size: int) -> None:
-    """Refuse a range behind the end; one that cannot be parsed is ignored, as RFC 9110 (14.2) requires.
-
-    Raises
-    ------
-    HTTPException
-        416: it starts behind the end.
-    """
+    """Refuse a range behind the end; one that cannot be parsed is ignored, as RFC 9110 (14.2) requires."""
     text = request.headers.get("range")
     if text is None:
         return

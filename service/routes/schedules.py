@@ -294,13 +294,7 @@ def _answer(found: Schedule, base: str, *, status_code: int = 200, headers: dict
 
 
 def _check_version(if_match: str | None, found: Schedule) -> None:
-    """Refuse a change of a version that the client has not seen; a weak tag never counts.
-
-    Raises
-    ------
-    ChangedMeanwhileError
-        The header names other versions only.
-    """
+    """Refuse a change of a version that the client has not seen; a weak tag never counts."""
     if if_match is None or if_match.strip() == "*":
         return
     if f'"{found.version}"' not in [tag.strip() for tag in if_match.split(",")]:

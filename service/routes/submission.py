@@ -63,17 +63,7 @@ class Submission:
         return InputReference(kind="upload", value=(await self.receive(stream, filename)).upload_id)
 
     async def submit(self, draft: Draft) -> Job:
-        """Queue a job; its row is committed when this returns.
-
-        Raises
-        ------
-        RequestError, InputRefusedError, NoSuchUploadError
-            An input cannot be used.
-        ForbiddenError
-            The priority needs another scope.
-        QueueFullError
-            Too many jobs wait.
-        """
+        """Queue a job; its row is committed when this returns. Raises as `checked`, or QueueFullError."""
 
         def create(request: JobRequest) -> Job:
             return self.store.create(

@@ -185,13 +185,7 @@ async def _from_form(form: Form, submission: Submission) -> Upload:
 
 
 def _file_name(part: Part, *, is_first: bool) -> str:
-    """The name of the one file that a form may have.
-
-    Raises
-    ------
-    RequestError
-        It is another field, or a second file.
-    """
+    """The name of the one file that a form may have; another field or a second file is refused."""
     if part.name != FILE_FIELD or part.filename is None or not is_first:
         raise RequestError([f"the form has the field {part.name[:80]!r}: send one file, as the field {FILE_FIELD!r}"])
     return part.filename

@@ -217,13 +217,7 @@ def _unwrapped(name: str, value: Any) -> Any:
 
 
 def _completed(settings: dict[str, Any], info: ValidationInfo, *names: str) -> dict[str, Any]:
-    """Settings with the general ones that are inputs of their own.
-
-    Raises
-    ------
-    FaultsError
-        Naming all faults of the settings, and every input that contradicts them.
-    """
+    """Settings with the general ones that are inputs of their own; raises all their faults and contradictions."""
     given = {name: info.data[name] for name in names if info.data.get(name) is not None}
     faults = [
         f"{name} is {word} and settings.{name} is {shortened(settings[name])}: give one of them"
