@@ -322,7 +322,6 @@ def face_tables(truth: list[RoofModel], models: list[RoofModel]) -> dict[str, pa
 
 
 def outcome_table(rows: list[dict[str, object]]) -> pa.Table:
-    """Outcomes by type."""
     counted = []
     for kind in sorted({str(row["true_type"]) for row in rows}):
         own = [row["outcome"] for row in rows if row["true_type"] == kind]

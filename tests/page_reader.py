@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from html.parser import HTMLParser
 
 import numpy as np
@@ -53,3 +54,25 @@ def count(png: bytes, colour: str) -> int:
     picture = pixels(png)
     near = np.abs(picture[:, :, :3] - to_rgb(colour)).max(axis=2) < 0.03
     return int(np.sum(near & (picture[:, :, 3] > 0.9)))
+
+
+def assert_loads_nothing(text: str, scripts: int = 0) -> Reader:
+    """A page is one file that loads nothing and holds only scripts of its own; the elements of the page."""
+    read = Reader(text)
+    assert read.open == []
+    assert len(read.all("script")) == scripts
+    assert not {"link", "iframe", "object", "embed"} & {tag for tag, _ in read.elements}
+    for _, attributes in read.elements:
+        for name in ("src", "href", "xlink:href", "srcset", "action"):
+            assert (attributes.get(name) or "#").startswith(("#", "data:image/png;base64,"))
+        assert not any(name.startswith("on") for name in attributes)
+    assert not re.search(r"https?:|url\(|@import", text)
+    return read
+
+
+def assert_pictures_have_words_and_ids_are_unique(read: Reader) -> None:
+    """Each image says in words what it shows, and each link leads to one place of the page."""
+    assert all(len(image["alt"] or "") > 20 for image in read.all("img"))
+    names = [attributes["id"] for _, attributes in read.elements if "id" in attributes]
+    assert len(set(names)) == len(names)
+    assert {(link["href"] or "")[1:] for link in read.all("a")} <= set(names)

@@ -82,7 +82,6 @@ def wait_for(
 
 
 def listens(port: int, host: str = "127.0.0.1") -> bool:
-    """Whether a program listens."""
     with contextlib.suppress(OSError), socket.create_connection((host, port), timeout=1.0):
         return True
     return False
@@ -97,23 +96,7 @@ def lives(process: psutil.Process) -> bool:
 
 
 class Program:
-    """One started program.
-
-    Parameters
-    ----------
-    name : str
-        What the test calls it; names its log.
-    command : sequence of str
-        Program and arguments; no shell.
-    log : Path
-        Gets standard output and standard error.
-    env : mapping, optional
-        The whole environment.
-    cwd : Path, optional
-        Working directory.
-    user : str or int, optional
-        Run as this user and the group of the same name or number.
-    """
+    """One started program; its standard output and standard error go to the file `log`."""
 
     def __init__(
         self,
@@ -220,13 +203,7 @@ class Program:
 
 
 class Programs:
-    """The programs of one test; all are ended when it is over, and their logs are shown if it failed.
-
-    Parameters
-    ----------
-    folder : Path
-        Gets the logs.
-    """
+    """The programs of one test; all are ended when it is over, and their logs are shown if it failed."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -259,7 +236,6 @@ class Programs:
 
 @pytest.fixture
 def programs(tmp_path: Path) -> Iterator[Programs]:
-    """Starts programs of one test."""
     folder = tmp_path / "logs"
     folder.mkdir()
     some = Programs(folder)
@@ -273,11 +249,6 @@ class PostgresServer:
     """A PostgreSQL server with a fresh cluster in a folder, on a free port of the loopback, with a password.
 
     PostgreSQL refuses to run as root; then it runs as the user `postgres`.
-
-    Parameters
-    ----------
-    folder : Path
-        Gets the data and the log; exists, and other users may enter its parents.
     """
 
     user = "gablework"

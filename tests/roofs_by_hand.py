@@ -51,7 +51,6 @@ def gable(name: str, x: float = 0.0, *, slope: float = 0.7, lift: float = 0.0, *
 def flat(
     name: str, x: float = 0.0, *, width: float = 10.0, depth: float = 8.0, z: float = 6.0, **more: Any
 ) -> RoofModel:
-    """A flat roof."""
     return model(name, RoofType.FLAT, [surface(rectangle(x, 0, x + width, depth), (0.0, 0.0, z), 0)], **more)
 
 

@@ -61,17 +61,7 @@ def _figures(sums: IntArray) -> dict[str, float]:
 
 
 def slowly_judged(kind: int, sums: IntArray, settings: CandidateSettings) -> Verdict | None:
-    """Why one whole surface is no candidate; None where it is one.
-
-    Parameters
-    ----------
-    kind : int
-        FacetKind of the surface: OBJECT, BUILDING or CROWN.
-    sums : (N_SUMS,) int64
-        Its sums.
-    settings : CandidateSettings
-        The thresholds.
-    """
+    """Why one whole surface is no candidate; None where it is one."""
     f = _figures(sums)
     sure = f["judged"] > 0 and f["planar_share"] >= settings.sure_planar_share
     sure = sure and f["canopy_share"] <= settings.max_canopy_share
@@ -143,15 +133,6 @@ def _joins(kind: int, sums: IntArray, verdict: Verdict | None, settings: Candida
 
 def slowly_united(surfaces: Surfaces, verdicts: list[Verdict | None], settings: CandidateSettings) -> IntArray:
     """The candidate that each surface belongs to: its own index, or that of a larger roof across a step.
-
-    Parameters
-    ----------
-    surfaces : Surfaces
-        Whole surfaces.
-    verdicts : list of Verdict or None
-        One a surface.
-    settings : CandidateSettings
-        `unite_share`.
 
     Returns
     -------
@@ -236,11 +217,6 @@ def _crossing_pairs(splits: Sequence[WholeSplit], offsets: npt.NDArray[np.int64]
 def whole_surfaces(splits: Sequence[WholeSplit]) -> tuple[Surfaces, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Unite the fragments of all tiles.
 
-    Parameters
-    ----------
-    splits : sequence of WholeSplit
-        All tiles, each with fragments.
-
     Returns
     -------
     Surfaces
@@ -321,19 +297,7 @@ def _ranges_by_key(splits: Sequence[WholeSplit], surface_of: dict[tuple[int, int
 
 
 def whole_join(splits: Sequence[WholeSplit], grid: TileGrid, settings: CandidateSettings, crs_name: str) -> Joined:
-    """Unite, judge, and say where each candidate's points lie.
-
-    Parameters
-    ----------
-    splits : sequence of WholeSplit
-        All tiles, in any order.
-    grid : TileGrid
-        The lattice, for the owners.
-    settings : CandidateSettings
-        What makes a surface a candidate.
-    crs_name : str
-        Goes into the ids.
-    """
+    """Unite, judge, and say where each candidate's points lie."""
     splits = sorted(splits, key=lambda s: s.tile)
     surfaces, surface_of_fragment, offsets = whole_surfaces(splits)
     count = len(surfaces.kind)

@@ -48,7 +48,6 @@ def part_id(result: BuildingResult, part: int) -> str:
 
 
 def _vertex_lines(xyz: FloatArray, reference: SpatialReference) -> list[str]:
-    """The `v` lines."""
     plan, up = decimals(reference.horizontal_unit_m), decimals(reference.vertical_unit_m)
     return [f"v {x:.{plan}f} {y:.{plan}f} {z:.{up}f}" for x, y, z in xyz.tolist()]
 

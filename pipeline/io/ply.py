@@ -191,7 +191,6 @@ class PlyFile:
                 )
 
     def _find_fields(self) -> dict[str, str]:
-        """Property by field."""
         names = [name for name, _ in self._vertex.properties]
         return {
             field: next(alias for alias in aliases if alias in names)

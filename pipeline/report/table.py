@@ -35,7 +35,6 @@ def _outcome_table(statistics: Mapping[str, Any]) -> Table:
 
 
 def _count_table(title: str, header: str, counts: Mapping[str, int]) -> Table:
-    """Counts by name."""
     table = Table(title=title, title_justify="left")
     table.add_column(header)
     table.add_column("count", justify="right")

@@ -102,20 +102,14 @@ def random_unique(seed: int, n: int, size: int) -> IntArray:
 small_sets = st.lists(st.tuples(st.integers(0, 7), st.integers(0, 7)), min_size=1, max_size=14, unique=True)
 
 
-@settings(max_examples=examples(300), deadline=None)
-@given(small_sets)
-def test_it_equals_the_brute_force_definition_on_small_lattices_full_of_ties(points: list[Point]) -> None:
-    xy = np.array(points, np.int64)
-    assert triangles(triangulate(xy), xy) == brute_force(xy)
+wide = st.integers(-900_000, 900_000)
 
 
-@settings(max_examples=examples(100), deadline=None)
-@given(
-    st.lists(
-        st.tuples(st.integers(-900_000, 900_000), st.integers(-900_000, 900_000)), min_size=3, max_size=9, unique=True
-    )
-)
-def test_it_equals_the_brute_force_definition_on_wide_sets(points: list[Point]) -> None:
+@settings(max_examples=examples(400), deadline=None)
+@given(small_sets | st.lists(st.tuples(wide, wide), min_size=3, max_size=9, unique=True))
+def test_it_equals_the_brute_force_definition_on_small_lattices_full_of_ties_and_on_wide_sets(
+    points: list[Point],
+) -> None:
     xy = np.array(points, np.int64)
     assert triangles(triangulate(xy), xy) == brute_force(xy)
 

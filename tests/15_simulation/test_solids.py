@@ -92,19 +92,11 @@ def test_every_shape_is_a_valid_solid_wherever_it_looks(shape: RoofShape, azimut
     assert check_solid(building_solid(placed(shape, azimuth_deg, slope))) == ()
 
 
+@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(100, 150), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("shape", list(RoofShape))
 @pytest.mark.parametrize("furnished", [False, True], ids=["bare", "furnished"])
-def test_buildings_of_any_size_are_valid_wherever_they_look(shape: RoofShape, furnished: bool) -> None:
-    for seed in range(3):
-        (solid,) = truth_record(drawn(shape, seed, furnished=furnished), (0.0, 0.0, 0.0)).solids
-        assert check_solid(solid) == ()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("shape", list(RoofShape))
-@pytest.mark.parametrize("furnished", [False, True], ids=["bare", "furnished"])
-def test_fifty_buildings_of_every_shape_are_valid(shape: RoofShape, furnished: bool) -> None:
-    for seed in range(100, 150):
+def test_buildings_of_any_size_are_valid_wherever_they_look(shape: RoofShape, furnished: bool, seeds: range) -> None:
+    for seed in seeds:
         (solid,) = truth_record(drawn(shape, seed, furnished=furnished), (0.0, 0.0, 0.0)).solids
         assert check_solid(solid) == (), seed
 

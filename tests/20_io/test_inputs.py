@@ -77,15 +77,17 @@ def test_a_vector_index_names_files_in_its_column(folder, ending):
     assert read_tile_index(str(index)).outlines is not None
 
 
-@pytest.mark.parametrize("column", COLUMNS)
-def test_each_usual_column_is_found_in_any_case(folder, column):
-    index = write_index(folder / "index.gpkg", ["a.laz"], column=column.upper(), other=["no file"])
-    assert names(find_inputs([index])) == ["a.laz"]
-
-
-def test_the_first_of_the_usual_columns_that_names_files_counts(folder):
-    index = write_index(folder / "index.gpkg", ["a.laz"], column="url", location=["Delft"], file=["b.laz"])
-    assert names(find_inputs([index])) == ["a.laz"]
+@pytest.mark.parametrize(
+    ("rows", "columns", "wanted"),
+    [
+        *((["a.laz"], {"column": column.upper(), "other": ["no file"]}, ["a.laz"]) for column in COLUMNS),
+        (["a.laz"], {"column": "url", "location": ["Delft"], "file": ["b.laz"]}, ["a.laz"]),
+        (["a.laz", None, "b.laz"], {}, ["a.laz", "b.laz"]),
+    ],
+)
+def test_the_first_usual_column_that_names_files_counts_in_any_case(folder, rows, columns, wanted):
+    index = write_index(folder / "index.gpkg", rows, **columns)
+    assert names(find_inputs([index])) == wanted
 
 
 def test_another_column_is_taken_where_it_is_the_only_one_that_names_files(folder):
@@ -97,11 +99,6 @@ def test_another_column_is_taken_where_it_is_the_only_one_that_names_files(folde
     write_index(folder / "index.gpkg", ["37EN1"], column="sheet")
     with pytest.raises(UnreadableInputError, match=r"no column names point files; its columns are sheet"):
         find_inputs([index])
-
-
-def test_tiles_without_a_file_are_passed_over(folder):
-    index = write_index(folder / "index.gpkg", ["a.laz", None, "b.laz"])
-    assert names(find_inputs([index])) == ["a.laz", "b.laz"]
 
 
 @pytest.mark.parametrize("crs", [RD, "EPSG:4326", "EPSG:25831"])

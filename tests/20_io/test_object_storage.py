@@ -70,18 +70,18 @@ def test_an_upload_of_a_file_is_made_again(storage, s3):
     assert s3.count(method="PUT") == 3
 
 
-def test_after_the_last_attempt_the_key_the_cause_and_the_fix_are_reported(storage, s3):
-    s3.script = lambda _: "busy"
-    with pytest.raises(RunError, match=r"run/state/a\.json cannot be written: the server is busy at all of 4 attempts"):
+@pytest.mark.parametrize(
+    ("answer", "message", "attempts"),
+    [
+        ("busy", r"run/state/a\.json cannot be written: the server is busy at all of 4 attempts", 4),
+        ("denied", r"a\.json cannot be written: access is denied .*Check the credentials", 1),
+    ],
+)
+def test_after_the_last_attempt_the_error_names_the_key_the_cause_and_the_fix(storage, s3, answer, message, attempts):
+    s3.script = lambda _: answer
+    with pytest.raises(RunError, match=message):
         storage.put("state/a.json", b"")
-    assert len(s3.seen) == 4
-
-
-def test_what_is_not_allowed_is_reported_at_once(storage, s3):
-    s3.script = lambda _: "denied"
-    with pytest.raises(RunError, match=r"run\.json cannot be written: access is denied .*Check the credentials"):
-        storage.put("run.json", b"")
-    assert len(s3.seen) == 1
+    assert len(s3.seen) == attempts
 
 
 def test_a_fault_is_not_taken_for_an_absence(storage, s3):

@@ -20,26 +20,33 @@ from pipeline.settings import RunSettings
 
 
 @pytest.mark.parametrize(
-    ("workers", "scheduler", "cpu_s", "at", "report", "engine"),
+    ("resources", "cpu_s", "at", "models", "engine"),
     [
-        (None, None, 0.0, 2, False, ("local", 2)),
-        (None, None, 2 * SMALL_S, 2, False, ("local", 2)),
-        (None, None, 2 * SMALL_S + 1.0, 2, False, ("cluster", 2)),
-        (None, None, 2 * SMALL_S + 1.0, 16, False, ("local", 16)),
-        (None, None, 5.0, 1, False, ("local", 1)),
-        (None, None, 5.0, 4, True, ("cluster", 4)),
-        (None, "tcp://far:8786", 5.0, 4, False, ("cluster", 0)),
-        (0, "tcp://far:8786", 5.0, 4, False, ("cluster", 0)),
-        (0, None, 1e6, 4, False, ("serial", 1)),
-        (0, None, 1e6, 4, True, ("serial", 1)),
-        (3, None, 0.0, 8, False, ("cluster", 3)),
+        (Resources(), 0.0, 2, True, ("local", 2)),
+        (Resources(), 2 * SMALL_S, 2, True, ("local", 2)),
+        (Resources(), 2 * SMALL_S + 1.0, 2, True, ("cluster", 2)),
+        (Resources(), 2 * SMALL_S + 1.0, 16, True, ("local", 16)),
+        (Resources(), 5.0, 1, True, ("local", 1)),
+        (Resources(performance_report="time.html"), 5.0, 4, True, ("cluster", 4)),
+        (Resources(scheduler="tcp://far:8786"), 5.0, 4, True, ("cluster", 0)),
+        (Resources(workers=0, scheduler="tcp://far:8786"), 5.0, 4, True, ("cluster", 0)),
+        (Resources(workers=0), 1e6, 4, True, ("serial", 1)),
+        (Resources(workers=0, performance_report="time.html"), 1e6, 4, True, ("serial", 1)),
+        (Resources(workers=3), 0.0, 8, True, ("cluster", 3)),
+        # Only the smallest jobs without buildings need no children.
+        (Resources(), 0.0, 4, False, ("serial", 1)),
+        (Resources(), 0.9 * ALONE_S, 4, False, ("serial", 1)),
+        (Resources(), 0.9 * ALONE_S, 4, True, ("local", 4)),
+        (Resources(), ALONE_S, 4, False, ("local", 4)),
+        (Resources(), 4 * SMALL_S + 1.0, 4, False, ("cluster", 4)),
+        (Resources(performance_report="time.html"), 0.0, 4, False, ("cluster", 4)),
+        (Resources(workers=2), 0.0, 4, False, ("cluster", 2)),
     ],
 )
-def test_what_is_asked_for_counts_before_what_a_job_costs(
-    workers: int | None, scheduler: str | None, cpu_s: float, at: int, report: bool, engine: tuple[str, int]
+def test_the_resources_of_a_request_count_before_the_cost_of_a_job(
+    resources: Resources, cpu_s: float, at: int, models: bool, engine: tuple[str, int]
 ) -> None:
-    resources = Resources(workers=workers, scheduler=scheduler, performance_report="time.html" if report else None)
-    assert engine_of(resources, expected_cpu_s=cpu_s, at=at) == engine
+    assert engine_of(resources, expected_cpu_s=cpu_s, at=at, models=models) == engine
 
 
 @pytest.mark.parametrize(("starts", "engine"), [(9.0, "local"), (11.0, "cluster")])
@@ -49,25 +56,6 @@ def test_a_cluster_starts_only_where_its_start_is_less_than_a_tenth_of_the_job(
 ) -> None:
     cpu_s = starts * RATES.cluster_start_s * at
     assert engine_of(Resources(), expected_cpu_s=cpu_s, at=at) == (engine, at)
-
-
-@pytest.mark.parametrize(
-    ("workers", "models", "cpu_s", "report", "engine"),
-    [
-        (None, False, 0.0, False, ("serial", 1)),
-        (None, False, 0.9 * ALONE_S, False, ("serial", 1)),
-        (None, True, 0.9 * ALONE_S, False, ("local", 4)),
-        (None, False, ALONE_S, False, ("local", 4)),
-        (None, False, 4 * SMALL_S + 1.0, False, ("cluster", 4)),
-        (None, False, 0.0, True, ("cluster", 4)),
-        (2, False, 0.0, False, ("cluster", 2)),
-    ],
-)
-def test_only_the_smallest_jobs_without_buildings_need_no_children(
-    workers: int | None, models: bool, cpu_s: float, report: bool, engine: tuple[str, int]
-) -> None:
-    resources = Resources(workers=workers, performance_report="time.html" if report else None)
-    assert engine_of(resources, expected_cpu_s=cpu_s, at=4, models=models) == engine
 
 
 def test_a_large_job_has_no_more_workers_than_there_is_memory_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,7 +58,6 @@ def child_processes(of: int | None = None) -> list[psutil.Process]:
 
 
 def ended(process: psutil.Process) -> bool:
-    """Whether a process has ended."""
     try:
         return bool(process.status() == psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:
@@ -176,9 +175,12 @@ def test_the_same_fault_has_the_same_detail(orders: Callable[[str], str]) -> Non
     assert [loss.detail for loss in first] == [loss.detail for loss in again]
 
 
-def test_printing_does_not_disturb_the_pipe(orders: Callable[[str], str]) -> None:
-    loud = "print('x' * 10**6); os.write(1, b'y' * 10**6); os.system('echo z')"
-    assert outcomes(orders, [loud, "1"]) == [loud, "1"]
+LOUD = "print('x' * 10**6); os.write(1, b'y' * 10**6); os.system('echo z')"
+
+
+@pytest.mark.parametrize("order", [LOUD, f"'{'a' * 5_000_000}'"], ids=["loud", "large"])
+def test_much_output_and_a_large_result_pass_the_pipe_whole(orders: Callable[[str], str], order: str) -> None:
+    assert outcomes(orders, [order, "1"]) == [order, "1"]
 
 
 @pytest.mark.slow
@@ -194,11 +196,6 @@ def test_an_error_of_the_function_is_raised_here(orders: Callable[[str], str]) -
         outcomes(orders, ["1", "raise PermissionError('not yours')"])
     with pytest.raises(RunError, match="Own: words"):  # a class that this process cannot know
         outcomes(orders, ["class Own(Exception): pass\nraise Own('words')"])
-
-
-def test_a_large_result_arrives_whole(tmp_path: Path, orders: Callable[[str], str]) -> None:
-    long = f"'{'a' * 5_000_000}'"
-    assert outcomes(orders, [long, "1"]) == [long, "1"]
 
 
 def test_cancelling_kills_the_child_within_an_item(orders: Callable[[str], str]) -> None:

@@ -167,19 +167,12 @@ easy = st.sampled_from(
 )
 
 
-@settings(max_examples=examples(25), deadline=None)
-@given(scene=patchworks, grid=grids, judging=easy)
-def test_patches_of_many_levels_are_joined_as_by_the_slow_join(
-    scene: Patchwork, grid: TileGrid, judging: CandidateSettings
+@settings(max_examples=examples(30), deadline=None)
+@given(scene=patchworks, grid=grids, judging=easy, every=st.sampled_from([1, 1, 2]))
+def test_patches_of_many_levels_in_all_or_some_tiles_are_joined_as_by_the_slow_join(
+    scene: Patchwork, grid: TileGrid, judging: CandidateSettings, every: int
 ) -> None:
-    slow, found = both_joins(scene.cut(grid), grid, CUT, judging)
-    assert found == slow
-
-
-@settings(max_examples=examples(10), deadline=None)
-@given(scene=patchworks, grid=grids)
-def test_only_some_of_the_tiles_are_joined_as_by_the_slow_join(scene: Patchwork, grid: TileGrid) -> None:
-    slow, found = both_joins(scene.cut(grid)[::2], grid, CUT, EASY)
+    slow, found = both_joins(scene.cut(grid)[::every], grid, CUT, judging)
     assert found == slow
 
 

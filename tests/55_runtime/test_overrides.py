@@ -76,7 +76,6 @@ def write_outlines(path: Path, outlines: dict[str, Any], **attributes: str) -> P
 
 @pytest.fixture(scope="module")
 def plain(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """The run without overrides."""
     from pipeline.runtime.request import RunRequest
     from pipeline.runtime.run import run
 

@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from typer.testing import CliRunner
+from command_line import invoke
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from faults.asked import environment
 
 import pipeline.reconstruct
-from pipeline.cli import app
 from pipeline.errors import SettingsError, UnreadableInputError
 from pipeline.io.crs import SpatialReference
 from pipeline.methods import ReconstructSettings
@@ -73,7 +72,6 @@ def bundle() -> Bundle:
 
 @pytest.fixture
 def path(bundle: Bundle, tmp_path: Path) -> Path:
-    """The bundle as a file."""
     return Path(write_bundle(str(tmp_path / "quarantine"), bundle))
 
 
@@ -94,12 +92,6 @@ def document_of(path: Path) -> dict[str, Any]:
     with zipfile.ZipFile(path) as archive:
         document: dict[str, Any] = json.loads(archive.read("bundle.json"))
     return document
-
-
-def invoke(*words: str) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error of a command line."""
-    result = CliRunner().invoke(app, list(words))
-    return result.exit_code, result.stdout, result.stderr
 
 
 def test_a_bundle_comes_back_as_it_was(bundle: Bundle, path: Path) -> None:

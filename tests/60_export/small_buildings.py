@@ -143,7 +143,6 @@ def gable(building_id: str = "gable", east: float = 0.0, **changes: Any) -> Buil
 
 
 def gable_solid(east: float = 0.0, first_plane: int = 0) -> Solid:
-    """The solid of `gable`."""
     corners = [(0, 0, 3), (10, 0, 3), (10, 8, 3), (0, 8, 3), (0, 4, 6), (10, 4, 6)]
     moved = [(x + east, float(y), float(z)) for x, y, z in corners]
     return roofed_solid(moved, [[[0, 1, 5, 4]], [[2, 3, 4, 5]]], 0.0, first_plane)

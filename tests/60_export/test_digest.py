@@ -32,7 +32,6 @@ BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent
 
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory, contexts: Contexts, rejected_objects: RejectedObjects) -> Path:
-    """A run of one tile."""
     folder = tmp_path_factory.mktemp("run")
     write_tile(folder, "t1", [build() for build in BUILT], rejected_objects, contexts["compound"])
     return folder

@@ -16,7 +16,6 @@ from pipeline.model import FaceKind, Solid, SolidFace
 
 
 def moved(solid: Solid, *by: float) -> Solid:
-    """The solid, shifted."""
     return dataclasses.replace(solid, vertices=solid.vertices + np.array(by))
 
 

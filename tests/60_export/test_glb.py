@@ -26,12 +26,10 @@ SURFACES = {"RoofSurface": FaceKind.ROOF, "WallSurface": FaceKind.WALL, "GroundS
 
 
 def lines_of(results: list[BuildingResult], context: RecordContext) -> list[str]:
-    """The CityJSONSeq of some buildings."""
     return list(cityjson_lines([(r, building_row(r, context)) for r in results], context.reference, "some buildings"))
 
 
 def written(results: list[BuildingResult], context: RecordContext) -> bytes:
-    """The GLB of some buildings."""
     reference = context.reference
     return glb_bytes(lines_of(results, context), reference.horizontal_unit_m, reference.vertical_unit_m)
 

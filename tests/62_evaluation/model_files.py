@@ -87,7 +87,6 @@ def without_planes(lines: Sequence[Json]) -> list[Json]:
 
 
 def without_semantics(lines: Sequence[Json]) -> list[Json]:
-    """The lines without semantics."""
     bare = copy.deepcopy(list(lines))
     for solid in _solids(bare):
         del solid["semantics"]
@@ -129,7 +128,6 @@ def _solids(lines: Iterable[Json]) -> Iterable[Json]:
 
 
 def by_id(models: ModelSet) -> dict[str, RoofModel]:
-    """The models by their names."""
     return {model.building_id: model for model in models.models}
 
 

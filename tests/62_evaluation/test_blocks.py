@@ -79,14 +79,16 @@ def lifted(model: RoofModel, up_m: float) -> RoofModel:
     return dataclasses.replace(model, surfaces=surfaces)
 
 
+def block_of(parts: tuple[RoofModel, ...]) -> RoofModel:
+    reference = Reference(name="r", kind="truth", buildings=parts, has_faces=True, outlines="truth", tiles=())
+    return joined_reference(reference).buildings[0]
+
+
 @pytest.mark.parametrize(("up_m", "groups"), [(0.0, [0, 0, 0, 0]), (0.5, [0, 0, 2, 2])])
 def test_faces_of_one_plane_that_touch_are_one_face_of_the_block(up_m: float, groups: list[int]) -> None:
     """The points do not show where one roof ends and the next begins, unless there is a step."""
     parts = (house("a", 0, "row"), lifted(house("b", 8, "row"), up_m))
-    joined = joined_reference(
-        Reference(name="r", kind="truth", buildings=parts, has_faces=True, outlines="truth", tiles=())
-    )
-    assert [surface.group for surface in joined.buildings[0].surfaces] == groups
+    assert [surface.group for surface in block_of(parts).surfaces] == groups
 
 
 def test_faces_of_one_plane_that_are_apart_stay_apart() -> None:
@@ -96,10 +98,7 @@ def test_faces_of_one_plane_that_are_apart_stay_apart() -> None:
         dataclasses.replace(house(name, x, "row"), surfaces=tuple(surfaces))
         for name, x, surfaces in (("a", 0, alone), ("b", 9, far))
     )
-    joined = joined_reference(
-        Reference(name="r", kind="truth", buildings=parts, has_faces=True, outlines="truth", tiles=())
-    )
-    assert [surface.group for surface in joined.buildings[0].surfaces] == [-1, -1]
+    assert [surface.group for surface in block_of(parts).surfaces] == [-1, -1]
 
 
 def test_points_follow_their_buildings_and_faces() -> None:
@@ -120,10 +119,7 @@ def test_a_block_is_as_hard_as_its_hardest_house() -> None:
 
 def test_unlike_roofs_of_a_block_are_a_combination() -> None:
     parts = (house("a", 0, "row"), house("b", 8, "row", RoofType.FLAT))
-    joined = joined_reference(
-        Reference(name="r", kind="truth", buildings=parts, has_faces=True, outlines="truth", tiles=())
-    )
-    assert joined.buildings[0].roof_type is RoofType.COMBINATION
+    assert block_of(parts).roof_type is RoofType.COMBINATION
 
 
 def test_a_reference_without_blocks_is_left_as_it_is() -> None:

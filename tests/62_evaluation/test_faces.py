@@ -422,7 +422,6 @@ def damaged(truth: list[RoofModel], random: np.random.Generator) -> list[RoofMod
 
 
 def damaged_face(face: RoofSurface, random: np.random.Generator) -> list[RoofSurface]:
-    """What became of one face."""
     kind = random.choice(["as_is", "drop", "lift", "turn", "shift", "slip", "cut", "double"])
     if kind == "drop":
         return []

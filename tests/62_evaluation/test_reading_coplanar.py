@@ -28,7 +28,6 @@ def arrays(faces: list[list[tuple[int, ...]]]) -> tuple[IntArray, IntArray, IntA
 
 
 def regions(xyz: FloatArray, faces: list[list[tuple[int, ...]]], planes: list[int] | None = None) -> list[int]:
-    """The regions of faces."""
     corners, ring_offsets, face_rings = arrays(faces)
     vectors = face_vectors(xyz, corners, ring_offsets, face_rings)
     numbers = np.array(planes or [-1] * len(faces), np.int64)

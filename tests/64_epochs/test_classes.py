@@ -16,6 +16,7 @@ from pipeline.ruler.simulation.roofs import RoofShape
 from pipeline.runtime.manifest import RunStatus
 
 Compare = Callable[..., dict[str, dict[str, Any]]]
+FLAT: dict[str, Any] = {"shape": RoofShape.FLAT, "azimuth": 90.0}
 GABLE_M3 = 12.0 * 9.0 * (5.0 + 4.5 * math.tan(math.radians(35.0)) / 2.0)
 
 
@@ -68,8 +69,7 @@ def test_a_house_with_another_roof_is_reshaped_and_not_raised(compare: Compare, 
 
 
 def test_an_extension_has_its_area_and_volume(compare: Compare) -> None:
-    flat = {"shape": RoofShape.FLAT, "azimuth": 90.0}
-    row = one(compare([house("a1", 0.0, length=12.0, **flat)], [house("a2", 2.0, length=16.0, **flat)]))
+    row = one(compare([house("a1", 0.0, length=12.0, **FLAT)], [house("a2", 2.0, length=16.0, **FLAT)]))
     assert row["change"] == "reshaped"
     assert row["added_m2"] == pytest.approx(36.0, rel=0.05)
     assert row["gained_m3"] == pytest.approx(36.0 * 5.0, rel=0.05)
@@ -78,17 +78,15 @@ def test_an_extension_has_its_area_and_volume(compare: Compare) -> None:
 
 
 def test_a_house_may_be_raised_and_reshaped_and_the_larger_volume_names_the_class(compare: Compare) -> None:
-    flat = {"shape": RoofShape.FLAT, "azimuth": 90.0}
-    before = house("a1", length=12.0, **flat)
-    mostly_up = one(compare([before], [house("a2", 1.0, length=14.0, eave=8.0, **flat)]))
+    before = house("a1", length=12.0, **FLAT)
+    mostly_up = one(compare([before], [house("a2", 1.0, length=14.0, eave=8.0, **FLAT)]))
     assert (mostly_up["change"], mostly_up["is_raised"], mostly_up["is_reshaped"]) == ("raised", True, True)
 
 
 def test_what_is_narrow_does_not_count(compare: Compare) -> None:
-    flat = {"shape": RoofShape.FLAT, "azimuth": 90.0, "width": 20.0}
     rows = compare(
-        [house("a1", length=12.0, **flat), house("b1", 100.0, length=12.0, **flat)],
-        [house("a2", 0.6, length=13.2, **flat), house("b2", 101.0, length=14.0, **flat)],
+        [house("a1", length=12.0, width=20.0, **FLAT), house("b1", 100.0, length=12.0, width=20.0, **FLAT)],
+        [house("a2", 0.6, length=13.2, width=20.0, **FLAT), house("b2", 101.0, length=14.0, width=20.0, **FLAT)],
     )
     assert (rows["a"]["change"], rows["b"]["change"]) == ("unchanged", "reshaped")
     assert rows["a"]["added_m2"] == 0.0
@@ -113,48 +111,36 @@ def test_a_known_shift_of_the_surveys_is_no_change(compare: Compare) -> None:
 
 
 def test_a_part_that_may_be_a_tree_and_a_roof_without_points_are_doubts(compare: Compare) -> None:
-    flat: dict[str, Any] = {"shape": RoofShape.FLAT, "azimuth": 90.0, "sigma": 0.03}
-    grown = house("a2", 2.0, length=16.0, **flat)
+    grown = house("a2", 2.0, length=16.0, sigma=0.03, **FLAT)
     rough = dataclasses.replace(grown, planes=(dataclasses.replace(grown.planes[0], rmse_m=0.2),))
     bare = dataclasses.replace(grown, quality=dataclasses.replace(grown.quality, unexplained_m2=30.0))
-    before = house("a1", length=12.0, **flat)
+    before = house("a1", length=12.0, sigma=0.03, **FLAT)
     for after, doubts in ((grown, []), (rough, ["rough_part"]), (bare, ["unexplained_part"])):
         row = one(compare([before], [after]))
         assert (row["change"], row["doubts"]) == ("reshaped", doubts)
 
 
 def test_one_building_that_is_modelled_as_two_did_not_change(compare: Compare) -> None:
-    flat = {"shape": RoofShape.FLAT, "azimuth": 90.0}
-    whole, halves = (
-        [house("a1", length=20.0, **flat)],
-        [
-            house("b2", -5.0, length=10.0, **flat),
-            house("c2", 5.0, length=10.0, **flat),
-        ],
-    )
-    split = one(compare(whole, halves))
+    halves = [house("b2", -5.0, length=10.0, **FLAT), house("c2", 5.0, length=10.0, **FLAT)]
+    split = one(compare([house("a1", length=20.0, **FLAT)], halves))
     assert (split["change"], split["relation"], split["doubts"]) == ("unchanged", "split", ["other_units"])
     assert (split["old_ids"], split["new_ids"]) == (["a1"], ["b2", "c2"])
     assert split["new_area_m2"] == pytest.approx(180.0, abs=0.1)
 
 
 def test_neighbours_that_share_out_one_roof_in_another_way_did_not_change(compare: Compare) -> None:
-    flat = {"shape": RoofShape.FLAT, "azimuth": 90.0}
     rows = compare(
-        [house("a1", -6.0, length=12.0, **flat), house("b1", 6.0, length=12.0, **flat)],
-        [house("a2", -5.0, length=14.0, **flat), house("b2", 7.0, length=10.0, **flat)],
+        [house("a1", -6.0, length=12.0, **FLAT), house("b1", 6.0, length=12.0, **FLAT)],
+        [house("a2", -5.0, length=14.0, **FLAT), house("b2", 7.0, length=10.0, **FLAT)],
     )
-    assert {name: (row["change"], row["relation"]) for name, row in rows.items()} == {
-        "a": ("unchanged", "one_to_one"),
-        "b": ("unchanged", "one_to_one"),
-    }
+    found = {name: (row["change"], row["relation"]) for name, row in rows.items()}
+    assert found == dict.fromkeys("ab", ("unchanged", "one_to_one"))
     assert rows["a"]["area_change_m2"] == pytest.approx(18.0, abs=0.1)
 
 
 def test_a_shed_under_a_new_hall_is_gone_and_the_hall_is_new(compare: Compare) -> None:
-    flat = {"shape": RoofShape.FLAT, "azimuth": 90.0}
     rows = compare(
-        [house("a1", length=5.0, width=4.0, eave=2.5, **flat)], [house("b2", length=40.0, width=30.0, eave=9.0, **flat)]
+        [house("a1", length=5.0, width=4.0, eave=2.5, **FLAT)], [house("b2", length=40.0, width=30.0, eave=9.0, **FLAT)]
     )
     assert {name: row["change"] for name, row in rows.items()} == {"a": "gone", "b": "new"}
     assert rows["a"]["doubts"] == ["overlaps_another"]

@@ -56,7 +56,6 @@ def figures(
     shift_m: float = 0.0,
     rough_new: bool = False,
 ) -> np.ndarray:
-    """The figures of one group."""
     entries = [*((f, False, True) for f in old), *((f, True, True) for f in new)]
     entries += [*((f, False, False) for f in guests[0]), *((f, True, False) for f in guests[1])]
     own = [polygon for (polygon, _), _, mine in entries if mine]

@@ -29,5 +29,4 @@ def make_run(tmp_path: Path) -> MakeRun:
 
 @pytest.fixture
 def street_run(make_run: MakeRun) -> Path:
-    """The run of the street."""
     return make_run(street())

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 import small_buildings as small
-from page_reader import Reader, count, pixels
+from page_reader import Reader, assert_loads_nothing, assert_pictures_have_words_and_ids_are_unique, count, pixels
 
 from pipeline.errors import RunError, SettingsError
 from pipeline.io import ReadOptions, Source, SourceInfo
@@ -60,7 +60,6 @@ def block(building_id: str) -> BuildingResult:
 
 
 def lost(building_id: str) -> BuildingResult:
-    """No model."""
     return dataclasses.replace(small.failed(building_id), footprint=shapely.box(0.0, 0.0, 10.0, 8.0))
 
 
@@ -195,7 +194,6 @@ def test_no_run_and_two_of_one_label_are_refused(runs: list[ComparedRun], tmp_pa
 
 
 def record(**changes: object) -> Record:
-    """A record of a gable."""
     fields: dict[str, object] = {
         "status": Status.OK,
         "reason": None,
@@ -235,12 +233,10 @@ def test_differences_are_the_shares_and_ranges_of_the_page() -> None:
 
 
 def compared(name: str, *records: Record) -> ComparedBuilding:
-    """A building."""
     return ComparedBuilding(building_id=name, records=records, true_id=None, difference=difference_of(records))
 
 
 def names(choices: list[Choice]) -> list[str]:
-    """Who was chosen."""
     return [choice.building.building_id for choice in choices]
 
 
@@ -329,7 +325,6 @@ def test_of_copc_a_window_a_building_is_read_and_gives_the_same_points(
 
 
 def gable_model(runs: list[ComparedRun], place: int, name: str) -> RoofModel:
-    """A model of a run."""
     return next(model for model in read_models(runs[place].run_dir).models if model.building_id == name)
 
 
@@ -341,7 +336,6 @@ def gable_points() -> np.ndarray:
 
 
 def raised(model: RoofModel, up_m: float) -> RoofModel:
-    """A copy higher up."""
     x, y, z = model.solid_origin
     surfaces = tuple(
         dataclasses.replace(one, coefficients=(one.coefficients[0], one.coefficients[1], one.coefficients[2] + up_m))
@@ -437,25 +431,13 @@ def test_the_page_is_one_file_that_loads_nothing_and_shows_every_run_of_every_ch
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(path.name for path in paths)
     assert steps == ["records", "points", "pictures", "page"]
     text = paths[2].read_text()
-    read = Reader(text)
-    assert read.open == []
-    assert len(read.all("script")) == 1
-    assert not {"link", "iframe", "object", "embed"} & {tag for tag, _ in read.elements}
-    for _, attributes in read.elements:
-        for name in ("src", "href", "xlink:href", "srcset", "action"):
-            assert (attributes.get(name) or "#").startswith(("#", "data:image/png;base64,"))
-        assert not any(name.startswith("on") for name in attributes)
-    assert not re.search(r"https?:|url\(|@import", text)
+    read = assert_loads_nothing(text, scripts=1)
     # Four buildings: a plan each, three views each, less the one that failed.
     assert len(read.all("img")) == 4 + 3 * 4 - 1
     assert sum(part.strip() == "no model" for part in read.texts) == 1
     assert "too_few_points: 2 points, at least 6" in text
     assert "no_plane: 0 planes, at least 1" in text
-    for image in read.all("img"):
-        assert len(image["alt"] or "") > 20
-    names = [attributes["id"] for _, attributes in read.elements if "id" in attributes]
-    assert len(set(names)) == len(names)
-    assert {(link["href"] or "")[1:] for link in read.all("a")} <= set(names)
+    assert_pictures_have_words_and_ids_are_unique(read)
     assert all("scope" in head for head in read.all("th"))
     assert len(text) < 5_000_000 / 4
 

@@ -44,7 +44,6 @@ def call(*words: str | Path) -> tuple[int, str, str]:
 
 
 def rows(text: str) -> dict[str, str]:
-    """The table of a command."""
     lines = [line.split("│")[1:3] for line in text.splitlines() if line.startswith("│")]
     return {name.strip(): value.strip() for name, value in lines}
 

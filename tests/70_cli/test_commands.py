@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from typer.testing import CliRunner
+from command_line import invoke
 
 from pipeline import __version__
 from pipeline.cli import app
@@ -18,12 +18,6 @@ COMMANDS = (
     *("reconstruct", "rerun", "compare", "classify", "inspect", "simulate", "digest"),
     *("evaluate", "warm-up", "demo", "replay", "report", "worker", "batch"),
 )
-
-
-def invoke(*words: str) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error of a command line."""
-    result = CliRunner().invoke(app, list(words))
-    return result.exit_code, result.stdout, result.stderr
 
 
 def ascii_tile(folder: Path) -> Path:

@@ -9,15 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from typer.testing import CliRunner
-
-from pipeline.cli import app
-
-
-def invoke(*words: str) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error of a command line."""
-    result = CliRunner().invoke(app, list(words))
-    return result.exit_code, result.stdout, result.stderr
+from command_line import invoke
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,6 @@ def evaluated(*words: str | Path) -> dict[str, Any]:
 
 
 def figures(document: dict[str, Any]) -> dict[str, float]:
-    """Measures over all buildings."""
     return {row["name"]: row["value"] for row in document["measures"] if row["subset"] == "all"}
 
 

@@ -7,21 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from command_line import invoke
 from object_store import SECRET
-from typer.testing import CliRunner
 
-from pipeline.cli import app
 from pipeline.console import ExitCode
 from pipeline.io import storage_at
 
 if TYPE_CHECKING:
     from object_store import FaultyProxy
-
-
-def invoke(*words: str) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error of a command line."""
-    result = CliRunner().invoke(app, list(words))
-    return result.exit_code, result.stdout, result.stderr
 
 
 @pytest.fixture(scope="module")

@@ -8,16 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
+from command_line import invoke
 
-from pipeline.cli import app
 from pipeline.console import ExitCode
-
-
-def invoke(*words: str) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error of a command line."""
-    result = CliRunner().invoke(app, list(words))
-    return result.exit_code, result.stdout, result.stderr
 
 
 @pytest.fixture(scope="module")

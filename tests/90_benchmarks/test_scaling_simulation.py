@@ -43,27 +43,21 @@ def test_the_longest_first_is_kept() -> None:
     assert ended_s == pytest.approx(7.0)
 
 
-def test_a_slow_driver_bounds_the_rate_whatever_the_workers() -> None:
-    for workers in (10, 1000):
-        found = simulate([stage(2000, 0.01, driver_s=0.01)], Machine(workers=workers))
-        assert found.wall_s == pytest.approx(2000 * 0.01, rel=0.02)
-        assert found.driver_s == pytest.approx(20.0)
-
-
-def test_a_slow_scheduler_bounds_the_rate_whatever_the_workers() -> None:
-    found = simulate([stage(2000, 0.01, scheduler_s=0.02)], Machine(workers=1000))
-    assert found.wall_s == pytest.approx(2000 * 0.02, rel=0.02)
-
-
-def test_bytes_of_results_cost_scheduler_and_driver() -> None:
-    found = simulate([stage(500, 0.01, result_bytes=1e6)], Machine(workers=100, byte_s=2e-8))
-    assert found.wall_s == pytest.approx(500 * 0.02, rel=0.05)
-    assert found.driver_s == pytest.approx(10.0)
-
-
-def test_shared_storage_bounds_what_all_workers_read() -> None:
-    found = simulate([stage(1000, 0.01, stored_bytes=1e8)], Machine(workers=500, storage_bytes_s=1e9))
-    assert found.wall_s == pytest.approx(1000 * 1e8 / 1e9, rel=0.02)
+@pytest.mark.parametrize(
+    ("tasks", "machine", "wall_s", "driver_s"),
+    [
+        (stage(2000, 0.01, driver_s=0.01), Machine(workers=10), 20.0, 20.0),
+        (stage(2000, 0.01, driver_s=0.01), Machine(workers=1000), 20.0, 20.0),
+        (stage(2000, 0.01, scheduler_s=0.02), Machine(workers=1000), 40.0, 0.0),
+        (stage(500, 0.01, result_bytes=1e6), Machine(workers=100, byte_s=2e-8), 10.0, 10.0),
+        (stage(1000, 0.01, stored_bytes=1e8), Machine(workers=500, storage_bytes_s=1e9), 100.0, 0.0),
+    ],
+    ids=["driver of few", "driver of many", "scheduler", "bytes of results", "shared storage"],
+)
+def test_the_scarcest_part_bounds_the_rate(tasks: Stage, machine: Machine, wall_s: float, driver_s: float) -> None:
+    found = simulate([tasks], machine)
+    assert found.wall_s == pytest.approx(wall_s, rel=0.05)
+    assert found.driver_s == pytest.approx(driver_s)
 
 
 def test_a_barrier_waits_for_the_last_task() -> None:

@@ -122,7 +122,6 @@ def compare_roofs(faces: RoofFaces, groups: RoofGroups, uniform_share: float, ve
 
 @kernel
 def _compare_all(faces: RoofFaces, groups: RoofGroups, share: float, shift: float, figures: FloatArray) -> None:
-    """Kernel of `compare_roofs`."""
     starts, boxes = groups.starts, groups.boxes
     for group in range(len(starts) - 1):
         west, south = boxes[group, 0], boxes[group, 1]

@@ -109,7 +109,6 @@ def _roof_strips(laz: Path, labels: Path, number_of: Mapping[str, int]) -> tuple
 
 
 def _scene(folder: Path) -> dict[str, Any]:
-    """The content of scene.json."""
     try:
         scene: dict[str, Any] = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -120,7 +120,6 @@ def _has_intervals(comparison: Comparison) -> bool:
 
 
 def _notes(comparison: Comparison) -> list[str]:
-    """Warnings about the runs."""
     notes = []
     for run, manifest in zip(comparison.runs, comparison.manifests, strict=True):
         if manifest.failed_tiles:

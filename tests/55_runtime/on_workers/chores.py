@@ -15,7 +15,6 @@ DEADLINE_S = 120.0
 
 
 def double(number: int) -> int:
-    """Twice the number."""
     return 2 * number
 
 
