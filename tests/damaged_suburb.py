@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pyarrow as pa
 import shapely
+from roofs_by_hand import points_of
 from shapely import affinity
 
 from pipeline.model import RoofType, Status
@@ -165,16 +166,7 @@ def roof_points(truth: list[RoofModel], density: float = 3.0) -> ReferencePoints
         parts.append(np.column_stack([x, y, z])[on])
         owners.append(np.full(int(on.sum()), number, np.int32))
     xyz, building = np.concatenate(parts), np.concatenate(owners)
-    n = len(xyz)
-    return ReferencePoints(
-        name="roofs",
-        xyz=xyz,
-        classification=np.full(n, 6, np.int32),
-        building=building,
-        face=np.full(n, -1, np.int32),
-        is_roof=np.ones(n, bool),
-        last=np.ones(n, bool),
-    )
+    return points_of(xyz, 6, "roofs", building=building, is_roof=True)
 
 
 def reference_of(truth: list[RoofModel], *, points: bool = True, has_faces: bool = True) -> Reference:

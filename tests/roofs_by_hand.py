@@ -14,7 +14,7 @@ from shapely import affinity
 from pipeline.model import RoofType
 from pipeline.ruler.evaluation.measure import Measure
 from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
-from pipeline.ruler.evaluation.reference import Conditions, Reference
+from pipeline.ruler.evaluation.reference import Conditions, Reference, ReferencePoints
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofShape
 from pipeline.ruler.simulation.scene import Scene, Terrain, place_building
@@ -81,6 +81,15 @@ def reference(buildings: Sequence[RoofModel], **more: Any) -> Reference:
     """True buildings, complete in EXTENT."""
     settings: dict[str, Any] = {"extent": EXTENT, "has_faces": True} | more
     return Reference(name="by hand", kind="truth", buildings=tuple(buildings), outlines="truth", tiles=(), **settings)
+
+
+def points_of(xyz: np.ndarray, classification: Any, name: str = "t", **fields: Any) -> ReferencePoints:
+    """Points of a reference; by default last returns on no building and no roof."""
+    values = {"building": -1, "face": -1, "is_roof": False, "last": True} | fields
+    whole = {
+        key: np.full(len(xyz), value, bool if key in ("is_roof", "last") else np.int32) for key, value in values.items()
+    }
+    return ReferencePoints(name=name, xyz=xyz, classification=np.full(len(xyz), classification, np.int32), **whole)
 
 
 def conditions(*, good: bool, shape: str = "gable") -> Conditions:

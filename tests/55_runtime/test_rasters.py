@@ -11,6 +11,7 @@ import numpy as np
 import pyproj
 import pytest
 import rasterio
+from las_files import write_las
 
 from pipeline.errors import SettingsError
 from pipeline.export.raster import NO_VALUE, RasterLattice, write_cog
@@ -54,15 +55,8 @@ def plateau(tmp_path_factory: pytest.TempPathFactory) -> Path:
     x, y = x[~hole] + 600_000, y[~hole] + 5_000_000
     roof = (x > 600_010) & (x < 600_030) & (y > 5_000_030) & (y < 5_000_042)
     z = np.where(roof, 16.0, slope(x, y)) + rng.normal(0, 0.01, len(x))
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales, header.offsets = np.full(3, 0.001), np.array([600_000.0, 5_000_000.0, 0.0])
-    header.add_crs(pyproj.CRS.from_user_input("EPSG:32632+5773"))
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = x, y, z
-    las.return_number = las.number_of_returns = np.ones(len(x), np.uint8)
     path = tmp_path_factory.mktemp("plateau") / "plateau.laz"
-    las.write(path)
-    return path
+    return write_las(path, np.column_stack((x, y, z)), "EPSG:32632+5773")
 
 
 def cells(summary: ClassifySummary, name: str) -> tuple[Any, Any, Any]:
@@ -120,15 +114,8 @@ def test_tiles_do_not_show(size_m: float, plateau: Path, rasters_of: Any) -> Non
 
 
 def test_feet_stay_feet(plateau: Path, rasters_of: Any, tmp_path: Path) -> None:
-    source = laspy.read(plateau)
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales = np.full(3, 0.001)
-    header.offsets = np.array([600_000.0 / FOOT, 5_000_000.0 / FOOT, 0.0])
-    header.add_crs(pyproj.CRS.from_epsg(2994))  # Oregon Lambert, international feet
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = (np.asarray(source[name]) / FOOT for name in "xyz")
-    las.return_number = las.number_of_returns = np.ones(len(source.points), np.uint8)
-    las.write(tmp_path / "feet.laz")
+    in_feet = laspy.read(plateau).xyz / FOOT
+    write_las(tmp_path / "feet.laz", in_feet, "EPSG:2994")  # Oregon Lambert, international feet
     summary = rasters_of(tmp_path / "feet.laz", vertical_unit="ft")
     surface, x, y = cells(summary, "surface")
     roof = (x > 600_011 / FOOT) & (x < 600_029 / FOOT) & (y > 5_000_031 / FOOT) & (y < 5_000_041 / FOOT)

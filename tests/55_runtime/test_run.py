@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow.dataset as ds
 import pytest
 import shapely
+from las_files import write_las
 
 import pipeline.export.tile
 import pipeline.reconstruct
@@ -265,12 +266,8 @@ def test_a_place_where_nothing_can_be_stored_is_refused_at_once(suburb: Path, re
 
 def test_a_meadow_has_no_building_and_ends_well(tmp_path: Path, reconstruct: Any) -> None:
     rng = np.random.default_rng(1)
-    las = laspy.create(point_format=6, file_version="1.4")
-    las.header.scales, las.header.offsets = [0.001] * 3, [200_000.0, 500_000.0, 0.0]
-    las.x, las.y = 200_000.0 + rng.uniform(0.0, 60.0, 8000), 500_000.0 + rng.uniform(0.0, 60.0, 8000)
-    las.z = rng.normal(0.0, 0.02, 8000)
-    las.return_number = las.number_of_returns = np.ones(8000, np.uint8)
-    las.write(tmp_path / "meadow.las")
+    x, y = 200_000.0 + rng.uniform(0.0, 60.0, 8000), 500_000.0 + rng.uniform(0.0, 60.0, 8000)
+    write_las(tmp_path / "meadow.las", np.column_stack((x, y, rng.normal(0.0, 0.02, 8000))))
     whole = reconstruct(tmp_path / "meadow.las", crs="EPSG:28992")
     tiled = reconstruct(tmp_path / "meadow.las", crs="EPSG:28992", settings={"tile_size_m": 25.0})
     assert whole.counts["candidates"] == whole.counts["rejected"] == 0

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 import shapely
+from roofs_by_hand import points_of
 from scipy import ndimage
 
 from pipeline.model import BoolArray, FloatArray, RoofType
@@ -45,16 +46,7 @@ def truth_of(buildings: Sequence[RoofModel], extent: shapely.Polygon) -> Referen
 
 
 def classified(xyz: FloatArray, is_building: BoolArray, name: str = "t") -> Callable[[], ReferencePoints]:
-    n = len(xyz)
-    points = ReferencePoints(
-        name=name,
-        xyz=xyz,
-        classification=np.where(is_building, 6, 2).astype(np.int32),
-        building=np.full(n, -1, np.int32),
-        face=np.full(n, -1, np.int32),
-        is_roof=is_building,
-        last=np.ones(n, np.bool_),
-    )
+    points = points_of(xyz, np.where(is_building, 6, 2), name, is_roof=is_building)
     return lambda: points
 
 

@@ -7,9 +7,10 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import laspy
 import numpy as np
 import pytest
+from las_files import write_las
+from roofs_by_hand import points_of
 from scipy import stats
 
 from pipeline.errors import InconsistentInputError
@@ -38,16 +39,7 @@ SETTINGS = SceneSettings()
 
 
 def tile(xyz: FloatArray, is_ground: BoolArray, name: str = "t", *, last: BoolArray | None = None) -> ReferencePoints:
-    n = len(xyz)
-    return ReferencePoints(
-        name=name,
-        xyz=xyz,
-        classification=np.where(is_ground, 2, 0).astype(np.int32),
-        building=np.full(n, -1, np.int32),
-        face=np.full(n, -1, np.int32),
-        is_roof=np.zeros(n, np.bool_),
-        last=np.ones(n, np.bool_) if last is None else last,
-    )
+    return points_of(xyz, np.where(is_ground, 2, 0), name, last=True if last is None else last)
 
 
 def reader(points: ReferencePoints) -> Callable[[], ReferencePoints]:
@@ -192,13 +184,7 @@ def test_a_point_that_is_not_offered_has_no_match() -> None:
 
 
 def write(path: Path, xyz: FloatArray, classes: np.ndarray) -> Path:
-    las = laspy.LasData(laspy.LasHeader(version="1.2", point_format=1))
-    las.header.scales, las.header.offsets = np.full(3, 0.001), np.floor(xyz.min(axis=0))
-    las.x, las.y, las.z = xyz.T
-    las.classification = classes.astype(np.uint8)
-    las.return_number = las.number_of_returns = np.ones(len(xyz), np.uint8)
-    las.write(path)
-    return path
+    return write_las(path, xyz, point_format=1, classification=classes)
 
 
 def test_files_of_another_program_give_their_ground_in_any_order_and_tiling(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pyogrio.raw
 import pyproj
 import pytest
 import shapely
+from las_files import write_las
 
 from pipeline.errors import InconsistentInputError, InputError, SettingsError
 from pipeline.io import ReadOptions
@@ -39,15 +40,7 @@ def street(step: float = 0.25) -> tuple[FloatArray, np.ndarray]:
 
 
 def write(path: Path, xyz: FloatArray, classes: np.ndarray, returns: int = 1, unit: float = 1.0) -> Path:
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales, header.offsets = np.full(3, 0.001), np.floor(xyz.min(axis=0) / unit)
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = (xyz / unit).T
-    las.classification = classes
-    las.return_number = np.ones(len(xyz), np.uint8)
-    las.number_of_returns = np.full(len(xyz), returns, np.uint8)
-    las.write(path)
-    return path
+    return write_las(path, xyz / unit, classification=classes, number_of_returns=returns)
 
 
 def write_footprints(path: Path) -> Path:

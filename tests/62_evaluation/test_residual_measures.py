@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 import shapely
+from roofs_by_hand import points_of
 from scipy.spatial import cKDTree
 
 from pipeline.model import FloatArray, LabelArray, RoofType
@@ -44,15 +45,7 @@ def house(name: str, x: float, y: float, *, length: float = 10.0, edge: bool = F
 
 
 def tile(xyz: FloatArray, building: LabelArray, name: str = "t") -> ReferencePoints:
-    return ReferencePoints(
-        name=name,
-        xyz=xyz,
-        classification=np.full(len(xyz), 6, np.int32),
-        building=building,
-        face=np.zeros(len(xyz), np.int32),
-        is_roof=building >= 0,
-        last=np.ones(len(xyz), np.bool_),
-    )
+    return points_of(xyz, 6, name, building=building, face=0, is_roof=building >= 0)
 
 
 def reader(points: ReferencePoints) -> Callable[[], ReferencePoints]:

@@ -10,6 +10,7 @@ import laspy
 import numpy as np
 import pytest
 import typer
+from las_files import write_las
 from typer.testing import CliRunner
 
 from pipeline.cli.classifying import classify
@@ -32,13 +33,9 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(1)
     x, y = rng.uniform(0, 50, (2, 15_000))
     roof = (np.abs(x - 25) < 6) & (np.abs(y - 25) < 5)
-    las = laspy.LasData(laspy.LasHeader(version="1.2", point_format=1))
-    las.header.scales = np.full(3, 0.001)
-    las.x, las.y, las.z = x, y, np.where(roof, 6.0, 0.0) + rng.normal(0, 0.01, len(x))
-    las.return_number = las.number_of_returns = np.ones(len(x), np.uint8)
+    z = np.where(roof, 6.0, 0.0) + rng.normal(0, 0.01, len(x))
     path = tmp_path_factory.mktemp("house") / "house.laz"
-    las.write(path)
-    return path
+    return write_las(path, np.column_stack((x, y, z)), point_format=1)
 
 
 def test_a_file_comes_back_with_classes_and_rasters(house: Path, tmp_path: Path) -> None:

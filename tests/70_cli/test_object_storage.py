@@ -69,7 +69,7 @@ def test_a_bundle_in_a_bucket_is_replayed(bucket: str) -> None:
     storage_at(bucket).put("run/quarantine/a.bundle", b"no bundle")
     code, _, said = invoke("replay", f"{bucket}/run/quarantine/a.bundle")
     assert code == ExitCode.INPUT
-    assert "no bundle, or broken" in said
+    assert "not a bundle, or broken" in said
 
 
 def test_a_store_that_denies_ends_with_the_code_of_run_directories(scene: Path, bucket: str, s3: FaultyProxy) -> None:

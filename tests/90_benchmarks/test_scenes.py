@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from roofs_by_hand import points_of
 
 from benchmarks import scene_suites
 from benchmarks.scene_scores import detection_score, footprint_score, is_whole, touching_united
@@ -50,16 +51,7 @@ def reference_of(*footprints: shapely.Polygon, points: ReferencePoints | None = 
 
 
 def points_at(xy: np.ndarray, classes: np.ndarray) -> ReferencePoints:
-    none = np.zeros(len(xy), np.int32)
-    return ReferencePoints(
-        name="points",
-        xyz=np.column_stack((xy, np.zeros(len(xy)))),
-        classification=classes.astype(np.int32),
-        building=none - 1,
-        face=none - 1,
-        is_roof=none > 0,
-        last=none == 0,
-    )
+    return points_of(np.column_stack((xy, np.zeros(len(xy)))), classes, "points")
 
 
 def test_cells_add_up_over_blocks_and_objects_count_by_their_size_and_the_edge() -> None:
