@@ -180,7 +180,7 @@ def test_the_same_rows_in_any_order_give_the_same_bytes(contexts: Contexts, reje
 
 
 def test_a_folder_that_is_no_run_is_an_error_that_names_it(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="no folder: give the directory that a run wrote"):
+    with pytest.raises(RunError, match="not a folder: give the directory that a run wrote"):
         table_dataset(str(tmp_path), "buildings")
 
 
