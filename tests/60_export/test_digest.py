@@ -196,7 +196,7 @@ def test_one_object_in_two_files_is_an_error(run_dir: Path, tmp_path: Path, cont
 
 
 def test_a_directory_without_a_run_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="buildings is no folder"):
+    with pytest.raises(RunError, match="buildings is not a folder"):
         run_digest(str(tmp_path))
 
 
