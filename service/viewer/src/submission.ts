@@ -358,18 +358,18 @@ function drawRow(sent: Sent, remove: () => void): void {
 }
 
 /** What the service read in the header. */
-function preflight(facts: Record<string, unknown>): HTMLElement[] {
-  const crs = facts["crs"] as { name?: string; epsg?: number | null } | null | undefined;
+function preflight(known: Record<string, unknown>): HTMLElement[] {
+  const crs = known["crs"] as { name?: string; epsg?: number | null } | null | undefined;
   const crsText = crs == null ? "no CRS" : crs.epsg == null ? (crs.name ?? "CRS without a code") : `EPSG:${crs.epsg}`;
   const facts =
-    facts["kind"] === "footprints"
-      ? [typeof facts["featureCount"] === "number" ? `${count(facts["featureCount"])} outlines` : null, crsText]
+    known["kind"] === "footprints"
+      ? [typeof known["featureCount"] === "number" ? `${count(known["featureCount"])} outlines` : null, crsText]
       : [
-          typeof facts["pointCount"] === "number" ? `${count(facts["pointCount"])} points` : null,
-          typeof facts["densityPerM2"] === "number" ? measure(facts["densityPerM2"], 1, "per m²") : null,
+          typeof known["pointCount"] === "number" ? `${count(known["pointCount"])} points` : null,
+          typeof known["densityPerM2"] === "number" ? measure(known["densityPerM2"], 1, "per m²") : null,
           crsText,
         ];
-  const notes = [...texts(facts["problems"]), ...texts(facts["warnings"])];
+  const notes = [...texts(known["problems"]), ...texts(known["warnings"])];
   return [
     el("p", { class: "facts", title: crs?.name ?? null }, facts.filter((fact) => fact !== null).join(" · ")),
     ...(notes.length === 0 ? [] : [warningNotice(...notes)]),
