@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 import shapely
 
 from pipeline import __version__
-from pipeline.errors import RunError
+from pipeline.errors import RunError, SettingsError
 from pipeline.export.geoparquet import table_dataset
 from pipeline.export.records import KEYS
 from pipeline.io.urls import has_mark, is_url, shown
@@ -123,7 +123,10 @@ def earlier_run(run_dir: str) -> Earlier:
 def request_of(manifest: RunManifest) -> RunRequest:
     """The request of a run, from its manifest."""
     sections = {str(name): dict(values) for name, values in manifest.settings.items()}
-    settings = RunSettings.from_mapping({**sections.pop("general"), **sections})
+    try:
+        settings = RunSettings.from_mapping({**sections.pop("general"), **sections})
+    except SettingsError as error:
+        raise RunError(f"run.json has the settings of an older gablework ({error.faults[0]}). {_AGAIN}") from error
     if settings.settings_hash != manifest.settings_hash:
         raise RunError("the settings in run.json are not those of its settings_hash: it was changed by hand")
     asked = manifest.request

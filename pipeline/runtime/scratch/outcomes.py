@@ -37,6 +37,9 @@ Brief = TypeVar("Brief")
 
 FOLDER = "kept"
 """Folder of scratch for all outcomes."""
+_FORMAT = 2
+"""Part of every key, to be raised when the class of an outcome moves or gets another content: the pickles of an older
+checkout of the same version are then not read."""
 _KEY_DIGITS = 40
 """Hexadecimal digits of a key: 160 bits."""
 
@@ -55,7 +58,7 @@ def key_of(*parts: object) -> str:
     >>> key_of(1, "a") == key_of(1, "a"), key_of(1) == key_of(1.0), key_of(("a", "b")) == key_of("ab")
     (True, False, False)
     """
-    digest = hashlib.sha256(fingerprint().encode())
+    digest = hashlib.sha256(f"{_FORMAT};{fingerprint()}".encode())
     for part in parts:
         _add(digest.update, part)
     return digest.hexdigest()[:_KEY_DIGITS]
