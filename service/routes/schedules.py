@@ -10,6 +10,7 @@ from fastapi import APIRouter, Body, Header, Path, Query, Response
 from starlette.concurrency import run_in_threadpool
 
 from pipeline.schedule import Cron, Missed, Overlap
+from service.drafts import Draft
 from service.errors import ChangedMeanwhileError, RequestError
 from service.jobs import JobRequest
 from service.processes import process_named
@@ -28,9 +29,11 @@ from service.routes.bound import Base, Reader, Settings_, Store, Submitter
 from service.routes.status import execute_request, status_info
 from service.routes.submission import Submitting
 from service.schedules import Definition, Schedule, ScheduleRun
+from service.settings import ServiceSettings
 from service.store import ScheduleFilter
 from service.wire import schedules as wire
 from service.wire.base import link, page_links, respond
+from service.wire.execute import Execute
 from service.wire.queries import Page, ScheduleQuery
 
 router = APIRouter(tags=["schedules"])
@@ -70,7 +73,7 @@ async def make_schedule(
     kept as long as the schedule exists.
     """
     settings, caller = submitting.settings, submitting.caller
-    draft = process_named(body.processID).draft(body.execute, settings)
+    draft = _draft(body.processID, body.execute, settings)
 
     def create(request: JobRequest) -> Schedule:
         definition = _definition(body, None, request, draft.priority)
@@ -80,6 +83,14 @@ async def make_schedule(
         made = await submission.checked(draft, create)
     place = f"{base}/schedules/{made.schedule_id}"
     return _answer(made, base, status_code=201, headers={"Location": place})
+
+
+def _draft(process_id: str, execute: Execute, settings: ServiceSettings) -> Draft:
+    """The draft of a schedule's jobs; raises RequestError with the faults of `execute`."""
+    try:
+        return process_named(process_id).draft(execute, settings)
+    except RequestError as error:
+        raise RequestError([f"execute: {fault}" for fault in error.faults]) from error
 
 
 def _definition(body: wire.SchedulePatch, before: Definition | None, request: JobRequest, priority: int) -> Definition:
@@ -166,7 +177,7 @@ async def change_schedule(
     draft = None
     if "execute" in body.model_fields_set:
         chosen = body.processID if "processID" in body.model_fields_set else process_id
-        draft = process_named(chosen).draft(body.execute, submitting.settings)
+        draft = _draft(chosen, body.execute, submitting.settings)
     elif "processID" in body.model_fields_set and body.processID != process_id:
         raise RequestError([f'processID is "{body.processID}": the schedule is of {process_id}, give execute, too'])
     # a precondition counts only for a request that would succeed without it

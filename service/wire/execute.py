@@ -72,8 +72,9 @@ class Execute(Request):
             unknown = [name for name in self.outputs if name not in kinds]
             faults += [f"{shortened(name)} is not an output: use {', '.join(kinds)}" for name in unknown]
             outputs = tuple(name for name in kinds if name in self.outputs)
-        if inputs is not None and max_inputs is not None and len(inputs.tiles) > max_inputs:
-            faults.append(f"tiles has {len(inputs.tiles)} entries: use at most {max_inputs}")
+        tiles = self.inputs.get("tiles")
+        if max_inputs is not None and isinstance(tiles, list) and len(tiles) > max_inputs:
+            faults.append(f"tiles has {len(tiles)} entries: use at most {max_inputs}")
         if inputs is None or faults:
             raise RequestError(faults)
         return inputs.draft(process_id, outputs)

@@ -79,6 +79,11 @@ def _changes(schema: dict[str, Any]) -> None:
     schema["minProperties"] = 1
 
 
+def _not_given() -> Any:
+    """The default of a word that a change need not give: an empty one, which no client can send."""
+    return Field(default_factory=str)
+
+
 class SchedulePatch(Request):
     """A change of a schedule: what is not given stays."""
 
@@ -99,7 +104,7 @@ class SchedulePatch(Request):
     missed: Missed = "run-latest"
     graceSeconds: Grace = 300.0
     overlap: Overlap = "skip"
-    processID: ProcessId = "reconstruct"
+    processID: ProcessId = _not_given()
     execute: Execute = Field(default_factory=lambda: Execute())  # noqa: PLW0108 - mypy wants it
     paused: bool = Field(False, description="Whether the clock is ignored.")
 
@@ -113,10 +118,11 @@ class SchedulePatch(Request):
     @field_validator("execute")
     @classmethod
     def _usable(cls, execute: Execute, info: ValidationInfo) -> Execute:
-        """Checks the inputs as those of a job that is submitted now."""
+        """Checks the inputs as those of a job that is submitted now; the route knows the process that stays."""
         if "processID" in info.data:
+            likely = "compare" if "methods" in execute.inputs else "reconstruct"
             try:
-                execute.draft(info.data["processID"])
+                execute.draft(info.data["processID"] or likely)
             except RequestError as error:
                 raise FaultsError([f"execute: {fault}" for fault in error.faults]) from error
         return execute
@@ -128,6 +134,7 @@ class ScheduleRequest(SchedulePatch):
     model_config = ConfigDict(json_schema_extra=optional_members)
 
     cron: Expression
+    processID: ProcessId = "reconstruct"
     execute: Execute
 
     @classmethod

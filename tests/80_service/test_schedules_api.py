@@ -237,6 +237,18 @@ def test_the_request_of_a_schedule_is_changed_as_a_whole_and_its_old_upload_may_
     assert local_service.client.delete(f"/uploads/{new}").status_code == 409
 
 
+def test_a_changed_request_is_one_of_the_schedule_s_process(local_service) -> None:
+    methods = ["arrangement", "kmeans"]
+    inputs = {"tiles": [{"href": f"/uploads/{local_service.upload()}"}], "crs": "EPSG:28992"}
+    made = make(local_service, processID="compare", execute={"inputs": {**inputs, "methods": methods}})
+    changed = patch(local_service, made, execute={"inputs": {**inputs, "methods": methods[::-1]}})
+    assert changed.status_code == 200, changed.text
+    assert changed.json()["execute"]["inputs"]["methods"] == methods[::-1]
+    refused = patch(local_service, made, execute={"inputs": inputs})
+    assert refused.status_code == 400
+    assert "execute: methods is missing" in refused.json()["detail"]
+
+
 @pytest.mark.parametrize(
     ("values", "fault"),
     [
