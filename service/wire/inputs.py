@@ -74,8 +74,7 @@ def _same_crs(one: str, other: str) -> bool:
 
 
 def _has_area(box: list[float]) -> list[float]:
-    x_min, y_min, x_max, y_max = box
-    if not (x_min < x_max and y_min < y_max):
+    if len(box) != 4 or not (box[0] < box[2] and box[1] < box[3]):
         raise ValueError("use x_min, y_min, x_max, y_max with a positive width and depth")
     return box
 
@@ -84,7 +83,6 @@ _FOUR_NUMBERS = {"type": "array", "items": {"type": "number"}, "minItems": 4, "m
 Coordinate = Annotated[float, Field(gt=-LARGEST_COORDINATE, lt=LARGEST_COORDINATE, allow_inf_nan=False)]
 Box = Annotated[
     list[Coordinate],
-    Field(min_length=4, max_length=4),
     AfterValidator(_has_area),
     BeforeValidator(_in_crs_of_tiles),
     WithJsonSchema(
