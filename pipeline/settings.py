@@ -27,7 +27,6 @@ from pipeline.terrain.settings import (
 )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class GeneralSettings(Parameters):
     """Settings of the run as a whole."""
 

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from pipeline.runtime.request import RunRequest
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class InputsTable(Parameters):
     """`[inputs]`: data to read."""
 
@@ -46,7 +45,6 @@ class InputsTable(Parameters):
     licence: str = parameter("", "Licence of the source data, written into the results.")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class OutputTable(Parameters):
     """`[output]`: files to write."""
 
@@ -58,7 +56,6 @@ class OutputTable(Parameters):
     report: bool = parameter(True, "Write run.html, the page about the run, when it is over.")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class WorkTable(Parameters):
     """`[work]`: intermediate results."""
 
@@ -69,7 +66,6 @@ class WorkTable(Parameters):
     )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ClusterTable(Parameters):
     """`[cluster]`: processes that do the work."""
 
@@ -106,7 +102,6 @@ class ClusterTable(Parameters):
     )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ScheduleTable(Parameters):
     """`[schedule]`: when `gablework batch schedule` runs it."""
 

@@ -5,8 +5,6 @@ The defaults are what measured better; `faithful()` keeps to the method's paper,
 
 from __future__ import annotations
 
-import dataclasses
-
 from pipeline.parameters import Parameters, parameter
 from pipeline.segmentation.clustering_settings import (
     ClusterMembershipSettings,
@@ -19,7 +17,6 @@ from pipeline.segmentation.clustering_settings import (
 from pipeline.segmentation.plane_settings import PlaneRefinementSettings, RegionGrowingSettings
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class RoofFaceSettings(Parameters):
     """How the planes of a method become roof faces; a method without this setting arranges them.
 
@@ -36,7 +33,6 @@ class RoofFaceSettings(Parameters):
     )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class FuzzySartSettings(RoofFaceSettings, FuzzySartClusteringSettings, PlaneRefinementSettings):
     """Settings of the recipe; those of the clustering, of the refinement and of the roof faces are among them."""
 
@@ -101,7 +97,6 @@ class FuzzySartSettings(RoofFaceSettings, FuzzySartClusteringSettings, PlaneRefi
         return min(max(self.noise_factor * sigma_m, self.min_absorption_m), self.max_absorption_m)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ParameterSpaceSettings(RoofFaceSettings, RegionGrowingSettings, RoofTreeSettings):
     """Settings that both methods share."""
 
@@ -153,7 +148,6 @@ class ParameterSpaceSettings(RoofFaceSettings, RegionGrowingSettings, RoofTreeSe
     )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ParameterSpace2dSettings(ParameterSpaceSettings, SingleLinkageSettings):
     """Settings of the method in slope and orientation."""
 
@@ -178,7 +172,6 @@ class ParameterSpace2dSettings(ParameterSpaceSettings, SingleLinkageSettings):
         )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ParameterSpace3dSettings(ParameterSpaceSettings, ParameterBoxSettings, ClusterMembershipSettings):
     """Settings of the method in slope, orientation and O-distance."""
 
@@ -196,7 +189,6 @@ class ParameterSpace3dSettings(ParameterSpaceSettings, ParameterBoxSettings, Clu
         )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class KMeansSettings(RoofFaceSettings, NormalClusteringSettings, PlaneRefinementSettings):
     """Settings of the recipe; those of the clustering, of the refinement and of the roof faces are among them."""
 

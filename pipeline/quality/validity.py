@@ -34,7 +34,6 @@ standards.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterable
 from itertools import chain
@@ -74,7 +73,6 @@ _MIN_SLENDERNESS = 1.2e-4
 point: of 600 slabs val3dity 2.6 finds half of those below 9e-5 faulty, a tenth at 1e-4, none above 1.2e-4."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ValidityTolerances(Parameters):
     """How exactly a solid has to keep the rules; the defaults are val3dity's."""
 

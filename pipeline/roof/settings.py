@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from pipeline.parameters import Parameters, parameter
 
 _CELL_SPACINGS = 1.2
@@ -12,7 +10,6 @@ _MIN_CELL_M = 0.25
 """A superstructure of a metre has four such cells per side."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class RoofSettings(Parameters):
     """How roof planes become roof faces and closed solids."""
 
@@ -151,7 +148,6 @@ class RoofSettings(Parameters):
         return self.outline == "walls" and self.straight_eaves
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ArrangementSettings(Parameters):
     """Costs of roof faces against the points that they explain."""
 
@@ -232,7 +228,6 @@ class ArrangementSettings(Parameters):
         return max(self.face_cost, min(by_area, self.face_points)), by_area
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class RoofTypeSettings(Parameters):
     """Thresholds of the roof types; they change no geometry."""
 

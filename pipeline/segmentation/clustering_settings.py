@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from pipeline.parameters import Parameters, parameter
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class FuzzySartClusteringSettings(Parameters):
     """Settings of the clustering; the paper publishes the vigilance alone."""
 
@@ -46,7 +43,6 @@ class FuzzySartClusteringSettings(Parameters):
     )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class NormalClusteringSettings(Parameters):
     """Settings of the clustering of facets; the paper has k = 2 and publishes no others."""
 
@@ -87,7 +83,6 @@ class NormalClusteringSettings(Parameters):
     )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class SingleLinkageSettings(Parameters):
     """Settings of the clustering in two dimensions."""
 
@@ -111,7 +106,6 @@ class SingleLinkageSettings(Parameters):
         return [*super().cross_faults(), *self.range_faults("min_linkage_deg", "linkage_start_deg")]
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ParameterBoxSettings(Parameters):
     """Settings of the coarse clustering in three dimensions."""
 
@@ -136,7 +130,6 @@ class ParameterBoxSettings(Parameters):
     )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ClusterMembershipSettings(Parameters):
     """Settings of the refinement of coarse clusters."""
 
@@ -187,7 +180,6 @@ class ClusterMembershipSettings(Parameters):
     )  # fmt: skip
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class RoofTreeSettings(Parameters):
     """Settings of both trees."""
 

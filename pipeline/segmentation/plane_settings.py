@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 from pipeline.parameters import Parameters, parameter
@@ -13,7 +12,6 @@ _GRID_M = 1e-3
 """Resolution of the points: a distance to a plane is never less, even if settings and noise are 0."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class AdaptivePlaneSettings(Parameters):
     """Settings of the detection."""
 
@@ -76,7 +74,6 @@ class AdaptivePlaneSettings(Parameters):
         return max(MIN_PLANE_POINTS, math.ceil(asked))
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class RegionGrowingSettings(Parameters):
     """Settings of region growing."""
 
@@ -111,7 +108,6 @@ class RegionGrowingSettings(Parameters):
         return min(max(self.growing_noises * sigma_m, self.min_growing_m), self.max_growing_m)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class PlaneRefinementSettings(Parameters):
     """Settings of the refinement; the paper publishes none of them."""
 

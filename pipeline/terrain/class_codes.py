@@ -14,7 +14,6 @@ OTHER = 255
 """Replaces an ASPRS code that the user took out of its group: neither ground, nor building, nor undecided."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ClassCodeSettings(Parameters):
     """Meaning of the codes in the file; if classes are trusted, points with a code in no list cannot be roof."""
 

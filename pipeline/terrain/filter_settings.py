@@ -9,7 +9,6 @@ from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS, PIT_CELLS, between_walls_support_m, wide_support_m
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class MorphologicalFilterSettings(Parameters):
     """Sizes and limits of the openings; used only with the morphological filter."""
 
@@ -127,7 +126,6 @@ class Level:
     """How far the decision on a point looks."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class HierarchicalFilterSettings(Parameters):
     """The hierarchy of cells and the tests of a joining point; used only with the hierarchical filter."""
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.filter_settings import HierarchicalFilterSettings, MorphologicalFilterSettings
 from pipeline.terrain.support import PLANARITY_SCALES
@@ -12,7 +10,6 @@ _MAX_SUPPORT_M = 500
 """A filter that looks farther makes a tile nearly all halo."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class OutlierSettings(Parameters):
     """When a point counts as a gross outlier."""
 
@@ -29,7 +26,6 @@ class OutlierSettings(Parameters):
         return 2.0 * self.cube_m
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
     """How ground is separated from objects."""
 
@@ -114,7 +110,6 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
         return float(self.reach_m + 4)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class VegetationSettings(Parameters):
     """How local planarity is measured."""
 
@@ -166,7 +161,6 @@ class VegetationSettings(Parameters):
         return 2.0 * self.radius_m * 2.0 ** (PLANARITY_SCALES - 1) + self.company_m
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class SurfaceSettings(Parameters):
     """How the TIN is thinned and cut."""
 
@@ -205,7 +199,6 @@ class SurfaceSettings(Parameters):
         return round(2 * self.thinning_m * 1000)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class CandidateSettings(Parameters):
     """Conditions that make a surface a candidate."""
 
@@ -272,7 +265,6 @@ class CandidateSettings(Parameters):
     )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class UnitSettings(Parameters):
     """How touching buildings are separated."""
 

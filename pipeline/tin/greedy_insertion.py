@@ -25,7 +25,6 @@ from pipeline.tin.half_edges import canonical_facets, locate, restore_delaunay, 
 from pipeline.tin.predicates import MAX_EXTENT_MM, orientation
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class GreedyInsertionSettings(Parameters):
     """Settings of the greedy insertion."""
 

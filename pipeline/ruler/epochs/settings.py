@@ -15,7 +15,6 @@ TABLE = "diff"
 """The table of the settings file."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class DiffSettings(Parameters):
     """The least size of a change."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -19,7 +18,6 @@ _TURN_S = 120.0
 """From the end of a strip to the start of the next."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ScannerSettings(Parameters):
     """The survey: instrument, flight and noise."""
 
