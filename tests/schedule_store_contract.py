@@ -140,6 +140,20 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
                 assert "schedules" not in sa.inspect(connection).get_table_names()
                 assert connection.execute(sa.select(table.c.job_id)).scalar_one() == job_id
 
+    def test_stored_requests_get_the_new_names_of_settings(self, store: JobStore) -> None:
+        old = {"method": "kmeans", "roof": {"minimum_points": 7, "flat_below_deg": 4.0}, "kmeans": {"least_points": 9}}
+        new = {"method": "kmeans", "roof": {"min_points": 7, "flat_below_deg": 4.0}, "kmeans": {"min_points": 9}}
+        stored = dataclasses.replace(request(), settings=old)
+        job_id = submit(store, settings=old).job_id
+        schedule_id = make(store, request=stored).schedule_id
+        with store._database.write() as connection:
+            config = migrations._config()
+            config.attributes["connection"] = connection
+            command.stamp(config, "0002")
+        store.migrate()
+        assert store.get(job_id).request.settings == new
+        assert store.schedules.get(schedule_id).definition.request.settings == new
+
     # --- made, read, changed, removed
 
     def test_a_schedule_comes_back_as_it_was_made(self, store: JobStore) -> None:

@@ -23,7 +23,7 @@ ProcessId = Annotated[
 
 _SUMMARY = {
     "id": "reconstruct",
-    "version": "0.1.0",
+    "version": "0.2.0",
     "title": "Reconstruct buildings",
     "jobControlOptions": ["async-execute", "dismiss"],
     "outputTransmission": ["reference"],
