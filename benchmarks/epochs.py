@@ -3,7 +3,7 @@
     python -m benchmarks.epochs --out DIR [--split dev|test] [--only suburb town] [--size 620] [--jobs 2]
                                 [--page docs/results/epochs.md]
 
-Scenes of the suites `suburb` and `town` are changed by `simulation.two_epochs`, scanned twice with other seeds
+Scenes of the suites `suburb` and `town` are changed by `benchmarks.two_epochs`, scanned twice with other seeds
 of the scanner, in `suburb-mixed` with two kinds of survey, reconstructed without footprints and compared. Runs that lie
 in DIR are used again. Writes DIR/epochs_SPLIT.md and DIR/CASE-SPLIT/diff, and its lines into the page.
 """
@@ -23,6 +23,7 @@ import shapely
 
 from benchmarks.entries import markdown_table
 from benchmarks.results_page import filled
+from benchmarks.two_epochs import TwoEpochs, Work, two_epochs
 from pipeline.ruler.epochs.diff import DiffRequest, diff
 from pipeline.ruler.epochs.records import Change
 from pipeline.ruler.simulation.als import ScannerSettings, scan
@@ -30,7 +31,6 @@ from pipeline.ruler.simulation.scene import Scene
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.suites import suite_named
 from pipeline.ruler.simulation.survey_files import write_points
-from pipeline.ruler.simulation.two_epochs import TwoEpochs, Work, two_epochs
 from pipeline.runtime.manifest import NAME, RunStatus, read_manifest
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources

@@ -10,12 +10,12 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 
+from benchmarks.two_epochs import TwoEpochs, Work, two_epochs
 from pipeline.ruler.epochs.diff import DiffRequest, diff
 from pipeline.ruler.simulation.als import scan
 from pipeline.ruler.simulation.suburb import suburb
 from pipeline.ruler.simulation.suites import suite_named
 from pipeline.ruler.simulation.survey_files import write_points
-from pipeline.ruler.simulation.two_epochs import TwoEpochs, Work, two_epochs
 from pipeline.runtime.manifest import read_manifest
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
