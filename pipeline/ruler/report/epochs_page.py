@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
@@ -205,10 +206,10 @@ def _figures(row: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _settings(settings: DiffSettings) -> list[tuple[str, str, str]]:
     """The thresholds with their values and meanings."""
-    found = []
-    for name, field in DiffSettings.__dataclass_fields__.items():
-        found.append((name, f"{getattr(settings, name):g} {field.metadata['unit']}".rstrip(), field.metadata["doc"]))
-    return found
+    return [
+        (field.name, f"{getattr(settings, field.name):g} {field.metadata['unit']}".rstrip(), field.metadata["doc"])
+        for field in dataclasses.fields(settings)
+    ]
 
 
 def _run_row(epoch: Epoch) -> tuple[str, ...]:
