@@ -121,13 +121,7 @@ class Console:
         self._logs = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
-        """Start logging.
-
-        Raises
-        ------
-        typer.Exit
-            `GABLEWORK_LOG_JSON` is neither 1 nor 0.
-        """
+        """Start logging; raises typer.Exit if `GABLEWORK_LOG_JSON` is neither 1 nor 0."""
         if self._log_json or os.environ.get("GABLEWORK_LOG_JSON"):
             from pipeline.runtime.monitoring import logs
 
@@ -145,10 +139,7 @@ class Console:
     ) -> None:
         """Close the bars; print what went wrong and end with its exit code.
 
-        Raises
-        ------
-        typer.Exit
-            With the code of `EXIT_CODES`, in place of any error except those that typer itself handles.
+        Raises typer.Exit with the code of `EXIT_CODES`, in place of any error except those that typer itself handles.
         """
         self._close_bars()
         with self._logs:

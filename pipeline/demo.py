@@ -47,23 +47,14 @@ def demonstrate(
 ) -> Demo:
     """Simulate, reconstruct, measure and draw into the folders `scene/`, `run/`, `report/` and the file `demo.png`.
 
+    Raises RunError if there is a run already, and `overwrite` is False.
+
     Parameters
     ----------
-    out : str or Path
-        Folder of everything.
-    on_event : callable
-        Gets the events of all steps.
     workers : int or None
         Processes of the embedded cluster; 0 runs serially, None follows the estimate.
-    overwrite : bool
-        Replace an earlier demo.
     size_m, seed : tuple of float or None, int or None
         Extent of the suburb east and north, and its seed; its own by default.
-
-    Raises
-    ------
-    RunError
-        There is a run already, and `overwrite` is False.
     """
     folder = Path(out)
     scene = simulate(

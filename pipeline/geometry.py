@@ -23,20 +23,7 @@ _LOWER_QUARTILE_CHI2 = (math.nan, 0.10153, 0.57536, 1.21253, 1.92256, 2.67460, 3
 
 @kernel
 def facet_normals(xyz: FloatArray, facets: LabelArray) -> FloatArray:
-    """Unit normals of facets, pointing up.
-
-    Parameters
-    ----------
-    xyz : (n, 3) float64
-        Vertices in metres.
-    facets : (m, 3) int32
-        Vertex indices.
-
-    Returns
-    -------
-    (m, 3) float64
-        z is never negative; (0, 0, 0) for a facet without area.
-    """
+    """Unit normals of facets, (m, 3), pointing up: z is never negative; (0, 0, 0) for a facet without area."""
     normals = np.zeros((len(facets), 3))
     for t in range(len(facets)):
         i, j, k = facets[t, 0], facets[t, 1], facets[t, 2]
@@ -101,17 +88,8 @@ def o_distances_m(normals: FloatArray, points: FloatArray) -> FloatArray:
 def fit_plane_coefficients(points: FloatArray, index: LabelArray) -> tuple[float, float, float, float]:
     """Least-squares plane z = a x + b y + c of some points (Eqs. 8 to 14), for use in compiled code.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Points in metres.
-    index : (k,) int32
-        Which of them; at least one.
-
-    Returns
-    -------
-    a, b, c, sse : float
-        Coefficients, and the sum of squared vertical residuals in m2 (Eq. 10). Collinear points: `solve_plane_moments`.
+    `index` (k,), at least one, says which of the points (n, 3). Returns a, b, c and the sum of squared vertical
+    residuals in m2 (Eq. 10). Collinear points: `solve_plane_moments`.
     """
     found = moments_of(points, index)
     a, b = solve_plane_moments(found.xx, found.xy, found.yy, found.xz, found.yz)
@@ -123,22 +101,10 @@ def fit_plane_coefficients(points: FloatArray, index: LabelArray) -> tuple[float
 
 
 def fit_plane(points: FloatArray) -> Plane:
-    """Least-squares plane z = a x + b y + c of points (Shorter & Kasparis, Eqs. 8 to 14).
+    """Least-squares plane z = a x + b y + c of points (n, 3) (Shorter & Kasparis, Eqs. 8 to 14).
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Points in metres, at least one.
-
-    Returns
-    -------
-    Plane
-        Points collinear in plan give the plane that is level across their line; a single position a horizontal one.
-
-    Raises
-    ------
-    ValueError
-        Without points.
+    Points collinear in plan give the plane that is level across their line; a single position a horizontal one. Raises
+    ValueError without points.
 
     Examples
     --------
@@ -164,10 +130,7 @@ def vertical_residuals_m(points: FloatArray, coefficients: tuple[float, float, f
 def ring_area_m2(ring: FloatArray) -> float:
     """Signed area of a ring in plan, square metres: positive where it runs counter-clockwise.
 
-    Parameters
-    ----------
-    ring : (n, 2) or (n, 3) float64
-        Vertices; the first may be repeated at the end. Fewer than three have no area.
+    Vertices are (n, 2) or (n, 3); the first may be repeated at the end. Fewer than three have no area.
     """
     area = 0.0
     for k in range(1, len(ring) - 1):
@@ -327,27 +290,12 @@ def _nearest_neighbours(
 
 
 def nearest_neighbours(points: FloatArray, k: int, cell_size_m: float | None = None) -> LabelArray:
-    """The k nearest other points of every point, exactly.
+    """The k nearest other points of every point, exactly: (n, k) int32.
 
-    Parameters
-    ----------
-    points : (n, 2) or (n, 3) float64
-        Positions in metres: distances are in plan or in space accordingly.
-    k : int
-        How many.
-    cell_size_m : float, optional
-        Cell of the search grid; it only changes the speed. Default: about two points per cell.
-
-    Returns
-    -------
-    (n, k) int32
-        Nearest first, of equal distances the lower index first; -1 where there are fewer other points. A point is not
-        its own neighbour, another one at the same position is.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong, k is negative or the cell size is not positive.
+    Nearest first, of equal distances the lower index first; -1 where there are fewer other points. A point is not its
+    own neighbour, another one at the same position is. Distances are in plan for points (n, 2), in space for (n, 3),
+    metres. The cell of the search grid only changes the speed; by default it holds about two points. Raises ValueError
+    if the shape is wrong, k is negative or the cell size is not positive.
 
     Examples
     --------
@@ -381,42 +329,22 @@ _UNEVEN = 1.3
 
 
 def point_spacing_m(points: FloatArray) -> float:
-    """Typical spacing of points in plan: 1 / sqrt(density) where most of them lie.
+    """Typical spacing of points in plan: 1 / sqrt(density) where most of them lie; nan for fewer than two points.
 
     The median over all points of the distance to the eighth neighbour, scaled by what it is among points strewn at
     random: robust against borders, gaps, and the short steps along a scan line. On a square lattice it gives 0.9 of the
     spacing.
-
-    Parameters
-    ----------
-    points : (n, 2) or (n, 3) float64
-        Points in metres; only x and y count.
-
-    Returns
-    -------
-    float
-        Metres; nan for fewer than two points.
     """
     return _spacings(_plan(points))[0]
 
 
 def spacing_over_area_m(points: FloatArray) -> float:
-    """Spacing of points in plan that holds over most of their area.
+    """Spacing of points in plan that holds over most of their area; nan for fewer than two points.
 
     Where two strips overlap on a part of a roof, most points lie there, but not most of the roof. A point represents an
     area that grows with the squared distance to its eighth neighbour; the median over the area is taken if it is more
     than 1.3 times that over the points, else `point_spacing_m`: with one density they differ by less than a quarter,
     borders included (measured on simulated and real roofs of 1 to 30 points per m2).
-
-    Parameters
-    ----------
-    points : (n, 2) or (n, 3) float64
-        Points in metres; only x and y count.
-
-    Returns
-    -------
-    float
-        Metres; nan for fewer than two points.
     """
     usual, over_area = _spacings(_plan(points))
     return over_area if over_area > _UNEVEN * usual else usual
@@ -459,17 +387,8 @@ def noise_sigma_m(points: FloatArray) -> float:
     """Robust standard deviation of the vertical noise, from the planes of nine neighbouring points each.
 
     The lower quartile over all points of the local root mean square residual, scaled by what it is for normal noise:
-    neighbourhoods across edges and in trees are the upper part of the distribution and do not count.
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Points in metres.
-
-    Returns
-    -------
-    float
-        Metres; nan for fewer than four points.
+    neighbourhoods across edges and in trees are the upper part of the distribution and do not count. In metres; nan for
+    fewer than four points.
     """
     freedom = min(9, len(points)) - 3
     if freedom < 1:
@@ -511,19 +430,9 @@ def _covered(xyz_mm: IntArray, points: FloatArray, radius_mm: int, height_mm: in
 
 
 def top_visible(points: FloatArray, radius_m: float = 0.5, height_m: float = 1.1) -> BoolArray:
-    """Which points see the sky: no other one is more than 1.1 m higher within 0.5 m in plan.
+    """Which points (n, 3) see the sky: no other one is more than 1.1 m higher within 0.5 m in plan.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Points in metres; compared on whole millimetres, so that limits are met exactly.
-    radius_m, height_m : float
-        The limits, whole millimetres.
-
-    Returns
-    -------
-    (n,) bool
-        True where the point is visible from above.
+    Points and limits are compared on whole millimetres, so that limits are met exactly.
     """
     if len(points) == 0:
         return np.zeros(0, np.bool_)

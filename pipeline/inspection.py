@@ -96,19 +96,8 @@ class Inspection:
 def inspect(path: str | Path, options: ReadOptions | None, on_progress: Callable[[int, int], None]) -> Inspection:
     """Read a tile once, streamed, and describe its content.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    options : ReadOptions, optional
-        Options of the user for the file.
-    on_progress : callable
-        Called with points read and points promised.
-
-    Raises
-    ------
-    InputError
-        The file or its points cannot be read.
+    `on_progress` is called with points read and points promised. Raises InputError if the file or its points cannot be
+    read.
     """
     source = open_source(path, options)
     raster = _Raster(source.info)

@@ -279,18 +279,14 @@ class PreparedCloud:
         faces: tuple[PlanFace, ...] | None = None,
         roof_type: RoofType | None = None,
     ) -> Segmentation:
-        """The result of a method, in the candidate's frame.
+        """The result of a method, in the candidate's frame; its planes are over the origin of `points`.
 
         Parameters
         ----------
-        planes : tuple of Plane
-            Over the origin of `points`.
         index : (k,) int64
             The points that the method labelled, `visible` or `highest`; all others get the label -1.
         labels : (k,) int32
             Their planes.
-        faces, roof_type
-            As in `Segmentation`.
         """
         all_labels = np.full(len(self.points), -1, np.int32)
         all_labels[index] = labels

@@ -65,16 +65,12 @@ def parameter(
     choices: tuple[str, ...] | None = None,
     changes_geometry: bool = True,
 ) -> Any:
-    """Describe one field of a settings class.
+    """Describe one field of a settings class: default, one sentence for the reference docs, unit, and what is valid.
 
     Parameters
     ----------
     default : bool, int, float, str, tuple of int or None
         The default; its type is the field's type.
-    doc : str
-        One sentence for the reference docs.
-    unit : str
-        Unit of a number; empty without one.
     minimum, maximum : float, optional
         Inclusive bounds of a number, of each number of a tuple, or of a whole number allowed instead of a text.
     choices : tuple of str, optional

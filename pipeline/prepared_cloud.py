@@ -15,21 +15,9 @@ A definition that methods, solids and the ruler share."""
 
 
 def prepare_cloud(candidate: Candidate, max_points: int | None = None) -> PreparedCloud:
-    """Prepare the points of a candidate.
+    """Prepare the points of a candidate; without any the cloud is empty.
 
-    Parameters
-    ----------
-    candidate : Candidate
-        Its points; without any the cloud is empty.
-    max_points : int, optional
-        More points are refused.
-
-    Raises
-    ------
-    BuildingError
-        Reason ``too_complex`` for more points.
-    ValueError
-        Where a coordinate is not finite.
+    Raises BuildingError ``too_complex`` for more points than `max_points`, ValueError where a coordinate is not finite.
     """
     if not np.isfinite(candidate.points).all():
         raise ValueError("a point of the candidate has a coordinate that is not finite")

@@ -84,26 +84,12 @@ class _Model(LodParts):
 
 
 def reconstruct_building(candidate: Candidate, method: str, settings: ReconstructSettings) -> BuildingResult:
-    """Model one building.
+    """Model one building by one of `pipeline.methods.METHODS`.
 
     The method finds planes; the plan is cut into roof faces and extruded. The first form whose solids are valid is
-    delivered, and a block where none is.
-
-    Parameters
-    ----------
-    candidate : Candidate
-        Points and terrain of one possible building.
-    method : str
-        One of `pipeline.methods.METHODS`.
-    settings : ReconstructSettings
-        For the method and for the roof.
-
-    Returns
-    -------
-    BuildingResult
-        Always one for a known method: a building's own faults are its status and reason, also unexpected ones
-        (`internal_error`). Only a lack of memory is passed on: it says nothing about the building, and a record of it
-        would differ between machines.
+    delivered, and a block where none is. There is always a result for a known method: a building's own faults are its
+    status and reason, also unexpected ones (`internal_error`). Only a lack of memory is passed on: it says nothing
+    about the building, and a record of it would differ between machines.
 
     Raises
     ------
@@ -350,18 +336,10 @@ def _block_model(form: Callable[[], list[SolidPart]], plane: Plane) -> _Model:
 def _record(
     building: _Building, model: _Model, fallback: BuildingError | None = None, codes: tuple[int, ...] = ()
 ) -> BuildingResult:
-    """The record of a building with a model; planes that no face uses are left out.
+    """The record of a building with valid solids; planes that no face uses are left out.
 
-    Parameters
-    ----------
-    building : _Building
-        Its candidate, method and settings.
-    model : _Model
-        Valid solids.
-    fallback : BuildingError, optional
-        Why the model is a block; None where it is the requested model.
-    codes : tuple of int
-        Of the faults that kept the method's own solids from delivery.
+    `fallback` is why the model is a block, None where it is the requested model; `codes` are those of the faults that
+    kept the method's own solids from delivery.
     """
     candidate, roof = building.candidate, building.roof
     used = sorted({face.plane for part in model.parts for face in part.faces})

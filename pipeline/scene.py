@@ -93,18 +93,7 @@ def terrain_of(
 ) -> tuple[Terrain, BoolArray, BoolArray]:
     """Terrain of a window, the mask of points that are not outliers, and the occupied cells.
 
-    Parameters
-    ----------
-    points : WindowPoints
-        Points of the window.
-    window : Window
-        Its extent.
-    settings : SceneSettings
-        Outliers and ground.
-    classes : ClassesInUse
-        Whether class 2 is the ground.
-    wanted : Window, optional
-        Where terrain is needed; in the whole window by default.
+    `wanted` is where terrain is needed; in the whole window by default.
     """
     lattice = lattice_of(window)
     kept = dense_enough(points.x_mm, points.y_mm, points.z_mm, settings.outliers)
@@ -169,25 +158,9 @@ def _vertices(
 def split_tile(
     points: WindowPoints, core: Window, window: Window, settings: SceneSettings, classes: ClassesInUse
 ) -> SplitTile:
-    """Split one tile into surface fragments.
+    """Split the core of one tile into surface fragments, and assign its points.
 
-    Parameters
-    ----------
-    points : WindowPoints
-        All points of the window: the core and a halo of at least `settings.support_with(classes, footprints=False)`.
-    core : Window
-        What the tile owns.
-    window : Window
-        What it sees.
-    settings : SceneSettings
-        All stages.
-    classes : ClassesInUse
-        Which classes of the file are believed.
-
-    Returns
-    -------
-    SplitTile
-        Fragments and the assignment of the core's points.
+    The window has the core and a halo of at least `settings.support_with(classes, footprints=False)`.
     """
     wanted = core.grown(math.ceil(1000 * settings.terrain_m(footprints=False)))
     terrain, kept, occupied = terrain_of(points, window, settings, classes, wanted)

@@ -160,15 +160,8 @@ class RunSettings:
     def from_mapping(cls, table: Mapping[str, Any]) -> RunSettings:
         """Settings from the `[settings]` table of a file.
 
-        Parameters
-        ----------
-        table : mapping
-            General settings at the top level, and one table per section: `SECTIONS` and those named after a method.
-
-        Raises
-        ------
-        SettingsError
-            Listing all faults at once: unknown names, wrong types, values out of range.
+        General settings are at its top level, and there is one table per section: `SECTIONS` and those named after a
+        method. Raises SettingsError with all faults at once: unknown names, wrong types, values out of range.
         """
         faults: list[str] = []
         general_values = {key: value for key, value in table.items() if not isinstance(value, Mapping)}
@@ -202,19 +195,9 @@ class RunSettings:
 
     @classmethod
     def from_toml(cls, path: str | None, overrides: Mapping[str, Any]) -> RunSettings:
-        """Settings of a TOML file under overrides of its top level.
+        """Settings of a TOML file, or the defaults, under overrides of its top level: `{"method": "fuzzy-sart"}`.
 
-        Parameters
-        ----------
-        path : str or None
-            A file with a `[settings]` table; None for the defaults.
-        overrides : mapping
-            General settings that win over the file, such as `{"method": "fuzzy-sart"}`.
-
-        Raises
-        ------
-        SettingsError
-            The file cannot be read or parsed, or holds faults.
+        Raises SettingsError if the file cannot be read or parsed, or holds faults.
         """
         table = read_table(path)
         table.update(overrides)
@@ -231,10 +214,7 @@ def _base(name: str, general: GeneralSettings | None) -> Parameters | None:
 def read_table(path: str | None) -> dict[str, Any]:
     """The `[settings]` table of a TOML file, as it stands there; empty for None.
 
-    Raises
-    ------
-    SettingsError
-        The file cannot be read or parsed, or has no such table.
+    Raises SettingsError if the file cannot be read or parsed, or has no such table.
     """
     if path is None:
         return {}

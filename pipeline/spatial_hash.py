@@ -82,22 +82,10 @@ def first_of_each(
     classification: ByteArray,
     return_count: ByteArray,
 ) -> BoolArray:
-    """Mask that keeps one of each set of equal points.
+    """Mask that keeps one of each set of equal points, as in `PointCloud`, with coordinates in millimetres.
 
     Points are equal if coordinates, return number and GPS time are; overlapping inputs repeat them. Which one stays
     depends on the values alone, not on their order.
-
-    Parameters
-    ----------
-    x_mm, y_mm, z_mm : (n,) int64
-        Coordinates in millimetres.
-    return_number, gps_time, source_id, classification, return_count : (n,) arrays
-        As in `PointCloud`.
-
-    Returns
-    -------
-    (n,) bool
-        True for the points that stay.
     """
     gps_bits = np.ascontiguousarray(gps_time).view(np.int64)
     kept: BoolArray = _first_of_each(x_mm, y_mm, z_mm, return_number, gps_bits, source_id, classification, return_count)

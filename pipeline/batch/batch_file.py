@@ -227,13 +227,7 @@ class Batch:
 
 
 def read_batch(path: str | Path) -> Batch:
-    """Read a batch file.
-
-    Raises
-    ------
-    SettingsError
-        It cannot be read or parsed, or has faults; all are listed.
-    """
+    """Read a batch file; raises SettingsError if it cannot be read or parsed, or for all its faults."""
     file = Path(path).resolve()
     try:
         document = tomllib.loads(file.read_text(encoding="utf-8"))

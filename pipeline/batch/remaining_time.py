@@ -31,19 +31,9 @@ class StageProgress:
 
 
 def remaining_s(planned: Mapping[str, float], seen: Mapping[str, StageProgress]) -> tuple[float, float] | None:
-    """The least and the most seconds that a run is likely to take from now on.
+    """The least and the most seconds that a run is likely to take from now on; None if nothing was planned.
 
-    Parameters
-    ----------
-    planned : mapping
-        Planned seconds of all stages, by name, in their order.
-    seen : mapping
-        Progress of the stages that began.
-
-    Returns
-    -------
-    (float, float) or None
-        None if nothing was planned.
+    `planned` has the seconds of all stages, by name, in their order, `seen` the progress of those that began.
 
     Examples
     --------

@@ -136,13 +136,7 @@ class FileBook:
 
 
 def read_schedule(work_folder: str) -> ScheduleRecord | None:
-    """The schedule of a batch; None if it never ran on a schedule.
-
-    Raises
-    ------
-    RunError
-        The file cannot be read.
-    """
+    """The schedule of a batch, None if it never ran on a schedule; raises RunError if the file cannot be read."""
     path = Path(work_folder, NAME)
     try:
         return ScheduleRecord.from_dict(json.loads(path.read_text(encoding="utf-8")))

@@ -224,10 +224,7 @@ class StatusWriter:
 def read_status(work_folder: str) -> Status:
     """The status of the run of a work folder; `dead` if it says running and no process holds the folder.
 
-    Raises
-    ------
-    RunError
-        There is none, or it cannot be read.
+    Raises RunError if there is none, or it cannot be read.
     """
     path = Path(work_folder, NAME)
     names = {field.name for field in dataclasses.fields(Status)}

@@ -20,12 +20,7 @@ _MAX_WORKERS = 1024
 
 
 def count_or_auto(text: str, *, least: int) -> str:
-    """The word of an option for workers: `auto`, or a number without leading zeros.
-
-    Raises
-    ------
-    BadParameter
-        It is neither `auto` nor a number of processes.
+    """The word of an option for workers: `auto`, or a number without leading zeros; raises BadParameter for others.
 
     Examples
     --------
@@ -40,13 +35,7 @@ def count_or_auto(text: str, *, least: int) -> str:
 
 
 def worker_count(text: str) -> int | None:
-    """The number of workers in an option; 0 for none, None for `auto`.
-
-    Raises
-    ------
-    BadParameter
-        It is neither `auto` nor a number of processes.
-    """
+    """The number of workers in an option; 0 for none, None for `auto`. Raises BadParameter as `count_or_auto`."""
     word = count_or_auto(text, least=0)
     return None if word == AUTO else int(word)
 

@@ -67,16 +67,14 @@ def _warn_unknown() -> None:
 def dispatcher_of(
     function: Callable[..., Any], options: Mapping[str, Any], prefix: str, fingerprint: Callable[[], bytes]
 ) -> Any:
-    """Numba's object for a kernel; the function itself if numba is switched off (`NUMBA_DISABLE_JIT`).
+    """Numba's object for a kernel's plain function; the function itself if numba is switched off (`NUMBA_DISABLE_JIT`).
+
+    The names of the kernel's files start with `prefix`.
 
     Parameters
     ----------
-    function : callable
-        The kernel's plain function.
     options : mapping
         Options beyond the common ones.
-    prefix : str
-        Start of the names of the kernel's files.
     fingerprint : callable
         Returns the kernel's fingerprint; called when a file is looked up.
     """

@@ -21,21 +21,10 @@ _PLAIN = (int, float, complex, str, bytes, bool, type(None), np.generic, np.dtyp
 
 
 def fingerprint(function: Callable[..., Any], options: Mapping[str, Any], source_of: SourceOf) -> bytes:
-    """The fingerprint of a kernel, 32 bytes.
+    """The fingerprint of a kernel's plain function and its options, 32 bytes.
 
-    Parameters
-    ----------
-    function : callable
-        The plain function of the kernel.
-    options : mapping
-        Options of its compilation.
-    source_of : callable
-        Returns function and options of a kernel; None for any other value.
-
-    Returns
-    -------
-    bytes
-        Equal for equal code on every machine with the same minor version of Python, whose bytecode it hashes.
+    It is equal for equal code on every machine with the same minor version of Python, whose bytecode it hashes.
+    `source_of` returns function and options of a kernel, and None for any other value.
     """
     found: dict[str, bytes] = {}
     waiting: list[Kerneled] = [(function, options)]

@@ -25,13 +25,7 @@ types: Any = numba.types
 
 
 def to_json(kind: Any) -> Any:
-    """A numba type as JSON.
-
-    Raises
-    ------
-    TypeError
-        No kernel takes such an argument yet: add it here.
-    """
+    """A numba type as JSON; raises TypeError for a type that no kernel takes yet: add it here."""
     if isinstance(kind, types.Array):
         return [to_json(kind.dtype), kind.ndim, kind.layout, *(() if kind.mutable else ("readonly",))]
     if isinstance(kind, types.BaseNamedTuple):
@@ -72,13 +66,7 @@ def from_json(document: Any) -> Any:
 
 
 def kernel_named(name: str) -> Kernel:
-    """A kernel by its name, `module:function`.
-
-    Raises
-    ------
-    AttributeError, ModuleNotFoundError
-        No kernel has this name.
-    """
+    """A kernel by its name, `module:function`; raises AttributeError or ModuleNotFoundError if there is none."""
     module, function = name.split(":")
     found: Kernel = getattr(importlib.import_module(module), function)
     return found

@@ -70,16 +70,9 @@ class Stored:
 
 
 def load(name: str, fingerprint: bytes, *, runnable: bool) -> Stored | None:
-    """A compiled kernel; None if none has this fingerprint.
+    """The compiled kernel in the file `name` (without its ending); None if none has this fingerprint of 32 bytes.
 
-    Parameters
-    ----------
-    name : str
-        File name without its ending.
-    fingerprint : bytes
-        Fingerprint of the kernel, 32 bytes.
-    runnable : bool
-        Whether it must have machine code, which a kernel lacks if only kernels have called it.
+    A `runnable` one has machine code, which a kernel lacks if only kernels have called it.
     """
     file_name = name + ENDING
     listed = _shipped_hashes().get(file_name)
@@ -124,15 +117,7 @@ def save(name: str, fingerprint: bytes, stored: Stored) -> None:
 
 
 def is_stored(prefix: str, fingerprint: bytes) -> bool:
-    """Whether a file of a kernel exists, for any signature and processor; reads its first bytes.
-
-    Parameters
-    ----------
-    prefix : str
-        Start of the names of the kernel's files.
-    fingerprint : bytes
-        Fingerprint of the kernel.
-    """
+    """Whether a file of a kernel exists, for any signature and processor; reads its first bytes."""
     for folder in (shipped_folder(), folder_of_kernels()):
         for path in folder.glob(f"{glob.escape(prefix)}*{ENDING}"):
             with contextlib.suppress(OSError), path.open("rb") as file:
@@ -166,12 +151,8 @@ def claimed(name: str) -> Iterator[None]:
 def ship(folder: Path, is_current: Callable[[str, bytes], bool]) -> int:
     """Copy the compiled kernels to a folder for a package, with a list of their hashes; returns the number of files.
 
-    Parameters
-    ----------
-    folder : Path
-        New or empty.
-    is_current : callable
-        Whether a kernel, `module.function`, has a fingerprint; files of earlier versions are left out.
+    The folder is new or empty. `is_current` says whether a kernel, `module.function`, has a fingerprint; files of
+    earlier versions are left out.
     """
     folder.mkdir(parents=True, exist_ok=True)
     hashes = {}

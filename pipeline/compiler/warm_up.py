@@ -42,18 +42,7 @@ def groups() -> list[str]:
 
 
 def listed(groups: Iterable[str] | None = None) -> list[Listed]:
-    """The kernels of some groups, the heaviest first, each once.
-
-    Parameters
-    ----------
-    groups : iterable of str, optional
-        Keys of the list; all of them by default.
-
-    Raises
-    ------
-    KeyError
-        No group has this name.
-    """
+    """The kernels of some groups (default all), the heaviest first, each once; raises KeyError for an unknown group."""
     found = json.loads(LIST.read_text(encoding="utf-8"))
     kernels = [Listed(kernel=k, arguments=a, weight=w) for name in groups or found for k, a, w in found[name]]
     return sorted(kernels, key=lambda one: -one.weight)
@@ -64,21 +53,9 @@ def compile_kernels(
     processes: int,
     on_progress: Callable[[int, int, float], None] | None = None,
 ) -> int:
-    """Compile kernels that are not compiled yet.
+    """Compile those `listed` kernels that are not compiled yet; returns how many were compiled or loaded.
 
-    Parameters
-    ----------
-    kernels : iterable of Listed
-        Those of `listed`.
-    processes : int
-        Number of processes.
-    on_progress : callable, optional
-        Gets the numbers of finished and of all kernels, and an estimate of the seconds left.
-
-    Returns
-    -------
-    int
-        Number of kernels that were compiled or loaded.
+    `on_progress` gets the numbers of finished and of all kernels, and an estimate of the seconds left.
     """
     waiting = list(kernels)
     whole = sum(one.weight for one in waiting) or 1
@@ -107,10 +84,7 @@ def _compile(one: Listed) -> int:
 def ship(folder: Path) -> int:
     """Copy all compiled kernels of this version to a folder for a package; returns the number of files.
 
-    Raises
-    ------
-    RunError
-        No kernel is compiled: numba is unknown or switched off.
+    Raises RunError if no kernel is compiled: numba is unknown or switched off.
     """
     from pipeline.compiler.signatures import kernel_named
 

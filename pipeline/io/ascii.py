@@ -265,16 +265,11 @@ class AsciiFile:
 
 
 def looks_like_pulses(first: FloatArray, last: FloatArray) -> bool:
-    """Whether pairs of points can be echoes of one pulse each.
+    """Whether pairs of points can be echoes of one pulse each; `first` and `last` (n, 3) are the triplets of each row.
 
     A beam is a straight line not far from the vertical: its echoes differ in plan by no more than their difference in
     elevation allows, and the first is the higher one. Colours, normals or times beside a point do not do this, unless
     the whole cloud is as small as they are, hence the extent. Some pulses must have two different echoes.
-
-    Parameters
-    ----------
-    first, last : (n, 3) float64
-        The triplets of each row.
     """
     drop = first[:, 2] - last[:, 2]
     apart = np.hypot(first[:, 0] - last[:, 0], first[:, 1] - last[:, 1])

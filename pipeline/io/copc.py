@@ -61,16 +61,9 @@ def octree_info(header: laspy.LasHeader) -> OctreeInfo | None:
 def nodes_within(
     path: Readable, stream: BinaryIO, info: OctreeInfo, window: Window, file_size: int
 ) -> npt.NDArray[np.void]:
-    """The nodes that hold points and meet the window, in file order.
+    """The nodes that hold points and meet the window, in file order, as an array of `ENTRY`.
 
-    Returns
-    -------
-    (n,) structured array of `ENTRY`
-
-    Raises
-    ------
-    UnreadableInputError
-        If a page or node lies outside the file.
+    Raises UnreadableInputError if a page or node lies outside the file.
     """
     fix = "Get the file again, or rewrite it as LAZ"
     pages, seen = [(info.root_offset, info.root_size)], set()

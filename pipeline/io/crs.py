@@ -77,13 +77,7 @@ UNKNOWN_REFERENCE = SpatialReference()
 
 
 def unit_in_metres(word: str, *, path: str) -> float:
-    """Metres per unit, from a word such as m, ft or us-ft.
-
-    Raises
-    ------
-    CrsError
-        If the word is none of `UNITS_M`.
-    """
+    """Metres per unit, from a word of `UNITS_M` such as m, ft or us-ft; raises CrsError for any other."""
     try:
         return UNITS_M[word.strip().lower()]
     except KeyError:
@@ -91,13 +85,7 @@ def unit_in_metres(word: str, *, path: str) -> float:
 
 
 def parse_crs(text: str, *, path: str) -> pyproj.CRS:
-    """The CRS that a user names: an EPSG code, WKT, PROJJSON or a PROJ string.
-
-    Raises
-    ------
-    CrsError
-        If PROJ does not understand the text.
-    """
+    """The CRS that a user names: an EPSG code, WKT, PROJJSON or a PROJ string; raises CrsError if PROJ rejects it."""
     import pyproj
 
     try:
@@ -134,12 +122,9 @@ def vertical_unit_of(crs: pyproj.CRS) -> float | None:
 
 
 def horizontal_unit_of(crs: pyproj.CRS, *, path: str) -> float:
-    """Metres a unit of the horizontal axes.
+    """Metres per unit of the horizontal axes.
 
-    Raises
-    ------
-    CrsError
-        If the CRS is geographic, geocentric or vertical only, or its two axes differ in unit.
+    Raises CrsError if the CRS is geographic, geocentric or vertical only, or its two axes differ in unit.
     """
     plane = horizontal_part(crs)
     reproject = "Reproject the file to a projected CRS, or give --crs EPSG:n where the header is wrong"
@@ -173,32 +158,19 @@ def resolve_reference(
     crs: str | None = None,
     vertical_unit: str | None = None,
 ) -> tuple[SpatialReference, tuple[str, ...]]:
-    """The reference of a file from its header and the user's overrides, and warnings.
+    """The reference of a file from its header and the user's overrides, and warnings of one sentence each.
+
+    The vertical unit is the user's, else the CRS's, else the header's, else the horizontal one. Raises CrsError if the
+    CRS is geographic or not understood, or the unit is not known.
 
     Parameters
     ----------
-    path : str
-        The file, for messages.
-    header_crs : pyproj.CRS, optional
-        As the header has it.
     header_horizontal_unit_m, header_vertical_unit_m : float, optional
         Metres per unit, if the header has a unit beside the CRS (GeoTIFF keys).
     crs : str, optional
         The user's CRS; overrides the header's.
     vertical_unit : str, optional
         The user's vertical unit, a word of `UNITS_M`; overrides everything else.
-
-    Returns
-    -------
-    reference : SpatialReference
-        The vertical unit is the user's, else the CRS's, else the header's, else the horizontal one.
-    warnings : tuple of str
-        One sentence each.
-
-    Raises
-    ------
-    CrsError
-        If the CRS is geographic or not understood, or the unit is not known.
     """
     warnings: list[str] = []
     chosen = header_crs

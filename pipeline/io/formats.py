@@ -57,13 +57,7 @@ def first_bytes(path: Readable) -> bytes:
 
 
 def recognise_format(path: Readable) -> str:
-    """las, ply or ascii.
-
-    Raises
-    ------
-    UnreadableInputError
-        If the file is none of these, or not what its name says.
-    """
+    """las, ply or ascii; raises UnreadableInputError if the file is none of these, or not what its name says."""
     head, suffix = first_bytes(path), path.suffix.lower()
     for magic, name in MAGIC.items():
         if head.startswith(magic):
@@ -108,13 +102,7 @@ def _is_number(field: bytes) -> bool:
 
 
 def files_in(folder: Path) -> list[Path]:
-    """The point files of a folder.
-
-    Raises
-    ------
-    UnreadableInputError
-        If it cannot be read, or holds none.
-    """
+    """The point files of a folder; raises UnreadableInputError if it cannot be read, or holds none."""
     try:
         entries = [path for path in folder.iterdir() if path.is_file()]
     except OSError as fault:

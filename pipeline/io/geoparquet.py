@@ -45,10 +45,7 @@ class GeometryColumn:
 def geometry_column(path: Path, schema: pa.Schema, column: str | None = None) -> GeometryColumn:
     """The facts about a geometry column in a file's schema; None for the primary one.
 
-    Raises
-    ------
-    UnreadableInputError
-        It says nothing of geometry, or the column is not there.
+    Raises UnreadableInputError if the schema says nothing of geometry, or the column is not there.
     """
     geo = _geo_of(path, schema.metadata or {})
     columns = geo["columns"]
@@ -72,10 +69,8 @@ def read_geoparquet(
 ) -> tuple[str | None, npt.NDArray[np.int64], npt.NDArray[np.object_], dict[str, Sequence[Any]], int]:
     """CRS, row numbers, geometries and attributes of a file, and how many of its polygons were passed over.
 
-    Parameters
-    ----------
-    boxes : callable, optional
-        Where features are wanted: as in `pipeline.io.vector_layer.read_layer`.
+    Features are wanted in `boxes`, as in `pipeline.io.vector_layer.read_layer`. Raises UnreadableInputError if the file
+    is not Parquet, has no geometry, or encodes it in a way that is not supported.
 
     Returns
     -------
@@ -89,11 +84,6 @@ def read_geoparquet(
         All other columns as plain Python values; other geometries and columns that only cover one are left out.
     int
         Polygons off the boxes.
-
-    Raises
-    ------
-    UnreadableInputError
-        It is not Parquet, has no geometry, or encodes it in a way that is not supported.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

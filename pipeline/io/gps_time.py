@@ -35,17 +35,11 @@ class GpsTimeKind(StrEnum):
 
 
 def kind_of(smallest_s: float, largest_s: float, *, flagged_as_adjusted: bool) -> GpsTimeKind:
-    """How to read times of a range, by the header's flag and by what the values can be.
+    """How to read times of a range in seconds, by the header's flag and by what the values can be.
 
-    Writers forget the flag, so values beyond a week are taken as adjusted standard time even without it. With the
-    flag, values within one week would mean mid September 2011 and are far more often seconds of the week: unknown.
-
-    Parameters
-    ----------
-    smallest_s, largest_s : float
-        Range of the times in the file, seconds.
-    flagged_as_adjusted : bool
-        Bit 0 of the global encoding.
+    Writers forget the flag, bit 0 of the global encoding, so values beyond a week are taken as adjusted standard time
+    even without it. With the flag, values within one week would mean mid September 2011 and are far more often seconds
+    of the week: unknown.
     """
     if smallest_s == largest_s:
         return GpsTimeKind.NONE

@@ -31,8 +31,9 @@ def find_inputs(
 ) -> list[str]:
     """The point files that paths, folders, patterns, URLs and tile indexes mean, each once, sorted by name.
 
-    Of a folder (not of the folders in it) its LAS, LAZ and PLY files are taken, and of its text files those that look
-    like points. A file that is named is taken whatever its name, unless it is a tile index.
+    Files are absolute paths without links, and URLs with their queries. Of a folder (not of the folders in it) its LAS,
+    LAZ and PLY files are taken, and of its text files those that look like points. A file that is named is taken
+    whatever its name, unless it is a tile index.
 
     Parameters
     ----------
@@ -42,11 +43,6 @@ def find_inputs(
         Take every entry for the path of one point file of this machine: what strangers name must lead nowhere else.
     cut : callable
         Which files of a tile index are wanted; by default all.
-
-    Returns
-    -------
-    list of str
-        Absolute paths without links, and URLs with their queries.
 
     Raises
     ------

@@ -85,10 +85,7 @@ class LasFile:
     def records(self, chunk_size: int, window: Window | None) -> Iterator[PointRecords]:
         """The records in file order, in pieces of `chunk_size`; of COPC with a window only the nodes that meet it.
 
-        Raises
-        ------
-        UnreadableInputError
-            If the data end or break before the promised count.
+        Raises UnreadableInputError if the data end or break before the promised count.
         """
         if window is not None and self._copc is not None:
             yield from self._octree_records(chunk_size, window)
@@ -97,13 +94,7 @@ class LasFile:
             yield self._to_records(raw)
 
     def whole_records(self, chunk_size: int) -> Iterator[tuple[npt.NDArray[np.uint8], PointRecords]]:
-        """The records in file order, each piece as its bytes with every field, and as `records` has it.
-
-        Raises
-        ------
-        UnreadableInputError
-            If the data end or break before the promised count.
-        """
+        """As `records`, without a window, but each piece also as its bytes with every field."""
         for raw in self._raw(chunk_size, lazrs.SELECTIVE_DECOMPRESS_ALL):
             yield raw, self._to_records(raw)
 

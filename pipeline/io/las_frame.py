@@ -70,10 +70,7 @@ class LasFrame:
 def read_frame(path: Path) -> LasFrame:
     """Everything of a LAS file but its points.
 
-    Raises
-    ------
-    InputError
-        If the header is damaged, or a record leads out of the file.
+    Raises InputError if the header is damaged, or a record leads out of the file.
     """
     block = read_header_block(path)
     with path.open("rb") as stream:

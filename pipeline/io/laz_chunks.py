@@ -130,12 +130,7 @@ def _table_offset(stream: BinaryIO, block: HeaderBlock) -> int:
 def check_chunks(path: Readable, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes, table: ChunkTable) -> None:
     """Hold the header's count against the chunks, to the point.
 
-    Raises
-    ------
-    InconsistentInputError
-        If the chunks hold another number of points.
-    UnreadableInputError
-        If a chunk is damaged.
+    Raises InconsistentInputError if the chunks hold another number of points, UnreadableInputError if one is damaged.
     """
     if block.point_format >= 6:
         _check_layers(path, stream, block, table)

@@ -17,17 +17,7 @@ if TYPE_CHECKING:
 
 
 def storage_at(place: str | Path) -> Storage:
-    """The storage of a folder or URL.
-
-    Parameters
-    ----------
-    place : str or Path
-        A path, or such as `s3://bucket/prefix`.
-
-    Raises
-    ------
-    RunError
-        A URL where nothing can be stored.
+    """The storage of a folder, a path, or of a URL; raises RunError for a URL where nothing can be stored.
 
     >>> storage_at("s3://bucket/runs/a/").place
     's3://bucket/runs/a'
@@ -41,10 +31,7 @@ def storage_at(place: str | Path) -> Storage:
 def made_here(place: str) -> Iterator[str]:
     """A folder of this machine for results that go to a place: the folder itself, or one whose files go to the URL.
 
-    Yields
-    ------
-    str
-        The folder. Where the block ends without an error its files are put; of a URL only then anything is.
+    Where the block ends without an error its files are put; of a URL only then anything is.
     """
     if not is_url(place):
         yield place
@@ -66,13 +53,7 @@ def place_below(place: str | Path, name: str) -> str:
 
 
 def arrow_at(place: str | Path) -> tuple[pafs.FileSystem, str]:
-    """The file system of Arrow that reads a folder or URL, and the path in it.
-
-    Raises
-    ------
-    RunError
-        A URL that cannot be read so.
-    """
+    """The file system of Arrow that reads a folder or URL, and the path in it; RunError if it cannot read the URL."""
     import pyarrow.fs as pafs
 
     if not is_url(str(place)):

@@ -270,10 +270,7 @@ def _with_property(element: Element, name: str, kind: str) -> Element:
 def promised_vertices(path: Readable) -> int:
     """The number of vertices that the header promises; nothing else is read.
 
-    Raises
-    ------
-    InputError
-        If the header is damaged or has no vertices.
+    Raises InputError if the header is damaged or has no vertices.
     """
     with path.open("rb") as stream:
         _, elements = _read_header(path, stream)

@@ -83,13 +83,7 @@ class RemoteFile:
         return PurePosixPath(self.name).suffix
 
     def stat(self) -> RemoteStatus:
-        """Size and time, asked for once.
-
-        Raises
-        ------
-        UnreadableInputError
-            The server does not report them.
-        """
+        """Size and time, requested once; raises UnreadableInputError if the server does not report them."""
         if self._status is None:
             self._status = self._asked()
         return self._status
@@ -104,13 +98,7 @@ class RemoteFile:
         return RemoteStatus(st_size=size, st_mtime_ns=_time_ns(info), etag=str(info.get("ETag") or ""))
 
     def open(self, mode: Literal["rb"] = "rb", /) -> io.BufferedReader:
-        """Its bytes; sequential reading uses larger pieces.
-
-        Raises
-        ------
-        UnreadableInputError
-            It cannot be reached.
-        """
+        """Its bytes; sequential reading uses larger pieces. Raises UnreadableInputError if it cannot be reached."""
         del mode
         self.stat()
         if self._whole is not None:
@@ -118,13 +106,7 @@ class RemoteFile:
         return io.BufferedReader(_Ranges(self))
 
     def read_at(self, begin: int, length: int) -> bytes:
-        """Some bytes, fewer where the file ends.
-
-        Raises
-        ------
-        UnreadableInputError
-            They cannot be read.
-        """
+        """Some bytes, fewer where the file ends; raises UnreadableInputError if they cannot be read."""
         end = min(begin + length, self.stat().st_size)
         parts = []
         while begin < end:
@@ -193,14 +175,9 @@ class RemoteFile:
         self._tried(lambda: self._filesystem.get_file(self.url, str(target)))
 
     def fetch(self, target: Path, check: Callable[[], None] = lambda: None) -> None:
-        """Write the whole file to a path of this machine, piece by piece.
+        """Write the whole file to a path of this machine, in an existing folder, piece by piece.
 
-        Parameters
-        ----------
-        target : Path
-            In a folder that is there.
-        check : callable
-            Called before each piece; what it raises ends the fetching.
+        `check` is called before each piece; what it raises ends the fetching.
 
         Raises
         ------
@@ -288,15 +265,8 @@ def file_at(location: str | Path) -> Readable:
 def on_this_machine(location: str | Path, folder: Path | None = None) -> Iterator[Path]:
     """A file as a path of this machine, for libraries that need one; fetched if it is behind a URL.
 
-    Parameters
-    ----------
-    folder : Path, optional
-        Where a fetched copy lies while the block runs; a temporary folder by default.
-
-    Raises
-    ------
-    UnreadableInputError
-        It cannot be fetched.
+    A fetched copy lies in the folder, by default a temporary one, while the block runs. Raises UnreadableInputError if
+    it cannot be fetched.
     """
     if not is_url(location):
         yield Path(location)

@@ -36,12 +36,7 @@ class RetryPolicy:
     """Time after the first attempt when no other begins: attempts that time out take a minute each."""
 
     def wait_s(self, failures: int, elapsed_s: float, draw: float) -> float | None:
-        """Seconds to wait before the next attempt; None if there is none.
-
-        Parameters
-        ----------
-        draw : float
-            A random number from 0 to 1.
+        """Seconds to wait before the next attempt, by a random number from 0 to 1; None if there is none.
 
         Examples
         --------

@@ -203,22 +203,8 @@ class Source:
     def chunks(self, chunk_size: int = 1_000_000) -> Iterator[PointCloud]:
         """The wanted points in metres, in the file's order (COPC with a window: in the octree's), in pieces.
 
-        Parameters
-        ----------
-        chunk_size : int
-            Most points a piece; bounds the memory.
-
-        Yields
-        ------
-        PointCloud
-            Never empty.
-
-        Raises
-        ------
-        UnreadableInputError
-            If the data end or break before the promised count.
-        InconsistentInputError
-            If a coordinate is NaN or infinite.
+        A piece has at least one and at most `chunk_size` points, which bounds the memory. Raises UnreadableInputError
+        if the data end or break before the promised count, InconsistentInputError if a coordinate is NaN or infinite.
         """
         if chunk_size < 1:
             raise SettingsError([f"chunk_size is {chunk_size}: use 1 or more"])
@@ -311,10 +297,7 @@ def open_source(
 ) -> Source:
     """Open a LAS, LAZ, COPC, PLY or ASCII file, and check all that can be checked without reading it through.
 
-    Parameters
-    ----------
-    known : SourceInfo, optional
-        What was found when the file was opened before, by the same options: what takes time is not done again.
+    `known` is what was found when the file was opened before, by the same options: what takes time is not done again.
 
     Raises
     ------

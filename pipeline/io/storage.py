@@ -36,10 +36,7 @@ def sha256_of(path: str | Path) -> str:
 def parts_of_key(key: str) -> tuple[str, ...]:
     """The parts of a key: a relative path with forward slashes, such as `state/x85_y447.json`.
 
-    Raises
-    ------
-    RunError
-        If the key is empty, absolute or leads out of its storage.
+    Raises RunError if the key is empty, absolute or leads out of its storage.
     """
     parts = PurePosixPath(key)
     if not parts.parts or parts.is_absolute() or ".." in parts.parts or "\\" in key:
@@ -128,12 +125,8 @@ class LocalStorage:
     def putting(self, key: str) -> Iterator[Path]:
         """A temporary path beside the final one, for the caller to write; renamed when the block ends.
 
-        When the block raises, the temporary file is removed and what stood under the key stays.
-
-        Raises
-        ------
-        RunError
-            If the folder cannot be made, or the block wrote nothing to the path.
+        When the block raises, the temporary file is removed and what was under the key stays. Raises RunError if the
+        folder cannot be made, or the block wrote nothing to the path.
         """
         final = self.path(key)
         try:
@@ -163,26 +156,14 @@ class LocalStorage:
         yield _OneByOne(self, check)
 
     def get(self, key: str) -> bytes:
-        """The bytes under a key.
-
-        Raises
-        ------
-        RunError
-            If there is nothing.
-        """
+        """The bytes under a key; raises RunError if there is nothing."""
         try:
             return self.path(key).read_bytes()
         except FileNotFoundError:
             raise RunError(f"{key!r} is not in {self.root}") from None
 
     def size(self, key: str) -> int:
-        """Bytes stored under the key.
-
-        Raises
-        ------
-        RunError
-            If there is nothing.
-        """
+        """Bytes stored under the key; raises RunError if there is nothing."""
         try:
             return self.path(key).stat().st_size
         except FileNotFoundError:
@@ -210,13 +191,7 @@ class LocalStorage:
         self.path(key).unlink(missing_ok=True)
 
     def clear(self, names: Iterable[str]) -> None:
-        """Remove files and whole folders.
-
-        Raises
-        ------
-        RunError
-            Something cannot be removed.
-        """
+        """Remove files and whole folders; raises RunError if something cannot be removed."""
         for name in names:
             path = self.path(name)
             try:

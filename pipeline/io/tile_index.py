@@ -117,10 +117,7 @@ def _lines(text: str) -> list[str]:
 def read_tile_index(location: str) -> TileIndex:
     """The files that an index names.
 
-    Raises
-    ------
-    UnreadableInputError
-        It cannot be read, names nothing, or does not say which column names the files.
+    Raises UnreadableInputError if it cannot be read, names nothing, or does not say which column names the files.
     """
     label = shown(location)
     if PurePosixPath(name_in(location)).suffix.lower() in VECTOR_SUFFIXES:

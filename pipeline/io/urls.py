@@ -78,13 +78,7 @@ def is_url(text: object) -> bool:
 
 
 def scheme_of(url: str) -> Scheme:
-    """The scheme of a URL.
-
-    Raises
-    ------
-    RunError
-        It is none of `SCHEMES`.
-    """
+    """The scheme of a URL; raises RunError for one that is not in `SCHEMES`."""
     name = url.partition("://")[0].lower()
     if name not in SCHEMES:
         raise RunError(f"{shown(url)}: {name}:// is not supported. Use {', '.join(SCHEMES)}://, or a path")
@@ -135,10 +129,7 @@ def name_in(location: str) -> str:
 def filesystem_of(url: str) -> Any:
     """The fsspec file system of a URL; one instance serves a whole process.
 
-    Raises
-    ------
-    RunError
-        The scheme is unknown, or its library is not installed.
+    Raises RunError if the scheme is unknown, or its library is not installed.
     """
     scheme = scheme_of(url)
     import fsspec

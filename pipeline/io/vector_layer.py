@@ -52,6 +52,8 @@ class VectorLayer:
 def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None) -> VectorLayer:
     """The one layer of a file that can hold polygons, or the named one.
 
+    Raises UnreadableInputError if the file cannot be read as vector data, or the layer is not there.
+
     Parameters
     ----------
     path : str or Path
@@ -60,11 +62,6 @@ def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None) 
         The layer; of GeoParquet the geometry column.
     boxes : callable, optional
         Where features are wanted; those whose bounds meet none of its boxes are passed over. None reads all.
-
-    Raises
-    ------
-    UnreadableInputError
-        The file cannot be read as vector data, or the layer is not there.
     """
     label = shown(str(path))
     if is_url(path) and label.lower().endswith(".shp"):

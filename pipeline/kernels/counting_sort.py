@@ -10,21 +10,10 @@ from pipeline.model import LabelArray
 
 @kernel
 def counting_sort(keys: LabelArray, count: int) -> tuple[LabelArray, LabelArray]:
-    """Members of every key.
+    """Members of every key: where those of each start, (count + 1,) int32 with their number, and their indices (m,).
 
-    Parameters
-    ----------
-    keys : (n,) int32
-        Key of every member, below `count`; members with a negative key are left out.
-    count : int
-        How many keys there are.
-
-    Returns
-    -------
-    starts : (count + 1,) int32
-        Where the members of each key start, and their number.
-    members : (m,) int32
-        Indices of the keys, ascending for each.
+    `keys` (n,) has the key of every member, below `count`; members with a negative key are left out. Indices ascend
+    within a key.
     """
     starts = np.zeros(count + 1, np.int32)
     for key in keys:

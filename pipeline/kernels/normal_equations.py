@@ -52,16 +52,9 @@ def moments_of(points: FloatArray, index: LabelArray) -> Moments:
 def solve_plane_moments(sxx: float, sxy: float, syy: float, sxz: float, syz: float) -> tuple[float, float]:
     """The slopes a, b that solve the centred normal equations (Eqs. 11 to 14).
 
-    Parameters
-    ----------
-    sxx, sxy, syy, sxz, syz : float
-        Sums of products of coordinates relative to their means.
-
-    Returns
-    -------
-    a, b : float
-        Where the points are collinear in plan, to 1e-6 of their spread, the plane is undetermined across the line: it
-        is taken level across, and sloping along the line. Where all are at one position it is horizontal.
+    Arguments are sums of products of coordinates relative to their means. Where the points are collinear in plan, to
+    1e-6 of their spread, the plane is undetermined across the line: it is taken level across, and sloping along the
+    line. Where all are at one position it is horizontal.
     """
     determinant = sxx * syy - sxy * sxy
     trace = sxx + syy

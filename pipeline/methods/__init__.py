@@ -47,12 +47,7 @@ class Method:
         return PRESETS[: 1 if self.faithful is None else 2]
 
     def preset(self, name: str) -> Parameters:
-        """The settings of a named preset.
-
-        Parameters
-        ----------
-        name : str
-            ``robust``, the defaults, or ``faithful``, the paper to the letter as far as it is printed.
+        """The settings ``robust``, the defaults, or ``faithful``, the paper to the letter as far as it is printed.
 
         Raises
         ------
@@ -116,22 +111,7 @@ METHODS: Mapping[str, Method] = {
 
 
 def method_named(name: str) -> Method:
-    """The method of a name.
-
-    Parameters
-    ----------
-    name : str
-        One of `METHODS`.
-
-    Returns
-    -------
-    Method
-        Its entry.
-
-    Raises
-    ------
-    SettingsError
-        Naming all methods.
+    """The method of a name, one of `METHODS`; raises SettingsError, naming all methods, for another one.
 
     Examples
     --------
@@ -159,25 +139,15 @@ class ReconstructSettings:
     """Levels of detail to be modelled, of `LODS` and in their order."""
 
     def segmentation(self, method: Method) -> Callable[[PreparedCloud], Segmentation]:
-        """The method with its settings bound.
-
-        Raises
-        ------
-        SettingsError
-            Where the settings belong to another method.
-        """
+        """The method with its settings bound; raises SettingsError where the settings belong to another method."""
         settings = self._of(method)
         return lambda cloud: method.segment(cloud, settings)
 
     def arranges(self, method: Method) -> bool:
         """Whether the plan is cut into roof faces along the lines in which planes meet.
 
-        True unless the settings say to trace them from the labels (`RoofFaceSettings.faces`).
-
-        Raises
-        ------
-        SettingsError
-            Where the settings belong to another method.
+        True unless the settings say to trace them from the labels (`RoofFaceSettings.faces`). Raises SettingsError
+        where the settings belong to another method.
 
         Examples
         --------

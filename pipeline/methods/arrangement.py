@@ -16,27 +16,10 @@ from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
 
 
 def segment(cloud: PreparedCloud, settings: AdaptivePlaneSettings) -> Segmentation:
-    """Find the roof planes of one building.
+    """Find the roof planes of one building; none where the points are nowhere flat.
 
     Points that a higher point of the building hides take no part and keep the label -1, as do points that no plane
-    explains.
-
-    Parameters
-    ----------
-    cloud : PreparedCloud
-        Its points.
-    settings : AdaptivePlaneSettings
-        Thresholds.
-
-    Returns
-    -------
-    Segmentation
-        Without planes where the points are nowhere flat.
-
-    Raises
-    ------
-    BuildingError
-        Reason ``too_few_points`` below the fewest points of a plane.
+    explains. Raises BuildingError ``too_few_points`` below the fewest points of a plane.
     """
     require_visible(cloud, cloud.visible, settings.min_points, f"min_points is {settings.min_points}")
     roof = cloud.points[cloud.visible]

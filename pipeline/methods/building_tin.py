@@ -16,13 +16,7 @@ MAX_EXTENT_M = MAX_EXTENT_MM / 1000.0 - 10.0
 
 
 def check_extent(points: FloatArray) -> None:
-    """Refuse what no single TIN can hold.
-
-    Raises
-    ------
-    BuildingError
-        Reason ``too_complex`` where the points, (n, 3) metres, extend over more than `MAX_EXTENT_M`.
-    """
+    """Raise BuildingError ``too_complex`` if points (n, 3) extend over more than `MAX_EXTENT_M`."""
     extent_m = float(np.ptp(points[:, :2], axis=0).max())
     if extent_m > MAX_EXTENT_M:
         raise BuildingError(
@@ -31,23 +25,10 @@ def check_extent(points: FloatArray) -> None:
 
 
 def ground_around(cloud: PreparedCloud, roof: FloatArray, gap_m: float, reach_m: float = math.inf) -> FloatArray:
-    """Samples of the terrain beside the building, and in its courtyards.
+    """Samples of the terrain beside the building and in its courtyards, (k, 3) metres, in their order.
 
-    Parameters
-    ----------
-    cloud : PreparedCloud
-        With the samples of its candidate.
-    roof : (n, 3) float64
-        Roof points about the origin of the cloud, at least one.
-    gap_m : float
-        Samples nearer in plan to a roof point than this are beneath the roof, and left out.
-    reach_m : float
-        Samples farther in plan from every roof point than this are left out too.
-
-    Returns
-    -------
-    (k, 3) float64
-        Metres about the origin of the cloud, in the order of the samples.
+    They and the roof points (n, 3), at least one, are about the origin of the cloud. Samples nearer in plan to a roof
+    point than `gap_m` are beneath the roof, and left out; so are those farther than `reach_m` from every roof point.
     """
     moved = (np.rint(cloud.candidate.ground * 1000.0) - cloud.shift_m * 1000.0) / 1000.0
     beside = far_from(moved, roof, gap_m)

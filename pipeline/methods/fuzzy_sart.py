@@ -35,22 +35,10 @@ from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, in
 
 
 def segment(cloud: PreparedCloud, settings: FuzzySartSettings) -> Segmentation:
-    """Find the roof planes of one building.
+    """Find the roof planes of one building; none where no cluster has one.
 
     Points that a higher point of the building hides (facades, returns from below the roof) take no part and keep the
     label -1, as do points that no plane explains.
-
-    Parameters
-    ----------
-    cloud : PreparedCloud
-        Its points, and the terrain around it.
-    settings : FuzzySartSettings
-        `FuzzySartSettings()` or `FuzzySartSettings.faithful()`.
-
-    Returns
-    -------
-    Segmentation
-        Without planes where no cluster has one.
 
     Raises
     ------

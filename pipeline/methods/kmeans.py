@@ -70,13 +70,6 @@ def segment(cloud: PreparedCloud, settings: KMeansSettings) -> Segmentation:
     Points that a higher point of the building hides (facades, returns from below the roof) take no part and keep the
     label -1, as do points that neither a plane nor the model explains.
 
-    Parameters
-    ----------
-    cloud : PreparedCloud
-        Its points, and the height of the ground.
-    settings : KMeansSettings
-        `KMeansSettings()` or `KMeansSettings.faithful()`.
-
     Returns
     -------
     Segmentation
@@ -106,23 +99,9 @@ def segment(cloud: PreparedCloud, settings: KMeansSettings) -> Segmentation:
 
 
 def building_top(cloud: PreparedCloud, settings: KMeansSettings) -> BuildingTop:
-    """The TIN of a building's visible points: the highest one of every position.
+    """The TIN of a building's visible points, at least one: the highest one of every position.
 
-    Parameters
-    ----------
-    cloud : PreparedCloud
-        With at least one point.
-    settings : KMeansSettings
-        `min_points`, and the distance that follows the noise.
-
-    Returns
-    -------
-    BuildingTop
-
-    Raises
-    ------
-    BuildingError
-        Reason ``too_few_points`` or ``too_complex``.
+    Raises BuildingError ``too_few_points`` or ``too_complex``.
     """
     require_visible(cloud, cloud.highest, settings.min_points, f"min_points is {settings.min_points}")
     top = cloud.points[cloud.highest]
@@ -140,17 +119,8 @@ def building_top(cloud: PreparedCloud, settings: KMeansSettings) -> BuildingTop:
 def cluster_facets(top: BuildingTop, settings: KMeansSettings) -> tuple[LabelArray, FacetClusters]:
     """Section 2.1: the facets of the TIN in clusters of one direction.
 
-    Returns
-    -------
-    labels : (m,) int32
-        Cluster of every facet of the TIN, -1 for those that are too steep or too long.
-    clusters : FacetClusters
-        Of the others, in their order.
-
-    Raises
-    ------
-    BuildingError
-        Reason ``no_plane`` where fewer than three facets are left; ``too_complex``.
+    Returns the cluster of every facet, (m,) int32, -1 for those that are too steep or too long, and the clusters of the
+    others, in their order. Raises BuildingError ``no_plane`` where fewer than three facets are left; ``too_complex``.
     """
     facets = top.tin.facets
     normals, areas_m2 = facet_normals(top.points, facets), facet_areas_m2(top.points, facets)
@@ -185,17 +155,8 @@ def cluster_facets(top: BuildingTop, settings: KMeansSettings) -> tuple[LabelArr
 def planes_of(top: BuildingTop, settings: KMeansSettings) -> tuple[FloatArray, LabelArray]:
     """Sections 2.1 and 2.2: points in sets of one plane, and the planes by least squares.
 
-    Returns
-    -------
-    planes : (k, 3) float64
-        (a, b, c); none where no cluster has a plane.
-    labels : (n,) int32
-        Plane of every point of the top, -1 for none.
-
-    Raises
-    ------
-    BuildingError
-        As `cluster_facets`; ``too_complex`` beyond the work of the refinement.
+    Returns the planes (a, b, c), (k, 3), none where no cluster has one, and the plane of every point of the top, (n,)
+    int32, -1 for none. Raises as `cluster_facets`, and ``too_complex`` beyond the work of the refinement.
     """
     clusters, _ = cluster_facets(top, settings)
     if settings.refine:
@@ -232,15 +193,8 @@ def model_of(
 ) -> BuildingPrimitive | None:
     """Sections 2.3 and 2.4: the gable of two planes, or the flat or pent counterpart of one.
 
-    Returns
-    -------
-    BuildingPrimitive or None
-        None for no plane or more than two; with `model: fitting` also where the model does not explain the building.
-
-    Raises
-    ------
-    BuildingError
-        With `model: always`: reason ``no_partition`` where the planes make none.
+    None for no plane or more than two; with `model: fitting` also where the model does not explain the building. With
+    `model: always` raises BuildingError ``no_partition`` where the planes make none.
     """
     if not 1 <= len(planes) <= 2:
         return None

@@ -110,12 +110,8 @@ def segment_3d(cloud: PreparedCloud, settings: ParameterSpace3dSettings) -> Segm
 def roof_clusters_2d(facets: BuildingFacets, settings: ParameterSpace2dSettings) -> tuple[LabelArray, FloatArray]:
     """Clusters of facets in slope and orientation that may be roof (sections 3.1 to 3.3).
 
-    Returns
-    -------
-    labels : (m,) int32
-        Cluster of every facet, -1 for none.
-    centres : (k, 3) float64
-        Mean slope, orientation and O-distance of the clusters.
+    Returns the cluster of every facet, (m,) int32, -1 for none, and the mean slope, orientation and O-distance of the
+    clusters, (k, 3).
     """
     taken = _facets_to_cluster(facets, settings)
 
@@ -150,10 +146,7 @@ def roof_clusters_3d(facets: BuildingFacets, settings: ParameterSpace3dSettings)
 def facets_of(cloud: PreparedCloud, settings: ParameterSpaceSettings) -> BuildingFacets:
     """Section 2: the Delaunay TIN of the building with some surrounding ground, about its barycentre.
 
-    Raises
-    ------
-    BuildingError
-        Reason ``too_few_points`` where hardly any are visible; ``too_complex`` where they extend too far.
+    Raises BuildingError ``too_few_points`` where hardly any are visible; ``too_complex`` where they extend too far.
     """
     require_visible(cloud, cloud.visible, _MIN_POINTS, f"at least {_MIN_POINTS} are needed")
     roof = cloud.points[cloud.visible]

@@ -26,7 +26,7 @@ def planes_of_clusters(
     distance_m: float,
     settings: PlaneRefinementSettings,
 ) -> tuple[FloatArray, LabelArray]:
-    """Roof planes of rough clusters, and the plane of every point.
+    """Roof planes (a, b, c) of rough clusters, (k, 3), each with points, and the plane of every point, (n,) int32.
 
     Parameters
     ----------
@@ -35,20 +35,11 @@ def planes_of_clusters(
     neighbours : (n, k) int32
         Nearest neighbours of every point, -1 where there are fewer.
     rough : (n,) int32
-        Cluster of every point, -1 for none.
+        Cluster of every point, -1 for none, as in the result.
     spacing_m : float
         Mean point spacing in plan.
     distance_m : float
         Up to which a point belongs to a plane: `settings.plane_distance_m` of the noise.
-    settings : PlaneRefinementSettings
-        All else.
-
-    Returns
-    -------
-    planes : (k, 3) float64
-        (a, b, c); every one has points.
-    labels : (n,) int32
-        Plane of every point, -1 for none.
 
     Raises
     ------

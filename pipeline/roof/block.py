@@ -39,29 +39,14 @@ def block_plane(points: FloatArray, ground_z_m: float, percentile: float) -> Pla
 def block_forms(
     footprint_mm: MultiPolygon, plane: Plane, ground_z_m: float, tolerance_m: float, min_area_m2: float
 ) -> Iterator[Callable[[], list[SolidPart]]]:
-    """Ways to draw one block for every part of a footprint, the nearest to it first.
+    """Ways to draw one block for every part of a footprint, the nearest to it first, with a horizontal plane.
 
-    First on the footprint itself; then opened by a few centimetres where it pinches, drawn back until parts and holes
-    do not touch, more and more simplified; at last on its convex hull.
+    First on the footprint itself, in valid integer millimetres; then opened by a few centimetres where it pinches,
+    drawn back until parts and holes do not touch, more and more simplified, up to `tolerance_m`; at last on its convex
+    hull. Parts below `min_area_m2` are left out unless there is no larger one.
 
-    Parameters
-    ----------
-    footprint_mm : MultiPolygon
-        Integer millimetres, valid.
-    plane : Plane
-        The horizontal roof.
-    ground_z_m : float
-        Elevation of the floor.
-    tolerance_m : float
-        Largest simplification of the outline (0 for none).
-    min_area_m2 : float
-        Smaller parts are left out unless there is no larger one.
-
-    Yields
-    ------
-    callable
-        Draws the blocks, at least one and not yet judged. Raises `BuildingError` where they cannot be drawn:
-        `no_footprint` where no part has an area, `no_partition` where parts overlap or touch; or what GEOS raises.
+    Each way draws the blocks, at least one and not yet judged. It raises BuildingError where they cannot be drawn:
+    `no_footprint` where no part has an area, `no_partition` where parts overlap or touch; or what GEOS raises.
     """
     build = partial(_blocks, plane=plane, ground_z_m=ground_z_m, min_area_m2=min_area_m2)
     yield partial(build, footprint_mm)

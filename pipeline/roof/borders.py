@@ -51,23 +51,9 @@ class _Arc:
 def straighten_borders(
     partition: RoofPartition, planes: Sequence[Plane], spacing_m: float, settings: RoofSettings
 ) -> RoofPartition:
-    """Draw the borders between roof faces as straight lines, leaving the outline.
+    """Draw the borders between roof faces as straight lines, leaving the outline, in a coverage in integer millimetres.
 
-    Parameters
-    ----------
-    partition : RoofPartition
-        A coverage in integer millimetres, clipped to its outline.
-    planes : sequence of Plane
-        The labels' planes.
-    spacing_m : float
-        Point spacing; the tolerances are multiples of it.
-    settings : RoofSettings
-        `border_tolerance_spacings`, `square_within_deg`.
-
-    Returns
-    -------
-    RoofPartition
-        A coverage with the same faces; the same object where nothing could be straightened.
+    The tolerances are multiples of the point spacing. The same object comes back where nothing could be straightened.
     """
     tolerance = settings.border_tolerance_spacings * spacing_m * 1e3
     arcs, rings = _arcs(partition)

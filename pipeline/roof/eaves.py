@@ -35,24 +35,11 @@ _MOVED = 0.4
 def straighten(
     outline_mm: MultiPolygon, spacing_m: float, settings: RoofSettings, points: EdgePoints | None = None
 ) -> MultiPolygon:
-    """Draw an outline with straight lines.
+    """Draw an outline with straight lines, valid in integer millimetres; a ring that moves too much area stays raw.
 
-    Parameters
-    ----------
-    outline_mm : MultiPolygon
-        The raw outline, integer millimetres.
-    spacing_m : float
-        Point spacing; the tolerances are multiples of it.
-    settings : RoofSettings
-        `eave_tolerance_spacings`, `square_within_deg`.
-    points : EdgePoints, optional
-        The roof points. With them every line that is long enough moves to the edge that they show, and the outline is
-        drawn back by what mixed pulses add; without them lines stay amid the raw zigzag.
-
-    Returns
-    -------
-    MultiPolygon
-        Integer millimetres, valid. A ring that would move too much area stays raw.
+    The tolerances are multiples of the point spacing. With the roof points every line that is long enough moves to the
+    edge that they show, and the outline is drawn back by what mixed pulses add; without them lines stay amid the raw
+    zigzag.
     """
     reach_mm = 0.0
     if points is not None:

@@ -67,16 +67,9 @@ class EdgePoints:
 
     @classmethod
     def of(cls, xy_mm: IntArray, split: BoolArray, spacing_m: float) -> EdgePoints:
-        """Sort points into cells of some point spacings.
+        """Sort at least one point (n, 2), in millimetres, into cells of some point spacings.
 
-        Parameters
-        ----------
-        xy_mm : (n, 2) int64
-            At least one point, millimetres.
-        split : (n,) bool
-            True where the pulse went on to a lower return; all False where the file does not record it.
-        spacing_m : float
-            Typical distance of neighbours.
+        `split` is True where the pulse went on to a lower return; all False where the file does not record it.
         """
         cell = max(1000, math.ceil(_DEPTH_SPACINGS * spacing_m * 1e3))
         low = xy_mm.min(axis=0)

@@ -91,19 +91,15 @@ class FacadePoints:
     def of(
         cls, single: FloatArray, later: FloatArray, roof: FloatArray, ground: FloatArray, ground_z_m: float
     ) -> FacadePoints:
-        """Take heights above the terrain and index the points.
+        """Take heights above the terrain, `ground_z_m` where there is no cell of it, and index the points.
 
         Parameters
         ----------
         single, later : (n, 3) and (k, 3) float64
             Points around and beneath the roof, of pulses with one return and the last of several, local metres; in
             any order.
-        roof : (m, 3) float64
-            The roof points, local metres.
         ground : (j, 3) float64
             The terrain at the middles of cells of 1 m, local metres.
-        ground_z_m : float
-            The terrain where there is no cell.
         """
         xyz = np.concatenate((single, later))
         cells, wanted = _cells(ground), _cells(xyz)
@@ -145,19 +141,8 @@ class Eave:
 def eave_of(start: FloatArray, end: FloatArray, points: FacadePoints, reach_m: float) -> Eave:
     """The wall beneath one line of an outline, as far as points show it.
 
-    Parameters
-    ----------
-    start, end : (2,) float64
-        Ends of the line, local metres, the roof on its left.
-    points : FacadePoints
-        Those of the building.
-    reach_m : float
-        Reach of the mixed pulses, see `mixed_pulse_reach_mm`.
-
-    Returns
-    -------
-    Eave
-        Its overhang is slightly negative where the outline was drawn a little inside the wall.
+    The line goes from `start` to `end`, (2,) local metres, the roof on its left; see `mixed_pulse_reach_mm` for the
+    reach. The overhang is slightly negative where the outline was drawn a little inside the wall.
     """
     length = math.dist(start, end)
     if length < _MIN_LENGTH_M:
@@ -223,23 +208,10 @@ def mean_overhang_m(eaves: Sequence[Eave], usual_m: float) -> float:
 
 
 def at_walls(outline_mm: MultiPolygon, points: FacadePoints, reach_m: float, usual_m: float) -> MultiPolygon:
-    """Draw an outline at the facades.
+    """Draw an outline at the facades; it is at the eaves, with straight lines, in integer millimetres, and stays valid.
 
-    Parameters
-    ----------
-    outline_mm : MultiPolygon
-        At the eaves, with straight lines, integer millimetres.
-    points : FacadePoints
-        Points that may show the walls.
-    reach_m : float
-        Reach of the mixed pulses, see `mixed_pulse_reach_mm`.
-    usual_m : float
-        Overhang where no wall of the whole outline is known.
-
-    Returns
-    -------
-    MultiPolygon
-        Integer millimetres, valid. A ring that would break stays at the eaves.
+    `usual_m` is the overhang where no wall of the whole outline is known; see `mixed_pulse_reach_mm` for the reach. A
+    ring that would break stays at the eaves.
     """
     polygons = [orient(polygon) for polygon in outline_mm.geoms]
     rings = [

@@ -23,10 +23,7 @@ _ROUND_MM = (5.0, 20.0)
 def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
     """A given footprint in integer millimetres, valid, without repeated vertices; it is in local metres, 2D or 3D.
 
-    Raises
-    ------
-    BuildingError
-        `no_footprint` where nothing with an area is left.
+    Raises BuildingError `no_footprint` where nothing with an area is left.
     """
     scaled = shapely.force_2d(footprint)
     scaled = shapely.set_coordinates(scaled, shapely.get_coordinates(scaled) * 1e3)
@@ -143,21 +140,10 @@ def polygons_of(geometry: shapely.Geometry) -> list[Polygon]:
 
 
 def clip_partition(partition: RoofPartition, footprint_mm: MultiPolygon, min_area_m2: float) -> RoofPartition:
-    """The part of a partition inside a footprint.
+    """The part of a partition inside a footprint in integer millimetres.
 
-    Parameters
-    ----------
-    partition : RoofPartition
-        A coverage that reaches beyond the footprint wherever there is roof.
-    footprint_mm : MultiPolygon
-        Integer millimetres.
-    min_area_m2 : float
-        Smaller pieces join the neighbour with the longest border, or go where they have none.
-
-    Raises
-    ------
-    BuildingError
-        `no_partition` where nothing is left.
+    The partition reaches beyond it wherever there is roof. Pieces below `min_area_m2` join the neighbour with the
+    longest border, or go where they have none. Raises BuildingError `no_partition` where nothing is left.
     """
     shapely.prepare(footprint_mm)
     polygons = np.array(partition.polygons, dtype=object)

@@ -108,21 +108,9 @@ def _cell_size(xy_mm: IntArray) -> int:
 
 
 def nearest_points(xy_mm: IntArray, query_mm: IntArray) -> tuple[LabelArray, FloatArray]:
-    """The nearest point in plan of every query.
+    """The nearest of points (n, 2), at least one, in plan of every query (q, 2), all in millimetres.
 
-    Parameters
-    ----------
-    xy_mm : (n, 2) int64
-        At least one point, millimetres.
-    query_mm : (q, 2) int64
-        Where to look, millimetres.
-
-    Returns
-    -------
-    index : (q,) int32
-        Row of `xy_mm`; of equally near points the lowest.
-    distance_m : (q,) float64
-        Distance in plan.
+    Returns its row, of equally near points the lowest, and the distance in metres, (q,).
     """
     index, squared = _nearest(
         np.ascontiguousarray(xy_mm[:, 0]),
@@ -150,27 +138,9 @@ def empty_samples(
 ) -> tuple[IntArray, LabelArray, FloatArray]:
     """Lattice samples around and between the points, where no point is near.
 
-    The lattice starts at its lower left corner, so it moves with the points.
-
-    Parameters
-    ----------
-    xy_mm : (n, 2) int64
-        The points, millimetres.
-    pitch_mm : int
-        Distance of the samples; widened where it would give more than a million of them.
-    low, high : (2,) int64
-        Opposite corners of the lattice.
-    gap_m : float
-        A sample nearer to a point than this is dropped.
-
-    Returns
-    -------
-    samples_mm : (s, 2) int64
-        The samples.
-    nearest : (s,) int32
-        The nearest point of each.
-    distance_m : (s,) float64
-        Its distance.
+    The lattice between the corners `low` and `high` starts at the lower left one, so it moves with the points. Samples
+    are `pitch_mm` apart, more where it would give more than a million of them; those nearer to a point than `gap_m` are
+    dropped. Returns the samples (s, 2) in millimetres, the nearest point of each, and its distance in metres.
     """
     while float((high - low).prod()) / pitch_mm**2 > _MAX_CELLS / 4:
         pitch_mm *= 2
@@ -248,7 +218,7 @@ def _pairs_that_cross(
 def continue_crossings(
     x: IntArray, y: IntArray, facets: LabelArray, labels: LabelArray, known: BoolArray, planes: FloatArray
 ) -> LabelArray:
-    """Labels in which borders of two planes that cross run straight, also where there are no points.
+    """Labels (n,) in which borders of two planes that cross run straight, also where there are no points.
 
     A place without points, or with a point that no plane explains, has the label of the nearest labelled point; a ridge
     would leave its line there. The edges between the points of two planes show whether they meet in a ridge (the lower
@@ -266,11 +236,6 @@ def continue_crossings(
         True for labels from the segmentation: they change only where both planes are equally good.
     planes : (k, 3) float64
         Coefficients in metres.
-
-    Returns
-    -------
-    (n,) int32
-        The new labels.
     """
     labels = labels.copy()
     pair_keys, kinds = _pairs_that_cross(x, y, facets, labels, known, planes)

@@ -45,12 +45,7 @@ class Run:
 def fitted_run(border: FloatArray, first: int, last: int) -> Run:
     """The line of least squares through the stretch between two vertices, every piece weighted by its length.
 
-    Parameters
-    ----------
-    border : (n, 2) float64
-        Vertices; the first of a closed border is not repeated.
-    first, last : int
-        Indices, `last` greater than `first`; taken modulo n.
+    The first vertex of a closed border (n, 2) is not repeated; `last` is greater than `first`, both are taken modulo n.
     """
     x, y, direction, length = _fit(border, first, last)
     return Run(first=first, last=last, x=x, y=y, direction=direction, length=length)
@@ -106,16 +101,10 @@ def _off_line(border: FloatArray, first: int, last: int, x: float, y: float, dir
 
 
 def split(border: FloatArray, tolerance: float, *, closed: bool) -> list[Run]:
-    """Cut a border into runs whose vertices lie within the tolerance of their chords.
+    """Cut a border into runs whose vertices lie within the tolerance, in the unit of the coordinates, of their chords.
 
-    Parameters
-    ----------
-    border : (n, 2) float64
-        Vertices; the first of a closed border is not repeated, and a run starts there.
-    tolerance : float
-        In the unit of the coordinates.
-    closed : bool
-        Whether the last vertex is joined to the first; such a border has at least three runs, or none.
+    The first vertex of a closed border (n, 2), whose last is joined to it, is not repeated, and a run starts there.
+    Such a border has at least three runs, or none.
     """
     path = np.vstack((border, border[:1])) if closed else border
     kept = shapely.get_coordinates(shapely.simplify(shapely.linestrings(path), tolerance, preserve_topology=False))
@@ -134,16 +123,7 @@ def split(border: FloatArray, tolerance: float, *, closed: bool) -> list[Run]:
 def merge(border: FloatArray, runs: Sequence[Run], tolerance: float, *, closed: bool) -> list[Run]:
     """Unite neighbouring runs while one line passes within the tolerance of all their vertices, the best pair first.
 
-    Parameters
-    ----------
-    border : (n, 2) float64
-        Vertices, as for `split`.
-    runs : sequence of Run
-        Its runs; exact ones stay.
-    tolerance : float
-        In the unit of the coordinates.
-    closed : bool
-        Whether the last run is followed by the first; then at least three runs stay.
+    Vertices and tolerance are as for `split`; exact runs stay, and of a closed border at least three runs.
     """
     merged = list(runs)
     least = 3 if closed else 1

@@ -60,27 +60,18 @@ def lower_lods(
     lods: Sequence[str],
     is_sound: Callable[[Solid], bool],
 ) -> list[LodParts]:
-    """A building at the requested levels of detail.
+    """A building's model in LoD2.2 at the requested levels of detail, the finest first.
+
+    All have the same parts in the same order. A level is left out where no form of it is sound.
 
     Parameters
     ----------
-    detailed : LodParts
-        Its model in LoD2.2.
     points : (n, 3) float64
         Its roof points, local metres; at least one.
     ground_z_m : float
         Elevation of the floor, local metres.
-    settings : RoofSettings
-        Percentile and steps of the levels.
     lods : sequence of str
         Some of 1.2, 1.3 and 2.2.
-    is_sound : callable
-        Judges a solid.
-
-    Returns
-    -------
-    list of LodParts
-        The finest first, all with the same parts in the same order. A level is left out where no form of it is sound.
     """
     whole = block_plane(points, ground_z_m, settings.block_height_percentile)
     forms: Mapping[str, Callable[[SolidPart], Iterator[LevelPart]]] = {
@@ -147,8 +138,6 @@ def level_forms(
         The horizontal roof where none of the points lies over the part.
     ground_z_m : float
         Elevation of the floor, local metres.
-    settings : RoofSettings
-        `level_step_m`, `block_height_percentile`, `min_part_area_m2`.
     """
     polygons = [_polygon_mm(face) for face in part.faces]
     borders = _borders(part.faces)

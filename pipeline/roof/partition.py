@@ -344,32 +344,12 @@ def _march(
 def march(
     xy_mm: IntArray, tin: Tin, labels: LabelArray, planes: FloatArray, outside_fraction: float, step_offset_m: float
 ) -> RoofPartition:
-    """Cut the plan into one polygon per connected region of equal labels.
+    """Cut the plan into one polygon per connected region of equal labels, in the order of their first facets.
 
-    Parameters
-    ----------
-    xy_mm : (n, 2) int64
-        Vertices of the TIN, millimetres.
-    tin : Tin
-        Their Delaunay triangulation.
-    labels : (n,) int32
-        Plane of every vertex, -1 outside. All vertices of the hull must be outside.
-    planes : (k, 3) float64
-        Coefficients a, b, c of z = a x + b y + c, metres.
-    outside_fraction : float
-        Where on the way from a roof vertex to an outside one the border lies.
-    step_offset_m : float
-        Distance of a high step edge from the points of its upper face.
-
-    Returns
-    -------
-    RoofPartition
-        The polygons in the order of their first facets; rounded to 1 mm.
-
-    Raises
-    ------
-    BuildingError
-        `no_partition` where no roof vertex is inside.
+    Vertices (n, 2) are in millimetres, their `labels` -1 outside, where all vertices of the hull must be; planes (k, 3)
+    are the coefficients a, b, c of z = a x + b y + c, metres. `outside_fraction` is where on the way from a roof vertex
+    to an outside one the border lies, `step_offset_m` the distance of a high step edge from the points of its upper
+    face. Polygons are rounded to 1 mm. Raises BuildingError `no_partition` where no roof vertex is inside.
 
     Examples
     --------

@@ -65,24 +65,9 @@ class RoofPoints:
 
 
 def roof_points(cloud: PreparedCloud, settings: RoofSettings) -> RoofPoints:
-    """Select the roof points of a candidate.
+    """Select the roof points of a candidate, in its order, without labels.
 
-    Parameters
-    ----------
-    cloud : PreparedCloud
-        The candidate's points.
-    settings : RoofSettings
-        `min_roof_height_m`, `min_points`, `min_points_in_footprint`.
-
-    Returns
-    -------
-    RoofPoints
-        In the candidate's order, without labels.
-
-    Raises
-    ------
-    BuildingError
-        `too_few_points` or `no_footprint`.
+    Raises BuildingError `too_few_points` or `no_footprint`.
     """
     candidate = cloud.candidate
     highest = candidate.points[cloud.highest]
@@ -137,29 +122,12 @@ class RoofPlan:
 
 
 def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettings) -> RoofPlan:
-    """Cut the plan into roof faces.
+    """Cut the plan into roof faces, neither clipped nor simplified: see `draw_plan`.
 
     With a footprint the faces are continued beyond it, to be clipped: so the walls will stand exactly on it. Without
-    one the eave lies between roof points and the empty places around them; straightened, it serves as a footprint.
-
-    Parameters
-    ----------
-    roof : RoofPoints
-        At least one of them with a label.
-    planes : sequence of Plane
-        The labels' planes.
-    settings : RoofSettings
-        Distances and areas.
-
-    Returns
-    -------
-    RoofPlan
-        Neither clipped nor simplified: see `draw_plan`.
-
-    Raises
-    ------
-    BuildingError
-        `no_partition` where nothing is left, `too_complex` beyond 1.9 km.
+    one the eave lies between roof points and the empty places around them; straightened, it serves as a footprint. At
+    least one roof point has a label. Raises BuildingError `no_partition` where nothing is left, `too_complex` beyond
+    1.9 km.
     """
     given = roof.footprint_mm
     margin = round(_MARGIN_SPACINGS * roof.spacing_m * 1e3)
@@ -220,10 +188,7 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
 def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:
     """The outline of a building, integer millimetres: given, drawn with touching units, or drawn around its points.
 
-    Raises
-    ------
-    BuildingError
-        `no_partition` or `too_complex`, as `partition_roof`.
+    Raises BuildingError as `partition_roof`.
     """
     if roof.footprint_mm is not None:
         _require_extent(float(np.ptp(shapely.get_coordinates(roof.footprint_mm), axis=0).max()) * 1e-3)
@@ -251,10 +216,7 @@ def arranged_faces(
 ) -> RoofPartition:
     """The plan as an arrangement of the lines in which planes meet.
 
-    Raises
-    ------
-    BuildingError
-        `no_partition` where the outline cannot be filled.
+    Raises BuildingError `no_partition` where the outline cannot be filled.
     """
     coefficients = np.array([plane.coefficients for plane in planes], np.float64).reshape(len(planes), 3)
     return arrange(roof.points, roof.labels, coefficients, outline_mm, roof.spacing_m, costs, clearance)
@@ -307,28 +269,9 @@ def plan_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> Iter
 
 
 def draw_clipped(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings, form: PlanForm) -> RoofPartition:
-    """Clip the faces by the outline and simplify the borders between them.
+    """Clip the faces of `partition_roof` by the outline and simplify the borders between them, in integer millimetres.
 
-    Parameters
-    ----------
-    plan : RoofPlan
-        From `partition_roof`.
-    roof : RoofPoints
-        For the spacing.
-    settings : RoofSettings
-        Areas and the simplification.
-    form : PlanForm
-        How.
-
-    Returns
-    -------
-    RoofPartition
-        In integer millimetres.
-
-    Raises
-    ------
-    BuildingError
-        `no_partition` where this form cannot be drawn.
+    Raises BuildingError `no_partition` where this form cannot be drawn.
     """
     outline_mm = plan.outline_mm
     if form.shrink_mm > 0.0:
@@ -369,29 +312,10 @@ def _frame(low: IntArray, high: IntArray, margin: int) -> IntArray:
 def level_unsupported_faces(
     partition: RoofPartition, roof: RoofPoints, planes: Sequence[Plane], ground_z_m: float, settings: RoofSettings
 ) -> tuple[RoofPartition, list[Plane]]:
-    """Replace the plane of every face that leaves its data by a horizontal one.
+    """Replace the plane of every face that leaves its data by a horizontal one at the median of the face's own points.
 
-    Steep planes that are continued a little too far dip (nearly) under the floor, or rise far above all points.
-
-    Parameters
-    ----------
-    partition : RoofPartition
-        The faces.
-    roof : RoofPoints
-        The horizontal plane lies at the median of the face's own points.
-    planes : sequence of Plane
-        The planes.
-    ground_z_m : float
-        The floor.
-    settings : RoofSettings
-        `min_clearance_m`, `max_overshoot_m`.
-
-    Returns
-    -------
-    partition : RoofPartition
-        With the labels of the new planes.
-    planes : list of Plane
-        The old ones and the new ones behind them.
+    Steep planes that are continued a little too far dip (nearly) under the floor, or rise far above all points. Returns
+    the partition with the labels of the new planes, which follow the old ones in the list.
     """
     labels = partition.labels.copy()
     extended = list(planes)

@@ -133,7 +133,7 @@ def fit_gable(
     min_side_share: float,
     margin_m: float = 0.0,
 ) -> GableFit:
-    """The gable of two planes: rectangles on their line of intersection, both made equal by the larger one.
+    """The gable of two best-fit planes: rectangles on their line of intersection, both made equal by the larger one.
 
     Parameters
     ----------
@@ -141,19 +141,10 @@ def fit_gable(
         Local metres, whole millimetres.
     labels : (n,) int32
         0 for the points of the first plane, 1 for those of the second, -1 for others.
-    planes : two of Plane
-        Their best-fit planes.
-    ground_z_m : float
-        Elevation of the floor.
     min_side_share : float
         At least this share of either plane's points must lie on one side of the line, the other's on the other.
     margin_m : float
         By how much the rectangles go beyond the hulls.
-
-    Returns
-    -------
-    GableFit
-        The model and all steps to it.
 
     Raises
     ------
@@ -215,33 +206,18 @@ def fit_gable(
 def fit_box(
     points: FloatArray, plane: Plane, ground_z_m: float, *, flat_below_deg: float, margin_m: float = 0.0
 ) -> BuildingPrimitive:
-    """The counterpart of the gable for one plane: the minimum rectangle around its points, flat or pent.
+    """The counterpart of the gable for one best-fit plane: the minimum rectangle around its points, flat or pent.
 
-    A pent roof falls along the side of the rectangle that is nearest to the plane's own direction, from the plane's
-    mean elevation over the upper edge to that over the lower one.
+    Points (n, 3) are in local metres, whole millimetres. A pent roof falls along the side of the rectangle that is
+    nearest to the plane's own direction, from the plane's mean elevation over the upper edge to that over the lower
+    one. Raises BuildingError ``no_partition`` where the points lie on one line in plan.
 
     Parameters
     ----------
-    points : (n, 3) float64
-        The points of the plane, local metres, whole millimetres.
-    plane : Plane
-        Their best-fit plane.
-    ground_z_m : float
-        Elevation of the floor.
     flat_below_deg : float
         A plane of less slope gives a flat roof, at its elevation over the middle of the rectangle.
     margin_m : float
         By how much the rectangle goes beyond the hull.
-
-    Returns
-    -------
-    BuildingPrimitive
-        flat or pent.
-
-    Raises
-    ------
-    BuildingError
-        Reason ``no_partition`` where the points lie on one line in plan.
     """
     hull = convex_hull(np.rint(points[:, :2] * 1e3).astype(np.int64))
     smallest = minimum_rectangle(hull)

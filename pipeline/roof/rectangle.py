@@ -74,17 +74,9 @@ class Rectangle:
 
 
 def line_of_intersection(first: Plane, second: Plane) -> PlanLine | None:
-    """Where two planes meet, in plan.
+    """Where two planes meet, in plan; None for parallel planes.
 
-    Parameters
-    ----------
-    first, second : Plane
-        The first is the lower one to the left of the line.
-
-    Returns
-    -------
-    PlanLine or None
-        Its origin is the foot of the perpendicular from (0, 0); None for parallel planes.
+    The first plane is the lower one to the left of the line. The origin is the foot of the perpendicular from (0, 0).
 
     Examples
     --------
@@ -104,18 +96,10 @@ def line_of_intersection(first: Plane, second: Plane) -> PlanLine | None:
 
 
 def convex_hull(xy_mm: IntArray) -> FloatArray:
-    """The exact convex hull of positions on whole millimetres.
+    """The exact convex hull of positions (n, 2) on whole millimetres, at least one; extent below 1,000 km.
 
-    Parameters
-    ----------
-    xy_mm : (n, 2) int64
-        Millimetres, at least one; extent below 1,000 km.
-
-    Returns
-    -------
-    (h, 2) float64
-        Metres, counter-clockwise from the smallest (x, y), without positions on its edges. Two where all lie on one
-        line, one where all are one.
+    Vertices (h, 2) in metres, counter-clockwise from the smallest (x, y), without positions on its edges. Two where all
+    lie on one line, one where all are one.
     """
     return _hull(np.ascontiguousarray(xy_mm[np.lexsort((xy_mm[:, 1], xy_mm[:, 0]))])) / 1e3
 
@@ -186,17 +170,8 @@ def _beyond(ring: FloatArray, side: float) -> FloatArray:
 def minimum_rectangle(hull: FloatArray) -> Rectangle | None:
     """The rectangle of least area around a convex hull: one side lies on an edge of it (Freeman and Shapira 1975).
 
-    Found with rotating calipers (Toussaint 1983): all edges in one turn.
-
-    Parameters
-    ----------
-    hull : (h, 2) float64
-        Counter-clockwise, metres.
-
-    Returns
-    -------
-    Rectangle or None
-        Along the edge that gives it, the first among equal areas (to 1e-9 of them). None for fewer than three vertices.
+    Found with rotating calipers (Toussaint 1983): all edges in one turn. The hull (h, 2) is counter-clockwise, in
+    metres. The first edge counts among equal areas (to 1e-9 of them). None for fewer than three vertices.
     """
     if len(hull) < 3:
         return None

@@ -25,21 +25,8 @@ def simplify_partition(partition: RoofPartition, tolerance_m: float, *, outline_
 
     A vertex whose triangle with its neighbours covers less than the squared tolerance is dropped, smallest first
     (Visvalingam and Whyatt 1993), unless borders would touch or cross. Vertices are dropped, never moved, so the
-    millimetre grid is kept; nodes where three borders meet stay.
-
-    Parameters
-    ----------
-    partition : RoofPartition
-        A valid coverage; its polygons keep their order.
-    tolerance_m : float
-        Square root of the area that may be cut off or added, metres; 0 changes nothing.
-    outline_too : bool
-        Whether the outer border is simplified as well.
-
-    Raises
-    ------
-    BuildingError
-        `no_partition` where a polygon vanished or fell apart.
+    millimetre grid is kept; nodes where three borders meet stay, and polygons keep their order. The tolerance is in
+    metres; 0 changes nothing. Raises BuildingError `no_partition` where a polygon vanished or fell apart.
     """
     if tolerance_m <= 0.0:
         return partition
@@ -58,12 +45,8 @@ def unite_close_vertices(partition: RoofPartition, distance_mm: float) -> RoofPa
     here, the same for a reader with a tolerance.
 
     Vertices of a coverage in integer millimetres that are at most this far apart become the leftmost of them; polygons
-    that vanish go. The same object comes back where no vertices are close.
-
-    Raises
-    ------
-    BuildingError
-        `no_partition` where a polygon breaks.
+    that vanish go. The same object comes back where no vertices are close. Raises BuildingError `no_partition` where a
+    polygon breaks.
     """
     polygons = np.array(partition.polygons, dtype=object)
     vertices = np.unique(shapely.get_coordinates(polygons), axis=0)

@@ -51,26 +51,11 @@ class _Mesh:
 
 
 def solid_parts(partition: RoofPartition, planes: Sequence[Plane], ground_z_m: float) -> list[SolidPart]:
-    """Extrude a partition to one closed solid for every connected part.
+    """Extrude a partition to one closed solid for every connected part, in the order of each part's first polygon.
 
-    Parameters
-    ----------
-    partition : RoofPartition
-        A valid coverage in integer millimetres.
-    planes : sequence of Plane
-        The planes that the labels number; they must lie above the floor over their polygons.
-    ground_z_m : float
-        Elevation of the floor, local metres.
-
-    Returns
-    -------
-    list of SolidPart
-        In the order of each part's first polygon. Coordinates are multiples of 1 mm.
-
-    Raises
-    ------
-    BuildingError
-        `no_partition` where borders overlap, pinch, or a plane dips under the floor.
+    The partition is a valid coverage in integer millimetres; the planes that its labels number lie above the floor over
+    their polygons. Coordinates of solids are multiples of 1 mm. Raises BuildingError `no_partition` where borders
+    overlap, pinch, or a plane dips under the floor.
     """
     mesh = _mesh(partition)
     edges = _insert_crossings(mesh, planes)

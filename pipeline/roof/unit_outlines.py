@@ -22,22 +22,10 @@ from pipeline.roof.settings import RoofSettings
 
 
 def unit_outlines(candidate: Candidate, units: LabelArray, settings: RoofSettings) -> list[MultiPolygon | None]:
-    """Draw the outlines of the units of one candidate.
+    """Draw the outlines of the units of one candidate, in local metres on the millimetre grid; (n,) units from 0.
 
-    Parameters
-    ----------
-    candidate : Candidate
-        All units.
-    units : (n,) int32
-        Unit of every point, numbered from 0.
-    settings : RoofSettings
-        As for the outline of one building.
-
-    Returns
-    -------
-    list of MultiPolygon or None
-        One per unit, local metres on the millimetre grid; they share borders and do not overlap. None for a unit
-        without a part of the plan, and for all where no plan can be drawn: such units are drawn one by one.
+    They share borders and do not overlap. None for a unit without a part of the plan, and for all where no plan can be
+    drawn: such units are drawn one by one.
     """
     count = int(units.max(initial=-1)) + 1
     try:

@@ -59,19 +59,9 @@ def _distances(points: FloatArray, raster: Raster, gap_m: float, far_m: float) -
 def _empty_cells(
     points: FloatArray, edges: FloatArray, pitch_m: float, gap_m: float, far_m: float
 ) -> tuple[FloatArray, LabelArray]:
-    """Centres of the cells in voids, (v, 2) metres, and the void of each, (v,).
+    """Centres of the cells in voids, (v, 2) metres, and the void of each, (v,), among points (n, 2) in edges (e, 4).
 
-    Parameters
-    ----------
-    points : (n, 2) float64
-        Roof points, metres.
-    edges : (e, 4) float64
-        Edges of the outline, metres.
-    pitch_m : float
-        Size of the cells.
-    gap_m, far_m : float
-        A void consists of connected cells farther than `gap_m` from every point, at least one of them farther than
-        `far_m`.
+    A void consists of connected cells farther than `gap_m` from every point, at least one of them farther than `far_m`.
     """
     west, south, east, north = edges[0, 0], edges[0, 1], edges[0, 0], edges[0, 1]
     for e in range(len(edges)):
@@ -115,23 +105,10 @@ def _empty_cells(
 def without_voids(
     outline_mm: MultiPolygon, points: FloatArray, spacing_m: float, settings: RoofSettings
 ) -> MultiPolygon:
-    """An outline without the places that are not roof.
+    """An outline in valid integer millimetres without the places that are not roof.
 
-    Parameters
-    ----------
-    outline_mm : MultiPolygon
-        Valid, integer millimetres.
-    points : (n, 3) float64
-        Roof points of the same frame, metres.
-    spacing_m : float
-        Typical distance of neighbouring points in plan.
-    settings : RoofSettings
-        `void_distance_m`, `min_void_m2`, `gap_spacings`, `min_part_area_m2`.
-
-    Returns
-    -------
-    MultiPolygon
-        Valid, integer millimetres; the same object where there is no void, or where nothing would be left.
+    Roof points (n, 3) of the same frame are in metres. The same object comes back where there is no void, or where
+    nothing would be left.
     """
     far_m = max(settings.void_distance_m, 2.0 * settings.gap_spacings * spacing_m)
     gap_m = settings.gap_spacings * spacing_m

@@ -54,12 +54,7 @@ class Variant:
 
     @classmethod
     def parse(cls, text: str) -> Variant:
-        """A variant from ``METHOD`` or ``METHOD:PRESET``.
-
-        Raises
-        ------
-        SettingsError
-            Naming all methods, or all presets.
+        """A variant from ``METHOD`` or ``METHOD:PRESET``; raises SettingsError naming all methods, or all presets.
 
         Examples
         --------
@@ -75,10 +70,7 @@ class Variant:
 def parse_variants(texts: Sequence[str]) -> tuple[Variant, ...]:
     """Variants from the words of a user, each with one or more variants separated by commas.
 
-    Raises
-    ------
-    SettingsError
-        All faults at once; fewer than two variants; one given twice.
+    Raises SettingsError with all faults at once; for fewer than two variants; for one given twice.
 
     Examples
     --------
@@ -160,15 +152,8 @@ def run_variant(
 ) -> RunVariant:
     """A variant of a run with some settings.
 
-    Parameters
-    ----------
-    tables : mapping
-        Values that differ from the presets, by the method's name.
-
-    Raises
-    ------
-    SettingsError
-        Values out of range, all at once.
+    `tables` are values that differ from the presets, by the method's name. Raises SettingsError for all values out of
+    range at once.
     """
     entry = method_named(variant.method)
     faults: list[str] = []
@@ -190,10 +175,7 @@ def settings_of(
 def own_tables(table: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """The methods' own tables among those of a settings file.
 
-    Raises
-    ------
-    SettingsError
-        The file names a method or a preset too.
+    Raises SettingsError if the file names a method or a preset too.
 
     Examples
     --------

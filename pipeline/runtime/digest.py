@@ -42,6 +42,8 @@ Fixed = npt.NDArray[np.uint8]
 def run_digest(run_dir: str, filesystem: pafs.FileSystem | None = None, tiles: Sequence[str] | None = None) -> str:
     """The sha256 of a run's content in hexadecimal.
 
+    Raises RunError if the directory lacks one of the tables, a table lacks its key, or an object comes twice.
+
     Parameters
     ----------
     run_dir : str
@@ -50,11 +52,6 @@ def run_digest(run_dir: str, filesystem: pafs.FileSystem | None = None, tiles: S
         Storage of the run; by default as `run_dir` says.
     tiles : sequence of str, optional
         Keys of the tiles that have tables; by default the run directory is listed.
-
-    Raises
-    ------
-    RunError
-        The directory lacks one of the tables, a table lacks its key, or an object comes twice.
     """
     if filesystem is None:
         filesystem, run_dir = arrow_at(run_dir)

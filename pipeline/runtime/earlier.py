@@ -91,10 +91,7 @@ def _is_one_of(column: str, values: Collection[str]) -> pc.Expression:
 def earlier_run(run_dir: str) -> Earlier:
     """What a run directory says about its run.
 
-    Raises
-    ------
-    RunError
-        It has no finished run of this version with its request.
+    Raises RunError if it has no finished run of this version with its request.
     """
     if is_url(run_dir):
         raise RunError(

@@ -24,14 +24,8 @@ ALONE_S = 0.5
 def engine_of(resources: Resources, *, expected_cpu_s: float, at: int, models: bool = True) -> tuple[Engine, int]:
     """The engine of a job, and its number of processes; 0 where they belong to a scheduler elsewhere.
 
-    Parameters
-    ----------
-    expected_cpu_s : float
-        CPU seconds of the job.
-    at : int
-        Workers for which this machine has cores and memory.
-    models : bool
-        Whether the job models buildings, which only child processes do.
+    `at` is the number of workers for which this machine has cores and memory. Only child processes model buildings, if
+    the job `models` any.
 
     Examples
     --------
@@ -54,10 +48,7 @@ def engine_of(resources: Resources, *, expected_cpu_s: float, at: int, models: b
 def workers_that_fit(at: int, memory: int, task_bytes: int) -> int:
     """Workers for which a machine has cores and memory, at least one.
 
-    Parameters
-    ----------
-    task_bytes : int
-        Memory of the largest task, above the process's own size.
+    `task_bytes` is the memory of the largest task, above the process's own size.
 
     Examples
     --------
@@ -72,6 +63,8 @@ def executor_for(
 ) -> Executor:
     """The executor that a request asks for.
 
+    Raises SettingsError if a performance report is requested without workers, or certificates cannot be used.
+
     Parameters
     ----------
     local_directory : str
@@ -80,11 +73,6 @@ def executor_for(
         What there is to do; a job is small by default.
     loads : sequence of str
         What child processes load, from `loads_of`, unless they have started already.
-
-    Raises
-    ------
-    SettingsError
-        A performance report is requested without workers, or certificates cannot be used.
     """
     engine, processes = engine_of(
         resources,

@@ -147,19 +147,9 @@ class RunManifest:
 
     @classmethod
     def from_json(cls, text: str, source: str = NAME) -> RunManifest:
-        """The manifest from JSON text.
+        """The manifest from JSON text as `to_json` writes it; unknown entries are ignored, messages name `source`.
 
-        Parameters
-        ----------
-        text : str
-            As `to_json` writes it; unknown entries are ignored.
-        source : str
-            Name of the file, for messages.
-
-        Raises
-        ------
-        RunError
-            The text is not a manifest, or has another format.
+        Raises RunError if the text is not a manifest, or has another format.
         """
         try:
             found = json.loads(text)
@@ -204,20 +194,12 @@ def _plain(value: Any) -> Any:
 
 
 def write_manifest(run_dir: str | Path, manifest: RunManifest, put: Put | None = None) -> None:
-    """Write `run.json` atomically.
-
-    Parameters
-    ----------
-    run_dir : str or Path
-        The local run directory; unused where `put` is given.
-    put : callable, optional
-        Stores a file elsewhere; `put_local(run_dir)` by default.
-    """
+    """Write `run.json` atomically to a local run directory, or by `put`, which stores a file elsewhere."""
     (put or put_local(run_dir))(NAME, manifest.to_json().encode())
 
 
 def read_manifest(run_dir: str | Path, filesystem: pafs.FileSystem | None = None) -> RunManifest:
-    """Read `run.json`.
+    """Read `run.json`; raises RunError if there is none, or it cannot be read.
 
     Parameters
     ----------
@@ -225,11 +207,6 @@ def read_manifest(run_dir: str | Path, filesystem: pafs.FileSystem | None = None
         The run directory: a path or URL, or a path of `filesystem`.
     filesystem : pyarrow.fs.FileSystem, optional
         Where the run lies; by default as `run_dir` says.
-
-    Raises
-    ------
-    RunError
-        There is none, or it cannot be read.
     """
     if filesystem is None:
         filesystem, run_dir = arrow_at(run_dir)

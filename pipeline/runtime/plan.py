@@ -76,10 +76,7 @@ def tile_size_m(density_per_m2: float, halo_m: float, area_m2: float) -> float:
 def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings) -> Plan:
     """Read every input's header and lay out the lattice.
 
-    Raises
-    ------
-    InputError
-        An input cannot be used, or two inputs disagree about their CRS.
+    Raises InputError if an input cannot be used, or two inputs disagree about their CRS.
     """
     sources = _looked_at(sorted(paths), options)
     first = sources[0].reference
@@ -151,10 +148,7 @@ def _looked_at(paths: Sequence[str], options: ReadOptions) -> tuple[SourceInfo, 
 def without_far_files(plan: Plan, paths: Sequence[str]) -> tuple[Plan, list[str]]:
     """The plan and paths without remote files that lie off --bbox and --aoi by their headers: no need to fetch them.
 
-    Raises
-    ------
-    EmptyInputError
-        No file is left.
+    Raises EmptyInputError if no file is left.
     """
     window = plan.options.window
     if window is None:

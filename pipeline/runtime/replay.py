@@ -35,18 +35,9 @@ class Replayed:
 
 
 def replay(bundle: Bundle, limits: IsolationLimits | None) -> Replayed:
-    """Model a bundle's building.
+    """Model a bundle's building in a child process with limits; raises RunError if none can be started.
 
-    Parameters
-    ----------
-    limits : IsolationLimits or None
-        Limits of the child process that models it; None models it in this process, where a debugger sees it and a crash
-        ends the process.
-
-    Raises
-    ------
-    RunError
-        No child process can be started.
+    Without limits it is modelled in this process, where a debugger sees it and a crash ends the process.
     """
     if limits is None:
         try:
@@ -73,10 +64,7 @@ def replay_row(bundle: Bundle, replayed: Replayed) -> Mapping[str, Any]:
 def write_replay(folder: str, bundle: Bundle, replayed: Replayed) -> tuple[Path, ...]:
     """Write `<building_id>.json`, and where there is a model `<building_id>.obj` and `<building_id>.city.jsonl`.
 
-    Raises
-    ------
-    RunError
-        The folder cannot be written.
+    Raises RunError if the folder cannot be written.
     """
     result, row = replayed.result, replay_row(bundle, replayed)
     texts = {".json": json.dumps(row, indent=1) + "\n"}

@@ -55,13 +55,7 @@ class RunRequest:
 
 
 def plan_inputs(request: RunRequest, progress: Progress) -> tuple[Plan, list[str]]:
-    """The plan of a run, and its input files in order.
-
-    Raises
-    ------
-    InputError
-        An input cannot be used.
-    """
+    """The plan of a run, and its input files in order; raises InputError if one cannot be used."""
     options = ReadOptions(
         crs=request.crs,
         vertical_unit=request.vertical_unit,

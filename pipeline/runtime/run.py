@@ -129,19 +129,12 @@ def run(
 
     Parameters
     ----------
-    request : RunRequest
-        What to reconstruct, and how.
     on_event : callable
         Gets an `Event` for every stage, step and warning.
     executor : Executor, optional
         Runs the tasks; by default the one that the request calls for.
     cancelled : callable
         Asked several times a second, from another thread. Once it is true, the run ends as soon as it can.
-
-    Returns
-    -------
-    RunSummary
-        Counts, timings, digest.
 
     Raises
     ------
@@ -172,7 +165,9 @@ def run_variants(
     cancelled: Callable[[], bool] = never,
     outdated: Sequence[Path] = (),
 ) -> list[VariantOutcome]:
-    """Model the same candidates in several ways: ingest, split and join run once, the rest once per variant.
+    """Model the same candidates in several ways: ingest, split and join run once, the rest once per variant, in order.
+
+    Raises the errors of `run`.
 
     Parameters
     ----------
@@ -182,16 +177,6 @@ def run_variants(
         At least one.
     outdated : sequence of Path
         Files about an earlier run, removed together with its results.
-
-    Returns
-    -------
-    list of VariantOutcome
-        In the variants' order.
-
-    Raises
-    ------
-    InputError, SettingsError, RunError, RunCancelledError, ClusterError
-        As in `run`.
     """
     started_at, began = dt.datetime.now(tz=dt.UTC), time.perf_counter()
     resources, settings = request.resources, variants[0].settings_in(request.settings)
@@ -492,10 +477,7 @@ def _checked(out: str, *, overwrite: bool, work: str | None = None) -> str:
 def check_out(out: str, *, overwrite: bool, work: str | None = None) -> None:
     """Refuse a run directory that must not be written, by its content; makes nothing.
 
-    Raises
-    ------
-    RunError
-        It is not empty and `overwrite` is not set, or it cannot be read.
+    Raises RunError if it is not empty and `overwrite` is not set, or it cannot be read.
     """
     storage = storage_at(out)
     run_dir = storage.place

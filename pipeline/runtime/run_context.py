@@ -133,19 +133,15 @@ def run_context(
 ) -> Iterator[RunContext]:
     """Open scratch, start the executor, watch for cancellation, and check that the plan fits into memory.
 
+    Without an executor the one that `resources` and `work` call for runs the tasks. An exception within the block also
+    ends the tasks that still run.
+
     Parameters
     ----------
     work : Expected
         What there is to do: decides which executor runs it.
     loads : sequence of str
         What child processes load, from `loads_of`.
-    executor : Executor, optional
-        Runs the tasks; by default the one that `resources` and `work` call for.
-
-    Yields
-    ------
-    RunContext
-        An exception within the block also ends the tasks that still run.
 
     Raises
     ------

@@ -71,21 +71,14 @@ class DetectedPlanes:
 
 
 def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneSettings) -> DetectedPlanes:
-    """Find the roof planes of one building.
+    """Find the roof planes of one building; none where points are too few, or flat nowhere.
 
     Parameters
     ----------
     points : (n, 3) float64
         Points that see the sky, metres about an origin in whole metres near them, in canonical order.
     spacing_m : float
-        Typical spacing in plan, from `geometry.point_spacing_m`.
-    settings : AdaptivePlaneSettings
-        Thresholds.
-
-    Returns
-    -------
-    DetectedPlanes
-        Without planes where points are too few, or flat nowhere; a spacing of nan or 0 counts as too few.
+        Typical spacing in plan, from `geometry.point_spacing_m`; nan or 0 counts as too few points.
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     if len(points) < MIN_PLANE_POINTS or not spacing_m > 0.0:
@@ -127,21 +120,8 @@ class _Limits(NamedTuple):
 def mean_nodes(points: FloatArray, cell_m: float, gap_m: float) -> tuple[FloatArray, LabelArray]:
     """Means of the points of every lattice cell, one for each stack of points that a vertical gap parts from others.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Metres.
-    cell_m : float
-        Size of the cells.
-    gap_m : float
-        Height from which on a gap parts a cell's points.
-
-    Returns
-    -------
-    nodes : (m, 3) float64
-        By cell in x and y, in a cell the lowest first.
-    node_of : (n,) int32
-        Node of every point.
+    From points (n, 3), metres; gaps part them from the height `gap_m` on. Returns the nodes (m, 3), by cell in x and y,
+    in a cell the lowest first, and the node of every point, (n,) int32.
     """
     n = len(points)
     row = np.empty(n, np.int64)
@@ -210,7 +190,7 @@ def _f_ratio(sums: FloatArray, i: int, j: int, sigma_m: float) -> float:
 
 @kernel
 def merge_by_f_test(sums: FloatArray, pairs: IntArray, sigma_m: float) -> LabelArray:
-    """Merge planes that an F-test does not distinguish, the least different first.
+    """Merge planes that an F-test does not distinguish, the least different first; (m,) int32, what each is part of.
 
     Parameters
     ----------
@@ -220,11 +200,6 @@ def merge_by_f_test(sums: FloatArray, pairs: IntArray, sigma_m: float) -> LabelA
         Codes low * m + high of planes that touch, ascending.
     sigma_m : float
         Standard deviation of the noise.
-
-    Returns
-    -------
-    (m,) int32
-        The plane that every plane became part of.
     """
     n = len(sums)
     root = np.arange(n).astype(np.int32)

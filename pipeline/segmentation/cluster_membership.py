@@ -32,18 +32,9 @@ class RefinedClusters:
 def spreads(slope_deg: float, spacing_m: float, settings: ClusterMembershipSettings) -> tuple[float, float, float]:
     """Standard deviations of slope and orientation (degrees) and O-distance (metres) that height noise gives facets.
 
-    The gradient of an equilateral facet with side s over points with height noise sigma has the standard deviation
-    sqrt(2) sigma / s in every direction. Along the slope it turns the plane by cos^2(slope) of that, across it by
-    1 / tan(slope).
-
-    Parameters
-    ----------
-    slope_deg : float
-        Mean slope of the cluster.
-    spacing_m : float
-        Mean point spacing.
-    settings : ClusterMembershipSettings
-        The noise.
+    They are those of a cluster of a mean slope. The gradient of an equilateral facet with side s, the mean point
+    spacing, over points with height noise sigma has the standard deviation sqrt(2) sigma / s in every direction. Along
+    the slope it turns the plane by cos^2(slope) of that, across it by 1 / tan(slope).
     """
     slope = math.radians(min(max(slope_deg, 0.0), 90.0))
     gradient = math.sqrt(2.0) * settings.height_noise_m / spacing_m
@@ -57,21 +48,14 @@ def refine_clusters(
 ) -> RefinedClusters:
     """Centres of coarse clusters, and the facets that belong to them.
 
+    Clusters with members enough whose O-distance has a small deviation (section 4.1) remain, in the order of `coarse`.
+
     Parameters
     ----------
     parameters : (m, 3) float64
         Slope and orientation in degrees, O-distance in metres.
     coarse : sequence of (k,) int32
         Facets of each coarse cluster, at least one; they may overlap.
-    spacing_m : float
-        Mean point spacing.
-    settings : ClusterMembershipSettings
-        All else.
-
-    Returns
-    -------
-    RefinedClusters
-        Those with members enough whose O-distance has a small deviation (section 4.1), in the order of `coarse`.
 
     Raises
     ------

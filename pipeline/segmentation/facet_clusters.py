@@ -10,19 +10,10 @@ from pipeline.model import FloatArray, LabelArray
 
 @kernel
 def connected_parts(labels: LabelArray, neighbours: LabelArray) -> LabelArray:
-    """Number the parts of equal label that hang together over edges.
+    """Number the parts of equal label that hang together over edges, (m,) int32, by their first facets.
 
-    Parameters
-    ----------
-    labels : (m,) int32
-        Cluster of every facet, -1 for none.
-    neighbours : (m, 3) int32
-        The facets across the edges, -1 at the hull.
-
-    Returns
-    -------
-    (m,) int32
-        Part of every facet, numbered by its first facet; -1 where the label is.
+    `labels` (m,) and the facets across the edges, `neighbours` (m, 3), are -1 for none and at the hull. Facets with the
+    label -1 keep it.
     """
     parts = np.full(labels.size, -1, np.int32)
     stack = np.empty(labels.size, np.int32)
@@ -56,6 +47,8 @@ def labels_of_points(
 ) -> LabelArray:
     """Cluster of every point: that of the facet that absorbed it, or of the largest labelled facet at its vertex.
 
+    The result is (n,) int32, -1 where no labelled facet holds or touches the point.
+
     Parameters
     ----------
     facets : (m, 3) int32
@@ -68,11 +61,6 @@ def labels_of_points(
         Point at every vertex, -1 where there is none.
     facet_of_point : (n,) int32
         Facet that holds a point that is not a vertex, else -1.
-
-    Returns
-    -------
-    (n,) int32
-        -1 where no labelled facet holds or touches the point.
     """
     labels = np.full(facet_of_point.size, -1, np.int32)
     largest = np.zeros(facet_of_point.size)

@@ -16,33 +16,17 @@ SLOPE, ORIENTATION, O_DISTANCE = 0, 1, 2
 
 
 def about_barycentre(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Points about their mean (section 2).
+    """Points (n, 3) about their mean (section 2), and that barycentre, (3,).
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Metres, whole millimetres; at least one.
-
-    Returns
-    -------
-    points : (n, 3) float64
-        Metres about the barycentre.
-    barycentre : (3,) float64
-        From sums of whole millimetres: it does not depend on the order of the points.
+    At least one point, in metres of whole millimetres; the barycentre is taken from sums of whole millimetres, so it
+    does not depend on the order of the points.
     """
     barycentre = np.rint(points * 1000.0).astype(np.int64).sum(axis=0) / (1000.0 * len(points))
     return points - barycentre, barycentre
 
 
 def facet_parameters(points: FloatArray, facets: LabelArray) -> FloatArray:
-    """Slope, orientation and O-distance of facets (sections 2 and 4).
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Metres about the barycentre.
-    facets : (m, 3) int32
-        Vertex indices.
+    """Slope, orientation and O-distance of facets over points in metres about the barycentre (sections 2 and 4).
 
     Returns
     -------
@@ -61,21 +45,10 @@ def facet_parameters(points: FloatArray, facets: LabelArray) -> FloatArray:
 
 
 def cluster_means(parameters: FloatArray, labels: LabelArray, n_clusters: int) -> FloatArray:
-    """Mean slope, orientation and O-distance of clusters.
+    """Mean slope, orientation and O-distance of clusters, (n_clusters, 3); 0 for clusters without members.
 
-    Parameters
-    ----------
-    parameters : (m, 3) float64
-        As `facet_parameters` gives them.
-    labels : (m,) int32
-        Cluster of every facet, -1 for none.
-    n_clusters : int
-        How many.
-
-    Returns
-    -------
-    (n_clusters, 3) float64
-        The orientation's mean is that of directions on a circle. Clusters without members: 0.
+    `parameters` (m, 3) are those of `facet_parameters`, `labels` (m,) the clusters of the facets, -1 for none. The
+    orientation's mean is that of directions on a circle.
     """
     means = np.zeros((n_clusters, 3))
     for k in range(n_clusters):

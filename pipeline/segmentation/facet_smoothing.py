@@ -18,23 +18,11 @@ _NORMAL_NOISE = 1.5
 
 
 def passes_for_noise(sigma_m: float, spacing_m: float, wanted_deg: float, max_passes: int) -> int:
-    """How often the normals are averaged until the noise turns them by at most a given angle.
+    """How often the normals are averaged until the noise turns them by at most a given angle, `max_passes` at most.
 
-    Parameters
-    ----------
-    sigma_m : float
-        Standard deviation of the vertical noise; nan for unknown.
-    spacing_m : float
-        Mean point spacing in plan, above 0; nan for unknown.
-    wanted_deg : float
-        Standard deviation of the slope that is good enough, above 0.
-    max_passes : int
-        Never more than these.
-
-    Returns
-    -------
-    int
-        0 where the facets are large enough as they are, or the noise is not known.
+    0 where the facets are large enough as they are, or the noise is not known. The standard deviation of the vertical
+    noise and the mean point spacing in plan, above 0, are nan if unknown; `wanted_deg`, above 0, is the standard
+    deviation of the slope that is good enough.
     """
     if not (math.isfinite(sigma_m) and math.isfinite(spacing_m)):
         return 0
@@ -47,12 +35,10 @@ def passes_for_noise(sigma_m: float, spacing_m: float, wanted_deg: float, max_pa
 def smoothed_normals(
     normals: FloatArray, areas_m2: FloatArray, neighbours: LabelArray, usable: BoolArray, passes: int
 ) -> FloatArray:
-    """Average normals over edges, as area vectors.
+    """Average upward unit normals (m, 3) over edges, as area vectors, to new unit normals.
 
     Parameters
     ----------
-    normals : (m, 3) float64
-        Unit normals, upward.
     areas_m2 : (m,) float64
         Surface areas.
     neighbours : (m, 3) int32
@@ -61,11 +47,6 @@ def smoothed_normals(
         Others neither give nor take.
     passes : int
         How often every facet adds its neighbours' vectors to its own; 0 leaves the normals as they are.
-
-    Returns
-    -------
-    (m, 3) float64
-        Unit normals.
     """
     vectors = np.empty_like(normals)
     for t in range(normals.shape[0]):

@@ -41,17 +41,9 @@ class Clustering:
 
 
 def vector_degree_of_match(template: npt.ArrayLike, vector: npt.ArrayLike) -> float:
-    """VDM of Eq. 3: product of the module and the angle degree of match.
+    """VDM of Eq. 3, product of the module and the angle degree of match: in [0, 1], 1 for equal vectors; symmetric.
 
-    Parameters
-    ----------
-    template, vector : array_like, shape (3,)
-        T and X. Where one of them is the zero vector nothing matches: 0.
-
-    Returns
-    -------
-    float
-        In [0, 1], 1 for equal vectors; symmetric.
+    `template` and `vector`, shape (3,), are T and X. Where one of them is the zero vector nothing matches: 0.
     """
     t, x = np.asarray(template, np.float64), np.asarray(vector, np.float64)
     t_module, x_module = math.sqrt(_dot(t, t)), math.sqrt(_dot(x, x))
@@ -78,17 +70,10 @@ def _angle_degree(cosine: float) -> float:
 
 
 def centre_of_building(points: FloatArray) -> FloatArray:
-    """The point that Eq. 7 moves to the origin: the middle of the bounding box.
+    """The point (3,) that Eq. 7 moves to the origin: the middle of the bounding box of points (n, 3).
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        The building *with its ground*: without it the plane of a flat or pent roof passes near the centre and
-        its footpoints degenerate.
-
-    Returns
-    -------
-    (3,) float64
+    They are the building *with its ground*: without it the plane of a flat or pent roof passes near the centre and its
+    footpoints degenerate.
     """
     lowest = points.min(axis=0)
     return np.asarray(lowest + (points.max(axis=0) - lowest) / 2.0, dtype=np.float64)
@@ -97,7 +82,9 @@ def centre_of_building(points: FloatArray) -> FloatArray:
 def facet_vectors(
     kind: str, normals: FloatArray, centroids: FloatArray, centre: FloatArray, *, scaled_min: float = 0.0
 ) -> FloatArray:
-    """The vectors that are clustered, one per facet.
+    """The vectors that are clustered, one per facet, (m, 3): dimensionless, or metres for ``footpoint``.
+
+    From the unit normals and the centroids of the facets, (m, 3), and the `centre_of_building`, in metres.
 
     Parameters
     ----------
@@ -105,19 +92,8 @@ def facet_vectors(
         ``unit_normal`` is the normal; ``footpoint`` the foot of the perpendicular from the centre to the facet's
         plane (the reading under which Figs. 6 and 7 of the paper make sense); ``spherical_scaled`` that foot as
         (r, theta, phi), each scaled to [scaled_min, 1] (the paper's literal words).
-    normals : (m, 3) float64
-        Unit normals.
-    centroids : (m, 3) float64
-        Centres of the facets, metres.
-    centre : (3,) float64
-        As `centre_of_building` gives it.
     scaled_min : float
         Lower end of the range of ``spherical_scaled``.
-
-    Returns
-    -------
-    (m, 3) float64
-        Dimensionless, or metres for ``footpoint``.
     """
     if kind == "unit_normal":
         return normals.copy()
@@ -156,24 +132,11 @@ def _to_one_range(values: FloatArray, scaled_min: float) -> FloatArray:
 
 
 def cluster(vectors: FloatArray, areas_m2: FloatArray, settings: FuzzySartClusteringSettings) -> Clustering:
-    """Cluster facet vectors by Fuzzy SART.
+    """Cluster facet vectors (n, 3), as `facet_vectors` gives them, by Fuzzy SART.
 
-    Inputs are presented in descending area, ties by index, epoch after epoch, until no neuron was made or removed,
-    all have lived tau epochs and none moved. Outliers have the label -1; without vectors there are no clusters.
-
-    Parameters
-    ----------
-    vectors : (n, 3) float64
-        As `facet_vectors` gives them.
-    areas_m2 : (n,) float64
-        Areas of the facets.
-    settings : FuzzySartClusteringSettings
-        Vigilance, tau and the constants of the reconstruction.
-
-    Raises
-    ------
-    BuildingError
-        Reason ``too_complex`` where more than ``clustering_work_limit`` comparisons would be needed.
+    Inputs are presented in descending area, ties by index, epoch after epoch, until no neuron was made or removed, all
+    have lived tau epochs and none moved. Outliers have the label -1; without vectors there are no clusters. Raises
+    BuildingError ``too_complex`` where more than ``clustering_work_limit`` comparisons would be needed.
     """
     order = np.argsort(-areas_m2, kind="stable")
     labels, templates, epochs, work = _learn(

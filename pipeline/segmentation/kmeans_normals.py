@@ -46,28 +46,11 @@ class FacetClusters:
 def cluster_normals(
     normals: FloatArray, weights: FloatArray, k: int, settings: NormalClusteringSettings
 ) -> FacetClusters:
-    """K-means of unit normals from farthest-point starts.
+    """K-means of unit normals (m, 3), at least one, with weights above 0, from farthest-point starts.
 
-    Parameters
-    ----------
-    normals : (m, 3) float64
-        Unit vectors, at least one.
-    weights : (m,) float64
-        Above 0.
-    k : int
-        Number of clusters, at least 1; fewer are found where there are fewer different normals.
-    settings : NormalClusteringSettings
-        `starts`, and limits of work.
-
-    Returns
-    -------
-    FacetClusters
-        Of the start with the least inertia, of equal ones the first. The numbers of the clusters follow the start.
-
-    Raises
-    ------
-    BuildingError
-        Reason ``too_complex`` where the products of facets with centres pass the limit.
+    Of several starts that with the least inertia counts, of equal ones the first; the numbers of the clusters follow
+    it. There are fewer than `k` clusters where there are fewer different normals. Raises BuildingError ``too_complex``
+    where the products of facets with centres pass the limit.
     """
     normals, weights = np.ascontiguousarray(normals), np.ascontiguousarray(weights)
     farthest = farthest_point_start(normals, weights, k + settings.starts - 1)
@@ -105,29 +88,11 @@ def choose_clusters(
     explained: Callable[[LabelArray], float],
     settings: NormalClusteringSettings,
 ) -> FacetClusters:
-    """K-means with the k of the settings, or with the k that the facets speak for.
+    """K-means with the `clusters` of the settings, or for 0 with the k that the facets speak for.
 
-    Parameters
-    ----------
-    normals : (m, 3) float64
-        Unit vectors, at least one.
-    weights : (m,) float64
-        Above 0.
-    explained : callable
-        From the labels of the facets to the share of points, 0 to 1, that lie on the planes of these clusters.
-    settings : NormalClusteringSettings
-        `clusters`, or 0 for the choice: the silhouette plus `residual_weight` times the share explained is largest;
-        of equal ones the smaller k.
-
-    Returns
-    -------
-    FacetClusters
-        With at least one cluster.
-
-    Raises
-    ------
-    BuildingError
-        Reason ``too_complex`` as in `cluster_normals`.
+    That has the largest sum of the silhouette and `residual_weight` times the share explained, of equal ones the
+    smaller k. `explained` gives the share of points, 0 to 1, that lie on the planes of the clusters of labels (m,).
+    Arguments and errors are otherwise those of `cluster_normals`.
     """
     if settings.clusters > 0:
         return cluster_normals(normals, weights, settings.clusters, settings)
@@ -147,19 +112,8 @@ def choose_clusters(
 def farthest_point_start(normals: FloatArray, weights: FloatArray, k: int) -> FloatArray:
     """The first centres: the normal farthest from the mean direction, then always the one farthest from all chosen.
 
-    Parameters
-    ----------
-    normals : (m, 3) float64
-        Unit vectors.
-    weights : (m,) float64
-        For the mean direction.
-    k : int
-        Centres wanted.
-
-    Returns
-    -------
-    (j, 3) float64
-        j <= k: as many as there are different normals. Equal distances: the lower index.
+    Unit normals (m, 3) give centres (j, 3), j <= k: as many as there are different normals. Weights count for the mean
+    direction. Equal distances: the lower index.
     """
     mean = np.zeros(3)
     for i in range(normals.shape[0]):
@@ -192,18 +146,9 @@ def farthest_point_start(normals: FloatArray, weights: FloatArray, k: int) -> Fl
 def kmeans(
     normals: FloatArray, weights: FloatArray, start: FloatArray, max_rounds: int
 ) -> tuple[LabelArray, FloatArray, float, int]:
-    """Rounds of assignment to the most similar centre and of new centres, until no facet changes.
+    """Rounds of assignment to the most similar centre and of new centres, until no facet changes or for `max_rounds`.
 
-    Parameters
-    ----------
-    normals : (m, 3) float64
-        Unit vectors.
-    weights : (m,) float64
-        Above 0.
-    start : (k, 3) float64
-        Unit vectors.
-    max_rounds : int
-        At least 1.
+    Unit normals (m, 3) have weights above 0; `start` (k, 3) are unit vectors.
 
     Returns
     -------
@@ -253,23 +198,10 @@ def kmeans(
 
 @kernel
 def silhouette(normals: FloatArray, weights: FloatArray, labels: LabelArray, k: int) -> float:
-    """Weighted mean silhouette (Rousseeuw 1987) with the distance 1 - cosine.
+    """Weighted mean silhouette (Rousseeuw 1987) with the distance 1 - cosine, -1 to 1, of unit normals (m, 3).
 
-    Parameters
-    ----------
-    normals : (m, 3) float64
-        Unit vectors.
-    weights : (m,) float64
-        A facet of weight 2 counts as two facets in one place, but one of them.
-    labels : (m,) int32
-        From 0 to k - 1.
-    k : int
-        Number of clusters.
-
-    Returns
-    -------
-    float
-        -1 to 1; a cluster of one facet counts 0; nan where fewer than two clusters have facets.
+    A facet of weight 2 counts as two facets in one place, but one of them. `labels` (m,) are from 0 to k - 1. A cluster
+    of one facet counts 0; the result is nan where fewer than two clusters have facets.
     """
     sums = np.zeros((k, 3))
     totals = np.zeros(k)
@@ -311,20 +243,8 @@ def labels_around(xyz: FloatArray, facets: LabelArray, facet_labels: LabelArray)
     """Cluster of every point: the one that most facets around the point belong to, by the sines of their angles there.
 
     The sine of the angle in plan is near 0 for slivers, such as a TIN has along its hull: their normals point anywhere.
-
-    Parameters
-    ----------
-    xyz : (n, 3) float64
-        Points, the vertices of the facets.
-    facets : (m, 3) int32
-        Vertex indices.
-    facet_labels : (m,) int32
-        Cluster of every facet, -1 for none.
-
-    Returns
-    -------
-    (n,) int32
-        Equal sums: the cluster of the facet that comes first; -1 where no labelled facet touches the point.
+    Points (n, 3) are the vertices of the facets, whose labels (m,) are -1 for none. Equal sums: the cluster of the
+    facet that comes first; -1 where no labelled facet touches the point.
     """
     n = xyz.shape[0]
     vertices = np.empty(3 * len(facets), np.int32)

@@ -28,7 +28,7 @@ _MIN_SEED_POINTS = 4
 def cluster_leftovers(
     points: FloatArray, neighbours: LabelArray, labels: LabelArray, distance_m: float, fewest_points: int
 ) -> LabelArray:
-    """Grow clusters among the points without a label.
+    """Grow clusters among the points without a label; their numbers, from the largest label on, replace the -1.
 
     Parameters
     ----------
@@ -42,11 +42,6 @@ def cluster_leftovers(
         Largest perpendicular distance of a point to the plane of the cluster that it joins.
     fewest_points : int
         Smaller clusters are not kept.
-
-    Returns
-    -------
-    (n,) int32
-        The same labels; leftovers in a cluster have a number from the largest label on.
     """
     n = labels.size
     grown = labels.copy()

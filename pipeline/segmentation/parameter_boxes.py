@@ -19,25 +19,11 @@ _ROWS = 1 << 12
 
 
 def coarse_clusters(parameters: FloatArray, settings: ParameterBoxSettings) -> tuple[LabelArray, ...]:
-    """Groups of neighbouring dense boxes.
+    """Groups of neighbouring dense boxes: the facets of each cluster, ascending; clusters may overlap.
 
-    Parameters
-    ----------
-    parameters : (m, 3) float64
-        Slope and orientation in degrees, O-distance in metres.
-    settings : ParameterBoxSettings
-        Boxes and thresholds.
-
-    Returns
-    -------
-    tuple of (k,) int32
-        Facets of each cluster, ascending; clusters ordered by the layer, slope and orientation of their first box.
-        Clusters may overlap.
-
-    Raises
-    ------
-    BuildingError
-        Reason ``too_complex`` beyond ``max_coarse_clusters``.
+    `parameters` (m, 3) are slope and orientation in degrees and O-distance in metres. Clusters are ordered by the
+    layer, slope and orientation of their first box. Raises BuildingError ``too_complex`` beyond
+    ``max_coarse_clusters``.
     """
     if len(parameters) == 0:
         return ()

@@ -24,19 +24,9 @@ _NO_MERGE = 1e30  # a cost above every real one
 def touching_pairs(neighbours: LabelArray, labels: LabelArray, usable: BoolArray) -> IntArray:
     """Codes low * n + high of all pairs of usable clusters that occur together among one point and its neighbours.
 
-    Parameters
-    ----------
-    neighbours : (p, k) int32
-        Nearest neighbours of every point, -1 where there are fewer.
-    labels : (p,) int32
-        Cluster of every point, -1 for none: so a gap of unlabelled points one wide is bridged.
-    usable : (n,) bool
-        Clusters that have a plane.
-
-    Returns
-    -------
-    (m,) int64
-        Ascending, each pair once.
+    They ascend, each pair once, int64. `neighbours` (p, k) of every point are -1 where there are fewer; `labels` (p,)
+    are the clusters of the points, -1 for none: so a gap of unlabelled points one wide is bridged. `usable` (n,)
+    clusters have a plane.
     """
     n = usable.size
     width = neighbours.shape[1]

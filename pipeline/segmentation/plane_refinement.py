@@ -48,8 +48,6 @@ def refine_planes(
         Largest perpendicular distance of a point to its plane.
     fewest_points : int
         Planes of fewer points are dropped.
-    settings : PlaneRefinementSettings
-        All else.
 
     Returns
     -------
@@ -100,14 +98,7 @@ def refine_planes(
 def describe_planes(points: FloatArray, planes: FloatArray, labels: LabelArray) -> tuple[Plane, ...]:
     """Planes with their support: count and root mean square vertical residual of the points that carry their label.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Metres, original elevations.
-    planes : (k, 3) float64
-        (a, b, c).
-    labels : (n,) int32
-        Plane of every point, -1 for none.
+    Points (n, 3) are metres with original elevations, planes (k, 3) their (a, b, c), labels (n,) -1 for none.
     """
     planes = np.ascontiguousarray(planes, dtype=np.float64).reshape(-1, 3)
     support = _support(points, planes, labels).tolist()

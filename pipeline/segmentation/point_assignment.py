@@ -63,8 +63,8 @@ def vote_among_neighbours(
 ) -> LabelArray:
     """Every point takes the plane of its neighbourhood with the least (distance / limit)^2 minus weight times votes.
 
-    All points choose at once from the labels before, so the outcome does not depend on their order. A plane beyond
-    the distance is not a choice; a point without any choice is an outlier.
+    All points choose at once from the labels before, so the outcome does not depend on their order. A plane beyond the
+    distance is not a choice; a point without any choice is an outlier, -1.
 
     Parameters
     ----------
@@ -84,11 +84,6 @@ def vote_among_neighbours(
         What one neighbour's vote counts against the squared relative distance.
     passes : int
         Most repetitions; it ends when nothing changes.
-
-    Returns
-    -------
-    (n,) int32
-        -1 for outliers.
     """
     width = neighbours.shape[1]
     old = labels.copy()

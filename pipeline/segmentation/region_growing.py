@@ -56,10 +56,6 @@ def grow_regions(
         Largest perpendicular distance of a point to the plane of the region that it joins.
     fewest_points : int
         Smaller regions are not kept.
-    settings : RegionGrowingSettings
-        All else.
-    work_limit : int
-        Most looks at neighbours.
 
     Returns
     -------

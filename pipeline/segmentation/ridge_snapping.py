@@ -48,7 +48,9 @@ def find_ridges(
     distance_m: float,
     reach_m: float,
 ) -> tuple[Ridge, ...]:
-    """The segments on which touching planes meet.
+    """The segments on which touching planes meet, by rising plane indices.
+
+    Planes that do not touch, are nearly parallel, or meet elsewhere than at their border (a step) give none.
 
     Parameters
     ----------
@@ -64,12 +66,6 @@ def find_ridges(
         A point is explained by a plane up to this perpendicular distance.
     reach_m : float
         Distance in plan from the line up to which points count as near.
-
-    Returns
-    -------
-    tuple of Ridge
-        By rising plane indices. Planes that do not touch, are nearly parallel, or meet elsewhere than at their
-        border (a step) give none.
     """
     segments = _segments(
         np.ascontiguousarray(points), planes, labels, np.ascontiguousarray(neighbours), distance_m, reach_m
@@ -89,16 +85,10 @@ def label_by_ridges(
     distance_m: float,
     reach_m: float,
 ) -> LabelArray:
-    """Labels whose borders along the ridges are straight.
+    """Labels (n,) int32 whose borders along the ridges are straight; parameters as for `find_ridges`.
 
-    A point within reach of a ridge that carries one of its two labels, and that both planes explain, takes the label
-    of the side of the line on which it lies; of several ridges the nearest one decides. All others keep theirs.
-    Parameters as for `find_ridges`.
-
-    Returns
-    -------
-    (n,) int32
-        New labels.
+    A point within reach of a ridge that carries one of its two labels, and that both planes explain, takes the label of
+    the side of the line on which it lies; of several ridges the nearest one decides. All others keep theirs.
     """
     snapped = labels.copy()
     nearest_m = np.full(len(points), np.inf)

@@ -26,20 +26,10 @@ def plausible_slopes(centres: FloatArray, min_deg: float, max_deg: float) -> Boo
 
 
 def classify_2d(centres: FloatArray, settings: RoofTreeSettings) -> TreeVerdict:
-    """The tree of section 3.3.
+    """The tree of section 3.3, of the mean slopes and orientations of the clusters left, degrees, in `centres` (k, 3).
 
-    Parameters
-    ----------
-    centres : (k, 3) float64
-        Mean slope and orientation of the clusters left, degrees; the O-distance plays no part.
-    settings : RoofTreeSettings
-        What similar means.
-
-    Returns
-    -------
-    TreeVerdict
-        No cluster: none. One: pent. Two with opposite orientations: a gable. More: each pair of opposite orientations
-        and similar slopes is a gable, and several gables are a combination.
+    No cluster: none. One: pent. Two with opposite orientations: a gable. More: each pair of opposite orientations and
+    similar slopes is a gable, and several gables are a combination. The O-distance plays no part.
 
     Examples
     --------
@@ -60,12 +50,7 @@ def classify_2d(centres: FloatArray, settings: RoofTreeSettings) -> TreeVerdict:
 def classify_3d(centres: FloatArray, settings: RoofTreeSettings) -> TreeVerdict:
     """The tree of section 4.2: as that of 3.3, but a pent roof is the one cluster above the origin.
 
-    Parameters
-    ----------
-    centres : (k, 3) float64
-        Mean slope and orientation in degrees, O-distance in metres, of the clusters left.
-    settings : RoofTreeSettings
-        What similar means, and what other clusters a pent roof may have beside it.
+    `centres` (k, 3) are mean slope and orientation in degrees and O-distance in metres of the clusters left.
 
     Examples
     --------

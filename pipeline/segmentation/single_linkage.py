@@ -32,24 +32,10 @@ class LinkedClusters:
 def cluster_by_linkage(
     slope_deg: FloatArray, orientation_deg: FloatArray, settings: SingleLinkageSettings
 ) -> LinkedClusters:
-    """Clusters of facets in slope and orientation, by the paper's rules.
+    """Clusters of facets in slope and orientation by the paper's rules; none where none has members enough.
 
-    Parameters
-    ----------
-    slope_deg, orientation_deg : (m,) float64
-        Slope 0 to 90, orientation 0 to 360, degrees.
-    settings : SingleLinkageSettings
-        The rules.
-
-    Returns
-    -------
-    LinkedClusters
-        Without clusters where none has members enough.
-
-    Raises
-    ------
-    BuildingError
-        Reason ``too_complex`` beyond ``linkage_work_limit``.
+    Slopes (m,) are 0 to 90, orientations (m,) 0 to 360 degrees. Raises BuildingError ``too_complex`` beyond
+    ``linkage_work_limit``.
     """
     distance = settings.linkage_start_deg
     work = 0
@@ -78,21 +64,8 @@ def link(
 ) -> tuple[LabelArray, int]:
     """Connected components of the facets nearer to one another than a distance; orientation wraps at 360.
 
-    Parameters
-    ----------
-    slope_deg, orientation_deg : (m,) float64
-        Degrees.
-    distance_deg : float
-        Facets at most this far apart are linked; at most 90.
-    work_limit : int
-        The labels are incomplete where the comparisons pass it.
-
-    Returns
-    -------
-    labels : (m,) int32
-        Component of every facet, numbered by its first facet.
-    work : int
-        Comparisons of facets.
+    Angles (m,) are in degrees, the distance is at most 90. Returns the component of every facet, (m,) int32, numbered
+    by its first facet, and the comparisons of facets; the labels are incomplete where these pass the limit.
     """
     return _link(
         np.ascontiguousarray(slope_deg, dtype=np.float64),

@@ -11,21 +11,7 @@ from pipeline.model import BoolArray, FloatArray
 
 @kernel
 def far_from(samples: FloatArray, points: FloatArray, distance_m: float) -> BoolArray:
-    """Which samples have no point within a distance in plan.
-
-    Parameters
-    ----------
-    samples : (m, 3) float64
-        Metres.
-    points : (n, 3) float64
-        Metres, at least one.
-    distance_m : float
-        More than 0.
-
-    Returns
-    -------
-    (m,) bool
-    """
+    """Which samples (m, 3) have none of the points (n, 3), at least one, within a distance above 0 in plan; metres."""
     x_min, y_min, x_max, y_max = np.inf, np.inf, -np.inf, -np.inf
     for i in range(len(points)):
         x_min, y_min = min(x_min, points[i, 0]), min(y_min, points[i, 1])

@@ -215,26 +215,10 @@ def _grow(
 
 @kernel
 def take_regions(surroundings: Surroundings, labels: LabelArray, first_label: int, limits: TrialLimits) -> int:
-    """Label regions among the unlabelled points, the greatest gain first, in place.
+    """Label regions among the unlabelled points (-1), the greatest gain first, in place; returns the last label plus 1.
 
     A gain can only fall as other regions take points, so the best trial region grows again and is taken if it is still
-    the best: a lazy greedy choice.
-
-    Parameters
-    ----------
-    surroundings : Surroundings
-        From `local_planes`. Points of little variance are the first seeds.
-    labels : (n,) int32
-        -1 for none; changed.
-    first_label : int
-        Of the first region.
-    limits : TrialLimits
-        Which regions are taken.
-
-    Returns
-    -------
-    int
-        One more than the last label.
+    the best: a lazy greedy choice. Points of little variance in `local_planes` are the first seeds.
     """
     neighbours, local = surroundings.neighbours, surroundings.planes
     distance_m, fewest_points = limits.distance_m, limits.fewest_points

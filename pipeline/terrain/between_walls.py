@@ -123,21 +123,11 @@ def _mark(out: BoolArray, lowest: Elevations, ahead: Distances, behind: Distance
 
 
 def between_walls(lowest: Elevations, widest: int, drop_mm: float, rise_mm: float) -> BoolArray:
-    """Mask of the cells of decks and roofs between two drops.
+    """Mask (rows, columns) of the cells of decks and roofs between two drops; none where there is no data.
 
-    Parameters
-    ----------
-    lowest : (rows, columns) int32
-        Elevation in mm of the lowest point of each cell; NO_DATA where there is none.
-    widest : int
-        Farthest that the two drops may lie apart, in cells.
-    drop_mm, rise_mm : float
-        Least drop, and least drop per cell of half the width: wider decks must be higher.
-
-    Returns
-    -------
-    (rows, columns) bool
-        Decks and roofs; none where there is no data.
+    `lowest` is the elevation in mm of the lowest point of each cell, NO_DATA where there is none. The drops lie at most
+    `widest` cells apart. The least drop is `drop_mm` and `rise_mm` per cell of half the width: wider decks must be
+    higher.
     """
     out = np.zeros(lowest.shape, np.bool_)
     for down, across in _DIRECTIONS.tolist():

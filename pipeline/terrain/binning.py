@@ -13,14 +13,10 @@ from pipeline.model import BoolArray, IntArray, LabelArray
 def points_by_cell(
     x: IntArray, y: IntArray, used: BoolArray, cell: int
 ) -> tuple[LabelArray, LabelArray, int, int, int, int]:
-    """Used points sorted by square cells.
+    """Used points sorted by square cells; coordinates (n,) in mm, of at least one point.
 
     Parameters
     ----------
-    x, y : (n,) int64
-        Coordinates in mm, at least one point.
-    used : (n,) bool
-        The points that are wanted.
     cell : int
         Side of a cell in mm; cells are anchored at the origin.
 

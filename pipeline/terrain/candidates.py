@@ -148,19 +148,9 @@ def _faults(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> Kin
 
 
 def judge_surfaces(surfaces: Surfaces, settings: CandidateSettings) -> KindArray:
-    """The first fault of each whole surface.
+    """The first `Fault` of each whole surface of any kind, (k,) int8.
 
-    Parameters
-    ----------
-    surfaces : Surfaces
-        Whole surfaces of any kind.
-    settings : CandidateSettings
-        The thresholds.
-
-    Returns
-    -------
-    (k,) int8
-        `Fault`; NOT_JUDGED for ground, steps, and surfaces that would be candidates without points.
+    NOT_JUDGED for ground, steps, and surfaces that would be candidates without points.
     """
     found = np.full(len(surfaces.kind), Fault.NOT_JUDGED, np.int8)
     solid = np.flatnonzero(np.isin(surfaces.kind, SOLID))
@@ -174,14 +164,7 @@ def judge_surfaces(surfaces: Surfaces, settings: CandidateSettings) -> KindArray
 def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Verdict | None:
     """Why one whole surface is not a candidate, in words; None if it is one.
 
-    Parameters
-    ----------
-    kind : int
-        FacetKind of the surface: OBJECT, BUILDING or CROWN.
-    sums : (N_SUMS,) int64
-        Its sums.
-    settings : CandidateSettings
-        The thresholds.
+    Its kind is OBJECT, BUILDING or CROWN; `sums` are (N_SUMS,) int64.
     """
     return next(verdicts(np.array([kind], np.int8), sums[None], settings))
 
@@ -275,21 +258,9 @@ def _largest_beside(
 
 
 def unite_levels(surfaces: Surfaces, faults: KindArray, settings: CandidateSettings) -> IntArray:
-    """The candidate that each surface belongs to: its own index, or that of a larger roof across a step.
+    """The candidate that each whole surface belongs to, (k,): its own index, or that of a larger roof across a step.
 
-    Parameters
-    ----------
-    surfaces : Surfaces
-        Whole surfaces.
-    faults : (k,) int8
-        From `judge_surfaces`.
-    settings : CandidateSettings
-        `unite_share`.
-
-    Returns
-    -------
-    (k,) int64
-        Index of the surface that leads the candidate; -1 for surfaces that belong to none.
+    `faults` are those of `judge_surfaces`. -1 for surfaces that belong to no candidate.
     """
     count = len(surfaces.kind)
     is_roof = faults == Fault.NONE

@@ -14,23 +14,9 @@ FILL_M = 3
 
 
 def terrain_at(x_mm: IntArray, y_mm: IntArray, terrain: Elevations, column0: int, row0: int) -> FloatArray:
-    """Terrain elevation in mm at the crossings of some eastings and northings.
+    """Terrain elevation in mm, (r, c), at the crossings of eastings (c,) and northings (r,); nan without terrain.
 
-    Parameters
-    ----------
-    x_mm : (c,) int64
-        Eastings.
-    y_mm : (r,) int64
-        Northings.
-    terrain : (rows, columns) int32
-        On the 1 m lattice.
-    column0, row0 : int
-        Its first cell.
-
-    Returns
-    -------
-    (r, c) float64
-        nan where there is no terrain.
+    `terrain` (rows, columns) int32 is on the 1 m lattice; its first cell is `column0`, `row0`.
     """
     x, y = np.meshgrid(x_mm, y_mm)
     below = height_above(x.ravel(), y.ravel(), np.zeros(x.size, np.int64), terrain, column0, row0)

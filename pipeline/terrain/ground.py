@@ -115,8 +115,6 @@ def ground_of(
         The points that may be ground: last returns without outliers, or the ground class of the file.
     window : tuple of int
         column0, row0, columns, rows of the lattice.
-    settings : GroundSettings
-        Windows, slope and tolerances.
     trusted : bool
         The usable points are ground by the classes of the file: they are only interpolated.
     wanted : tuple of int, optional
@@ -202,26 +200,12 @@ def _near_terrain(
 def ground_points(
     x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, terrain: Terrain, settings: GroundSettings
 ) -> BoolArray:
-    """Which points lie on the ground.
+    """Which points (n,), in absolute millimetres, lie on the ground of a window that holds them.
 
     A point is ground if it lies less than `tolerance_m`, plus `tolerance_slope` times the terrain's rise over a metre,
     above the terrain (the rule of SMRF: Pingel, Clarke and McBride 2013), or anywhere below it: the lattice follows the
     lowest points, and steep ground rises far above them within a cell. Returns and outliers do not matter here; points
     without terrain are not ground.
-
-    Parameters
-    ----------
-    x_mm, y_mm, z_mm : (n,) int64
-        Absolute coordinates in millimetres.
-    terrain : Terrain
-        The ground of a window that holds the points.
-    settings : GroundSettings
-        Tolerances.
-
-    Returns
-    -------
-    (n,) bool
-        True for ground.
     """
     rise = 0.0 if settings.filter == "hierarchical" else settings.tolerance_slope
     found: BoolArray = _near_terrain(

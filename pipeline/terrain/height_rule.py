@@ -14,20 +14,7 @@ from pipeline.model import BoolArray, FloatArray, LabelArray
 
 
 def facet_z_difference(z_m: FloatArray, facets: LabelArray) -> FloatArray:
-    """MX_zdiff: elevation difference of the two vertices of a facet that lie farthest apart in elevation.
-
-    Parameters
-    ----------
-    z_m : (n,) float64
-        Elevation of the vertices, metres.
-    facets : (m, 3) int
-        Vertex indices.
-
-    Returns
-    -------
-    (m,) float64
-        Metres, at least 0.
-    """
+    """MX_zdiff, (m,) metres: elevation difference of the highest and the lowest vertex of every facet."""
     corners = z_m[facets]
     return np.asarray(corners.max(axis=1) - corners.min(axis=1), dtype=np.float64)
 
@@ -40,17 +27,7 @@ def facet_z_highest(z_m: FloatArray, facets: LabelArray) -> FloatArray:
 def z_avg(z_highest_m: FloatArray, is_wall: BoolArray) -> float:
     """Z_avg: mean of Z_mx over the wall facets; a sum of whole millimetres, in any order of the facets.
 
-    Parameters
-    ----------
-    z_highest_m : (m,) float64
-        As `facet_z_highest` gives it.
-    is_wall : (m,) bool
-        True for wall facets.
-
-    Returns
-    -------
-    float
-        Metres; minus infinity without walls: then every facet passes the rule.
+    Z_mx (m,) are those of `facet_z_highest`, in metres. Minus infinity without walls: then every facet passes the rule.
     """
     count = int(np.count_nonzero(is_wall))
     if count == 0:
@@ -60,22 +37,10 @@ def z_avg(z_highest_m: FloatArray, is_wall: BoolArray) -> float:
 
 
 def facets_above_z_avg(z_m: FloatArray, facets: LabelArray, *, wall_height_m: float = 2.0) -> BoolArray:
-    """Which facets can be roof by the printed rule.
+    """Which facets (m, 3) over vertices at elevations (n,), metres, can be roof by the printed rule.
 
-    Parameters
-    ----------
-    z_m : (n,) float64
-        Elevation of the vertices, metres.
-    facets : (m, 3) int
-        Vertex indices.
-    wall_height_m : float
-        Elevation difference from which a facet is a wall.
-
-    Returns
-    -------
-    (m,) bool
-        True if the facet is not a wall and its centre (mean of its vertices) lies above Z_avg; all facets without
-        walls.
+    A facet can if it is not a wall and its centre (mean of its vertices) lies above Z_avg; without walls all can. A
+    wall has an elevation difference of `wall_height_m` or more.
     """
     is_wall = facet_z_difference(z_m, facets) >= wall_height_m
     threshold_m = z_avg(facet_z_highest(z_m, facets), is_wall)

@@ -138,23 +138,11 @@ def _without_clumps(lowest: Elevations, size: int, column0: int, row0: int, dept
 def hierarchical_ground(
     lowest: Elevations, corner: tuple[int, int], settings: HierarchicalFilterSettings, pit_depth_mm: int
 ) -> BoolArray:
-    """Mask of the cells that hold ground.
+    """Mask of the cells that hold ground; none where there is no data.
 
-    Parameters
-    ----------
-    lowest : (rows, columns) int32
-        Elevation in mm of the lowest point of each cell, single pits cleared; NO_DATA where there is none.
-    corner : tuple of int
-        Absolute column and row of the first cell: the coarse cells are anchored at the CRS's origin.
-    settings : HierarchicalFilterSettings
-        Levels and tests.
-    pit_depth_mm : int
-        Depth of a pit.
-
-    Returns
-    -------
-    (rows, columns) bool
-        Ground; none where there is no data.
+    `lowest` is the elevation in mm of the lowest point of each cell, single pits of `pit_depth_mm` cleared, NO_DATA
+    where there is none. `corner` is the absolute column and row of the first cell: coarse cells are anchored at the
+    CRS's origin.
     """
     lowest = _without_clumps(lowest, settings.clump_m, *corner, pit_depth_mm)
     ground = _lowest_of_cells(lowest, settings.seed_cell_m, *corner)

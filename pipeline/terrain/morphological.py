@@ -69,12 +69,8 @@ def closed_gaps(lowest: Elevations, reach: int) -> Elevations:
 def without_clumps(lowest: Elevations, level: Elevations, slope_mm: Elevations, deep_mm: int) -> Elevations:
     """Clear cells far below the trend that few around them share: clumps of low outliers.
 
-    Parameters
-    ----------
-    lowest, level, slope_mm : (rows, columns) int32
-        Lowest points, the trend and its rise in mm a cell.
-    deep_mm : int
-        Depth below the trend, on level ground; as much more as the trend rises over a cell.
+    From the lowest points, the trend and its rise in mm a cell. Cells lie `deep_mm` below the trend on level ground,
+    and as much more as the trend rises over a cell.
     """
     rows, columns = lowest.shape
     out = lowest.copy()
@@ -121,15 +117,13 @@ def _heights(
 def regrown(
     lowest: Elevations, ground: BoolArray, barred: BoolArray, passes: int, limits: tuple[int, int, float]
 ) -> BoolArray:
-    """Ground, and the cells level with the ground beside them.
+    """Ground, and the cells level with the ground beside them; elevations are in mm.
 
-    Most of the ground beside a brow, the rim of a terrace or the crest of a dam lies along its contour; a roof has
-    none on its level, and a bush on a slope only some of it, uphill.
+    Most of the ground beside a brow, the rim of a terrace or the crest of a dam lies along its contour; a roof has none
+    on its level, and a bush on a slope only some of it, uphill.
 
     Parameters
     ----------
-    lowest : (rows, columns) int32
-        Elevations in mm.
     ground, barred : (rows, columns) bool
         Where it starts, and what never joins.
     passes : int
@@ -160,21 +154,10 @@ def regrown(
 def morphological_ground(
     lowest: Elevations, corner: tuple[int, int], settings: MorphologicalFilterSettings
 ) -> BoolArray:
-    """Mask of the cells that hold ground.
+    """Mask of the cells that hold ground; none where there is no data.
 
-    Parameters
-    ----------
-    lowest : (rows, columns) int32
-        Elevation in mm of the lowest point of each cell, single pits cleared; NO_DATA where there is none.
-    corner : tuple of int
-        Absolute column and row of the first cell: coarse cells are anchored at the CRS's origin.
-    settings : MorphologicalFilterSettings
-        Openings and tests.
-
-    Returns
-    -------
-    (rows, columns) bool
-        Ground; none where there is no data.
+    `lowest` is the elevation in mm of the lowest point of each cell, single pits cleared, NO_DATA where there is none.
+    `corner` is the absolute column and row of the first cell: coarse cells are anchored at the CRS's origin.
     """
     radius = settings.max_window_m
     elevation = closed_gaps(lowest, GAP_CELLS)

@@ -75,19 +75,11 @@ def erode_once(eroded: Elevations, scratch: Elevations, radius: int) -> None:
 
 @kernel
 def dilate_back(surface: Elevations, eroded: Elevations, opened: Elevations, scratch: Elevations, radius: int) -> None:
-    """From an erosion to the opening, written to the framed array `opened`.
+    """From an erosion to the opening of a surface with NO_DATA in holes, written to the framed array `opened`.
 
     Elements are centred only on cells with data: beyond the edge of the data an element would see only the roof that
-    the edge cuts.
-
-    Parameters
-    ----------
-    surface : (rows, columns) int32
-        The surface that is opened; NO_DATA in holes.
-    eroded, opened, scratch : (rows + 2, columns + 2) int32
-        The erosion by the octagon of `radius`, the result, and scratch space.
-    radius : int
-        Radius of the octagon in cells.
+    the edge cuts. `eroded`, the erosion by the octagon of a radius in cells, `opened` and `scratch` are (rows + 2,
+    columns + 2).
     """
     rows, columns = surface.shape
     opened[:] = _LOW
@@ -102,7 +94,11 @@ def dilate_back(surface: Elevations, eroded: Elevations, opened: Elevations, scr
 
 @kernel
 def cut_off(surface: Elevations, base_mm: Elevations, rise_mm: float, largest: int) -> ByteArray:
-    """The first radius of a growing opening that removes more from a cell than it may.
+    """The first radius of a growing opening that removes more from a cell than it may, (rows, columns) uint8.
+
+    0 where no step removes more, and in holes. A planar slope loses nothing to an opening. A hilltop, crest or brow
+    loses by each cell of radius no more than its slope rises over a cell; an object loses all of its height at once
+    when the element no longer fits into it.
 
     Parameters
     ----------
@@ -114,16 +110,6 @@ def cut_off(surface: Elevations, base_mm: Elevations, rise_mm: float, largest: i
         Additional height per cell of the radius.
     largest : int
         Largest radius in cells; every radius from 1 on is tried.
-
-    Returns
-    -------
-    (rows, columns) uint8
-        The radius; 0 where no step removes more, and in holes.
-
-    Notes
-    -----
-    A planar slope loses nothing to an opening. A hilltop, crest or brow loses by each cell of radius no more than its
-    slope rises over a cell; an object loses all of its height at once when the element no longer fits into it.
     """
     rows, columns = surface.shape
     found = np.zeros((rows, columns), np.uint8)

@@ -142,19 +142,6 @@ def _dense_enough(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, cube_mm: int, 
 
 
 def dense_enough(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: OutlierSettings) -> BoolArray:
-    """Mask of the points that are not gross outliers.
-
-    Parameters
-    ----------
-    x_mm, y_mm, z_mm : (n,) int64
-        Absolute coordinates in millimetres: the cubes are anchored at the CRS's origin.
-    settings : OutlierSettings
-        Side of the cubes and the fewest neighbours.
-
-    Returns
-    -------
-    (n,) bool
-        False for outliers; empty for no points.
-    """
+    """Mask (n,) of the points that are not gross outliers; absolute millimetres, as cubes start at the CRS's origin."""
     kept: BoolArray = _dense_enough(x_mm, y_mm, z_mm, round(settings.cube_m * 1000), settings.min_neighbours)
     return kept

@@ -109,16 +109,12 @@ def join_planes(
     reach: int,
     limits: tuple[float, float, float],
 ) -> None:
-    """Mark in `joined` the asked cells that fit the plane through the ground within reach, or lie below it.
+    """Mark in `joined` the asked cells that fit the plane through the ground within reach, or lie below it; all in mm.
 
     Parameters
     ----------
-    elevation : (rows, columns) int32
-        Elevations in mm.
     ground, asked : (rows, columns) bool
         What the planes go through, and what is judged.
-    joined : (rows, columns) bool
-        Written.
     reach : int
         Half side of the squares in cells; nothing farther is looked at.
     limits : tuple of float
@@ -147,24 +143,9 @@ def join_planes(
 def leaning_planes(elevation: Elevations, used: BoolArray, half: int, widest: int) -> tuple[Elevations, Elevations]:
     """The trend at every cell: level and rise of the plane through the used cells of a square around it.
 
-    A square that holds few used cells, or all of them to one side, would carry its plane too far: there the square
-    grows, up to `widest`.
-
-    Parameters
-    ----------
-    elevation : (rows, columns) int32
-        Elevations in mm.
-    used : (rows, columns) bool
-        What the planes go through.
-    half, widest : int
-        Half sides of the smallest and the largest square, in cells; a square needs as many used cells as `half`.
-
-    Returns
-    -------
-    level : (rows, columns) int32
-        Elevation of the plane at the cell in mm; NO_DATA where the largest square holds nothing.
-    slope_mm : (rows, columns) int32
-        Steepest rise in mm a cell; 0 where there is no plane.
+    A square that holds fewer used cells than `half`, or all of them to one side, would carry its plane too far: there
+    the square grows. Half sides go from `half` to `widest` cells. Returns the elevation of the plane at the cell in mm,
+    NO_DATA where the largest square holds nothing, and its steepest rise in mm a cell, 0 where there is no plane.
     """
     rows, columns = elevation.shape
     sums = plane_sums(elevation, used)

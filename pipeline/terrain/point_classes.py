@@ -84,10 +84,7 @@ def support_m(vegetation: VegetationSettings) -> float:
 def tops_nearby(x: IntArray, y: IntArray, z: IntArray, used: BoolArray, wanted: BoolArray, reach: int) -> IntArray:
     """Elevation of the highest used point within a distance in plan of each wanted one, int64 (n,).
 
-    Returns
-    -------
-    (n,) int64
-        NO_DATA where it was not wanted or there is none.
+    NO_DATA where it was not wanted or there is none.
     """
     n = x.size
     out = np.full(n, np.int64(NO_DATA), np.int64)
@@ -133,23 +130,9 @@ def counts_nearby(x: IntArray, y: IntArray, used: BoolArray, reach: int) -> IntA
 
 @kernel
 def sums_around(x: IntArray, y: IntArray, used: BoolArray, values: IntArray, cell: int) -> IntArray:
-    """Sums of some values over the used points in the 3 x 3 cells around each used point.
+    """Sums (n, k) of int64 values over the used points in the 3 x 3 cells around each used point; zeros for others.
 
-    Parameters
-    ----------
-    x, y : (n,) int64
-        Places in mm; the cells are anchored at the CRS's origin.
-    used : (n,) bool
-        The points.
-    values : (n, k) int64
-        What is summed.
-    cell : int
-        Side of a cell in mm.
-
-    Returns
-    -------
-    (n, k) int64
-        Zeros for points that are not used.
+    Places (n,) and the side of a cell are in mm; cells are anchored at the CRS's origin.
     """
     n, k = values.shape
     out = np.zeros((n, k), np.int64)
@@ -205,21 +188,9 @@ def index_of_each(
 
 
 def classes_of(evidence: PointEvidence, wanted: BoolArray, vegetation: VegetationSettings) -> ByteArray:
-    """Class of every wanted point.
+    """`PointClass` of every wanted point, (n,) uint8; 0 for the others.
 
-    Parameters
-    ----------
-    evidence : PointEvidence
-        The points of a window that reaches `support_m` beyond the wanted ones.
-    wanted : (n,) bool
-        The points to be classified.
-    vegetation : VegetationSettings
-        How smoothness is judged.
-
-    Returns
-    -------
-    (n,) uint8
-        `PointClass`; 0 for points that are not wanted.
+    `evidence` holds the points of a window that reaches `support_m` beyond the wanted ones.
     """
     e = evidence
     x, y, z = e.x_mm, e.y_mm, e.z_mm
@@ -253,16 +224,10 @@ def classes_of(evidence: PointEvidence, wanted: BoolArray, vegetation: Vegetatio
 
 
 def noise_of(x_mm: IntArray, y_mm: IntArray, height_mm: IntArray, rise_mm: IntArray, outlier: BoolArray) -> BoolArray:
-    """Mask of the noise: gross outliers, and a few points far below the terrain.
+    """Mask of the noise: gross outliers, which are nearly alone in space, and a few points far below the terrain.
 
-    Parameters
-    ----------
-    x_mm, y_mm, height_mm : (n,) int64
-        Places and heights above the terrain, NO_DATA where there is none.
-    rise_mm : (n,) int64
-        Rise of the terrain over a metre: on a slope a point may lie lower by what the terrain rises over the box.
-    outlier : (n,) bool
-        Points nearly alone in space.
+    Places and heights above the terrain are in mm, NO_DATA where there is none. `rise_mm` is the rise of the terrain
+    over a metre: on a slope a point may lie lower by what the terrain rises over the box.
     """
     limit = DEEP_MM + rise_mm * PIT_REACH_MM // 1000
     deep = (height_mm != NO_DATA) & (height_mm < -limit)
@@ -273,23 +238,9 @@ def noise_of(x_mm: IntArray, y_mm: IntArray, height_mm: IntArray, rise_mm: IntAr
 def leafiness(evidence: PointEvidence, among: BoolArray, tall: BoolArray, vegetation: VegetationSettings) -> KindArray:
     """Whether points are vegetation by what lies around them: pulses that go on, or a surface that is not smooth.
 
-    Tall points need one of them, low points both: cars and fences scatter pulses, too.
-
-    Parameters
-    ----------
-    evidence : PointEvidence
-        The points.
-    among : (n,) bool
-        The points that are looked at, and judged: neither ground nor building.
-    tall : (n,) bool
-        Higher than cars and fences.
-    vegetation : VegetationSettings
-        Radius and largest roughness; fewest points for a judgement.
-
-    Returns
-    -------
-    (n,) int8
-        `LEAFY`, `SMOOTH`, or `UNKNOWN` where there are too few points to tell or the point is not looked at.
+    Points that are `tall`, higher than cars and fences, need one of them, low points both: cars and fences scatter
+    pulses, too. Points `among` are looked at, and judged: neither ground nor building. Returns `LEAFY`, `SMOOTH`, or
+    `UNKNOWN` where there are too few points for a judgement or the point is not looked at.
     """
     # most points are ground or building: the sums are held for the others only
     index = np.flatnonzero(among)

@@ -373,14 +373,8 @@ def patches_of(
 ) -> tuple[Patches, Borders, RoofVertices]:
     """Planar patches of a roof, the borders between them, and its vertices with their neighbours.
 
-    Parameters
-    ----------
-    x, y, z : (n,) int64
-        Vertices in millimetres from a place near by, sorted by (x, y).
-    tin : Tin
-        Their Delaunay TIN.
-    min_step_m : float
-        Planes closer than this in elevation meet.
+    Vertices (n,) are in millimetres from a place near by, sorted by (x, y), under their Delaunay TIN. Planes closer
+    than `min_step_m` in elevation meet.
     """
     radii = circumradii(x, y, tin.facets)
     limit = _TYPICAL_RADII * float(np.median(radii))

@@ -44,7 +44,7 @@ class SceneSettings:
         return self.support_with(ClassesInUse(), footprints=False)
 
     def support_with(self, classes: ClassesInUse, *, footprints: bool) -> float:
-        """How far a tile looks beyond its core, given the classes and footprints in use.
+        """How far in metres a tile looks beyond its core, given classes in use and `footprints`; at most `support_m`.
 
         Three lengths add up: how far from the core terrain is needed, how far a terrain elevation looks from there, and
         how far the search for outliers looks.
@@ -55,18 +55,6 @@ class SceneSettings:
         - A terrain elevation looks as far as the ground filter. With class 2 as ground no filter runs, which leaves
           `GroundSettings.trusted_support_m`.
         - Class 6 does not shorten the distance: its points are judged one by one.
-
-        Parameters
-        ----------
-        classes : ClassesInUse
-            Which classes of the file are believed.
-        footprints : bool
-            Whether the footprints are given.
-
-        Returns
-        -------
-        float
-            Metres; never more than `support_m`.
         """
         ground_m = self.ground.trusted_support_m if classes.ground else self.ground.support_m
         return self.outliers.support_m + ground_m + self.terrain_m(footprints=footprints)

@@ -59,29 +59,18 @@ def fragments_of(
     canopy_m: float,
     ground_m: float,
 ) -> tuple[Fragments, LabelArray]:
-    """Cut a scene's TIN by its walls and describe the fragments.
+    """Cut a scene's TIN by its walls to fragments, and assign every point to one, (n,) int32, -1 for none.
 
     Parameters
     ----------
     tin : Tin
         Delaunay TIN of the vertices, exact within 4 circumradii around the core.
-    vertices : SceneVertices
-        The vertices.
     points : ScenePoints
         All points of the core, to be assigned to fragments.
     core : tuple of int
         x0, y0, x1, y1 of the tile in mm, half-open.
-    settings : SurfaceSettings
-        What cuts.
     canopy_m, ground_m : float
         Least height of canopy above a surface, and of an object above the terrain.
-
-    Returns
-    -------
-    Fragments
-        Sums and keys.
-    (n,) int32
-        Fragment of every point, -1 where none.
     """
     x, y = vertices.x_mm, vertices.y_mm
     wall_mm = round(settings.wall_m * 1000)

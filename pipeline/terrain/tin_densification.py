@@ -91,12 +91,10 @@ def _join_facets(
 def join_facets(
     elevation: Elevations, ground: BoolArray, asked: BoolArray, reach: int, limits: tuple[float, float, float]
 ) -> tuple[BoolArray, BoolArray]:
-    """Judge cells by the TIN of the ground.
+    """Judge cells by the TIN of the ground: which join it, and which of them a facet decided on; elevations in mm.
 
     Parameters
     ----------
-    elevation : (rows, columns) int32
-        Elevations in mm.
     ground, asked : (rows, columns) bool
         The vertices of the TIN, and what is judged; no cell is both.
     reach : int
@@ -104,11 +102,6 @@ def join_facets(
     limits : tuple of float
         Farthest perpendicular distance above a facet in mm; distance in mm up to which angles do not matter; sine of
         the largest angle.
-
-    Returns
-    -------
-    joined, judged : (rows, columns) bool
-        What joins the ground, and what a facet decided on.
     """
     vertex_r, vertex_c = np.nonzero(ground)
     tin = triangulate(np.column_stack((vertex_c, vertex_r)))

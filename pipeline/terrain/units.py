@@ -81,15 +81,7 @@ def _facing(patches: Patches, borders: Borders, row: int) -> _Facing | None:
 
 
 def units_of_patches(patches: Patches, borders: Borders, settings: UnitSettings) -> LabelArray:
-    """The unit of every patch, (k,) int32, numbered by one of its patches.
-
-    Parameters
-    ----------
-    patches, borders : Patches, Borders
-        The roof of one candidate.
-    settings : UnitSettings
-        Where units are split.
-    """
+    """The unit of every patch of a candidate's roof, (k,) int32, numbered by one of its patches."""
     count = len(patches.areas_m2)
     unit = np.arange(count)
     large = (patches.areas_m2 >= _PART_M2) & ~np.isnan(patches.levels_mm)
@@ -270,19 +262,9 @@ def smallest_points(x: IntArray, y: IntArray, z: IntArray, label: LabelArray) ->
 
 
 def units_of(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSettings) -> LabelArray:
-    """Find the units of one candidate.
+    """Unit of every point of one candidate, (n,) int32, numbered by their lexicographically smallest points.
 
-    Parameters
-    ----------
-    x_mm, y_mm, z_mm : (n,) int64
-        All points of the candidate in absolute millimetres, in any order.
-    settings : UnitSettings
-        What separates units.
-
-    Returns
-    -------
-    (n,) int32
-        Unit of every point; numbered from 0 in the order of their lexicographically smallest points.
+    All its points are in absolute millimetres, in any order.
     """
     n = len(x_mm)
     one = np.zeros(n, np.int32)

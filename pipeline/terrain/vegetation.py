@@ -197,25 +197,11 @@ def _planar(
 def planarity(
     x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, wanted: BoolArray, settings: VegetationSettings
 ) -> KindArray:
-    """Whether the surroundings of each vertex are planar.
+    """Whether the surroundings of each wanted vertex are planar: 1 planar, 0 rough, -1 not wanted or few neighbours.
 
-    A vertex is judged by the most planar of nine windows: one around it and eight shifted by 0.8 of
-    the radius, as edge-preserving filters do (Nagao and Matsuyama 1979), since every point near a
-    ridge or an eave has a planar side.
-
-    Parameters
-    ----------
-    x_mm, y_mm, z_mm : (n,) int64
-        Thinned points in millimetres.
-    wanted : (n,) bool
-        The vertices to be judged; all within `level_m` in elevation are neighbours.
-    settings : VegetationSettings
-        Radius and the largest roughness.
-
-    Returns
-    -------
-    (n,) int8
-        1 planar, 0 rough, -1 where it was not wanted or there are too few neighbours to tell.
+    A vertex is judged by the most planar of nine windows: one around it and eight shifted by 0.8 of the radius, as
+    edge-preserving filters do (Nagao and Matsuyama 1979), since every point near a ridge or an eave has a planar side.
+    Vertices are thinned points in millimetres; all within `level_m` in elevation are neighbours.
     """
     verdict = np.full(len(x_mm), -1, np.int8)
     for scale in range(PLANARITY_SCALES):
@@ -280,21 +266,8 @@ def crowns(
     superstructures return most pulses once, crowns do not. In a file of single returns nothing is a crown, and whole
     surfaces are judged by their shape alone.
 
-    Parameters
-    ----------
-    x_mm, y_mm, z_mm : (n,) int64
-        Thinned points in millimetres.
-    planar : (n,) int8
-        Verdicts of `planarity`.
-    several : (n,) bool
-        The vertex comes from a pulse of several returns.
-    settings : VegetationSettings
-        `company_m`, `crown_share` and `pierced_share`.
-
-    Returns
-    -------
-    (n,) bool
-        False where there was no verdict.
+    Vertices are thinned points in millimetres, `planar` their verdicts by `planarity`; without one a vertex is not in a
+    crown. `several` marks those from a pulse of several returns.
     """
     radius_mm = round(settings.company_m * 1000)
     mask: BoolArray = _crowns(

@@ -97,23 +97,11 @@ def _on_fine(lowest: Elevations, floors: Elevations, column0: int, row0: int, ab
 
 
 def wide_objects(lowest: Elevations, corner: tuple[int, int], narrower: int, radius: int, rise_mm: float) -> BoolArray:
-    """Mask of the cells of wide objects.
+    """Mask of the cells of wide objects; none where there is no data.
 
-    Parameters
-    ----------
-    lowest : (rows, columns) int32
-        Elevation in mm of the lowest point of each cell; NO_DATA where there is none.
-    corner : tuple of int
-        Absolute column and row of the first cell.
-    narrower, radius : int
-        Radii of the first and the last opening, in cells.
-    rise_mm : float
-        Height that a step may remove per cell of the radius: wider objects must be higher.
-
-    Returns
-    -------
-    (rows, columns) bool
-        Objects; none where there is no data.
+    `lowest` is the elevation in mm of the lowest point of each cell, NO_DATA where there is none; `corner` is the
+    absolute column and row of the first cell. `narrower` and `radius` are the radii of the first and the last opening,
+    in cells. A step may remove `rise_mm` per cell of the radius: wider objects must be higher.
     """
     surface = _coarse(lowest, *corner)
     for _ in range(FILL):  # the higher side wins: an outlier must not grow
@@ -130,16 +118,7 @@ def with_corners(lowest: Elevations, wide: BoolArray, first: ByteArray) -> BoolA
     """Wide objects with the corners into which no octagon fits.
 
     A narrower opening removed the corner of a hall in smaller steps. The corner is level with the hall, and the first
-    openings cut it off.
-
-    Parameters
-    ----------
-    lowest : (rows, columns) int32
-        Elevations in mm.
-    wide : (rows, columns) bool
-        Cells of wide objects.
-    first : (rows, columns) uint8
-        Radius at which the first openings cut a cell off; 0 where they did not.
+    openings cut it off at the radius `first`, 0 where they did not. Elevations are in mm.
     """
     rows, columns = lowest.shape
     out = wide.copy()

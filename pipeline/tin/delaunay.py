@@ -92,30 +92,13 @@ def hilbert_order(xy_mm: IntArray) -> LabelArray:
 
 
 def triangulate(xy_mm: IntArray) -> Tin:
-    """The Delaunay triangulation of different points on whole millimetres.
+    """The Delaunay triangulation of different points (n, 2) on whole millimetres; see `unique_xy`.
 
     The hull is the exact convex hull, and points on its edges are vertices of it; there are no auxiliary vertices. At
     the hull, facets may be long and narrow. Facets start with their smallest vertex index and are sorted, so the same
-    points in the same order give the same arrays, and in another order the same triangles.
-
-    Parameters
-    ----------
-    xy_mm : (n, 2) int64
-        Easting, northing in millimetres. No two points may be equal; see `unique_xy`.
-
-    Returns
-    -------
-    Tin
-        Vertex indices are those of `xy_mm`. No facets where fewer than three points are given or all are collinear.
-
-    Raises
-    ------
-    ValueError
-        If the points extend over more than 2 km, or two are equal.
-
-    Notes
-    -----
-    Of points on a common circle, the perturbation described in `pipeline.tin.predicates` decides.
+    points in the same order give the same arrays, and in another order the same triangles. Of points on a common
+    circle, the perturbation described in `pipeline.tin.predicates` decides. There are no facets where fewer than three
+    points are given or all are collinear. Raises ValueError if the points extend over more than 2 km, or two are equal.
 
     Examples
     --------
@@ -164,21 +147,10 @@ def _refuse_duplicates(xy_mm: IntArray, order: LabelArray, duplicate: int) -> No
 
 
 def unique_xy(xy_mm: IntArray, z_mm: IntArray) -> tuple[IntArray, LabelArray]:
-    """Keep the highest point of every position.
+    """Keep the highest point of every position in whole millimetres, of equal heights the lowest index.
 
-    Parameters
-    ----------
-    xy_mm : (n, 2) int64
-        Easting, northing in millimetres.
-    z_mm : (n,) int64
-        Elevation in millimetres; of equal heights the lowest index is kept.
-
-    Returns
-    -------
-    kept : (u,) int64
-        Indices of the kept points, ascending.
-    kept_of_point : (n,) int32
-        For every point the position in `kept` of the one that stands for it.
+    Returns the indices of the kept points, (u,) int64, ascending, and for every point the position among them of the
+    one that represents it, (n,) int32.
 
     Examples
     --------

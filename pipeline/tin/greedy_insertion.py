@@ -317,29 +317,10 @@ def _facets_of(points: IntArray, facet_of_point: LabelArray, inserted: IntArray,
 def insert_greedily(points_m: FloatArray, settings: GreedyInsertionSettings, corner_z_m: float) -> GreedyTin:
     """Triangulate points by greedy insertion with noise absorption.
 
-    The TIN begins with four corners around the points. Of points at one position the highest takes part.
+    The TIN begins with four corners around the points (n, 3), metres of whole millimetres, at the elevation of the
+    ground. Of points at one position the highest takes part. Without points there are no vertices and no facets. Raises
+    ValueError if the points with their margins extend over more than 2^21 mm, 2.097 km.
 
-    Parameters
-    ----------
-    points_m : (n, 3) float64
-        Points in metres, whole millimetres.
-    settings : GreedyInsertionSettings
-        Absorption and margin.
-    corner_z_m : float
-        Elevation of the four corners: that of the ground.
-
-    Returns
-    -------
-    GreedyTin
-        Without points, no vertices and no facets.
-
-    Raises
-    ------
-    ValueError
-        If the points with their margins extend over more than 2^21 mm, 2.097 km.
-
-    Notes
-    -----
     The point inserted next is that of the largest *vertical* error, as Garland & Heckbert have it: perpendicular
     distances differ wildly on walls. Eq. 2 of Shorter & Kasparis is the slope of the facet and is computed as such, as
     it is 0/0 for a point on the facet.

@@ -183,21 +183,9 @@ def canonical_facets(
 ) -> tuple[LabelArray, LabelArray, LabelArray]:
     """Real facets by the caller's vertex numbers, smallest vertex first, sorted.
 
-    Parameters
-    ----------
-    origin, twin : (4 m,) int32
-        The half-edges.
-    n_facets : int
-        Facets in use, those at infinity among them.
-    order : (n,) int32
-        The caller's number of every vertex, below n.
-
-    Returns
-    -------
-    facets, neighbours : (r, 3) int32
-        As in `pipeline.model.Tin`.
-    number : (n_facets,) int32
-        Row of every facet; -1 at infinity.
+    From the half-edges (4 m,), the number of facets in use, those at infinity among them, and the caller's number of
+    every vertex, `order` (n,). Returns facets and neighbours (r, 3) as in `pipeline.model.Tin`, and the row of every
+    facet, -1 at infinity.
     """
     n = len(order)
     first_edge = np.full(n_facets, -1, np.int32)

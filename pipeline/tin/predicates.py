@@ -31,10 +31,7 @@ _CERTAIN = float(1 << 36)
 def orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> float:
     """Twice the signed area of the triangle a, b, c in mm2; positive where it turns left; exact.
 
-    Parameters
-    ----------
-    ax, ay, bx, by, cx, cy : float
-        Whole millimetres, at most 2^21 apart.
+    Coordinates are whole millimetres, at most 2^21 apart.
     """
     return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
 
@@ -45,11 +42,8 @@ def lies_in_circumcircle(
 ) -> bool:
     """Whether d lies inside the circle through a, b, c, which turn left; exact, ties broken symbolically (see above).
 
-    Parameters
-    ----------
-    ax, ay, bx, by, cx, cy, dx, dy : float
-        Whole millimetres, at most 2^21 apart; four different points. Where a, b, c are collinear the circle is the
-        half-plane that d's sign of orientation makes of it, as Lawson's flips need it.
+    Coordinates are whole millimetres, at most 2^21 apart; four different points. Where a, b, c are collinear the circle
+    is the half-plane that d's sign of orientation makes of it, as Lawson's flips need it.
     """
     adx = ax - dx
     ady = ay - dy

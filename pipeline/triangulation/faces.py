@@ -67,19 +67,10 @@ def triangulate_face(vertices: FloatArray, rings: Sequence[Sequence[int]]) -> In
 
 @kernel
 def triangulate_rings(corners: IntArray, ring_offsets: IntArray) -> tuple[IntArray, int]:
-    """Triangulate one face from the corners of its rings.
+    """Triangles (t, 3) int64 of one face, as indices into its corners, and `DONE`; or no triangle and the fault.
 
-    Parameters
-    ----------
-    corners : (n, 3) int64
-        Corners of all rings in mm, outer ring first.
-    ring_offsets : (r + 1,) int64
-        Where each ring starts in corners, and n.
-
-    Returns
-    -------
-    (t, 3) int64 and int
-        Indices into corners, and `DONE`, or no triangle and the fault.
+    `corners` (n, 3) int64 of all rings are in mm, outer ring first; `ring_offsets` (r + 1,) is where each starts, and
+    n.
     """
     flat, has_area = project_along_dominant_axis(corners, ring_offsets[1])
     nothing = np.empty((0, 3), np.int64)

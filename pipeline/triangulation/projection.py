@@ -33,17 +33,8 @@ def area_vector(corners: IntArray, start: int, stop: int) -> tuple[int, int, int
 def project_along_dominant_axis(corners: IntArray, outer_stop: int) -> tuple[IntArray, bool]:
     """Drop the coordinate in which the outer ring's normal is longest.
 
-    Parameters
-    ----------
-    corners : (n, 3) int64
-        Corners of all rings in mm, outer ring first.
-    outer_stop : int
-        Number of corners of the outer ring.
-
-    Returns
-    -------
-    (n, 2) int64 and bool
-        Corners in the plane, the outer ring counter-clockwise; False where it encloses no area.
+    Of the corners of all rings, (n, 3) int64 in mm, the first `outer_stop` are the outer ring. Returns them in the
+    plane, (n, 2), the outer ring counter-clockwise; and False where it encloses no area.
     """
     x, y, z = area_vector(corners, 0, outer_stop)
     flat = np.empty((len(corners), 2), np.int64)

@@ -214,8 +214,6 @@ def arrange(
         Valid, in integer millimetres of the same frame; with courtyards as holes.
     spacing_m : float
         Typical distance of neighbouring points in plan.
-    settings : ArrangementSettings
-        Costs and lengths.
     clearance : float
         Times the usual distances that vertices keep from each other; more where planes nearly meet in one point and no
         solid is valid.

@@ -96,14 +96,9 @@ def _with_directions_of(plane: FloatArray, directions: FloatArray, n: int) -> in
 
 @kernel
 def border_places(labels: LabelArray, raster: Raster, n_planes: int) -> tuple[FloatArray, IntArray]:
-    """Places amid neighbouring cells of different labels, ordered by their pair of labels.
+    """Places (m, 2) in metres amid neighbouring cells of different labels, ordered by their pair of labels.
 
-    Returns
-    -------
-    places : (m, 2) float64
-        Metres.
-    pairs : (m,) int64
-        low * n_planes + high, ascending.
+    Also returns those pairs, (m,) int64: low * n_planes + high, ascending.
     """
     place, columns = raster.place, raster.columns
     places = np.empty((2 * len(place), 2))
@@ -232,16 +227,10 @@ def candidate_lines(
     cap_m: float,
     min_length_m: float,
 ) -> CandidateLines:
-    """Lines along the borders of coarse labels.
+    """Lines along the `border_places` of coarse labels of planes (k, 3) through roof points (n, 3).
 
     Parameters
     ----------
-    places, pairs
-        From `border_places`.
-    points : (n, 3) float64
-        Roof points, metres.
-    planes : (k, 3) float64
-        Coefficients a, b, c.
     edges : (e, 4) float64
         Edges of the outline, metres.
     cell_m : float

@@ -109,18 +109,12 @@ def _heights_of_planes(points: FloatArray, labels: LabelArray, planes: FloatArra
 def cell_costs(
     plan: Subdivision, points: FloatArray, labels: LabelArray, planes: FloatArray, cells: IntArray, limits: Limits
 ) -> tuple[IntArray, IntArray]:
-    """Cost of every plane in every cell.
+    """Cost of every plane in every cell, (c, k) int64, in thousandths of an unexplained point.
 
     Where a plane leaves the heights of its own points at corners of a cell, it costs as if that share of the cell, or a
     few points, were not explained: planes are not continued far above or below their data without points. That share of
-    the points that the cell lacks for its area misfits, or a few points.
-
-    Returns
-    -------
-    costs : (c, k) int64
-        By the capped residuals, in thousandths of an unexplained point.
-    misfits : (c, k) int64
-        The same without residuals within half the cap.
+    the points that the cell lacks for its area misfits, or a few points. Costs are capped residuals; the misfits,
+    returned too, are the same without residuals within half the cap.
     """
     xy, graph, n_cells = plan.xy, plan.graph, plan.counts[CELLS]
     k = len(planes)
@@ -229,23 +223,11 @@ def unite_faces(
     face_cost: int,
     doubtful_cost: int,
 ) -> None:
-    """Give whole faces the label of a neighbour while that saves more than it costs, the best first.
+    """Give whole faces the label of a neighbour while that saves more than it costs, the best first, in place.
 
     This saves their common border, and a face for every neighbour with that label; it costs the points that misfit
-    then. A face costs more the more of its own points misfit it.
-
-    Parameters
-    ----------
-    misfits : (c, k) int64
-        From `cell_costs`.
-    held : (c,) int32
-        From `points_per_cell`.
-    pairs, weights : arrays
-        From `cell_borders`.
-    labels : (c,) int32
-        Plane of every cell; changed in place.
-    face_cost, doubtful_cost : int
-        Cost of a face that all its points fit, and of one that half of them misfit.
+    then. A face costs more the more of its own points misfit it: `face_cost` if all fit, `doubtful_cost` if half of
+    them misfit. Misfits are those of `cell_costs`, `held` of `points_per_cell`, pairs and weights of `cell_borders`.
     """
     k = misfits.shape[1]
     while True:

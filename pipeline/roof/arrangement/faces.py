@@ -186,25 +186,10 @@ def _cheapest_corner(plan: Subdivision, planes: FloatArray, star: _Star, m: int,
 def part_crossings(
     plan: Subdivision, labels: LabelArray, planes: FloatArray, clearance: float
 ) -> tuple[LabelArray, int]:
-    """Part borders that cross in a way that no solid can have.
+    """Part borders that cross in a way that no solid can have, in the plan and in the labels, in place.
 
-    Parameters
-    ----------
-    plan : Subdivision
-        Changed in place.
-    labels : (c + room,) int32
-        Plane of every cell, with room for the new ones; changed in place.
-    planes : (k, 3) float64
-        Coefficients a, b, c.
-    clearance : float
-        Times the usual size of a corner.
-
-    Returns
-    -------
-    faces : (c,) int32
-        Face of every cell.
-    n_faces : int
-        Their number.
+    `labels` (c + room,) are the planes of the cells, with room for the new ones. Corners have `clearance` times the
+    usual size. Returns the face of every cell, (c,) int32, and the number of faces.
     """
     xy, graph, counts = plan.xy, plan.graph, plan.counts
     corner_mm = clearance * _CORNER_MM
@@ -287,14 +272,8 @@ def corners_of_borders(plan: Subdivision, n_outline: int, faces: LabelArray) -> 
 def trace_faces(plan: Subdivision, faces: LabelArray, needed: BoolArray) -> tuple[IntArray, IntArray, LabelArray]:
     """The rings around all faces, outer rings to the left, holes to the right; rings that touch themselves are parted.
 
-    Returns
-    -------
-    vertices : (n,) int64
-        Vertices of the rings, one ring after the other, not closed.
-    starts : (r + 1,) int64
-        First vertex of every ring.
-    owner : (r,) int32
-        Face of every ring.
+    Returns the vertices of the rings, one ring after the other, not closed, the first vertex of every ring, (r + 1,),
+    and the face of every ring, (r,).
     """
     graph, n_edges = plan.graph, plan.counts[EDGES]
     vertices = np.empty(n_edges, np.int64)
@@ -348,16 +327,8 @@ def rings_of_faces(
 ) -> tuple[FloatArray, IntArray, LabelArray, bool]:
     """The rings from `trace_faces` by faces, the outer one of each first.
 
-    Returns
-    -------
-    nodes : (n, 2) float64
-        Millimetres.
-    ring_of : (n,) int64
-        Ring of each node, ascending.
-    owner : (r,) int32
-        Face of every ring, ascending.
-    is_sound : bool
-        Whether every face has one outer ring, and every ring three vertices.
+    Returns nodes (n, 2) in millimetres, the ring of each, ascending, the face of every ring, ascending, and whether the
+    rings are sound: every face has one outer ring, and every ring three vertices.
     """
     n_rings = len(owner)
     is_outer = np.empty(n_rings, np.bool_)

@@ -330,27 +330,18 @@ def cut_off_far_corners(
 ) -> int:
     """Cut corners of cells off where the plane of the cell leaves the heights of all points around.
 
+    Returns how many cells have such corners, cut or not.
+
     Parameters
     ----------
     plan : Subdivision
         Changed in place.
     points, cells : (n, 3) float64 and (n,) int64
         Metres; the cell of each.
-    planes : (k, 3) float64
-        Coefficients a, b, c.
-    labels : (c,) int32
-        Plane of every cell.
-    around : HeightsAround
-        From `heights_around`.
     limits : Limits
         How far a plane may go above or below the points, and the cap of residuals.
     line : int
         Number of the first line that is drawn.
-
-    Returns
-    -------
-    int
-        Cells that have such corners, cut or not.
     """
     far_m = limits.overshoot_m
     graph, counts = plan.graph, plan.counts

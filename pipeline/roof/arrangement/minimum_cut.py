@@ -275,20 +275,9 @@ def _build_flow(
 
 @kernel
 def expand_labels(costs: IntArray, allowed: Allowed, neighbours: Neighbours, labels: LabelArray, rounds: int) -> None:
-    """Lower the cost of labels by expansions of every label in turn until none helps.
+    """Lower the cost of labels, in place, by expansions of every label in turn until none helps.
 
-    Parameters
-    ----------
-    costs : (n, k) int64
-        Cost of every label at every node.
-    allowed : Allowed
-        The nodes that can take each label.
-    neighbours : Neighbours
-        The edges.
-    labels : (n,) int32
-        Changed in place.
-    rounds : int
-        At most so many turns through all labels.
+    `costs` (n, k) are those of every label at every node. There are at most so many `rounds` through all labels.
     """
     n, k = costs.shape
     n_arcs = 2 * (len(neighbours.others) // 2 + n)

@@ -55,25 +55,10 @@ def _fit(points: FloatArray, chosen: LabelArray, plane: FloatArray, cap_m: float
 
 @kernel
 def refitted_planes(points: FloatArray, labels: LabelArray, planes: FloatArray, cap_m: float) -> FloatArray:
-    """Every plane refitted by least squares to the points of its places that it explains.
+    """Every plane (k, 3) refitted by least squares to the points of its places that it explains.
 
-    This is repeated while it lowers the sum of capped residuals.
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Local metres, in a canonical order.
-    labels : (n,) int32
-        Plane of the place of each point; -1 for none.
-    planes : (k, 3) float64
-        Coefficients a, b, c.
-    cap_m : float
-        Residual from which a point is unexplained.
-
-    Returns
-    -------
-    (k, 3) float64
-        New coefficients.
+    This is repeated while it lowers the sum of residuals capped at `cap_m`, from which a point is unexplained. Points
+    (n, 3) are in local metres, in a canonical order; `labels` has the plane of the place of each, -1 for none.
     """
     better = planes.copy()
     fitted = np.empty(3)

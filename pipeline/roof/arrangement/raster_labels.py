@@ -260,14 +260,10 @@ def _settle(costs: IntArray, raster: Raster, side: int, diagonal: int, labels: L
 def raster_labels(
     points: FloatArray, planes: FloatArray, edges: FloatArray, cell_m: float, cap_m: float, cost_per_m: float
 ) -> tuple[LabelArray, Raster]:
-    """The labels of a raster of half the given cell, (n,) int32, and that raster.
+    """The labels of a raster of half the given cell, (n,) int32, and that raster, for points (n, 3) and planes (k, 3).
 
     Parameters
     ----------
-    points : (n, 3) float64
-        Roof points, local metres.
-    planes : (k, 3) float64
-        Coefficients a, b, c; at least one.
     edges : (e, 4) float64
         Edges of the outline's rings, metres.
     cell_m : float

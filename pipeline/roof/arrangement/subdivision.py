@@ -209,10 +209,7 @@ def _set_face(graph: IntArray, start: int, face: int) -> None:
 def insert_chord(plan: Subdivision, u: int, v: int, face: int, line: int) -> int:
     """Join two vertices of a cell by an edge, which is the last one then, unless it would touch anything.
 
-    Returns
-    -------
-    int
-        Cells made: 1, or 0 where two loops of the cell became one; -1 where there is no room for the chord.
+    Returns the cells made: 1, or 0 where two loops of the cell became one; -1 where there is no room for the chord.
     """
     graph, counts = plan.graph, plan.counts
     at_u, at_v = _corner(plan, u, v, face), _corner(plan, v, u, face)
@@ -282,19 +279,11 @@ def cell_at(plan: Subdivision, x: float, y: float) -> int:
 
 @kernel
 def subdivision_of(ring_xy: IntArray, ring_starts: IntArray, polygon_of_ring: IntArray, room: int) -> Subdivision:
-    """An outline with one cell per polygon.
+    """An outline with one cell per polygon, and room for some vertices and edges.
 
-    Parameters
-    ----------
-    ring_xy : (n, 2) int64
-        Vertices of the rings, not closed, millimetres; outer rings turn left, holes right. They come first, and so do
-        their 2 n half-edges, the even ones inside.
-    ring_starts : (r + 1,) int64
-        First vertex of every ring.
-    polygon_of_ring : (r,) int64
-        The polygon of every ring.
-    room : int
-        Vertices and edges to leave room for.
+    Vertices `ring_xy` (n, 2) of the rings, not closed, are in millimetres; outer rings turn left, holes right. They
+    come first, and so do their 2 n half-edges, the even ones inside. `ring_starts` (r + 1,) is the first vertex of
+    every ring.
     """
     n = len(ring_xy)
     xy = np.zeros((n + room, 2), np.int64)
@@ -423,18 +412,10 @@ def _supported_spans(candidates: CandidateLines, number: int, half_m: float) -> 
 
 @kernel
 def subdivide(plan: Subdivision, candidates: CandidateLines, reach_m: float, clearance: float) -> None:
-    """Cut an outline by candidate lines, those with the highest scores first.
+    """Cut an outline from `subdivision_of` by candidate lines, those with the highest scores first, in place.
 
-    Parameters
-    ----------
-    plan : Subdivision
-        From `subdivision_of`; changed in place.
-    candidates : CandidateLines
-        From `candidate_lines`.
-    reach_m : float
-        How far beyond its supporting places a line cuts.
-    clearance : float
-        Times the usual distance within which a line passes through a vertex.
+    A line cuts `reach_m` beyond its supporting places, and passes through a vertex within `clearance` times the usual
+    distance.
     """
     in_mm = np.empty(3)
     for number in ascending_order(-candidates.scores):

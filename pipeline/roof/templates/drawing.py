@@ -60,30 +60,11 @@ def draw_parts(
     origin_m: FloatArray,
     min_face_m2: float,
 ) -> RoofPartition:
-    """The outline cut into the roof faces of its parts.
+    """The outline cut into the roof faces of its parts: a coverage; label `MAX_PLANES` p + k is plane k of part p.
 
-    Parameters
-    ----------
-    outline_mm : MultiPolygon
-        Valid, integer millimetres.
-    regions, counts, planes : arrays
-        As `parts.fit_parts` gives them.
-    direction : float
-        Of the frame's axis u, radians.
-    origin_m : (2,) float64
-        Of the frame.
-    min_face_m2 : float
-        A smaller face joins the neighbour with which it has the longest border.
-
-    Returns
-    -------
-    RoofPartition
-        A coverage of the outline; label `MAX_PLANES` p + k is plane k of part p.
-
-    Raises
-    ------
-    BuildingError
-        `no_partition` where faces break on the grid.
+    Regions, counts and planes are those of `parts.fit_parts`, in a frame with its axis u in a direction in radians. A
+    face below `min_face_m2` joins the neighbour with which it has the longest border. Raises BuildingError
+    `no_partition` where faces break on the grid.
     """
     cos, sin = math.cos(direction), math.sin(direction)
     x0, y0 = origin_m.tolist()

@@ -80,13 +80,7 @@ class Templates:
     """(n,) int32, 4 p + k for a point over plane k of part p."""
 
     def faces(self, bic_margin: float = math.nan) -> RankedFaces:
-        """Draw the roof faces.
-
-        Raises
-        ------
-        BuildingError
-            `no_partition` where they break on the millimetre grid.
-        """
+        """Draw the roof faces; raises BuildingError `no_partition` where they break on the millimetre grid."""
         drawn = draw_parts(
             self.outline_mm, self.regions, self.counts, self.planes, self.direction, self.origin_m, _MIN_FACE_M2
         )
@@ -117,12 +111,8 @@ class Templates:
 def fit_templates(points: FloatArray, outline_mm: MultiPolygon) -> Templates:
     """Fit flat, pent, gable, hip and half-hip roofs to the parts of an outline, of the least BIC that is found.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Roof points that see the sky, local metres, in a canonical order.
-    outline_mm : MultiPolygon
-        Valid, integer millimetres of the same frame.
+    Points (n, 3) see the sky and are in local metres, in a canonical order; the outline is valid, in integer
+    millimetres of the same frame.
 
     Raises
     ------

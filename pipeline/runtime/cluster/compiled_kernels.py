@@ -25,15 +25,7 @@ def kernels_are_compiled(kernels: Iterable[Any] = (*GROUND, *MODELLING)) -> bool
     """Whether a run here needs no compilation; only reads the header of one file per kernel.
 
     The answer holds for this user on this machine, or for all users of `NUMBA_CACHE_DIR`, not for workers elsewhere.
-
-    Parameters
-    ----------
-    kernels : iterable
-        Representatives of all kernels; `MODELLING` is enough for inputs with classes.
-
-    Returns
-    -------
-    bool
-        Also True if numba is switched off (`NUMBA_DISABLE_JIT`).
+    The kernels represent all others; `MODELLING` is enough for inputs with classes. Also True if numba is switched off
+    (`NUMBA_DISABLE_JIT`).
     """
     return all(kernel.is_compiled for kernel in kernels)

@@ -232,10 +232,7 @@ class DaskExecutor:
     def __enter__(self) -> Self:
         """Connect, and start the cluster if it is owned.
 
-        Raises
-        ------
-        ClusterError
-            The scheduler does not answer, or certificates and address do not match.
+        Raises ClusterError if the scheduler does not answer, or certificates and address do not match.
         """
         import dask
         from distributed import Client
@@ -364,10 +361,7 @@ class DaskExecutor:
 def memory_of_workers(*, workers: int, scheduler: str | None, tls: TlsFiles | None = None) -> tuple[int, int | None]:
     """The number of workers that a run would have now, and the memory limit of the smallest; starts nothing.
 
-    Raises
-    ------
-    ClusterError
-        The scheduler does not answer.
+    Raises ClusterError if the scheduler does not answer.
     """
     if scheduler is None:
         if workers == 0:

@@ -66,12 +66,8 @@ class LocalExecutor:
     ) -> Generator[Measured[Result], None, None]:
         """Results as they come.
 
-        Raises
-        ------
-        RunCancelledError
-            The run was cancelled.
-        RunError
-            One task killed its children, also when it ran alone.
+        Raises RunCancelledError if the run was cancelled, RunError if one task killed its children, also when it ran
+        alone.
         """
         return _Stage(stage, function, tasks, watch, self._memory_bytes).results(self._children)
 

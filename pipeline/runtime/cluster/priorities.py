@@ -16,12 +16,7 @@ _BAND = 499_999
 
 
 def priority_of(traffic: Traffic, wish: int = 0) -> int:
-    """The priority of a run's tasks.
-
-    Parameters
-    ----------
-    wish : int
-        The user's priority; compared only with that of other runs of the same kind.
+    """The priority of a run's tasks; the user's wish is compared only with that of other runs of the same kind.
 
     Examples
     --------

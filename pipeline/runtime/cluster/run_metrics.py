@@ -157,24 +157,10 @@ def combined(*listeners: Listener) -> Listener:
 
 
 def serve_metrics(port: int, host: str = "127.0.0.1") -> Callable[[], None]:
-    """Serve the figures of this process at `http://host:port/metrics` from a new thread.
+    """Serve the figures of this process at `http://host:port/metrics` from a new thread; returns what stops the server.
 
-    Parameters
-    ----------
-    port : int
-        Port to listen on.
-    host : str
-        Address to listen on. No key is required, so everyone who can reach it can read the figures.
-
-    Returns
-    -------
-    callable
-        Stops the server.
-
-    Raises
-    ------
-    SettingsError
-        The port is taken, or the address does not belong to this machine.
+    No key is required, so everyone who can reach the address can read the figures. Raises SettingsError if the port is
+    taken, or the address does not belong to this machine.
     """
     tallies = TallyMetrics()
     try:

@@ -122,17 +122,9 @@ def _no_pass_phrase() -> str:
 
 
 def given_tls(ca: str | None = None, cert: str | None = None, key: str | None = None) -> TlsFiles | None:
-    """The files named by options or the environment; None if there are none.
+    """The files named by options or the environment, where a missing option is looked up; None if there are none.
 
-    Parameters
-    ----------
-    ca, cert, key : str or None
-        Paths from options; a missing one is looked up in the environment.
-
-    Raises
-    ------
-    SettingsError
-        A file is missing or cannot be used.
+    Raises SettingsError if a file is missing or cannot be used.
     """
     named = {
         name: given or os.environ.get(VARIABLES[name], "") for name, given in (("ca", ca), ("cert", cert), ("key", key))
@@ -149,10 +141,7 @@ def given_tls(ca: str | None = None, cert: str | None = None, key: str | None = 
 def check_address(address: str, tls: TlsFiles | None, *, configured: bool) -> None:
     """Refuse an address that does not match the files, before any connection.
 
-    Raises
-    ------
-    ClusterError
-        `tls://` without files, or files for another protocol.
+    Raises ClusterError for `tls://` without files, or files for another protocol.
     """
     protocol = address.split("://", maxsplit=1)[0] if "://" in address else "tcp"
     if protocol == "tls" and tls is None and not configured:

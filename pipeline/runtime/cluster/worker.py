@@ -98,10 +98,7 @@ class DrainingWorker(Worker):
 def serve_worker(options: WorkerOptions, say: Callable[[str], None]) -> None:
     """Run a worker until SIGTERM or SIGINT drains it; a second signal ends it at once.
 
-    Parameters
-    ----------
-    say : callable
-        Gets one line of text at every change.
+    `say` gets one line of text at every change.
 
     Raises
     ------

@@ -36,11 +36,8 @@ _FIRST_VICTIM = "1000"
 def main(arguments: Sequence[str]) -> None:
     """Serve one parent until it is gone.
 
-    Parameters
-    ----------
-    arguments : sequence of str
-        The parent's process id, then the loads, which run before this process is ready: `module:function`,
-        `module:function:argument` with a text, or a `module` to import.
+    The arguments are the parent's process id, then the loads, which run before this process is ready:
+    `module:function`, `module:function:argument` with a text, or a `module` to import.
     """
     start_own_process()
     serve_parent(int(arguments[0]), arguments[1:])

@@ -184,6 +184,8 @@ def borrowed_child(
 ) -> contextlib.AbstractContextManager[SupervisedChild]:
     """A ready child of this process for a `with` block.
 
+    Raises RunCancelledError if `cancelled` turned true, RunError if no child can be started.
+
     Parameters
     ----------
     cancelled : callable
@@ -193,13 +195,6 @@ def borrowed_child(
     loads : sequence of str, optional
         Loads of a new child, as in `isolation.child_main`; all methods by default. An existing child loads what else it
         needs when it needs it.
-
-    Raises
-    ------
-    RunCancelledError
-        `cancelled` turned true.
-    RunError
-        No child can be started.
     """
     return _pool.borrowed(cancelled, fresh=fresh, loads=loads)
 
@@ -207,11 +202,8 @@ def borrowed_child(
 def preload(loads: Sequence[str]) -> None:
     """Start the server that children are forked from, and let it load what they need in the meantime.
 
-    Parameters
-    ----------
-    loads : sequence of str
-        Its loads, as in `isolation.child_main`. Without this call the server has the first child's loads. An existing
-        server loads nothing else; each child then loads what is missing.
+    Loads are as in `isolation.child_main`. Without this call the server has the first child's loads. An existing server
+    loads nothing else; each child then loads what is missing.
     """
     _pool.preload(loads)
 

@@ -51,10 +51,8 @@ _STANDARD = 3
 def main(arguments: Sequence[str]) -> None:
     """Load, then serve one owner until it is gone.
 
-    Parameters
-    ----------
-    arguments : sequence of str
-        The owner's process id, the descriptor of the socket to it, then the loads, as in `isolation.child_main`.
+    The arguments are the owner's process id, the descriptor of the socket to it, then the loads, as in
+    `isolation.child_main`.
     """
     start_own_process()
     child_main.end_with_parent(int(arguments[0]))
@@ -88,12 +86,7 @@ def load_all(loads: Sequence[str]) -> None:
 def serve_forked(owner: int, orders: socket.socket, stderr: int, loads: Sequence[str] = ()) -> NoReturn:
     """Become the server of the process that this one was just forked from, keeping only its memory.
 
-    Parameters
-    ----------
-    stderr : int
-        Descriptor for the standard error of this process.
-    loads : sequence of str
-        Additional loads, as in `isolation.child_main`.
+    `stderr` is the descriptor for the standard error of this process; the loads are additional ones.
     """
     try:
         start_own_process()

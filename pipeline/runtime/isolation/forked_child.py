@@ -136,13 +136,7 @@ class ForkedServer:
         return self._waited(os.WNOHANG)
 
     def wait(self, timeout: float | None = None) -> int | None:
-        """Wait for its end; returns its return code.
-
-        Raises
-        ------
-        TimeoutError
-            It still lives.
-        """
+        """Wait for its end and return its return code; raises TimeoutError if it still lives."""
         if timeout is not None and self._code is None:
             pidfd = os.pidfd_open(self._pid)
             try:
@@ -240,13 +234,7 @@ class ForkServer:
         return self.alive and self._environment == read_at_start(os.environ)
 
     def fork(self, loads: Sequence[str], stderr: int) -> ForkedChild:
-        """Order a process that runs `isolation.child_main`, forked after the server has loaded.
-
-        Raises
-        ------
-        OSError
-            The server is gone.
-        """
+        """Order a process that runs `isolation.child_main`, forked once the server has loaded; OSError if that died."""
         self._used = True
         order = Order(environment=environment_with_this_package(), folder=_folder(), loads=tuple(loads))
         theirs: list[int] = []

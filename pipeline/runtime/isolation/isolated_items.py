@@ -88,21 +88,15 @@ def supervise(
 ) -> Iterator[tuple[int, Result | Loss]]:
     """Call a function on items in a child process and survive the death of the child.
 
+    Yields each item's index and its outcome, a result or a `Loss`, once and in any order. `cancelled` is polled four
+    times a second; the child is killed once it is true. New children have the `loads`, as in `isolation.child_main`.
+
     Parameters
     ----------
     function : callable
         Takes one item; both are pickled.
-    cancelled : callable
-        Polled four times a second; the child is killed once it is true.
     second_chance : bool
         Whether an item that killed its process is tried once more, alone in a fresh one, before it is given up.
-    loads : sequence of str, optional
-        Loads of new children, as in `isolation.child_main`.
-
-    Yields
-    ------
-    int, Result or Loss
-        The item's index and its outcome; each item once, in any order.
 
     Raises
     ------

@@ -107,10 +107,7 @@ class Frames:
     def feed(self, received: bytes) -> Iterator[Any]:
         """Add bytes; yields the messages that are now complete.
 
-        Raises
-        ------
-        ValueError
-            The bytes are not messages: something else wrote into the pipe.
+        Raises ValueError if the bytes are not messages: something else wrote into the pipe.
         """
         self._held += received
         while len(self._held) >= _LENGTH.size:

@@ -42,16 +42,7 @@ def loads_of(job: Job, *, footprints: bool, method: str | None = None) -> list[s
 def start_early(job: Job, *, workers: int | None, scheduler: str | None, footprints: bool, method: str | None) -> None:
     """Start the server of a job that may be small, unless it runs elsewhere or a server exists.
 
-    Parameters
-    ----------
-    job : {'reconstruct', 'classify'}
-        Its stages are loaded.
-    workers, scheduler
-        As given by the user.
-    footprints : bool
-        Whether footprints are given: then no surfaces are searched.
-    method : str or None
-        Name of the method; None for the default one.
+    It loads the job's stages; if footprints are given no surfaces are searched. The method is None for the default one.
     """
     if workers is not None or scheduler is not None:
         return

@@ -74,10 +74,7 @@ class Bundle:
 def write_bundle(folder: str, bundle: Bundle) -> str:
     """Write `<folder>/<building_id>.bundle`, whole or not at all; replaces an earlier one and returns its path or URL.
 
-    Raises
-    ------
-    OSError, RunError
-        It cannot be written.
+    Raises OSError or RunError if it cannot be written.
     """
     candidate = bundle.candidate
     footprint = candidate.footprint

@@ -120,13 +120,7 @@ class SupervisedChild:
             return None
 
     def wait_until_ready(self, timeout_s: float, cancelled: Callable[[], bool]) -> str | None:
-        """Wait until the child has loaded what it needs.
-
-        Returns
-        -------
-        str or None
-            Why it will never be ready; None if it is ready.
-        """
+        """Wait until the child has loaded what it needs; returns why it will never be ready, None if it is ready."""
         if self._ready:
             return None
         deadline = time.monotonic() + timeout_s

@@ -115,14 +115,8 @@ class PlainLines(logging.Formatter):
 def configure(*, as_json: bool, name: str = _NAME, also: tuple[str, ...] = ()) -> None:
     """Send the lines of a logger to standard error with their facts, whatever the program does with other loggers.
 
-    Parameters
-    ----------
-    as_json : bool
-        One JSON object per line instead of plain lines.
-    name : str
-        The logger; all of gablework's by default.
-    also : tuple of str
-        Loggers of libraries to format in the same way; their levels stay.
+    Lines are plain or one JSON object each. By default the logger is that of all of gablework. The loggers of the
+    libraries in `also` are formatted in the same way; their levels stay.
     """
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(formatter(as_json=as_json))
@@ -142,15 +136,10 @@ class _QuietLibraries(logging.Filter):
 
 
 def log_everything_as_json() -> Callable[[], None]:
-    """Write all lines of this process as JSON to standard error.
+    """Write all lines of this process as JSON to standard error; returns what restores the logging of before.
 
     This includes lines of libraries, also of those loaded later, Python's warnings, and uncaught exceptions of any
     thread. It is for processes of gablework, never for one that imports it as a library.
-
-    Returns
-    -------
-    callable
-        Restores what was there before.
     """
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(formatter(as_json=True))
@@ -195,13 +184,7 @@ def _log_fault_of_thread(fault: threading.ExceptHookArgs) -> None:
 
 
 def wants_json() -> bool:
-    """Whether the environment asks for JSON lines.
-
-    Raises
-    ------
-    SettingsError
-        The variable is neither yes nor no.
-    """
+    """Whether the environment asks for JSON lines; raises SettingsError if the variable is neither yes nor no."""
     given = os.environ.get(VARIABLE, "").strip().lower()
     if given in {"1", "true", "yes", "on"}:
         return True

@@ -12,10 +12,7 @@ _CGROUP = Path("/sys/fs/cgroup")
 def cores(cgroup: Path = _CGROUP) -> int:
     """Cores that this process may use, at least one.
 
-    Parameters
-    ----------
-    cgroup : Path
-        Folder with the limits of the control group (version 2); a quota of two and a half cores counts as two.
+    The folder `cgroup` has the limits of the control group (version 2); a quota of two and a half cores counts as two.
     """
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quota, _, period = _text(cgroup / "cpu.max").partition(" ")

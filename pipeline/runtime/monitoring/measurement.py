@@ -110,11 +110,8 @@ def pack_task(function: Callable[[Task], Result], task: Task) -> bytes:
 def measure_packed(client_fingerprint: str, task: bytes, stage: str = "") -> Measured[Any]:
     """Run and measure a client's packed task, if this process has the client's versions.
 
-    Raises
-    ------
-    VersionMismatchError
-        It has others: a late worker must not mix other versions into a result. Raised before the task is unpickled,
-        which could then fail in strange ways.
+    If it has others VersionMismatchError is raised, since a late worker must not mix other versions into a result. This
+    happens before the task is unpickled, which could then fail in strange ways.
     """
     configure_once()
     if client_fingerprint != fingerprint():

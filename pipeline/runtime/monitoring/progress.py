@@ -31,14 +31,9 @@ class Progress:
         self._part, self._parts, self._label = 0, 1, ""
 
     def part(self, number: int, parts: int, label: str) -> Progress:
-        """The progress of one of several equal parts: a copy that knows what happened before.
+        """The progress of one of several equal parts, from 0: a copy that knows what happened before.
 
-        Parameters
-        ----------
-        number, parts : int
-            Which part, from 0, and how many there are. The events of a stage count all parts one after the other.
-        label : str
-            What messages call the part.
+        The events of a stage count all parts one after the other. Messages call the part by its label.
         """
         own = Progress(self.listener, self.watch)
         own.timings, own.peaks, own.warnings = dict(self.timings), dict(self.peaks), list(self.warnings)

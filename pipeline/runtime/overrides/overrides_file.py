@@ -109,13 +109,8 @@ class OwnModelling:
 def own_modelling(override: Override, base: RunSettings) -> OwnModelling:
     """The method and the settings of a building that an override models in its own way.
 
-    What the override does not name is as in the run: the method's own settings too, where neither method nor preset
-    is another.
-
-    Raises
-    ------
-    SettingsError
-        A name or a value is none; all faults at once.
+    What the override does not name is as in the run: the method's own settings too, where neither method nor preset is
+    another. Raises SettingsError with all faults at once for names and values that do not exist.
     """
     sections = base.as_dict()
     method = method_named(override.method or base.general.method).name
@@ -140,19 +135,10 @@ def own_modelling(override: Override, base: RunSettings) -> OwnModelling:
 
 
 def read_overrides(path: str | Path, reference: SpatialReference, base: RunSettings) -> tuple[Override, ...]:
-    """The entries of an overrides file, in its order.
+    """The entries of an overrides file (TOML), in its order; vector files that it names are sought beside it.
 
-    Parameters
-    ----------
-    path : str or Path
-        A TOML file; vector files that it names are sought beside it.
-    reference : SpatialReference
-        The run's CRS: `point` and WKT are in its coordinates.
-
-    Raises
-    ------
-    SettingsError
-        The file cannot be read or parsed, or holds faults: all of them at once.
+    `point` and WKT are in the coordinates of the run's CRS. Raises SettingsError if the file cannot be read or parsed,
+    or holds faults: all of them at once.
     """
     try:
         document = tomllib.loads(Path(path).read_text(encoding="utf-8"))

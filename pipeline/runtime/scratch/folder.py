@@ -88,13 +88,7 @@ class Scratch:
             (folder / self.attempt).touch()
 
     def path(self, *parts: str) -> Path:
-        """A path inside; its folder exists afterwards.
-
-        Raises
-        ------
-        RunCancelledError
-            The scratch itself is gone, and the run with it.
-        """
+        """A path inside; its folder exists afterwards. Raises RunCancelledError if scratch, and the run, is gone."""
         path = Path(self.root, *parts)
         try:
             for folder in reversed(path.relative_to(self.root).parents[:-1]):
@@ -130,13 +124,7 @@ class Scratch:
         return flat.reshape(shape, order=order)
 
     def rows(self, name: str, key: str, start: int, stop: int) -> npt.NDArray[Any]:
-        """Some rows of a stored array, whose others are not read.
-
-        Raises
-        ------
-        ValueError
-            The file ends before them.
-        """
+        """Some rows of a stored array, whose others are not read; raises ValueError if the file ends before them."""
         with open(f"{self.root}/{name}/{key}.npy", "rb", buffering=0) as stream:  # noqa: PTH123 - a Path takes longer
             dtype, shape, _, offset = _layout(stream.read(_LONGEST_HEADER_BYTES))
             width = math.prod(shape[1:])
@@ -150,10 +138,7 @@ class Scratch:
     def put_bytes(self, name: str, content: bytes) -> None:
         """Store bytes under a name, whole or not at all.
 
-        Raises
-        ------
-        RunCancelledError
-            The run was cancelled, or another took its place.
+        Raises RunCancelledError if the run was cancelled, or another took its place.
         """
         target = self.path(name)
         temporary = target.with_name(f".{target.name}.{uuid4().hex}")

@@ -64,12 +64,8 @@ def _made(parent: Path) -> tuple[Path, int]:
 def locked_results(run_dir: str) -> Iterator[None]:
     """Lock a run directory while it is written, so that no other run on this file system writes it too.
 
-    The lock needs no file in it. Object stores, and file systems that cannot lock folders, are not locked.
-
-    Raises
-    ------
-    RunError
-        Another run has locked the directory.
+    The lock needs no file in it. Object stores, and file systems that cannot lock folders, are not locked. Raises
+    RunError if another run has locked the directory.
     """
     if is_url(run_dir):
         yield

@@ -19,21 +19,10 @@ SCRATCH = "scratch"
 
 
 def check_scratch(run_dir: str, scratch: str | None, scheduler: str | None) -> None:
-    """Refuse a run whose workers would have no common scratch.
+    """Refuse a run whose workers would have no common scratch: the folder that the user names, if any.
 
-    Parameters
-    ----------
-    run_dir : str
-        The run directory, a path or URL.
-    scratch : str or None
-        The folder that the user names.
-    scheduler : str or None
-        The address of workers elsewhere; None for workers of this machine.
-
-    Raises
-    ------
-    RunError
-        The run directory is a URL, the workers are elsewhere, and no folder is named; or the folder is a URL itself.
+    Raises RunError if the run directory is a URL, the workers are elsewhere (a scheduler's address is given), and no
+    folder is named; or if the folder is a URL itself.
     """
     if scratch is not None and is_url(scratch):
         raise RunError(f"the scratch {shown(scratch)} is a URL: give a folder, such as --scratch /data/scratch")
@@ -46,13 +35,7 @@ def check_scratch(run_dir: str, scratch: str | None, scheduler: str | None) -> N
 
 @contextlib.contextmanager
 def run_scratch(run_dir: str, scratch: str | None) -> Iterator[Scratch]:
-    """Scratch for the duration of a run.
-
-    Raises
-    ------
-    RunError
-        Scratch of an earlier run cannot be removed.
-    """
+    """Scratch for the duration of a run; raises RunError if scratch of an earlier run cannot be removed."""
     folder = _scratch_folder(run_dir, scratch)
     found = Scratch(str(folder / uuid4().hex))
     found.create()
@@ -81,10 +64,7 @@ def _scratch_folder(run_dir: str, scratch: str | None) -> Path:
 def remove_folder(folder: Path) -> None:
     """Rename a folder of scratch, then remove it: no late task of an earlier run can find it and fill it again.
 
-    Raises
-    ------
-    RunError
-        It cannot be renamed.
+    Raises RunError if it cannot be renamed.
     """
     if folder.exists():
         doomed = folder.with_name(f".{folder.name}.{uuid4().hex}")

@@ -48,12 +48,7 @@ def key_of(*parts: object) -> str:
     """Digest of all that an outcome depends on, and of the versions of this process.
 
     Dataclasses, enums, mappings, sequences, numbers, texts, times, geometries and arrays are hashed by type and value,
-    alike in every process.
-
-    Raises
-    ------
-    TypeError
-        A part is of an unknown kind, which must not be left out in silence.
+    alike in every process. Raises TypeError for a part of an unknown kind, which must not be left out in silence.
 
     >>> key_of(1, "a") == key_of(1, "a"), key_of(1) == key_of(1.0), key_of(("a", "b")) == key_of("ab")
     (True, False, False)
@@ -175,10 +170,7 @@ class StoredOutcome(Generic[Brief]):
 def run_and_store(work: OutcomeTask[Task, Result, Brief]) -> StoredOutcome[Brief]:
     """Run a task and store its outcome.
 
-    Raises
-    ------
-    RunError
-        Scratch or results cannot be read or written; earlier outcomes stay.
+    Raises RunError if scratch or results cannot be read or written; earlier outcomes stay.
     """
     try:
         result = work.function(work.task)
@@ -211,10 +203,7 @@ def brief_of(scratch: Scratch, place: Place) -> Any:
 def result_of(scratch: Scratch, place: Place) -> Any:
     """The result of a stored outcome. Only for our own scratch: pickles run code.
 
-    Raises
-    ------
-    RunCancelledError
-        The outcome is gone, and the run with it.
+    Raises RunCancelledError if the outcome is gone, and the run with it.
     """
     try:
         content = Path(scratch.root, place.name).read_bytes()

@@ -45,15 +45,8 @@ _OF_A_RUN = ("dask", "fetched")
 def locked_work(folder: str) -> Iterator[Scratch]:
     """Lock a work folder until the block ends; made where it does not exist, on a file system that all workers share.
 
-    Yields
-    ------
-    Scratch
-        Stores the outcomes of tasks; taken over from all earlier attempts.
-
-    Raises
-    ------
-    RunError
-        Another process works there, or the folder is not a work folder, or cannot be written.
+    Its scratch stores the outcomes of tasks; they are taken over from all earlier attempts. Raises RunError if another
+    process works there, or the folder is not a work folder, or cannot be written.
     """
     root = Path(folder).resolve()
     make_work(root)
@@ -164,10 +157,7 @@ def is_at_work(folder: str) -> bool:
 def refuse_foreign(folder: str) -> None:
     """Refuse early a folder that cannot be a work folder; makes nothing.
 
-    Raises
-    ------
-    RunError
-        It is a file, has files of others, or was made by another version.
+    Raises RunError if it is a file, has files of others, or was made by another version.
     """
     root = Path(folder)
     try:

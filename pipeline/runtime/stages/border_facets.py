@@ -44,12 +44,7 @@ def facet_names(keys: IntArray) -> npt.NDArray[np.uint64]:
 def united_by_name(count: int, names: npt.NDArray[np.uint64], holders: IntArray) -> IntArray:
     """Smallest member (count,) int64 of the set of each element, where elements that share a name are in one set.
 
-    Parameters
-    ----------
-    names : (j, 2) uint64
-        Names.
-    holders : (j,) int
-        The element with each name.
+    `names` (j, 2) uint64 belong to the elements `holders` (j,).
     """
     order = np.lexsort((names[:, 1], names[:, 0]))
     same = np.flatnonzero((names[order[1:]] == names[order[:-1]]).all(axis=1))
@@ -66,14 +61,12 @@ def shared_facets(
 ) -> tuple[BoolArray, BoolArray]:
     """Which facets another tile may see, and which of them suffice to connect the same fragments.
 
+    Facets have names (j, 2) uint64, and only facets of one `FacetKind` are connected.
+
     Parameters
     ----------
     keys : (j, 6) int64
         Keys from `facet_keys` of all facets of some kinds that the tile sees and another may see.
-    names : (j, 2) uint64
-        Their names.
-    kinds : (j,) int8
-        Their FacetKind: only facets of one kind are connected.
 
     Returns
     -------

@@ -44,12 +44,7 @@ def clear_tiles(scratch: Scratch, folder: str, wanted: Iterable[Place]) -> None:
 def tidy(scratch: Scratch, joined: Joined, models: Collection[str], run_dirs: Sequence[str]) -> None:
     """Remove what a finished run no longer needs: models by other settings, and points of units that are gone.
 
-    Parameters
-    ----------
-    models : collection of str
-        Stages under which its models are stored.
-    run_dirs : sequence of str
-        Where it published.
+    `models` are the stages under which its models are stored, `run_dirs` where it published.
     """
     published = {publishing(run_dir) for run_dir in run_dirs}
     for stage in Path(scratch.root, FOLDER).glob("*"):

@@ -39,14 +39,9 @@ class Finished:
 
 
 def finished(surfaces: Surfaces, ranges: IntArray, settings: CandidateSettings) -> Finished:
-    """Judge whole surfaces, and unite levels to candidates.
+    """Judge whole surfaces, and unite levels to candidates; no step connects the surfaces with any other.
 
-    Parameters
-    ----------
-    surfaces : Surfaces
-        One or more complete sets; no step connects them with any other surface.
-    ranges : (p, 4) int64
-        Surface, tile, start, stop of runs of their points.
+    `ranges` (p, 4) int64 are surface, tile, start, stop of runs of their points.
     """
     leader = unite_levels(surfaces, judge_surfaces(surfaces, settings), settings)
     points = surfaces.lowest_point_mm

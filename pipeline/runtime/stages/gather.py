@@ -143,12 +143,8 @@ def gather(
 ) -> tuple[Candidate, CandidateFacts]:
     """One candidate with the terrain around it.
 
-    Parameters
-    ----------
-    gps_kind : GpsTimeKind
-        Whether GPS times can be converted to dates.
-    beside : bool
-        Whether to add the points around and beneath it; a candidate with a known outline has none.
+    `gps_kind` says whether GPS times can be converted to dates, `beside` whether to add the points around and beneath
+    it; a candidate with a known outline has none.
     """
     points = points_of(scratch, site)
     footprint = site.footprint

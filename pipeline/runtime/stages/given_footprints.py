@@ -39,17 +39,9 @@ class GivenFootprints:
 
 
 def given_footprints(path: str, plan: Plan) -> GivenFootprints:
-    """Read the footprints of a run.
+    """Read the footprints of a run, within the bounds of its inputs, cut by --bbox and --aoi.
 
-    Parameters
-    ----------
-    plan : Plan
-        Bounds the data: those of the inputs, cut by --bbox and --aoi.
-
-    Raises
-    ------
-    InputError
-        The file cannot be used.
+    Raises InputError if the file cannot be used.
     """
     area = shapely.union_all([shapely.box(*i.bounds_m[:2], *i.bounds_m[3:5]) for i in plan.sources])
     unit = plan.reference.horizontal_unit_m

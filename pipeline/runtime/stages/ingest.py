@@ -58,12 +58,7 @@ class IngestTask:
 def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
     """Bucket the points of all inputs by tile; what each input held, in the order of the paths.
 
-    Raises
-    ------
-    EmptyInputError
-        No usable point is left.
-    InconsistentInputError
-        All points lie on one line.
+    Raises EmptyInputError if no usable point is left, InconsistentInputError if all points lie on one line.
     """
     plan, progress = context.plan, context.progress
     known = {info.path: info for info in plan.sources}
@@ -120,10 +115,7 @@ def part_of(path: str) -> str:
 def to_records(cloud: PointCloud, path: str) -> npt.NDArray[np.void]:
     """Points in whole millimetres.
 
-    Raises
-    ------
-    InconsistentInputError
-        An elevation is beyond what whole millimetres of 32 bits hold (2,147 km).
+    Raises InconsistentInputError if an elevation is beyond what whole millimetres of 32 bits hold (2,147 km).
     """
     if np.abs(cloud.xyz[:, 2]).max(initial=0.0) * MM > _MAX_MM:
         worst = float(cloud.xyz[np.abs(cloud.xyz[:, 2]).argmax(), 2])
@@ -144,15 +136,7 @@ def to_records(cloud: PointCloud, path: str) -> npt.NDArray[np.void]:
 def ingest_file(task: IngestTask) -> Ingested:
     """Read one file and bucket its points by tile; a file behind a URL is fetched into scratch meanwhile.
 
-    Returns
-    -------
-    Ingested
-        Counts and facts; the points are in scratch under `points/<tile>/<part>.bin`.
-
-    Raises
-    ------
-    InputError
-        The file cannot be used.
+    The points are in scratch under `points/<tile>/<part>.bin`. Raises InputError if the file cannot be used.
     """
     task.scratch.check_cancelled()
     if not is_url(task.path):

@@ -237,12 +237,10 @@ def join_footprints(
     crs_name: str,
     attributes: Sequence[str | None] | None = None,
 ) -> Joined:
-    """The candidates where footprints were given: one per footprint, also where it holds no point.
+    """The candidates where footprints were given: one per footprint, also where it holds no point; splits in any order.
 
     Parameters
     ----------
-    splits : iterable of Split
-        All tiles, in any order.
     numbers : mapping
         By tile, the numbers of its footprints; its split numbers them from 0.
     footprints, source_ids : sequences

@@ -72,10 +72,7 @@ def neighbourhood(tile: Tile, grid: TileGrid, settings: SceneSettings) -> Window
 def label(task: LabelTask) -> Labelled:
     """Classify the points of a tile.
 
-    Returns
-    -------
-    Labelled
-        Counts; the classes are in scratch under `classes/<tile>/<input>.bin`, one byte per point of the bucket.
+    The classes are in scratch under `classes/<tile>/<input>.bin`, one byte per point of the bucket.
     """
     task.scratch.check_cancelled()
     window = neighbourhood(task.tile, task.grid, task.settings)

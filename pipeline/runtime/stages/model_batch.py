@@ -128,15 +128,7 @@ class Packed:
 
 
 def model_batch(task: BatchTask) -> Batch:
-    """Model a batch.
-
-    Raises
-    ------
-    OSError
-        Scratch cannot be read or written.
-    RunError
-        Child processes cannot be started.
-    """
+    """Model a batch; raises OSError if scratch cannot be read or written, RunError if children cannot be started."""
     models = _here(task) if task.isolation is None else _in_child(task, task.isolation)
     try:
         packed = dict(models)

@@ -75,12 +75,8 @@ def open_fragments(
 ) -> TileSurfaces:
     """Finish what a tile can, and pass on the part of its other fragments that a join needs.
 
-    Parameters
-    ----------
-    keys : (n,) int64
-        Fragments with points, ascending.
-    starts : (n + 1,) int64
-        Where the points of each start in the tile's sorted points.
+    `keys` (n,) int64 are the fragments with points, ascending, and `starts` (n + 1,) where the points of each begin in
+    the tile's sorted points.
     """
     kind, count = fragments.kind, len(fragments.kind)
     opened, holders, names = _shared_facets(fragments, tile, grid, cut)

@@ -107,11 +107,7 @@ def draw_outlines(task: OutlineTask) -> DrawnOutlines:
     """Draw the outlines of the units of some blocks.
 
     A block that cannot be drawn does not end the run: its units lose their common walls and are drawn one by one.
-
-    Raises
-    ------
-    MemoryError, OSError
-        Scratch cannot be read, or does not fit into memory.
+    Raises MemoryError or OSError if scratch cannot be read, or does not fit into memory.
     """
     drawn: dict[str, MultiPolygon] = {}
     warnings = []

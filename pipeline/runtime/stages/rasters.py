@@ -88,12 +88,9 @@ def with_neighbours(tiles: set[Tile]) -> list[Tile]:
 
 
 def draw_tile(task: RasterTask) -> Tile:
-    """Draw terrain, surface and height in the cells whose centres a tile owns, in units of the CRS.
+    """Draw terrain, surface and height in the cells whose centres a tile owns, in units of the CRS; returns the tile.
 
-    Returns
-    -------
-    Tile
-        The tile; its cells are in scratch under `rasters/<tile>/<block>/`.
+    The cells are in scratch under `rasters/<tile>/<block>/`.
     """
     task.scratch.check_cancelled()
     core, lattice = task.grid.core(task.tile), task.lattice

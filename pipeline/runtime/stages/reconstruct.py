@@ -52,13 +52,7 @@ def models_stage(settings: RunSettings) -> str:
 
 
 def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, compared: bool = False) -> Models:
-    """Model all candidates, the batches of most points first.
-
-    Parameters
-    ----------
-    compared : bool
-        Whether seconds are compared with those of other methods.
-    """
+    """Model all candidates, the batches of most points first; seconds may be compared with those of other methods."""
     scratch, plan = context.scratch, context.plan
     stage, method = models_stage(settings), settings.general.method
     tasks: dict[Place, BatchTask] = {}

@@ -25,13 +25,7 @@ _HOUSES = ((4, 10), (14, 20))
 
 
 def rehearse_scene(outlines: str = "") -> None:
-    """Split, join and divide a tile with houses, its classes known.
-
-    Parameters
-    ----------
-    outlines : str
-        `given` where footprints are given; then the tile is only split.
-    """
+    """Split, join and divide a tile with houses, its classes known; with the outlines `given` it is only split."""
     footprints = tuple(shapely.box(low, low, high, high) for low, high in _HOUSES) if outlines else None
     steps = np.arange(500, _SIDE_M * MM, 1000)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))

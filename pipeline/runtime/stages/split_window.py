@@ -99,10 +99,7 @@ class Split:
 def split_window(task: SplitTask, settings: SceneSettings) -> Split:
     """Split one tile and store its points, sorted by fragment, and its terrain.
 
-    Returns
-    -------
-    Split
-        Descriptors; the arrays are in scratch under `<folder>/<tile>/`.
+    The arrays are in scratch under `<folder>/<tile>/`.
     """
     task.scratch.check_cancelled()
     loaded = load_window(task.scratch, task.grid, task.tile)

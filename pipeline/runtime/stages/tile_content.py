@@ -47,16 +47,8 @@ def zone_sums(
 ) -> ZoneSums:
     """Number and two 64-bit hash sums of the points of one tile, by zone: (3, 3, 3) uint64.
 
-    Parameters
-    ----------
-    records : (n,) POINT
-        Points of the tile.
-    gps_bits : (n,) uint64
-        The bits of their GPS times.
-    x0, y0, x1, y1 : int
-        The tile's core in mm, half-open.
-    halo : int
-        Width of the outer zones in mm.
+    `gps_bits` (n,) are the bits of the points' GPS times. The tile's core, half-open, and the width `halo` of the outer
+    zones are in mm.
     """
     sums = np.zeros((3, 3, 3), np.uint64)
     for i in range(records.size):
@@ -93,12 +85,8 @@ def are_apart(grid: TileGrid) -> bool:
 def content_of_window(sums: Mapping[Tile, ZoneSums], grid: TileGrid, window: Window, tile: Tile) -> list[object]:
     """The content of a tile's window, for its key: the tile's own sums, and those of each neighbour that face it.
 
-    Parameters
-    ----------
-    sums : mapping
-        Sums of all tiles with points, over all inputs; made with the halo of `grid`.
-    window : Window
-        The tile's core and a halo at most as wide as that of the lattice.
+    Sums are those of all tiles with points, over all inputs, made with the halo of `grid`. The window is the tile's
+    core and a halo at most as wide as that of the lattice.
     """
     found: list[object] = []
     apart = are_apart(grid)

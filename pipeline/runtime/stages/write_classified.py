@@ -159,13 +159,7 @@ class _Labels:
 
 
 def write_classified(task: ClassifiedTask) -> ClassifiedFile:
-    """Write one file.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read any more.
-    """
+    """Write one file; raises InputError if its input cannot be read any more."""
     task.scratch.check_cancelled()
     source = open_source(task.path, task.options)
     counts: Counter[int] = Counter()
