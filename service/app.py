@@ -37,7 +37,7 @@ ROUTERS: tuple[APIRouter, ...] = (
 
 
 def create_app(settings: ServiceSettings, store: JobStore | None = None) -> FastAPI:
-    """The application. By default its store is the one that the settings name, migrated at start.
+    """Build the application. By default it opens the store named in the settings and migrates it at start.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
 
 
 def start(settings: ServiceSettings, store: JobStore) -> None:
-    """Make the state folder and the tables, and refuse to listen to others without keys.
+    """Make the state folder and the tables; refuse an address that others can reach if there are no keys.
 
     Raises
     ------

@@ -18,9 +18,9 @@ from service.keys import Key, Scope, digest_of, looks_like_key
 from service.settings import ServiceSettings
 
 TRUST_S = 2.0
-"""Seconds for which an answer of the key table is reused: a revoked key works for at most this time."""
+"""Seconds for which an answer of the key table is reused; a revoked key works at most this long."""
 REMEMBERED = 4096
-"""Most keys remembered at once."""
+"""Maximum number of keys in memory."""
 FIX = "Send the header `Authorization: Bearer gw_…` with a key from `gablework keys create --name NAME`"
 
 
@@ -31,7 +31,7 @@ class KeyTable(Protocol):
         """All keys that were ever made, revoked ones included."""
 
     def key_by_digest(self, digest: str) -> Key | None:
-        """The key, also a revoked one."""
+        """The key, even if it is revoked."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from service.settings import ServiceSettings
     from service.store import JobStore
 
-keys = typer.Typer(
-    help="Keys with which clients are known to the service.", no_args_is_help=True, rich_markup_mode=None
-)
+keys = typer.Typer(help="Manage the keys that identify clients.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(keys, name="keys")
 
 State = Annotated[
@@ -43,7 +41,7 @@ ServiceWorkers = Annotated[
     ),
 ]
 Scheduler = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")
+    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use instead of the embedded cluster.")
 ]
 
 _STANDARD_INPUT = 0
@@ -52,7 +50,7 @@ _STANDARD_INPUT = 0
 
 @contextlib.contextmanager
 def _service_errors() -> Iterator[None]:
-    """The service's errors as those that the console knows.
+    """Turn the service's errors into those that the console shows.
 
     Raises
     ------
@@ -72,7 +70,7 @@ def _service_errors() -> Iterator[None]:
 
 
 def _settings(**options: Any) -> ServiceSettings:
-    """Settings of the environment, under the options of the command line.
+    """Settings from the environment, overridden by the options of the command line.
 
     Raises
     ------
@@ -95,10 +93,10 @@ def _settings(**options: Any) -> ServiceSettings:
 def _log_to_stderr() -> None:
     import logging
 
-    # nothing is set up here where lines are JSON: the console did
+    # no effect if lines are JSON: the console has set up the root logger
     logging.basicConfig(format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     logging.getLogger().setLevel(logging.INFO)
-    # each names an odd request; a client that sends many must not fill the log
+    # each line names a malformed request; a client that sends many must not fill the log
     for chatty in ("alembic", "python_multipart"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
 
@@ -106,7 +104,7 @@ def _log_to_stderr() -> None:
 @app.command()
 def serve(
     host: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Address to listen on; anything but loopback needs keys.")
+        str | None, typer.Option(metavar="ADDRESS", help="Address to listen on; all except loopback need keys.")
     ] = None,
     port: Annotated[
         int | None, typer.Option(metavar="N", min=0, max=65535, help="Port to listen on; 0 takes a free one.")
@@ -119,10 +117,10 @@ def serve(
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
     driver: Annotated[
-        bool, typer.Option("--driver/--no-driver", help="Keep a driver beside it, or leave jobs to drivers elsewhere.")
+        bool, typer.Option("--driver/--no-driver", help="Run a driver here, or leave jobs to drivers elsewhere.")
     ] = True,
     public_url: Annotated[
-        str | None, typer.Option(metavar="URL", help="How clients reach the service, where a proxy stands before it.")
+        str | None, typer.Option(metavar="URL", help="URL by which clients reach the service behind a proxy.")
     ] = None,
     input_root: Annotated[
         list[str] | None, typer.Option(metavar="DIR", help="Jobs may name inputs below this folder; repeatable.")
@@ -132,7 +130,7 @@ def serve(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Answer REST requests and the web page, with a job driver and a cluster beside it."""
+    """Serve the REST API and the web page, with a job driver and a cluster."""
     with Console(as_json=as_json) as console, _service_errors():
         from service.supervisor import serve as serve_until_stopped
 
@@ -176,7 +174,7 @@ def drive(
         str | None, typer.Option(metavar="NAME", help="Name in logs and leases; default host and process.")
     ] = None,
     with_parent: Annotated[
-        bool, typer.Option("--with-parent", help="End when standard input closes, as `gablework serve` asks for.")
+        bool, typer.Option("--with-parent", help="End when standard input closes; set by `gablework serve`.")
     ] = False,
 ) -> None:
     """Run the jobs of a service: the driver alone, for an API that runs elsewhere."""
@@ -215,7 +213,7 @@ def _opened(state: str | None, database_url: str | None) -> Iterator[JobStore]:
 
 @keys.command(name="create")
 def create_key(
-    name: Annotated[str, typer.Option(metavar="TEXT", help="Your own words for it.")],
+    name: Annotated[str, typer.Option(metavar="TEXT", help="Your own name for the key.")],
     scope: Annotated[
         str, typer.Option(metavar="SCOPE", help="read, submit or admin; each includes those before it.")
     ] = "submit",
@@ -223,7 +221,7 @@ def create_key(
     database_url: DatabaseUrl = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a key and show it, once: only its hash is stored."""
+    """Make a key and show it once; only its hash is stored."""
     with Console(as_json=as_json) as console, _service_errors():
         from service.keys import Scope, new_key
 
@@ -238,7 +236,7 @@ def create_key(
 
 @keys.command(name="list")
 def list_keys(state: State = None, database_url: DatabaseUrl = None, as_json: AsJson = False) -> None:
-    """List the keys; not the keys themselves, which are not stored."""
+    """List ids, names and scopes of the keys; the keys themselves are not stored."""
     with Console(as_json=as_json) as console, _service_errors():
         with _opened(state, database_url) as store:
             found = store.keys()
@@ -264,32 +262,30 @@ def list_keys(state: State = None, database_url: DatabaseUrl = None, as_json: As
 
 @keys.command(name="revoke")
 def revoke_key(
-    key_id: Annotated[str, typer.Argument(metavar="ID", help="As `gablework keys list` shows it.")],
+    key_id: Annotated[str, typer.Argument(metavar="ID", help="Id of the key, as in `gablework keys list`.")],
     state: State = None,
     database_url: DatabaseUrl = None,
     as_json: AsJson = False,
 ) -> None:
-    """Revoke a key: it is refused from now on, its jobs stay."""
+    """Revoke a key. It is refused from now on; its jobs stay."""
     with Console(as_json=as_json) as console, _service_errors(), _opened(state, database_url) as store:
         made = store.keys()
         if key_id not in {key.key_id for key in made}:
-            raise SettingsError(
-                [f"there is no key {key_id!r}: `gablework keys list` shows the {len(made)} that there are"]
-            )
+            raise SettingsError([f"there is no key {key_id!r}: `gablework keys list` shows all {len(made)}"])
         store.revoke_key(key_id)
         console.say(f"revoked {key_id}")
         console.document({"revoked": key_id})
 
 
 def only_called(every: typer.Typer, words: Sequence[str]) -> typer.Typer:
-    """The command line with no other command than the one that is called, so that the options of one are built.
+    """The command line reduced to the called command, since building the options of all commands takes time.
 
     Parameters
     ----------
     every : typer.Typer
         The whole command line.
     words : sequence of str
-        What was typed after `gablework`; all commands stay where the first word is none of them.
+        The arguments after `gablework`; if the first one is not a command, all commands stay.
     """
     called = next(iter(words), None)
     commands = [one for one in every.registered_commands if _name_of(one) == called]

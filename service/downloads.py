@@ -82,7 +82,7 @@ def name_of(url: httpx.URL) -> str:
     Raises
     ------
     RequestError
-        It does not end in the name of a file that is read.
+        It does not end in the name of a supported file.
     """
     return clean_filename(unquote(url.path.rsplit("/", 1)[-1]))
 
@@ -95,13 +95,13 @@ def download(text: str, *, settings: ServiceSettings, target: Path, cancelled: C
     Raises
     ------
     InputRefusedError
-        The URL, or what it redirects to, is not on a listed host.
+        The URL or one of its redirects is not on a listed host.
     TooLargeError
         More bytes than allowed.
     NoSpaceError
         The disk is full.
     UnreadableInputError
-        The server does not give it.
+        The server does not deliver it.
     RunCancelledError
         The job was cancelled.
     """
@@ -109,7 +109,7 @@ def download(text: str, *, settings: ServiceSettings, target: Path, cancelled: C
     place = target / hashlib.sha256(text.encode()).hexdigest()[:16]
     place.mkdir(parents=True, exist_ok=True)
     path = place / name_of(url)
-    # No proxies, cookies or .netrc of the environment: they could lead elsewhere than the checked URL.
+    # No proxies, cookies or .netrc from the environment: they could divert the checked URL.
     timeout = httpx.Timeout(READ_S, connect=CONNECT_S)
     with httpx.Client(timeout=timeout, trust_env=False, verify=httpx.create_ssl_context()) as client:
         attempt = 1
@@ -188,7 +188,7 @@ def _stream_to(
             size += len(piece)
             _check_size(url, size, limit)
             if time.monotonic() > until_s:
-                raise UnreadableInputError(shown(url), f"not there within {FETCH_S:g} s", "Upload the file")
+                raise UnreadableInputError(shown(url), f"not fetched within {FETCH_S:g} s", "Upload the file")
             digest.update(piece)
             stream.write(piece)
         stream.flush()

@@ -33,7 +33,7 @@ class Draft:
     footprints: InputReference | Inline | None
     """Outlines."""
     priority: int
-    """Higher goes first."""
+    """Higher runs first."""
     values: Mapping[str, Any]
     """The other fields of the `JobRequest`."""
 

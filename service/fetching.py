@@ -22,7 +22,7 @@ class UploadTable(Protocol):
     """The part of the store that is used here."""
 
     def upload(self, upload_id: str, *, owner: str | None = None) -> Upload:
-        """One upload, with an owner only its own."""
+        """One upload; with `owner` only if it belongs to that key."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,9 +30,9 @@ class Fetched:
     """An input on this machine's disk."""
 
     reference: InputReference
-    """As it was named."""
+    """The reference in the request."""
     path: Path
-    """Its place on disk."""
+    """Its path on disk."""
     points: int
     """Points of a point cloud, by its header; 0 for footprints."""
     sha256: str | None
@@ -91,7 +91,7 @@ def _check_upload(
     folder: StateFolder,
     owner: str | None,
 ) -> int:
-    """The points of an upload that fits."""
+    """The number of points of an upload; refuses one that does not fit."""
     upload = store.upload(source.value, owner=owner)
     _upload_path(upload, folder)
     _check_suffix(source, upload.filename, suffixes)
@@ -114,7 +114,7 @@ def _upload_path(upload: Upload, folder: StateFolder) -> Path:
 
 
 def _check_suffix(source: InputReference, name: str, suffixes: tuple[str, ...]) -> None:
-    """Refuse points as footprints and the other way round, by the ending that decides how a file is read."""
+    """Refuse points as footprints and vice versa, by the ending that decides how a file is read."""
     if not name.lower().endswith(suffixes):
         what = "point cloud" if suffixes is POINT_SUFFIXES else "file of footprints"
         raise RequestError([f"{source.kind} {name[:80]!r} is not a {what}: its name must end in {', '.join(suffixes)}"])

@@ -1,4 +1,4 @@
-"""Makes the file names of clients safe, and lists the endings that are read."""
+"""Makes the file names of clients safe, and lists the supported endings."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ FOOTPRINT_SUFFIXES = (".gpkg", *GEOJSON_SUFFIXES, *PARQUET_SUFFIXES)
 SUFFIXES = (*POINT_SUFFIXES, *FOOTPRINT_SUFFIXES)
 """Endings of the files that are accepted."""
 NAME_LIMIT = 120
-"""Bytes of a file's name; a longer one loses the end of its stem, not its ending."""
+"""Maximum bytes of a file's name; a longer stem is cut at its end."""
 DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
 """Names that Windows reserves, with any ending."""
 FORBIDDEN = re.compile(r'[<>:"|?*]')
-"""Characters that Windows allows in no name."""
+"""Characters that Windows forbids in names."""
 
 
 def clean_filename(name: str) -> str:
@@ -30,7 +30,7 @@ def clean_filename(name: str) -> str:
     Raises
     ------
     RequestError
-        Nothing is left, or the ending does not belong to a format that is read.
+        Nothing is left, or the ending is not that of a supported format.
 
     >>> clean_filename("../../etc/passwd.laz")
     'passwd.laz'

@@ -1,4 +1,4 @@
-"""The state folder: where uploads, attempts and results lie. Paths only come from ids that we made."""
+"""The state folder with uploads, attempts and results. Its paths are built only from ids that the service made."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ def is_id(text: str) -> bool:
 
 
 def _checked(identifier: str) -> str:
-    """An id that we made; anything else is a fault of the caller, never a path.
+    """The identifier, if it can be one of ours; anything else never becomes a path.
 
     Raises
     ------
     ValueError
-        It is no id.
+        It is not an id.
     """
     if not is_id(identifier):
-        raise ValueError(f"{identifier!r} is no id of this service")
+        raise ValueError(f"{identifier!r} is not an id of this service")
     return identifier
 
 
@@ -40,12 +40,12 @@ class StateFolder:
 
     @property
     def uploads(self) -> Path:
-        """One folder an upload."""
+        """One folder per upload."""
         return self.root / "uploads"
 
     @property
     def jobs(self) -> Path:
-        """One folder a job."""
+        """One folder per job."""
         return self.root / "jobs"
 
     def upload(self, upload_id: str) -> Path:
@@ -61,7 +61,7 @@ class StateFolder:
         return self.job(job_id) / f"attempt-{attempt}"
 
     def inputs(self, job_id: str, attempt: int) -> Path:
-        """What the attempt fetched."""
+        """The files that the attempt fetched."""
         return self.attempt(job_id, attempt) / "inputs"
 
     def run(self, job_id: str, attempt: int) -> Path:
@@ -69,7 +69,7 @@ class StateFolder:
         return self.attempt(job_id, attempt) / "run"
 
     def comparison(self, job_id: str, attempt: int) -> Path:
-        """The folder of a comparison: a run directory a method, and what was made of them."""
+        """The folder of a comparison: one run directory per method, and the files made from them."""
         return self.attempt(job_id, attempt) / "comparison"
 
     def outputs(self, job_id: str, attempt: int) -> Path:

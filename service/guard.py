@@ -35,7 +35,7 @@ PAGE_POLICY = (
 """Content security policy of the web page."""
 
 DATA_POLICY = "default-src 'none'; frame-ancestors 'none'"
-"""Content security policy of all else, unless its route names another: a browser runs nothing from a file."""
+"""Content security policy of all other answers, unless a route sets its own: a browser runs nothing from a file."""
 
 
 class Guard:

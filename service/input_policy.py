@@ -2,11 +2,11 @@
 
 Hosts are listed in the setting `input_hosts`, each as an origin:
 
-- `data.example.org` means `https://data.example.org`, its usual port and no other;
+- `data.example.org` means `https://data.example.org` on its default port only;
 - `data.example.org:8443` means https on that port;
 - `http://10.0.0.7:9000` means plain http, for networks that use it on purpose.
 
-A listed host is trusted, also in what its name resolves to and in its redirects within the list.
+A listed host is trusted, including the addresses of its name and its redirects to listed hosts.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ CRS_FORMS = (
     re.compile(r"\{.*\}", re.DOTALL),
     re.compile(r"\+proj=[A-Za-z0-9_+=.,\s-]*"),
 )
-"""Authority and code, URN, WKT, the OGC's URI, PROJJSON, and PROJ strings without places of files."""
+"""Authority and code, URN, WKT, the OGC's URI, PROJJSON, and PROJ strings without paths of files."""
 CRS_FILES = re.compile(r"grids|\+init|PARAMETERFILE", re.IGNORECASE)
 """Words that make PROJ open files."""
 
@@ -58,7 +58,7 @@ def checked_crs(text: str, *, path: str) -> pyproj.CRS:
     Raises
     ------
     CrsError
-        Another text, or PROJ does not understand it.
+        It is another text, or PROJ does not understand it.
     """
     text = text.strip()
     if not any(form.fullmatch(text) for form in CRS_FORMS) or CRS_FILES.search(text):
@@ -118,7 +118,7 @@ def checked_url(text: str, settings: ServiceSettings) -> httpx.URL:
         public = text.rpartition("@")[2].partition("?")[0]
         raise InputRefusedError(f"{public[:80]!r} is not a URL that can be fetched: give https://host/path")
     if url.userinfo:
-        raise InputRefusedError(f"{shown(url)} carries a user or password: give a URL without")
+        raise InputRefusedError(f"{shown(url)} contains a user or password: give a URL without them")
     allowed = {origin_of(entry) for entry in settings.input_hosts}
     if origin not in allowed:
         names = ", ".join(settings.input_hosts) or "none"
@@ -161,7 +161,7 @@ def checked_path(text: str, settings: ServiceSettings) -> Path:
             "GABLEWORK_INPUT_ROOTS"
         )
     try:
-        # only opening it shows whether it can be read; without waiting, since a pipe would wait for its writer
+        # only opening it shows whether it can be read; non-blocking, since a pipe would wait for its writer
         handle = os.open(resolved, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError as fault:
         raise UnreadableInputError(text[:200], f"cannot be read ({fault.strerror})", "Check the path") from fault

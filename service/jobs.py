@@ -40,60 +40,60 @@ class JobStatus(StrEnum):
 
 
 class Fault(StrEnum):
-    """What kind of cause a job failed for; decides the HTTP status of its results."""
+    """Kind of failure of a job; decides the HTTP status of its results."""
 
     INPUT = "input"
-    """An input cannot be used: the client's business."""
+    """An input cannot be used; the client must change it."""
     SETTINGS = "settings"
-    """Settings are out of range: the client's business."""
+    """Settings are out of range; the client must change them."""
     REFUSED = "refused"
     """An input is not allowed or too large."""
     CLUSTER = "cluster"
-    """No cluster, or it was lost again and again."""
+    """There is no cluster, or it was lost repeatedly."""
     LOST = "lost"
-    """Drivers died over the job again and again."""
+    """Drivers died repeatedly during the job."""
     INTERNAL = "internal"
-    """A fault of ours."""
+    """A fault of the service."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class InputReference:
-    """Where an input lies."""
+    """Location of an input."""
 
     kind: Literal["upload", "path", "url"]
-    """How it was given."""
+    """Kind of location."""
     value: str
     """The upload's id, the absolute path, or the URL."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JobRequest:
-    """What a job is to do; validated when it was submitted."""
+    """The job's request, validated at submission."""
 
     process_id: str = "reconstruct"
     """The process."""
     tiles: tuple[InputReference, ...]
     """Point clouds."""
     footprints: InputReference | None = None
-    """A vector file of outlines."""
+    """A vector file of building outlines."""
     crs: str | None = None
-    """Stands above the headers' CRS."""
+    """Overrides the CRS in the headers."""
     vertical_unit: str | None = None
-    """Stands above the headers' vertical unit."""
+    """Overrides the vertical unit in the headers."""
     bbox: tuple[float, float, float, float] | None = None
     """x_min, y_min, x_max, y_max in the CRS's units."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """What differs from the defaults, as the tables of a settings file; `method`, `preset` and `classes` included."""
+    """Settings that differ from the defaults, as in a settings file; includes `method`, `preset` and `classes`."""
     methods: tuple[str, ...] = ()
-    """What a comparison runs, each METHOD or METHOD:PRESET; empty of other processes."""
+    """Methods of a comparison, each METHOD or METHOD:PRESET; empty for other processes."""
     meshes: str = "building"
-    """One OBJ a building, one a tile, or none."""
+    """building or tile: one OBJ file for each; glb: one GLB file per tile; or none."""
     licence: str | None = None
     """Licence of the source data."""
     outputs: tuple[str, ...] | None = None
-    """Ids of the outputs that are wanted; None for all."""
+    """Ids of the wanted outputs; None for all."""
     title: str | None = None
-    """The user's words."""
+    """The user's title."""
 
     @property
     def upload_ids(self) -> list[str]:
@@ -140,45 +140,45 @@ class Job:
     job_id: str
     """32 hexadecimal digits, random: it cannot be guessed."""
     owner: str | None
-    """Id of the key that submitted it; None where keys are not used."""
+    """Id of the key that submitted it; None if keys are not used."""
     request: JobRequest
-    """What is to be done."""
+    """Its request."""
     status: JobStatus
     priority: int = 0
-    """Higher goes first."""
+    """Higher runs first."""
     message: str = ""
-    """One sentence on what happens or what came out."""
+    """One sentence about the progress or the outcome."""
     progress: int = 0
     """0 to 100; never falls within an attempt."""
     stage: str = ""
     """The stage of the run."""
     created_at: dt.datetime
-    """With a time zone, as all times here."""
+    """With a time zone, like all times here."""
     started_at: dt.datetime | None = None
     """When the first driver claimed it."""
     finished_at: dt.datetime | None = None
     updated_at: dt.datetime
     dismiss_requested: bool = False
-    """A running job's driver is to stop."""
+    """Whether the driver of a running job must stop."""
     attempt: int = 0
-    """Times it was claimed; names the folder of the attempt."""
+    """Number of claims; names the folder of the attempt."""
     lost_attempts: int = 0
-    """Attempts whose driver or cluster was lost; what counts towards giving up."""
+    """Attempts whose driver or cluster was lost; too many of them end the job."""
     lease_owner: str | None = None
     """Name of the driver that holds it."""
     lease_until: dt.datetime | None = None
-    """Until when the claim counts."""
+    """Time at which the claim ends."""
     failure: JobFailure | None = None
     """Why it failed."""
     summary: Mapping[str, Any] | None = None
     """Counts, digest and timings of the run, once successful."""
     schedule_id: str | None = None
-    """The schedule that it came of; it may be gone by now."""
+    """The schedule that made it; it may be removed by now."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JobEvent:
-    """One thing that happened to a job, for the event stream."""
+    """An event of a job, for the event stream."""
 
     sequence: int
     """Counts up within the job, from 1; the id of the server-sent event."""
@@ -186,7 +186,7 @@ class JobEvent:
     kind: str
     """status (accepted, running, ...), stage, progress, warning or waiting."""
     status: JobStatus | None = None
-    """The status that the job came to; only of kind `status`."""
+    """The new status; only for kind `status`."""
     stage: str = ""
     done: int = 0
     total: int = 0

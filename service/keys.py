@@ -56,13 +56,13 @@ class Key:
     """A key as it is stored, without the key itself."""
 
     key_id: str
-    """32 hexadecimal digits; the owner of jobs and uploads. No secret."""
+    """32 hexadecimal digits; the owner of jobs and uploads. Not a secret."""
     name: str
-    """The user's words for it."""
+    """The user's name for it."""
     digest: str
     """SHA-256 of the key, hexadecimal."""
     scopes: frozenset[Scope]
-    """What it may do, with all that those scopes include."""
+    """Its scopes, with all that they include."""
     created_at: dt.datetime
     """With a time zone."""
     revoked_at: dt.datetime | None = None

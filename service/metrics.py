@@ -14,7 +14,7 @@ from service.jobs import JobStatus
 from service.store import JobFilter, JobStore
 
 BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 120.0)
-"""Bounds of the histogram of durations."""
+"""Bounds of the histogram of durations in seconds."""
 
 
 class _Jobs(Collector):
@@ -25,7 +25,7 @@ class _Jobs(Collector):
         self._streams = streams
 
     def collect(self) -> Iterator[Metric]:
-        """The figures of now."""
+        """The current figures."""
         counts = self._store.counts()
         jobs = GaugeMetricFamily("gablework_jobs", "Jobs by status.", labels=["status"])
         for status in JobStatus:
@@ -71,7 +71,7 @@ class Metrics:
         )
         self.duration = Histogram(
             "gablework_request_duration_seconds",
-            "From the request's head to the answer's.",
+            "Time from the head of the request to that of the answer.",
             ["method", "path"],
             buckets=BUCKETS_S,
             registry=self.registry,
@@ -86,7 +86,7 @@ class Metrics:
 
 
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
-"""Methods that are counted by name; a client may send any word."""
+"""Methods that are counted by name; a client may send any other word."""
 
 
 class Measured:

@@ -1,7 +1,7 @@
-"""Forms with files (multipart/form-data), part by part while they arrive, without temporary files.
+"""Parses forms with files (multipart/form-data) part by part while they arrive, without temporary files.
 
 The framework's own parser writes every file to a temporary one before a route sees it; here a route passes the bytes
-to their destination and stops at the first one too many.
+to their destination and stops when the limit is exceeded.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Part:
 
 
 class Form:
-    """A form that arrives.
+    """A form that is arriving.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class Form:
     content_type : str
         The request's header; names the boundary.
     max_parts : int
-        More are refused.
+        Maximum number of parts.
 
     Raises
     ------

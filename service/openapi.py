@@ -20,7 +20,7 @@ from service.wire.jobs import JobForm, ServerSentEvent
 from service.wire.problems import Problem
 
 VERSION = "3.0.3"
-"""Of the document's format."""
+"""Version of OpenAPI."""
 
 TAGS = (
     {"name": "service", "description": "Landing page, conformance, health and metrics."},
@@ -77,7 +77,7 @@ def operations(found: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]
 
 
 _UNCOUNTED = ("/healthz", "/readyz")
-"""Paths without a limit of requests, for monitoring."""
+"""Paths without a rate limit, for monitoring."""
 
 
 def _complete(path: str, operation: dict[str, Any]) -> None:

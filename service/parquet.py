@@ -1,8 +1,8 @@
-"""Checks a GeoParquet file of a stranger: decodes it once, piece by piece, and keeps nothing.
+"""Checks a client's GeoParquet file: decodes it once, piece by piece, and keeps nothing.
 
-A few bytes of Parquet can stand for millions of rows, and one long text for as many copies of itself: sizes in the
-footer do not tell. So the columns that will be read are decoded here, by the child with little memory and little time
-that `service.preflight` starts, until they end or are too much.
+A few bytes of Parquet can encode millions of rows, or millions of copies of one long text; the sizes in the footer do
+not show it. The child process of `service.preflight`, which has little memory and time, therefore decodes the columns
+that will be read, until they end or exceed the limits.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 ROWS_LIMIT = 20_000_000
-"""Rows; a GeoPackage of the bytes that are taken holds fewer."""
+"""Maximum number of rows; a GeoPackage of the maximum size holds fewer."""
 DECODED_LIMIT = 2**30
-"""Bytes of all columns decoded: as many as a GeoPackage may have."""
+"""Maximum number of decoded bytes of all columns: as many as a GeoPackage may have."""
 FOOTER_LIMIT = 2**24
-"""Bytes of the footer, which is read at once."""
+"""Maximum number of bytes of the footer, which is read at once."""
 ROWS_AT_ONCE = 1024
 MAGIC = b"PAR1"
-FIX = "Write it anew as GeoParquet with WKB, as GDAL, DuckDB or geopandas do"
+FIX = "Write it again as GeoParquet with WKB, as GDAL, DuckDB or geopandas do"
 CODE = re.compile(r"(?:urn:ogc:def:crs:)?EPSG:(?:[\d.]*:)?(\d{4,6})")
 
 
 def parquet_facts(path: Path) -> tuple[int, str, dict[str, Any] | None]:
-    """Rows, geometry column and CRS (name and EPSG code; None where the file says that it is unknown).
+    """Rows, geometry column and CRS (name and EPSG code; None if the file says that it is unknown).
 
     Raises
     ------
     UnreadableInputError
-        No Parquet, damaged, cut off, without geometry, or in an encoding that is not read.
+        Not Parquet, damaged, cut off, without geometry, or in an unsupported encoding.
     EmptyInputError
         No rows.
     TooLargeError
-        More rows or bytes than are taken.
+        More rows or bytes than allowed.
     CrsError
-        Its CRS is none that PROJ may be asked about.
+        Its CRS is a text that PROJ must not search for.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -67,7 +67,7 @@ def parquet_facts(path: Path) -> tuple[int, str, dict[str, Any] | None]:
                 decoded += sum(_plain(path, column).nbytes for column in batch.columns)
                 if decoded > DECODED_LIMIT:
                     raise TooLargeError(
-                        f"{path.name} holds more than {DECODED_LIMIT} bytes once it is decoded: cut out the area of "
+                        f"{path.name} holds more than {DECODED_LIMIT} bytes when decoded: cut out the area of "
                         "the points, or leave columns out"
                     )
     except (pa.ArrowException, OSError, OverflowError, ValueError) as fault:
@@ -78,7 +78,7 @@ def parquet_facts(path: Path) -> tuple[int, str, dict[str, Any] | None]:
 
 
 def _check_footer(path: Path) -> None:
-    """Refuse what does not begin and end as Parquet does, or whose footer is larger than any true one."""
+    """Refuse a file that does not begin and end like Parquet, or whose footer is larger than any real one."""
     size = path.stat().st_size
     with path.open("rb") as stream:
         head = stream.read(len(MAGIC))
@@ -94,7 +94,7 @@ def _check_footer(path: Path) -> None:
 
 
 def _plain(path: Path, column: pa.Array) -> pa.Array:
-    """The values of a column, each spelt out as its reader will have it."""
+    """The values of a column, decoded as its reader will get them."""
     import pyarrow as pa
 
     if pa.types.is_dictionary(column.type):

@@ -45,15 +45,15 @@ def examine(path: Path, *, max_points: int) -> dict[str, Any]:
     -------
     dict
         Plain JSON values. `kind` points or footprints, `format`, `usable`, `problems` that `crs` or other inputs of a
-        job may still heal, `warnings`, `crs` (name and EPSG code); of points `pointCount`, `horizontalUnitM`,
+        job may still fix, `warnings`, `crs` (name and EPSG code); for points `pointCount`, `horizontalUnitM`,
         `verticalUnitM`, `bounds` (x_min, y_min, z_min, x_max, y_max, z_max in the CRS's units), `densityPerM2`,
-        `hasReturns`, `hasClasses`, `acquiredFrom`, `acquiredTo`; of footprints `featureCount`, `layers`. None for what
-        is not known.
+        `hasReturns`, `hasClasses`, `acquiredFrom`, `acquiredTo`; for footprints `featureCount`, `layers`. Unknown
+        values are None.
 
     Raises
     ------
     InputError
-        Not a format that is read, damaged, or header and size disagree.
+        Not a supported format, damaged, or header and size disagree.
     TooLargeError
         More points than allowed.
     """
@@ -66,7 +66,7 @@ def examine(path: Path, *, max_points: int) -> dict[str, Any]:
             str(path), f"cannot be read ({fault.strerror or fault})", "Check the file and its permissions"
         ) from fault
     except MemoryError:
-        raise UnreadableInputError(str(path), "its header asks for more memory than any true one", REFUSED) from None
+        raise UnreadableInputError(str(path), "its header needs more memory than any real one", REFUSED) from None
 
 
 def _examine_points(path: Path, max_points: int) -> dict[str, Any]:
@@ -130,7 +130,7 @@ def _points(kind: str, count: int, **known: Any) -> dict[str, Any]:
 
 
 def _only_counted(path: Path, name: str) -> dict[str, Any]:
-    """The facts of text and PLY that are too large to be read through beforehand."""
+    """The facts of text and PLY that are too large to be read through here."""
     warning = f"the file has no header with bounds and more than {PASS_BYTES >> 20} MiB: the job reads it through"
     return _points(name, _count_before_reading(path, name), warnings=[warning])
 
@@ -150,7 +150,7 @@ def promised_points(path: Path) -> int | None:
     Raises
     ------
     InputError
-        Not a format that is read, or the header is damaged.
+        Not a supported format, or the header is damaged.
     """
     name = recognise_format(path)
     return None if name == "ascii" else _count_before_reading(path, name)
@@ -228,7 +228,7 @@ class Examiner:
                 line = b""
             except TimeoutError:
                 self._end()
-                return _unreadable(f"its header is not understood within {self._timeout_s:g} s")
+                return _unreadable(f"its header could not be read within {self._timeout_s:g} s")
             if line.endswith(b"\n"):
                 self._served += 1
                 answer: dict[str, Any] = json.loads(line)
@@ -236,7 +236,7 @@ class Examiner:
             self._end()
             if attempt:
                 break
-        return _unreadable("reading its header ends the reader")
+        return _unreadable("reading its header crashes the reader")
 
     def _running(self) -> subprocess.Popen[bytes]:
         """The child; a new one if there is none or it has served enough files."""
@@ -288,7 +288,7 @@ _FAULTS: dict[str, type[InputError]] = {
 
 
 def _unreadable(problem: str) -> dict[str, Any]:
-    """The answer for a file over which the child was lost."""
+    """The answer for a file that ended the child."""
     return {"kind": UnreadableInputError.__name__, "problem": problem, "fix": REFUSED}
 
 

@@ -33,7 +33,7 @@ OWN = "urn:gablework:problem:"
 """Prefix of our types."""
 
 MEDIA_TYPE = "application/problem+json"
-"""Of every problem document."""
+"""Media type of problem documents."""
 
 RETRY_AFTER_S = 30
 """Seconds after which a client may try again, if nothing better is known."""
@@ -50,7 +50,7 @@ class Kind:
     type_uri: str
     """Its type."""
     title: str
-    """The same words for every problem of this kind."""
+    """The same for every problem of this kind."""
     retry: bool = False
     """Whether the answer has `Retry-After`."""
 
@@ -101,7 +101,7 @@ INTERNAL = Kind(status=500, type_uri=f"{OWN}internal", title="A fault of the ser
 """Anything else."""
 
 FOREIGN = Kind(status=403, type_uri=f"{OWN}foreign-origin", title="The request comes from another site")
-"""A page of another site, or a foreign host name, asks a service that needs no keys."""
+"""A request from a page of another site, or with a foreign host name, to a service without keys."""
 
 FAILURES: Mapping[Fault, Kind] = {
     Fault.INPUT: Kind(status=422, type_uri=f"{OWN}job-failed-input", title="An input could not be used"),
@@ -111,7 +111,7 @@ FAILURES: Mapping[Fault, Kind] = {
     Fault.LOST: Kind(status=503, type_uri=f"{OWN}job-failed-lost", title="Drivers were lost over the job"),
     Fault.INTERNAL: Kind(status=500, type_uri=f"{OWN}job-failed-internal", title="A fault of the service"),
 }
-"""The answer of a failed job's results, by the cause."""
+"""The answer to a request for the results of a failed job, by cause."""
 
 
 class JobFailedError(errors.ServiceError):

@@ -1,4 +1,4 @@
-"""The settings of a run as clients send them: their JSON schema, the words of the choices, and all faults."""
+"""The settings of a run as clients send them: their JSON schema, the valid words of choices, and all faults."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.parameters import Parameters
 from pipeline.settings import SECTIONS, GeneralSettings, RunSettings
 
 LARGEST_INTEGER = 2**53
-"""JSON's numbers beyond it are not exact everywhere."""
+"""JSON parsers need not read larger integers exactly."""
 
 DEFAULTS = GeneralSettings()
 """Defaults of the general settings."""
@@ -21,11 +21,11 @@ DEFAULTS = GeneralSettings()
 VARIANTS = tuple(
     word for method, entry in METHODS.items() for word in (method, *(f"{method}:{preset}" for preset in entry.presets))
 )
-"""What a comparison can run: every method by itself, and with each of its presets."""
+"""The variants that a comparison can run: every method by itself, and with each of its presets."""
 
 
 def choices(name: str) -> tuple[str, ...]:
-    """The words of a general setting."""
+    """The valid words of a general setting."""
     field = next(field for field in dataclasses.fields(GeneralSettings) if field.name == name)
     words: tuple[str, ...] = field.metadata["choices"]
     return words

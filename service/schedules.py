@@ -10,7 +10,7 @@ from pipeline.schedule import Entry, Outcome, Rules
 from service.jobs import JobRequest
 
 OUTCOMES = (Outcome.SUBMITTED, Outcome.WAITING, Outcome.SKIPPED, Outcome.MISSED, Outcome.FAILED)
-"""What may become of a slot of the service, or of a run by hand."""
+"""The possible outcomes of a slot of the service, or of a run by hand."""
 COUNTED = tuple(outcome for outcome in OUTCOMES if outcome is not Outcome.WAITING)
 """Outcomes that are final."""
 
@@ -26,7 +26,7 @@ class Trigger(StrEnum):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Definition(Rules):
-    """A schedule as the client defines it; checked already."""
+    """A schedule as the client defines it; already checked."""
 
     title: str | None = None
     """A text by the user; also the title of its jobs if the request has none."""

@@ -34,17 +34,17 @@ class ServiceSettings(BaseSettings):
         default=None,
         description="SQLAlchemy URL; default SQLite in the state folder. PostgreSQL: postgresql+pg8000://user:password@host/database",
     )
-    host: str = Field(default="127.0.0.1", description="Address to listen on; anything but loopback needs keys.")
+    host: str = Field(default="127.0.0.1", description="Address to listen on; all except loopback need keys.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
     public_url: str | None = Field(
-        default=None, description="How clients reach the service, for links; default as the request says."
+        default=None, description="URL by which clients reach the service, for links; default as in the request."
     )
     root_path: str = Field(default="", description="Path prefix behind a proxy.")
 
     # who
     open_without_keys: bool = Field(
         default=False,
-        description="Answer without keys on other addresses than loopback. Only for networks closed by other means.",
+        description="Accept requests without keys on addresses except loopback. Only for closed networks.",
     )
 
     # inputs
@@ -54,32 +54,32 @@ class ServiceSettings(BaseSettings):
     input_hosts: tuple[str, ...] = Field(
         default=(), description="Hosts (name or name:port) from which jobs may fetch inputs by URL; none by default."
     )
-    max_upload_bytes: int = Field(default=4 * _GIB, gt=0, description="Largest upload or fetched input.")
-    max_body_bytes: int = Field(default=2**20, gt=0, description="Largest body of other requests, JSON and the like.")
-    max_points: int = Field(default=500_000_000, gt=0, description="Most points of all inputs of one job.")
-    max_inputs: int = Field(default=1000, gt=0, description="Most input files of one job.")
+    max_upload_bytes: int = Field(default=4 * _GIB, gt=0, description="Maximum bytes of an upload or a fetched input.")
+    max_body_bytes: int = Field(default=2**20, gt=0, description="Maximum bytes of the body of other requests.")
+    max_points: int = Field(default=500_000_000, gt=0, description="Maximum number of points of all inputs of one job.")
+    max_inputs: int = Field(default=1000, gt=0, description="Maximum number of input files of one job.")
     upload_days: float = Field(
         default=7.0, gt=0.0, le=36_500.0, description="Days after which an upload that no job needs is removed."
     )
 
     # limits
-    max_queued: int = Field(default=1000, gt=0, description="Most jobs that may wait; more are refused.")
-    max_queued_per_key: int = Field(default=200, gt=0, description="Most jobs of one key that may wait.")
+    max_queued: int = Field(default=1000, gt=0, description="Maximum number of waiting jobs; more are refused.")
+    max_queued_per_key: int = Field(default=200, gt=0, description="Maximum number of waiting jobs of one key.")
     max_schedules_per_key: int = Field(
-        default=100, gt=0, description="Most schedules of one key, or of all together where keys are not used."
+        default=100, gt=0, description="Maximum number of schedules of one key, or in total if keys are not used."
     )
     rate_limit: str = Field(
-        default="6000/minute", description="Requests of one key or address, in the notation of the library limits."
+        default="6000/minute", description="Request limit of one key or address, in the notation of the library limits."
     )
-    max_event_streams: int = Field(default=200, gt=0, description="Most event streams open at once.")
+    max_event_streams: int = Field(default=200, gt=0, description="Maximum number of open event streams.")
 
     # the driver and its cluster
     scheduler: str | None = Field(default=None, description="Address of a Dask scheduler; default an embedded cluster.")
     tls_ca: str | None = Field(
-        default=None, description="CA of the certificates of the cluster's processes, PEM; its traffic is TLS then."
+        default=None, description="CA of the certificates of the cluster's processes, PEM; turns TLS on."
     )
     tls_cert: str | None = Field(default=None, description="The driver's own certificate for the cluster, PEM.")
-    tls_key: str | None = Field(default=None, description="Its key, PEM, where it is not in the same file.")
+    tls_key: str | None = Field(default=None, description="Its key, PEM, if it is not in the same file.")
     workers: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = Field(
         default="auto", description="Processes of the embedded cluster; auto takes one per core."
     )
@@ -90,19 +90,19 @@ class ServiceSettings(BaseSettings):
         allow_inf_nan=False,
         description="Seconds after which a silent driver's job passes to another.",
     )
-    max_attempts: int = Field(default=3, ge=1, description="Drivers that may die over a job before it is failed.")
+    max_attempts: int = Field(default=3, ge=1, description="Number of lost drivers after which a job fails.")
     poll_s: float = Field(
         default=0.5,
         gt=0.0,
         allow_inf_nan=False,
-        description="Seconds between a driver's looks for work and for dismissals.",
+        description="Seconds between a driver's checks for work and for dismissals.",
     )
     drain_s: float = Field(
         default=600.0,
         ge=0.0,
-        description="Seconds that SIGTERM leaves running jobs; then they are given back to the queue.",
+        description="Seconds that running jobs get after SIGTERM; then they go back to the queue.",
     )
-    log_json: bool = Field(default=False, description="Log one JSON object a line in place of plain lines.")
+    log_json: bool = Field(default=False, description="Log one JSON object per line instead of plain lines.")
     building_timeout_s: float = Field(
         default=600.0, gt=0.0, allow_inf_nan=False, description="Seconds after which a building's work is stopped."
     )
@@ -117,7 +117,7 @@ class ServiceSettings(BaseSettings):
 
     @functools.cached_property
     def resources(self) -> Resources:
-        """What jobs run with; `workers` is None where the driver chooses.
+        """The resources of jobs; `workers` is None if the driver chooses.
 
         Raises
         ------
@@ -146,7 +146,7 @@ class ServiceSettings(BaseSettings):
             return False
 
     def check_address(self, *, has_keys: bool) -> None:
-        """Refuse to listen to others without keys.
+        """Refuse an address that others can reach if there are no keys.
 
         Raises
         ------

@@ -28,25 +28,25 @@ MIN_PAUSE_S = 0.5
 """Seconds before a driver that died is started again, the first time."""
 
 LONGEST_PAUSE_S = 30.0
-"""Seconds before it is started again, when it dies again and again."""
+"""Maximum seconds before it is started again, if it dies repeatedly."""
 
 STEADY_S = 60.0
-"""A driver that lived so long is started again at once."""
+"""Seconds after which a driver counts as steady: if it dies, the pauses begin anew."""
 
 KEEP_ALIVE_S = 75
-"""Seconds that a connection without requests stays: longer than proxies keep theirs, so that they close it first."""
+"""Seconds that an idle connection stays open: longer than at proxies, which should close it first."""
 
 CLOSING_S = 10
-"""Seconds that requests have to end when the process is to end."""
+"""Seconds that requests get to finish when the process must end."""
 
 GRACE_S = 30.0
-"""Seconds that a driver has for its own end, beside those in which it drains."""
+"""Seconds that a driver gets for its own end, in addition to those for draining."""
 
 _log = logging.getLogger("gablework.serve")
 
 
 def pause_s(deaths: int) -> float:
-    """Seconds before the next start, after so many deaths in a row.
+    """Seconds before the next start after a number of deaths in a row.
 
     >>> [pause_s(n) for n in (1, 2, 3, 10)]
     [0.5, 1.0, 2.0, 30.0]
@@ -60,14 +60,14 @@ def environment_of(settings: ServiceSettings, inherited: Mapping[str, str]) -> d
     Parameters
     ----------
     settings : ServiceSettings
-        What it is to read.
+        The settings that it must read.
     inherited : mapping
         This process's own environment.
     """
     prefix = "GABLEWORK_"
     environment = dict(inherited)
     for name in ServiceSettings.model_fields:
-        # on this machine they may be written in any case
+        # on this machine their names may have any case
         for written in [given for given in environment if given.upper() == f"{prefix}{name}".upper()]:
             del environment[written]
         value = getattr(settings, name)
@@ -88,7 +88,7 @@ class Supervisor:
     Parameters
     ----------
     command : sequence of str
-        What starts a driver. Its standard input is a pipe that closes when this process ends, however it does.
+        Starts a driver. Its standard input is a pipe that closes when this process ends in any way.
     environment : mapping
         Its environment.
     """
@@ -97,12 +97,12 @@ class Supervisor:
         self._command = command
         self._environment = dict(environment)
         self._child: subprocess.Popen[bytes] | None = None
-        # a signal's handler may take it where this thread holds it already
+        # a signal handler may take it while this thread holds it
         self._lock = threading.RLock()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._keep, name="supervisor", daemon=True)
         self.deaths = 0
-        """How often a driver died since the last one that was steady."""
+        """Number of deaths since the last steady driver."""
 
     def start(self) -> None:
         """Start the driver, and watch it."""
@@ -142,7 +142,7 @@ class Supervisor:
             self._launch()
 
     def ask_to_end(self) -> None:
-        """Tell the driver, once, to end its jobs and itself: a second time it would not finish them."""
+        """Ask the driver once to finish its jobs and end; a second signal would end it at once."""
         with self._lock:
             if not self._ending.is_set() and self._child is not None and self._child.poll() is None:
                 self._child.terminate()
@@ -157,12 +157,12 @@ class Supervisor:
         try:
             child.wait(within_s)
         except subprocess.TimeoutExpired:
-            _log.error("the driver did not end within %.0f s and is killed; its jobs go back to the line", within_s)
+            _log.error("the driver did not end within %.0f s and is killed; its jobs go back to the queue", within_s)
             child.kill()
             child.wait()
 
     def kill(self) -> None:
-        """End the driver now; its jobs go back to the line when their leases end."""
+        """End the driver now; its jobs go back to the queue when their leases end."""
         with self._lock:
             self._ending.set()
             if self._child is not None:
@@ -181,13 +181,13 @@ class _Server(uvicorn.Server):
         self._on_exit = on_exit
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, then tell."""
+        """Start, then report it."""
         await super().startup(sockets)
         if self.started and not self.should_exit:
             self._on_ready()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """End; streams end of themselves, and the driver starts to drain."""
+        """End; streams end by themselves, and the driver starts to drain."""
         self._application.state.streams.closing = True
         self._on_exit()
         super().handle_exit(sig, frame)
@@ -199,7 +199,7 @@ def listen(settings: ServiceSettings) -> tuple[socket.socket, str]:
     Raises
     ------
     StartUpError
-        The address cannot be had.
+        The address is not available.
     """
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:
@@ -227,7 +227,7 @@ def serve(settings: ServiceSettings, on_ready: Callable[[str], None], *, with_dr
     Raises
     ------
     StartUpError
-        The address cannot be had, or needs keys.
+        The address is not available, or needs keys.
     StoreError
         The database does not answer.
     """
@@ -258,11 +258,11 @@ def serve(settings: ServiceSettings, on_ready: Callable[[str], None], *, with_dr
     signals: list[int] = []
 
     def on_signal(number: int, _frame: FrameType | None) -> None:
-        # the server has its own handlers while it runs, and hands on here what they caught
+        # while it runs, the server has its own handlers; it passes the caught signals on to this one
         signals.append(number)
         server.should_exit = True
         if len(signals) > 1 and supervisor is not None:
-            _log.warning("asked a second time: the driver is killed")
+            _log.warning("second signal: the driver is killed")
             supervisor.kill()
 
     before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}

@@ -45,7 +45,7 @@ class UploadTable(Protocol):
         """The time, with a time zone."""
 
     def add_upload(self, upload: Upload) -> None:
-        """Keep the record."""
+        """Store the record."""
 
 
 class _Sink:
@@ -160,7 +160,7 @@ async def receive(
 
 
 def _check_size(name: str, size: int, limit: int) -> None:
-    """Refuse what is too much, as soon as it is."""
+    """Refuse a file as soon as it is too large."""
     if size > limit:
         raise TooLargeError(
             f"{name} has more than {limit} bytes: cut it into tiles, or raise GABLEWORK_MAX_UPLOAD_BYTES"
@@ -174,7 +174,7 @@ def _check_digest(name: str, found: str, promised: str | None) -> None:
 
 
 async def _blocks(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
-    """The same bytes in blocks of at least `BLOCK_BYTES`, the last one excepted."""
+    """The same bytes in blocks of at least `BLOCK_BYTES`, except the last."""
     held: list[bytes] = []
     size = 0
     async for piece in stream:

@@ -1,8 +1,8 @@
-"""Footprints from strangers: what a GeoPackage or GeoJSON is, without the library that will read it.
+"""Checks a client's file of footprints without the library that will read it.
 
-A GeoPackage is a database, which can hold views that never end and columns that are computed; GeoJSON can be nested
-without measure; GeoParquet can hold more than its bytes let guess. All are refused here. Shapefiles are several files
-and are taken by path only.
+A GeoPackage is a database, which can hold endless views and computed columns; GeoJSON can be nested without limit;
+GeoParquet can hold far more than its size suggests. All of these are refused here. Shapefiles are several files and
+are accepted by path only.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES, PARQUET_SUFF
 VECTOR_SUFFIXES = (*FOOTPRINT_SUFFIXES, ".shp")
 """Endings of footprints."""
 GEOPACKAGE_LIMIT = 2**30
-"""Bytes of a GeoPackage or GeoParquet; where all of it lies on the data, all is held in memory."""
+"""Maximum number of bytes of a GeoPackage or GeoParquet; if all of it overlaps the points, all is held in memory."""
 GEOJSON_LIMIT = 2**28
 """Bytes."""
 DEPTH_LIMIT = 64
-"""Levels of GeoJSON: a multipolygon in a collection has twelve."""
+"""Maximum depth of GeoJSON; a multipolygon in a collection has twelve levels."""
 STEPS_LIMIT = 50_000_000
 """Steps of the database engine for one statement, about a second."""
 VALUE_LIMIT = 2**24
-"""Bytes of one value in a GeoPackage that are read here."""
+"""Maximum number of bytes of one value in a GeoPackage."""
 HEAD_BYTES = 65_536
 BLOCK_BYTES = 1 << 20
 
@@ -50,7 +50,7 @@ MEMBER = re.compile(rb'"type"\s*:\s*"(FeatureCollection|Feature|Polygon|MultiPol
 
 
 def examine_vector(path: Path) -> dict[str, Any]:
-    """What a file of footprints is; see `service.preflight.examine`.
+    """The facts of a file of footprints; see `service.preflight.examine`.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def examine_vector(path: Path) -> dict[str, Any]:
     EmptyInputError
         No features.
     TooLargeError
-        More bytes than are held in memory.
+        More bytes than allowed.
     """
     suffix = path.suffix.lower()
     limit = GEOJSON_LIMIT if suffix in GEOJSON_SUFFIXES else GEOPACKAGE_LIMIT
@@ -129,7 +129,7 @@ def _opened(path: Path) -> sqlite3.Connection:
 
 
 def _refuse_programs(path: Path, database: sqlite3.Connection) -> None:
-    """Refuse what is no plain table where plain tables belong."""
+    """Refuse virtual tables except indexes, and views as tables of the format."""
     for kind, name, statement in database.execute("SELECT type, name, sql FROM sqlite_master"):
         module = MODULE.search(str(statement)) if kind == "table" else None
         is_virtual = str(statement).lstrip().upper().startswith("CREATE VIRTUAL")
@@ -203,7 +203,7 @@ def _geojson(path: Path, head: bytes) -> dict[str, Any]:
 
 
 def _levels(path: Path) -> Iterator[tuple[tuple[int, int, int], int]]:
-    """Of each block of the file: lowest, highest and last level of brackets relative to its start; and its features."""
+    """For each block of the file: lowest, highest and last level of brackets relative to its start; its features."""
     in_text, rest = False, b""
     with path.open("rb") as stream:
         while block := rest + stream.read(BLOCK_BYTES - len(rest)):

@@ -420,7 +420,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         submit(store, owner="k")
         entries = store.schedules.tick(now=NOON + HOUR, max_queued=10, max_queued_per_key=1)
         assert [(run.outcome, run.job_id) for run in entries] == [(Outcome.FAILED, None)]
-        assert "1 jobs of this key wait and 1 may" in entries[0].message
+        assert "1 jobs of this key wait, the limit is 1" in entries[0].message
         assert runs_of(store, made) == entries
         assert jobs_of(store, made) == []
         assert store.counts()[JobStatus.ACCEPTED] == 1

@@ -1,4 +1,4 @@
-"""The driver: claims jobs, runs them on one cluster and records their progress. A process of its own."""
+"""The driver: claims jobs, runs them on one cluster and records their progress. It is a separate process."""
 
 from service.driver.process import Driver, run_driver
 

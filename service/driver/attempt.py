@@ -44,7 +44,7 @@ class Compare(Protocol):
     def __call__(
         self, request: CompareRequest, on_event: Listener, executor: Executor | None, cancelled: Callable[[], bool]
     ) -> CompareSummary:
-        """Run several methods over the same candidates, and write what they have to show."""
+        """Run several methods on the same candidates and write the comparison."""
 
 
 class Gather(Protocol):
@@ -60,7 +60,7 @@ class Gather(Protocol):
         target: Path,
         cancelled: Callable[[], bool],
     ) -> tuple[list[Fetched], Fetched | None]:
-        """All inputs on this machine's disk."""
+        """Fetch all inputs to this machine's disk."""
 
 
 class WriteOutputs(Protocol):
@@ -137,12 +137,12 @@ def perform(held: LeasedJob, shop: DriverParts) -> tuple[str, dict[str, Any]]:
     RunCancelledError
         The job was cancelled.
     Exception
-        Ends the attempt; `failures` describes it.
+        Any other error; `failures` describes it.
     """
     job, folder = held.job, shop.folder
     begin = WORK.get(job.request.process_id)
     if begin is None:
-        raise RequestError([f"this driver knows no process {job.request.process_id}: it knows {', '.join(WORK)}"])
+        raise RequestError([f"this driver does not run the process {job.request.process_id}, only {', '.join(WORK)}"])
     attempt = folder.attempt(job.job_id, job.attempt)
     # the number of an attempt is unique; files there are from before a backup of the database was restored
     shutil.rmtree(attempt, ignore_errors=True)
@@ -235,7 +235,7 @@ def run_request(
     """
     return RunRequest(
         inputs=tuple(str(tile.path) for tile in tiles),
-        only_files=True,  # a tile of a stranger that is really a tile index must not be followed
+        only_files=True,  # a client's tile may be a tile index in disguise, which must not be followed
         out=str(out),
         settings=RunSettings.from_mapping(request.settings),
         footprints=None if outlines is None else str(outlines.path),

@@ -18,7 +18,7 @@ from service.jobs import JobStatus
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 15.0
-"""Seconds between two tries to reach a database that is away; they double from the first to the longest."""
+"""Seconds between two tries to reach the database: the first and the longest pause; each is twice the one before."""
 
 
 class Attempts:
@@ -47,7 +47,7 @@ class Attempts:
                 if held.cancelled():
                     raise RunCancelledError("the job was cancelled")  # noqa: TRY301
                 message, summary = perform(held, self._shop)
-            except BaseException as error:  # noqa: BLE001 - whatever ends an attempt must become the job's end
+            except BaseException as error:  # noqa: BLE001 - every exception must end the job, not the driver
                 self._end_early(held, error)
                 return
             done = self._settle(
@@ -98,9 +98,9 @@ class Attempts:
         self._settle(held, lambda: self._shop.store.fail(job, failure), JobStatus.FAILED)
 
     def _settle(self, held: LeasedJob, write: Callable[[], None], status: JobStatus) -> bool | None:
-        """Write the outcome of an attempt, however long the database is away; False if the lease is lost.
+        """Write the outcome of an attempt, as soon as the database answers; False if the lease is lost.
 
-        A commit whose answer was lost did happen: the job then has the status at this very attempt. None if the driver
+        If the answer to a commit was lost, the job already has this status at this attempt. None if the driver
         must end before the outcome is known: a janitor decides about the files when the database is back.
         """
         pause = FIRST_PAUSE_S

@@ -45,7 +45,7 @@ def failure_of(error: BaseException, *, scrub: Callable[[str], str], reference: 
     Parameters
     ----------
     error : exception
-        It ended the attempt.
+        The exception that ended the attempt.
     scrub : callable
         Removes the paths of this machine from a message.
     reference : str
@@ -73,7 +73,7 @@ def failure_of(error: BaseException, *, scrub: Callable[[str], str], reference: 
     if isinstance(error, ClusterError):
         times = "once" if attempts == 1 else f"{attempts} times"
         return JobFailure(
-            fault=Fault.CLUSTER, detail=f"the cluster was lost {times} over this job; the last time {message}"
+            fault=Fault.CLUSTER, detail=f"the cluster was lost {times} during this job; the last time {message}"
         )
     if isinstance(error, RunError):
         return JobFailure(fault=Fault.INTERNAL, detail=f"{message} (reference {reference})")

@@ -1,4 +1,4 @@
-"""Removes files that no job and no upload needs any longer, and never what a live lease may use."""
+"""Removes files that no job or upload needs any longer, but never files that a live lease may use."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def tidy(store: JobStore, folder: StateFolder) -> list[Path]:
     Parameters
     ----------
     store : JobStore
-        Knows the jobs and the uploads.
+        The records of jobs and uploads.
     folder : StateFolder
-        Has their files.
+        Their files.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
     found = sorted(path.name for path in _entries(folder.jobs) if is_id(path.name))
     known = store.attempts(found)
     if found and not known and sum(store.counts().values()) == 0:
-        LOG.warning("the database has no jobs, but %s has: they are kept, in case it is the wrong one", folder.jobs)
+        LOG.warning("the database has no jobs, but %s has: they are kept, it may be the wrong database", folder.jobs)
         return []
     removed = []
     for job_id in found:

@@ -20,9 +20,9 @@ from service.store import JobStore
 LOG = logging.getLogger("gablework.driver")
 
 _FLUSH_S = 0.5
-"""Least seconds between two writes of progress."""
+"""Minimum seconds between two writes of progress."""
 _MAX_PENDING = 500
-"""Most events that wait while the database is away; the oldest are dropped first."""
+"""Maximum number of events that wait while the database does not answer; the oldest are dropped first."""
 
 
 class Engine(Protocol):
@@ -52,7 +52,7 @@ class Stop(IntEnum):
 
 
 class LeasedJob:
-    """Keeps a claimed job while the driver works on it; a context manager.
+    """Holds a claimed job while the driver works on it; a context manager.
 
     A thread renews the lease three times within its length, whatever the run does. (The run's heavy work is in other
     processes. Its work in this process releases the interpreter's lock at least every few milliseconds, as numpy and
@@ -62,13 +62,13 @@ class LeasedJob:
     Parameters
     ----------
     store : JobStore
-        Has the job.
+        The store with the job.
     job : Job
         As it was claimed.
     lease_s : float
         Length of the lease.
     poll_s : float
-        Seconds between looks for a dismissal.
+        Seconds between checks for a dismissal.
     claimed_s : float
         `time.monotonic()` of a moment before the claim.
     """
@@ -112,7 +112,7 @@ class LeasedJob:
         return self._stop
 
     def cancelled(self) -> bool:
-        """Whether the attempt must end; also if the database keeps the heartbeat waiting for too long."""
+        """Whether the attempt must end; also if the database blocks the heartbeat for too long."""
         if not self._stopped.is_set() and time.monotonic() - self._renewed_s >= self._lease_s:
             self.stop(Stop.LOST)
         return self._stopped.is_set()
@@ -123,7 +123,7 @@ class LeasedJob:
         return not self.cancelled() and time.time() - self._renewed_at_s > self._lease_s / 2.0
 
     def wait(self, seconds: float) -> bool:
-        """Wait, at most until the attempt must end; whether it must."""
+        """Wait, at most until the attempt must end; returns whether it must."""
         return self._stopped.wait(seconds)
 
     def stop(self, reason: Stop) -> None:
@@ -167,7 +167,7 @@ class LeasedJob:
             self._written_s = time.monotonic()
 
     def _job_event(self, event: Event) -> JobEvent | None:
-        """An event of a run in the words of the service; None if clients do not need it."""
+        """Translate an event of a run into one of the job; None if clients do not need it."""
         if event.kind == "finished" or (event.kind == "run" and not self._waited):
             return None
         # without a message, the stage is described; after a pause it is described again
@@ -193,7 +193,7 @@ class LeasedJob:
         )
 
     def _keep(self) -> None:
-        """Renew, look and write until the attempt is over."""
+        """Renew the lease, check for a dismissal and write events until the attempt is over."""
         while not self._over.wait(self._poll_s):
             try:
                 self._look()
@@ -212,7 +212,7 @@ class LeasedJob:
                     LOG.warning("no heartbeat for %.0f s: %s", silent_s, error, extra=self.facts)
 
     def _look(self) -> None:
-        """Renew the lease if it is time, otherwise look for a dismissal."""
+        """Renew the lease if that is due, otherwise check for a dismissal."""
         now_s = time.monotonic()
         if now_s - self._renewed_s >= self._lease_s / 3.0 - self._poll_s:
             wanted = self._store.renew(self.job, lease_s=self._lease_s)
@@ -224,5 +224,5 @@ class LeasedJob:
 
     @property
     def facts(self) -> dict[str, object]:
-        """Fields of a log line beside its message."""
+        """Additional fields of a log line."""
         return {"job": self.job.job_id, "attempt": self.job.attempt}

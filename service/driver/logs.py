@@ -8,7 +8,7 @@ from pipeline.runtime.monitoring import logs
 
 
 def configure(*, as_json: bool) -> None:
-    """Send the driver's own lines with their fields to standard error, whatever the program does with other loggers."""
+    """Log the driver's own lines with their fields to standard error, independent of all other loggers."""
     logs.configure(as_json=as_json)
     quieten()
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _ABSOLUTE = re.compile(r"(?<![\w:/.\\])/(?:[^\s/:;,'\"()<>|]+/)+([^\s/:;,'\"()<>|]*)")
 _ADDRESS = re.compile(r" ?\b(?:tcp|tls|ucx|inproc)://(?:\[[^\]\s]*\]|[^\s/:]*)(?::[0-9]+)?(?:/[^\s:]*)?")
 _WARNINGS = 100
-"""Most warnings in the summary of a job; `run.json` has all."""
+"""Maximum number of warnings in the summary of a job; `run.json` has all."""
 
 
 class Scrubber:
@@ -77,11 +77,11 @@ def comparison_outcome(summary: CompareSummary) -> str:
     parts = [f"{label} {_by_status(run)}" for label, run in summary.runs.items()]
     sentence = f"{len(summary.runs)} methods on {_buildings(first)}: {'; '.join(parts)}"
     broken = [label for label, run in summary.runs.items() if run.failed_tiles]
-    return f"{sentence}; tiles are missing of {', '.join(broken)}" if broken else sentence
+    return f"{sentence}; tiles of {', '.join(broken)} are missing" if broken else sentence
 
 
 def comparison_digest(summary: CompareSummary, scrub: Scrubber, engine_version: str) -> dict[str, Any]:
-    """The stored summary of a comparison: that of every run by its label."""
+    """The stored summary of a comparison: the summary of each run by label."""
     runs = {label: digest_of(run, scrub, engine_version) for label, run in summary.runs.items()}
     return {"engine_version": engine_version, "runs": runs}
 

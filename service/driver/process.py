@@ -47,7 +47,7 @@ class Driver:
     tools : Tools, optional
         The steps of an attempt.
     cluster : SharedCluster, optional
-        Runs the runs.
+        The workers.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Driver:
     # --- from outside
 
     def stop(self, *, at_once: bool = False) -> None:
-        """End: no new jobs; those that run get `drain_s`, or no time if it must end at once."""
+        """End the driver. It takes no new jobs; running jobs get `drain_s`, or no time with `at_once`."""
         self._stops += 2 if at_once else 1
 
     def signalled(self) -> None:
@@ -154,7 +154,7 @@ class Driver:
         """Let running jobs finish, or give them back; whether all ended."""
         began_s = time.monotonic()
         held = self._all_held()
-        LOG.info("the driver ends: %d jobs run, they get %g s", len(held), self._settings.drain_s, extra=self._facts)
+        LOG.info("the driver ends: its %d running jobs get %g s", len(held), self._settings.drain_s, extra=self._facts)
         while self._is_busy():
             out_of_time = time.monotonic() - began_s >= self._settings.drain_s
             if out_of_time or self._stops > 1 or self._parent_gone:
@@ -169,7 +169,7 @@ class Driver:
             time.sleep(_TICK_S)
         stuck = self._all_held()
         for one in stuck:
-            LOG.error("the run does not end; the job is given back all the same", extra=one.facts)
+            LOG.error("the run does not end; the job is given back anyway", extra=one.facts)
             with contextlib.suppress(LeaseLostError, StoreError):
                 self._store.release(one.job, lost=False)
         return not stuck
@@ -208,10 +208,10 @@ class Driver:
                 pause = FIRST_PAUSE_S
                 wait_s = 0.0 if worked else self._settings.poll_s
             except StoreError as error:
-                LOG.warning("no job can be claimed, again in %g s: %s", pause, error, extra=self._facts)
+                LOG.warning("cannot claim a job, next try in %g s: %s", pause, error, extra=self._facts)
                 wait_s, pause = pause, min(LONGEST_PAUSE_S, 2.0 * pause)
             except Exception:  # noqa: BLE001 - a slot that ended would leave a driver that looks alive and claims nothing
-                LOG.exception("an unexpected fault, again in %g s", pause, extra=self._facts)
+                LOG.exception("an unexpected fault, next try in %g s", pause, extra=self._facts)
                 wait_s, pause = pause, min(LONGEST_PAUSE_S, 2.0 * pause)
             finally:
                 with self._lock:
@@ -249,15 +249,15 @@ class Driver:
     # --- the clock of the schedules
 
     def _keep_time(self) -> None:
-        """Look again and again for schedules that are due. Every driver does so; one of them decides a slot."""
+        """Check regularly for schedules that are due. Every driver does so; one of them decides each slot."""
         pause = FIRST_PAUSE_S
         while not self._stopping.is_set():
             try:
                 self._tick()
             except StoreError as error:
-                LOG.warning("the schedules cannot be read, again in %g s: %s", pause, error, extra=self._facts)
-            except Exception:  # noqa: BLE001 - a clock that stood still would leave a driver that looks alive
-                LOG.exception("an unexpected fault with the schedules, again in %g s", pause, extra=self._facts)
+                LOG.warning("cannot read the schedules, next try in %g s: %s", pause, error, extra=self._facts)
+            except Exception:  # noqa: BLE001 - without this thread the driver would look alive
+                LOG.exception("an unexpected fault with the schedules, next try in %g s", pause, extra=self._facts)
             else:
                 pause = FIRST_PAUSE_S
                 self._stopping.wait(self._settings.poll_s)
@@ -297,13 +297,13 @@ class Driver:
                 return
 
     def _until_done(self, action: Callable[[], None], complaint: str) -> bool:
-        """Try again until the database is there; False if the driver must end."""
+        """Repeat an action until the database answers; False if the driver must end."""
         pause = FIRST_PAUSE_S
         while not self._stopping.is_set():
             try:
                 action()
             except StoreError as error:
-                LOG.warning("%s, again in %g s: %s", complaint, pause, error, extra=self._facts)
+                LOG.warning("%s, next try in %g s: %s", complaint, pause, error, extra=self._facts)
                 self._stopping.wait(pause)
                 pause = min(LONGEST_PAUSE_S, 2.0 * pause)
             else:

@@ -21,15 +21,15 @@ WEIGHTS = MappingProxyType(
 
 WORDS = MappingProxyType(
     {
-        "inputs": "inputs are made ready",
+        "inputs": "inputs are prepared",
         "plan": "the run is planned",
         "ingest": "points are read",
         "split": "surfaces are found in the tiles",
-        "join": "surfaces are united over the borders of tiles",
-        "outline": "touching buildings are drawn together",
+        "join": "surfaces are joined across the borders of tiles",
+        "outline": "touching buildings are outlined together",
         "reconstruct": "buildings are modelled",
         "publish": "tiles are written",
-        "records": "the runs are put side by side",
+        "records": "the runs are compared",
         "points": "points are read for the pictures",
         "pictures": "pictures are drawn",
         "page": "the page is written",

@@ -1,4 +1,4 @@
-"""The one cluster of a driver: started on first use, restarted after it broke, waited for if it is elsewhere."""
+"""The cluster of a driver: started on first use, restarted after a failure; an external scheduler is waited for."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class SharedCluster:
         """
         with self._lock:
             if self._closed:
-                raise ClusterError("the driver ends and starts no workers any more")
+                raise ClusterError("the driver is ending and starts no more workers")
             if self._engine is None:
                 self._engine = self._make().__enter__()
             return self._engine
@@ -73,7 +73,7 @@ class SharedCluster:
     def replace(self, broken: Engine) -> None:
         """Stop workers that broke; the next run starts new ones. A scheduler elsewhere is left alone.
 
-        Another job may have replaced them before and may use the new ones by now: these are left alone, too.
+        If another job has already replaced them, the new workers are left alone, too.
         """
         if self._scheduler is not None:
             return
@@ -108,8 +108,8 @@ class SharedCluster:
             if reported_s is None or waited_s - reported_s >= _REPORT_S:
                 reported_s = waited_s
                 message = (
-                    f"waiting: the cluster's scheduler does not answer, for {waited_s:.0f} s now; "
-                    "the job goes on as soon as it does"
+                    f"waiting: the cluster's scheduler has not answered for {waited_s:.0f} s; "
+                    "the job continues as soon as it does"
                 )
                 LOG.warning("the scheduler %s does not answer", self._scheduler, extra=held.facts)
                 held.record(Event(kind="waiting", message=message))

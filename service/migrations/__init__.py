@@ -34,7 +34,7 @@ def known() -> frozenset[str]:
 
 
 def current(connection: Connection) -> str | None:
-    """The revision that the database is at; None where it has no tables of ours."""
+    """The revision of the database; None if it has none of our tables."""
     return MigrationContext.configure(connection).get_current_revision()
 
 

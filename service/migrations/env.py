@@ -1,4 +1,4 @@
-"""What Alembic runs to reach the database: the connection is handed in by `service.migrations.upgrade`."""
+"""Alembic's script to reach the database; `service.migrations.upgrade` passes the connection in."""
 
 from __future__ import annotations
 

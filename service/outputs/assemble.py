@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from service.outputs.report import Tally
 
 Progress = Callable[[int, int], None]
-"""Gets the number of tiles done and of all tiles. An exception from it ends the work and leaves no partial file."""
+"""Gets the number of finished tiles and of all tiles. An exception from it ends the work and leaves no partial file."""
 
 _TABLES = ("buildings", "planes", "rejected")
 
@@ -36,7 +36,7 @@ class RunTile:
     """One published tile of a run."""
 
     key: str
-    """Such as x85_y447."""
+    """Its key, such as x85_y447."""
     files: tuple[str, ...]
     """Its files, relative to the run directory."""
 
@@ -60,7 +60,7 @@ def write_outputs(
 ) -> None:
     """Write the outputs of a finished run, and the index of its buildings.
 
-    Every file gets its name when it is complete, and the catalogue comes last. A repetition gives the same bytes. One
+    Every file gets its name when it is complete, and the catalogue comes last. Writing again gives the same bytes. One
     tile is in memory at a time.
 
     Parameters
@@ -73,7 +73,7 @@ def write_outputs(
         Ids of `OUTPUTS`; all by default. The file of features and the index are always written: the service needs
         them for single buildings.
     on_progress : callable
-        Gets tiles done and all tiles.
+        Gets the number of finished tiles and of all tiles.
 
     Raises
     ------
@@ -116,19 +116,19 @@ def write_outputs(
 
 
 def _manifest(run_dir: Path) -> Mapping[str, Any]:
-    """The content of run.json of a run that ended.
+    """The content of run.json of a finished run.
 
     Raises
     ------
     RunError
-        It did not end, or is not there.
+        The run did not end, or does not exist.
     """
     from pipeline.errors import RunError
     from pipeline.runtime.manifest import NAME, RunStatus, read_manifest
 
     status = read_manifest(run_dir).status
     if status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
-        raise RunError(f"{run_dir} is {status.value}: outputs are made of runs that ended")
+        raise RunError(f"{run_dir} is {status.value}: outputs need a finished run")
     found: Mapping[str, Any] = json.loads((run_dir / NAME).read_text(encoding="utf-8"))
     return found
 

@@ -123,7 +123,7 @@ class BuildingIndexFile:
         )
 
     def _finish(self) -> None:
-        """Write what stands above single buildings."""
+        """Write the search index and the names of the tiles."""
         self._connection.execute("CREATE INDEX key_by_tile ON key (tile)")
         self._connection.execute(_TILES)
         self._connection.executemany(
@@ -132,13 +132,13 @@ class BuildingIndexFile:
         self._connection.execute("COMMIT")
 
     def __enter__(self) -> Self:
-        """Be written to."""
+        """Open for writing."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Write what is left."""
+        """Finish the file, or leave it if there was an exception."""
         if kind is None:
             self._finish()
         self._connection.close()

@@ -1,4 +1,4 @@
-"""Pages of a job's buildings as GeoJSON, cut out of files that lie ready; reads the index and nothing numerical."""
+"""Pages of a job's buildings as GeoJSON, cut out of prepared files; loads no numerical library."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from service.outputs.catalogue import ResultsCrs
 GONE = "the buildings of this job are no longer in the state folder: submit it again"
 """The message if the files were removed."""
 MAX_LIMIT = 10_000
-"""Most buildings of one page."""
+"""Maximum number of buildings of one page."""
 MAX_OFFSET = 10**12
-"""Most buildings before a page."""
+"""Maximum number of buildings before a page."""
 _CHUNK_BYTES = 1 << 16
 _CACHE_KIB = 512
 _NARROW_SHARE = 0.05
-"""Windows whose tiles hold a smaller share of all buildings are looked up tile by tile, where a row costs ten times
+"""A window whose tiles hold a smaller share of all buildings is looked up tile by tile; a row then costs ten times
 more."""
 
 
 class CoordinateChoice(StrEnum):
-    """Which coordinates a request speaks."""
+    """The coordinates of a request."""
 
     CRS84 = "CRS84"
     """Longitude and latitude in WGS 84."""
@@ -41,20 +41,20 @@ class CoordinateChoice(StrEnum):
 
     @property
     def is_native(self) -> bool:
-        """Whether it is the tiles' own."""
+        """Whether these are the tiles' own coordinates."""
         return self is CoordinateChoice.NATIVE
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BuildingQuery:
-    """What a page is asked for."""
+    """The query for a page."""
 
     bbox: Box | None = None
     """Buildings whose footprint's bounds meet this window, border included; those without a footprint never do."""
     bbox_native: bool = False
     """The window is in the tiles' own coordinates."""
     native: bool = False
-    """Coordinates go out as the tiles' own."""
+    """The answer has the tiles' own coordinates."""
     statuses: tuple[str, ...] = ()
     """Any of these; empty for all."""
     roof_types: tuple[str, ...] = ()
@@ -62,14 +62,14 @@ class BuildingQuery:
     reasons: tuple[str, ...] = ()
     """Any of these; empty for all."""
     limit: int = 100
-    """Most buildings of the page."""
+    """Maximum number of buildings of the page."""
     offset: int = 0
-    """Buildings before it, in the order of their ids."""
+    """Number of buildings before it, in the order of their ids."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class FeaturePart:
-    """Where a building's feature lies, and what takes the place of its geometry."""
+    """Position of a building's feature in the file, and the geometry that replaces its own."""
 
     start: int
     size: int
@@ -158,7 +158,7 @@ def parsed_bbox(text: str, *, native: bool) -> Box:
 
 
 def checked_choice(choice: CoordinateChoice | None, crs: ResultsCrs, parameter: str) -> bool:
-    """Whether the tiles' own coordinates are meant; they are the only ones if the CRS is unknown.
+    """Whether the tiles' own coordinates are requested; they are the only ones if the CRS is unknown.
 
     Raises
     ------

@@ -80,7 +80,7 @@ class Catalogue:
             return NoSuchOutputError(f"{problem} {', '.join(self.runs)}")
         if output_id not in KINDS:
             return NoSuchOutputError(f"there is no output {output_id[:80]!r}; this job has: {there}")
-        return NoSuchOutputError(f"this job was asked not to make {output_id}, or had nothing for it; it has: {there}")
+        return NoSuchOutputError(f"the request left out {output_id}, or the job had nothing for it; it has: {there}")
 
 
 def run_outputs(out_dir: Path, label: str) -> Path:
@@ -108,7 +108,7 @@ def output_file(out_dir: Path, output_id: str) -> Path:
     Raises
     ------
     NoSuchOutputError
-        The process has no such output, the job was asked not to make it, or its file is gone.
+        The process has no such output, the request left it out, or its file is gone.
     """
     catalogue = read_catalogue(out_dir)
     if output_id not in catalogue.outputs:

@@ -55,7 +55,7 @@ def write_comparison_outputs(
     wanted : sequence of str, optional
         Ids of `COMPARISON_OUTPUTS`; all by default.
     on_progress : callable
-        Gets the number of tiles and files done, and of all. An exception from it ends the work.
+        Gets the number of finished tiles and files, and of all. An exception from it ends the work.
 
     Raises
     ------
@@ -126,7 +126,7 @@ def _add(archive: zipfile.ZipFile, folder: Path, name: str, clean: Callable[[str
 
 
 def _cleaner(folder: Path, labels: Sequence[str]) -> Callable[[str], str]:
-    """A function that removes the server's folders from a text, also in the spelling of a page."""
+    """A function that removes the server's folders from a text, also as escaped in a page."""
     manifests = [json.loads((folder / RUNS / label / "run.json").read_text(encoding="utf-8")) for label in labels]
     paths = {entry["path"] for manifest in manifests for entry in manifest["inputs"]}
     # the request repeats them with links resolved

@@ -43,7 +43,7 @@ class Wgs84Transformation:
     def of_run(cls, crs: Mapping[str, Any] | None) -> Wgs84Transformation:
         """The transformation for the `crs` entry of a run.json.
 
-        A compound CRS counts by its horizontal part: footprints have no elevation.
+        A compound CRS is reduced to its horizontal part: footprints have no elevation.
         """
         if crs is None or crs.get("wkt") is None:
             unknown = ResultsCrs(name=None, uri=None, to_wgs84=None, accuracy_m=None)
@@ -176,7 +176,7 @@ class FeatureCollectionFile:
         self._first = True
 
     def add(self, feature: FeatureText) -> int:
-        """Append a feature; where it starts."""
+        """Append a feature; returns its first byte."""
         self._put(b"\n" if self._first else b",\n")
         self._first = False
         start = self._position

@@ -33,7 +33,7 @@ class OutputKind:
     output_id: str
     """Its name in requests, results and paths."""
     title: str
-    """A few words."""
+    """A short title."""
     description: str
     """Content, and how to read it."""
     media_type: str

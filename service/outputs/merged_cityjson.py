@@ -23,7 +23,7 @@ _EMPTY: dict[str, Any] = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FeaturePlace:
-    """Where a building's feature lies in its tile's file."""
+    """Position of a building's feature in its tile's file."""
 
     building_id: str
     """The building."""
@@ -116,5 +116,5 @@ class MergedCityJson:
 
 
 def _json(value: dict[str, Any]) -> bytes:
-    """One line of JSON without idle spaces."""
+    """One line of JSON without spaces."""
     return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()

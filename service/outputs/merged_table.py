@@ -136,7 +136,7 @@ def _united_column(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _united_bounds(bounds: Sequence[Sequence[float]]) -> list[float]:
-    """The bounds of several bounds; flat if one of them is.
+    """The union of several bounds; 2D if one of them is 2D.
 
     >>> _united_bounds([[0.0, 0.0, 1.0, 2.0, 2.0, 3.0], [-1.0, 1.0, 0.0, 1.0, 5.0, 9.0]])
     [-1.0, 0.0, 0.0, 2.0, 5.0, 9.0]

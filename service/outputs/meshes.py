@@ -1,4 +1,4 @@
-"""The OBJ files of a run: all in one zip file, or those of one building. The bytes of a zip file hold no time."""
+"""The OBJ files of a run: all in one zip file, or those of one building. Zip files contain no times."""
 
 from __future__ import annotations
 

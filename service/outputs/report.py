@@ -1,4 +1,4 @@
-"""The report of a run: an ordered account of what was asked, from which inputs, what came out and what did not."""
+"""The report of a run: request, inputs, results and failures, in a fixed order."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FORMAT = 1
 
 @dataclasses.dataclass(kw_only=True)
 class Tally:
-    """Counts that are taken while the tables are merged."""
+    """Counts made while the tables are merged."""
 
     buildings: int = 0
     statuses: Counter[str] = dataclasses.field(default_factory=Counter)
@@ -123,7 +123,7 @@ def report_bytes(found: Mapping[str, Any]) -> bytes:
 
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:
-    """Counts, largest first."""
+    """The counts, largest first."""
     return dict(sorted(counts.items(), key=lambda entry: (-entry[1], entry[0])))
 
 

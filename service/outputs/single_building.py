@@ -55,7 +55,7 @@ def stored_building(out_dir: Path, building_id: str, *, native: bool = False) ->
     Raises
     ------
     NoSuchBuildingError
-        There is none of this id.
+        No building has this id.
     NoSuchOutputError
         The outputs are gone.
     """
@@ -128,11 +128,11 @@ def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str, lod: str | 
         if own_lod is None:
             why = building.feature["properties"]["reason"]
             raise NoSuchBuildingError(f"building {name} has no model ({why}), so it has no mesh")
-        raise NoSuchBuildingError(f"this job was asked for no meshes: take building {name} as CityJSON")
+        raise NoSuchBuildingError(f"the request left out the meshes: use CityJSON for building {name}")
     kind = building.mesh_path.rpartition(".")[2]
     if kind != wanted:
         problem = f"this job has meshes as {kind.upper()}, not as {wanted.upper()}"
-        raise NoSuchBuildingError(f"{problem}: take building {name} with f={kind}")
+        raise NoSuchBuildingError(f"{problem}: request building {name} with f={kind}")
     path = run_dir / building.mesh_path
     if lod not in {None, own_lod}:
         # named by pipeline.export.tile.mesh_path

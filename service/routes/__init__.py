@@ -1,1 +1,1 @@
-"""The paths of the service: one module a chapter of it, each with its `router`."""
+"""The routes of the service: one module per chapter, each with its `router`."""

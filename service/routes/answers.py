@@ -1,4 +1,4 @@
-"""What routes declare about their answers for the OpenAPI document."""
+"""The answers of routes, declared for the OpenAPI document."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ SCHEDULE_RUN_EXAMPLE = {
     "slots": 1,
     "jobID": JOB_ID,
     "at": "2026-03-01T01:30:00.412Z",
-    "message": "in time",
+    "message": "on time",
     "links": [{"href": f"http://127.0.0.1:8000/jobs/{JOB_ID}", "rel": "monitor", "type": "application/json"}],
 }
 

@@ -109,8 +109,8 @@ class _Asked:
     status: Annotated[_Statuses, Query(description=_any_of(Status))] = None
     roof_type: Annotated[_RoofTypes, Query(description=_any_of(RoofType))] = None
     reason: Annotated[_Reasons, Query(description=_any_of(Reason))] = None
-    limit: Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Most buildings of the page.")] = 100
-    offset: Annotated[int, Query(ge=0, le=MAX_OFFSET, description="Buildings before the page.")] = 0
+    limit: Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Maximum number of buildings of the page.")] = 100
+    offset: Annotated[int, Query(ge=0, le=MAX_OFFSET, description="Number of buildings before the page.")] = 0
 
     def query(self, known: ResultsCrs) -> BuildingQuery:
         """The query, in the coordinates of the results."""
@@ -127,7 +127,7 @@ class _Asked:
         )
 
     def again(self, label: str | None, start: int) -> str:
-        """The same query from another building on."""
+        """The same query, starting at another building."""
         lists = (("status", self.status), ("roof_type", self.roof_type), ("reason", self.reason))
         given = [
             ("method", label),

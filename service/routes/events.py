@@ -36,7 +36,7 @@ LONGEST_LOOK_S = 2.0
 """Longest time in seconds between looks at a job without events; the first looks come sooner."""
 
 PAGE = 500
-"""Events that are read together."""
+"""Maximum number of events per read."""
 
 REPRESENTATIONS: Mapping[str, str] = {"application/json": "json", "text/event-stream": "sse"}
 """Media types of the events with their names in the parameter f; the first one wins among equals."""

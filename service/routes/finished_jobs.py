@@ -29,7 +29,7 @@ class FinishedJob:
     run_dir: Path
     """Its run directory, or the folder of its comparison."""
     catalogue: Catalogue
-    """What the outputs are."""
+    """The list of the outputs."""
     label: str | None = None
     """The requested run of a comparison; None for the whole comparison, and for other jobs."""
 

@@ -1,4 +1,4 @@
-"""Whether the process lives and can work, and its metrics."""
+"""Liveness, readiness and metrics."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ router = APIRouter(tags=["service"])
 
 @router.get(
     "/healthz",
-    summary="Whether the process lives",
-    responses={200: document(Health, "It does.", {"status": "ok"})},
+    summary="Whether the process is alive",
+    responses={200: document(Health, "The process is alive.", {"status": "ok"})},
 )
 async def healthz() -> Response:
     """Say that the process answers; nothing else is checked."""
@@ -38,8 +38,12 @@ _READY = {"status": "ok", "checks": {"database": "ok", "state": "ok", "driver": 
     "/readyz",
     summary="Whether the service can work",
     responses={
-        200: document(Health, "It can.", _READY),
-        503: document(Health, "It cannot now.", {"status": "unavailable", "checks": {"database": "does not answer"}}),
+        200: document(Health, "The service can work.", _READY),
+        503: document(
+            Health,
+            "The service cannot work now.",
+            {"status": "unavailable", "checks": {"database": "does not answer"}},
+        ),
     },
 )
 def readyz(request: Request, store: Store, folder: Folder) -> Response:

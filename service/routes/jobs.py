@@ -31,13 +31,13 @@ from service.wire.queries import JobQuery, interval
 router = APIRouter(tags=["jobs"])
 
 DISMISSAL_S = 5.0
-"""Seconds that a dismissal waits for the driver to let go."""
+"""Seconds that a dismissal waits for the driver to stop."""
 
 LOOK_S = 0.1
-"""Seconds between looks at a job that is being dismissed."""
+"""Seconds between checks of a job that is being dismissed."""
 
 OTHER_PARTS = 50
-"""Parts of a form beside its files."""
+"""Maximum number of parts of a form that are not files."""
 
 JobId = Annotated[str, Path(alias="jobID", description="As in the job's statusInfo.", examples=[JOB_ID])]
 
@@ -118,7 +118,7 @@ async def _stored(part: Part, submission: Submission, number: int) -> dict[str, 
     """A file of the form, as a reference to its upload."""
     most = submission.settings.max_inputs
     if number >= most:
-        raise RequestError([f"{part.name} comes more than {most} times: use fewer files"])
+        raise RequestError([f"{part.name} is given more than {most} times: use fewer files"])
     kept = await submission.keep(part.chunks(), part.filename or "")
     return {"href": f"/uploads/{kept.value}"}
 

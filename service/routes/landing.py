@@ -24,7 +24,7 @@ SPECIFICATION = "http://www.opengis.net/spec/ogcapi-processes-1/1.0/conf/"
 CONFORMANCE = tuple(
     f"{SPECIFICATION}{name}" for name in ("core", "json", "oas30", "ogc-process-description", "job-list", "dismiss")
 )
-"""The parts of the standard that are met."""
+"""The implemented parts of the standard."""
 
 OPENAPI_TYPE = "application/vnd.oai.openapi+json;version=3.0"
 
@@ -63,7 +63,7 @@ def _for_machines(base: str) -> Response:
             link(f"{base}/?f=html", "alternate", "The web page", "text/html"),
             link(f"{base}/openapi.json", "service-desc", "The API", OPENAPI_TYPE),
             link(f"{base}/docs", "service-doc", "The API for people", "text/html"),
-            link(f"{base}/conformance", f"{RELATIONS}conformance", "The parts of OGC API - Processes that are met"),
+            link(f"{base}/conformance", f"{RELATIONS}conformance", "The implemented parts of OGC API - Processes"),
             link(f"{base}/processes", f"{RELATIONS}processes", "The processes"),
             link(f"{base}/jobs", f"{RELATIONS}job-list", "The jobs"),
             link(f"{base}/schedules", "schedules", "The schedules"),
@@ -101,7 +101,7 @@ UNBUILT = """<!doctype html>
     responses={200: document(Conformance, "The classes.", {"conformsTo": list(CONFORMANCE)})},
 )
 def conformance() -> Response:
-    """List the parts of OGC API - Processes that are met."""
+    """List the implemented parts of OGC API - Processes."""
     return respond(Conformance(conformsTo=list(CONFORMANCE)))
 
 

@@ -39,8 +39,8 @@ _SUMMARY = {
 )
 def processes(
     base: Base,
-    limit: Annotated[int, Query(ge=1, le=10_000, description="Most processes to list.")] = 10,
-    offset: Annotated[int, Query(ge=0, le=10_000, description="Processes to pass over.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=10_000, description="Maximum number of processes to list.")] = 10,
+    offset: Annotated[int, Query(ge=0, le=10_000, description="Number of processes to skip.")] = 0,
 ) -> Response:
     """List the processes."""
     rows = list(PROCESSES.values())
@@ -84,7 +84,7 @@ async def execute(
     body: Annotated[Execute, Body(openapi_examples={"reconstruct": {"value": EXAMPLE}})],
     base: Base,
     submitting: Submitting,
-    prefer: Annotated[str | None, Header(description="`respond-async` is always the case.")] = None,
+    prefer: Annotated[str | None, Header(description="`respond-async` always applies.")] = None,
 ) -> Response:
     """Submit a job. It always runs asynchronously: the answer comes at once and links to the job's status."""
     draft = process_named(process_id).draft(body, submitting.settings)

@@ -155,7 +155,7 @@ def _saved_name(job_id: str, label: str | None, path: FilePath) -> str:
 
 
 def _is_known(if_none_match: str, etag: str) -> bool:
-    """Whether a client has the file already.
+    """Whether a client already has the file.
 
     >>> _is_known('W/"a", "b"', '"b"'), _is_known("*", '"b"'), _is_known("", '"b"')
     (True, True, False)
@@ -165,7 +165,7 @@ def _is_known(if_none_match: str, etag: str) -> bool:
 
 
 def _check_range(request: Request, size: int) -> None:
-    """Refuse a range behind the end; one that cannot be parsed is ignored, as RFC 9110 (14.2) requires."""
+    """Refuse a range beyond the end; one that cannot be parsed is ignored, as RFC 9110 (14.2) requires."""
     text = request.headers.get("range")
     if text is None:
         return
@@ -175,5 +175,5 @@ def _check_range(request: Request, size: int) -> None:
         request.scope["headers"] = [entry for entry in request.scope["headers"] if entry[0] != b"range"]
         return
     if any(int(first) >= size if first else int(last) == 0 for first, last in ends):
-        problem = f"the range {text[:80]} lies behind the end: there are {size} bytes"
+        problem = f"the range {text[:80]} starts beyond the end: the file has {size} bytes"
         raise HTTPException(416, problem, {"Content-Range": f"bytes */{size}"})

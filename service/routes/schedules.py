@@ -39,7 +39,7 @@ from service.wire.queries import Page, ScheduleQuery
 router = APIRouter(tags=["schedules"])
 
 NEXT_TIMES = 5
-"""Next times in a schedule's document."""
+"""Number of next times in a schedule's document."""
 
 ScheduleId = Annotated[str, Path(alias="scheduleID", description="As in the schedule itself.", examples=[SCHEDULE_ID])]
 
@@ -167,7 +167,7 @@ async def change_schedule(
     submitting: Submitting,
     if_match: Annotated[
         str | None,
-        Header(description="The ETag that the client has; the change is refused if it is another one now."),
+        Header(description="The ETag that the client has; the change is refused if the schedule has another one."),
     ] = None,
 ) -> Response:
     """Change what is given; the rest stays. Slots that come while it is paused do not count as missed."""
@@ -179,7 +179,7 @@ async def change_schedule(
         chosen = body.processID if "processID" in body.model_fields_set else process_id
         draft = _draft(chosen, body.execute, submitting.settings)
     elif "processID" in body.model_fields_set and body.processID != process_id:
-        raise RequestError([f'processID is "{body.processID}": the schedule is of {process_id}, give execute, too'])
+        raise RequestError([f'processID is "{body.processID}": the schedule runs {process_id}, give execute, too'])
     # a precondition counts only for a request that would succeed without it
     _check_version(if_match, before)
 
@@ -201,7 +201,7 @@ async def change_schedule(
     summary="Remove a schedule",
     status_code=204,
     response_class=Response,
-    responses={204: {"description": "It is removed. Its jobs stay; one that runs goes on."}, **problems(404)},
+    responses={204: {"description": "It is removed. Its jobs stay; a running one continues."}, **problems(404)},
 )
 def remove_schedule(schedule_id: ScheduleId, store: Store, caller: Submitter) -> Response:
     """Remove a schedule with the history of its slots."""

@@ -63,7 +63,7 @@ def _links(job: Job, base: str, *, with_request: bool) -> list[Link]:
 
 
 def _words(job: Job) -> str:
-    """A sentence if the store has none."""
+    """The message of a job that has none in the store."""
     if job.status is JobStatus.RUNNING and job.dismiss_requested:
         return "dismissal was requested; the work is being stopped"
     return {

@@ -40,7 +40,7 @@ class Submission:
     settings: ServiceSettings
     caller: Principal
     threads: anyio.CapacityLimiter
-    """How many calls may write jobs at once."""
+    """Limits the calls that write jobs at the same time."""
     made: list[str] = dataclasses.field(default_factory=list)
     """Ids of the uploads of this call."""
 

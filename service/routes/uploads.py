@@ -32,7 +32,7 @@ FILE_FIELD = "file"
 """Field of a form that holds the file."""
 MAX_PARTS = 20
 FORM_SLACK_BYTES = 65_536
-"""Bytes that a form may have beside the file."""
+"""Bytes that a form may have in addition to the file."""
 DIGEST = re.compile(r"(?:^|,)\s*sha-256\s*=\s*:([A-Za-z0-9+/=]*):", re.IGNORECASE)
 
 EXAMPLE: dict[str, Any] = {
@@ -74,9 +74,9 @@ def _named(
         Query(max_length=1024, description="Name of the file, if the body is the file; its ending decides the format."),
     ] = None,
     content_disposition: Annotated[
-        str | None, Header(description='Names the file likewise: `attachment; filename="a.laz"`.')
+        str | None, Header(description='Another way to name the file: `attachment; filename="a.laz"`.')
     ] = None,
-    x_filename: Annotated[str | None, Header(description="Names the file likewise, percent-encoded.")] = None,
+    x_filename: Annotated[str | None, Header(description="Another way to name the file, percent-encoded.")] = None,
 ) -> str:
     """The name of the file; empty if there is none."""
     return filename or _disposition_name(content_disposition) or unquote(x_filename or "")
@@ -136,7 +136,7 @@ async def send(
 ) -> Response:
     """Send one file, as the body itself or as the field `file` of a form; it is stored while it arrives.
 
-    The answer has the content of the file's header. `usable: false` comes with `problems` that a job can still heal,
+    The answer has the content of the file's header. `usable: false` comes with `problems` that a job can still fix,
     such as a missing projected CRS.
     """
     encoding = request.headers.get("content-encoding", "identity").strip().lower()
@@ -192,7 +192,7 @@ def _file_name(part: Part, *, is_first: bool) -> str:
 
 
 def _check_length(request: Request, settings: ServiceSettings, *, slack_bytes: int) -> None:
-    """Refuse a body that is too long by its own header, before it is read."""
+    """Refuse a body that is too long according to its header, before it is read."""
     length = request.headers.get("content-length", "")
     if length.isascii() and length.isdigit() and int(length) > settings.max_upload_bytes + slack_bytes:
         raise TooLargeError(

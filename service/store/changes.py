@@ -17,7 +17,7 @@ from service.store.records import job_of, storable
 from service.store.tables import EVENTS, JOBS
 
 MAX_KEPT = 1000
-"""Events per job that are kept beside its status events and the latest progress of each stage."""
+"""Events kept per job, in addition to its status events and the latest progress of each stage."""
 _LASTING = ("status", "progress")
 
 

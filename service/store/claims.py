@@ -1,4 +1,4 @@
-"""What drivers do with jobs: claim, renew, record, finish, give back. Within a transaction."""
+"""The operations of drivers on jobs: claim, renew, record, finish, give back. Within a transaction."""
 
 from __future__ import annotations
 
@@ -70,14 +70,14 @@ def take_first(connection: Connection, driver: str, *, now: dt.datetime, lease_s
 
 
 def renew(connection: Connection, held: Job, *, until: dt.datetime) -> bool:
-    """Lengthen a lease; True where the job is to be dismissed.
+    """Extend a lease; True if the job must be dismissed.
 
     An expired lease that no driver took can be renewed.
 
     Raises
     ------
     LeaseLostError
-        It is not held any more.
+        The job is no longer held.
     """
     row = lock_held(connection, held)
     connection.execute(sa.update(JOBS).where(JOBS.c.job_id == held.job_id).values(lease_until=until))
@@ -92,7 +92,7 @@ def finish(
     Raises
     ------
     LeaseLostError
-        It is not held any more.
+        The job is no longer held.
     """
     move(connection, lock_held(connection, held), status, now=now, message=message, **values)
 
@@ -105,12 +105,12 @@ def failed_values(failure: JobFailure) -> dict[str, Any]:
 def release(
     connection: Connection, held: Job, *, now: dt.datetime, lost: bool, message: str, not_before: dt.datetime | None
 ) -> None:
-    """Give a job back to the line, or end it where it is to be dismissed.
+    """Put a job back into the queue, or end it if its dismissal was requested.
 
     Raises
     ------
     LeaseLostError
-        It is not held any more.
+        The job is no longer held.
     """
     row = lock_held(connection, held)
     counted = {"lost_attempts": row.lost_attempts + int(lost)}

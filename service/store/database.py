@@ -23,7 +23,7 @@ _EPOCH_JULIAN = 2440587.5
 _WRITES = "gablework_writes"
 _POOL_SIZE = 10
 _WAIT_S = 30
-"""Most seconds that a statement waits: for SQLite's write lock, for a connection, for PostgreSQL's answer."""
+"""Maximum seconds that a statement waits: for SQLite's write lock, for a connection, for PostgreSQL's answer."""
 _RETRY_S = 0.01
 _LOCK_MIGRATIONS = 0x6761626C01
 LOCK_SUBMISSIONS = 0x6761626C02

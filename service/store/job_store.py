@@ -16,7 +16,7 @@ from service.store.schedule_store import ScheduleStore
 
 
 class JobStore:
-    """Jobs, events, uploads, schedules and keys; one a process, safe to share between its threads.
+    """Jobs, events, uploads, schedules and keys; one per process, safe to share between its threads.
 
     Every method is a transaction of its own and may raise `StoreError` when the database does not answer.
     The time is always the database's: machines whose clocks differ agree on leases.
@@ -35,7 +35,7 @@ class JobStore:
     def __init__(self, url: str) -> None:
         self._database = Database(url)
         self.schedules = ScheduleStore(self._database)
-        """Schedules, and what became of their slots."""
+        """Schedules and the history of their slots."""
 
     def __enter__(self) -> Self:
         """For `with`: closes the connections at the end."""
@@ -67,7 +67,7 @@ class JobStore:
         Raises
         ------
         StoreError
-            It does not, or it has not.
+            It does not answer, or has other tables.
         """
         self._database.check()
 
@@ -76,7 +76,7 @@ class JobStore:
         with self._database.read() as connection:
             return self._database.now(connection)
 
-    # --- what clients do
+    # --- for clients
 
     def create(
         self,
@@ -92,13 +92,13 @@ class JobStore:
         Parameters
         ----------
         request : JobRequest
-            What is to be done; checked already.
+            The job's request, already checked.
         owner : str or None
-            The key that submits; None where keys are not used: then only the whole line is limited.
+            The key that submits; None if keys are not used, then only the whole queue is limited.
         priority : int
-            Higher goes first.
+            Higher runs first.
         max_queued, max_queued_per_key : int
-            Most jobs that may wait, of all and of this key; jobs that run do not count.
+            Maximum number of waiting jobs, in total and of this key; running jobs do not count.
 
         Raises
         ------
@@ -131,9 +131,9 @@ class JobStore:
             return queries.listed(connection, criteria, self._database.now(connection))
 
     def dismiss(self, job_id: str, *, owner: str | None = None) -> Job:
-        """Stop a job: one that waits is dismissed at once, the driver of one that runs is asked to let go.
+        """Stop a job. A waiting job is dismissed at once; the driver of a running job is asked to stop.
 
-        A job that is over stays as it is; one that runs, but whose driver is lost, is dismissed at once.
+        A job that is over stays as it is. A running job whose driver is lost is dismissed at once.
 
         Raises
         ------
@@ -145,7 +145,7 @@ class JobStore:
             return queries.get(connection, job_id, owner)
 
     def remove(self, job_id: str) -> None:
-        """Forget a job that is over, with its events; its folder is the caller's business.
+        """Delete a job that is over, with its events; the caller removes its folder.
 
         Raises
         ------
@@ -172,29 +172,29 @@ class JobStore:
         with self._database.read() as connection:
             return queries.attempts(connection, job_ids)
 
-    # --- what drivers do
+    # --- for drivers
 
     def claim(self, driver: str, *, lease_s: float, max_attempts: int) -> Job | None:
-        """Take the first job in line: highest priority, then oldest.
+        """Claim the first job in the queue: highest priority, then oldest.
 
-        Jobs whose lease has ended are put back in line first, or failed when they were lost `max_attempts` times,
-        or dismissed where that was asked for.
+        Before that, jobs whose lease has ended go back into the queue, fail if they were lost `max_attempts` times,
+        or are dismissed if that was requested.
 
         Parameters
         ----------
         driver : str
-            Name of the driver, another for each process.
+            Name of the driver, unique per process.
         lease_s : float
             Seconds for which the job is held, unless it is renewed.
         max_attempts : int
-            Losses with which a job is given up.
+            Number of losses after which a job fails.
 
         Returns
         -------
         Job or None
-            The job as it is now held; None where nothing waits.
+            The job as it is now held; None if no job waits.
         """
-        # most looks find nothing: they take no lock
+        # most checks find nothing: they take no lock
         with self._database.read() as connection:
             if not claims.work_waits(connection, self._database.now(connection)):
                 return None
@@ -205,24 +205,24 @@ class JobStore:
             return None if job_id is None else queries.get(connection, job_id, None)
 
     def renew(self, job: Job, *, lease_s: float) -> bool:
-        """Hold a job for `lease_s` more seconds from now; True where it is to be dismissed.
+        """Hold a job for `lease_s` seconds from now; True if it must be dismissed.
 
         Raises
         ------
         LeaseLostError
-            The job is not held any more.
+            The job is no longer held.
         """
         with self._database.write() as connection:
             until = self._database.now(connection) + dt.timedelta(seconds=lease_s)
             return claims.renew(connection, job, until=until)
 
     def still_held(self, job: Job) -> bool:
-        """Whether a job that is held is to be dismissed; only looks, and takes no lock.
+        """Whether a job that is held must be dismissed; only reads, and takes no lock.
 
         Raises
         ------
         LeaseLostError
-            The job is not held any more.
+            The job is no longer held.
         """
         with self._database.read() as connection:
             return bool(changes.held_row(connection, job).dismiss_requested)
@@ -233,7 +233,7 @@ class JobStore:
         Raises
         ------
         LeaseLostError
-            The job is not held any more.
+            The job is no longer held.
         """
         with self._database.write() as connection:
             row = changes.lock_held(connection, job)
@@ -245,7 +245,7 @@ class JobStore:
         Raises
         ------
         LeaseLostError
-            The job is not held any more.
+            The job is no longer held.
         """
         self._finish(job, JobStatus.SUCCESSFUL, message=message, summary=dict(summary), progress=100)
 
@@ -255,22 +255,22 @@ class JobStore:
         Raises
         ------
         LeaseLostError
-            The job is not held any more.
+            The job is no longer held.
         """
         self._finish(job, JobStatus.FAILED, message=failure.detail, **claims.failed_values(failure))
 
     def dismissed(self, job: Job) -> None:
-        """End a job that was to be dismissed: its driver let go.
+        """End a job whose dismissal was requested: its driver has stopped.
 
         Raises
         ------
         LeaseLostError
-            The job is not held any more.
+            The job is no longer held.
         """
         self._finish(job, JobStatus.DISMISSED, message="dismissed")
 
     def release(self, job: Job, *, lost: bool, message: str = "", retry_after_s: float = 0.0) -> None:
-        """Give a job back to the line; one that is to be dismissed ends instead.
+        """Put a job back into the queue; if its dismissal was requested, it ends instead.
 
         Parameters
         ----------
@@ -279,14 +279,14 @@ class JobStore:
         lost : bool
             Whether the attempt counts as lost.
         message : str
-            Why, for the client.
+            The reason, for the client.
         retry_after_s : float
             Seconds during which it cannot be claimed.
 
         Raises
         ------
         LeaseLostError
-            The job is not held any more.
+            The job is no longer held.
         """
         with self._database.write() as connection:
             now = self._database.now(connection)
@@ -301,7 +301,7 @@ class JobStore:
     # --- uploads
 
     def add_upload(self, upload: Upload) -> None:
-        """Store what is known of an upload; its file is in place already."""
+        """Store the record of an upload; its file is already in place."""
         with self._database.write() as connection:
             uploads.add(connection, upload)
 
@@ -322,7 +322,7 @@ class JobStore:
             return uploads.listed(connection, owner, limit, offset)
 
     def remove_upload(self, upload_id: str) -> None:
-        """Forget an upload; the caller removes its file afterwards. One that does not exist is no fault.
+        """Delete an upload; the caller removes its file afterwards. One that does not exist is ignored.
 
         Raises
         ------
@@ -350,17 +350,17 @@ class JobStore:
             keys.add(connection, key)
 
     def key_by_digest(self, digest: str) -> Key | None:
-        """The key with this digest, a revoked one too; None where there is none."""
+        """The key with this digest, even if it is revoked; None if there is none."""
         with self._database.read() as connection:
             return keys.by_digest(connection, digest)
 
     def keys(self) -> builtins.list[Key]:
-        """All keys, revoked ones too, oldest first."""
+        """All keys, also revoked ones, oldest first."""
         with self._database.read() as connection:
             return keys.every(connection)
 
     def revoke_key(self, key_id: str) -> None:
-        """Revoke a key; one that does not exist is no fault."""
+        """Revoke a key; one that does not exist is ignored."""
         with self._database.write() as connection:
             keys.revoke(connection, key_id, self._database.now(connection))
 

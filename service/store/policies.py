@@ -1,4 +1,4 @@
-"""What is decided about jobs, as pure functions; the time is an argument."""
+"""Decisions about jobs, as pure functions; the time is an argument."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ def lease_expired(job: Job, now: dt.datetime) -> bool:
 
 
 def after_loss(job: Job, max_attempts: int) -> JobStatus:
-    """What becomes of a job whose driver was lost.
+    """The next status of a job whose driver was lost.
 
     Parameters
     ----------
     job : Job
         As it was when the driver was lost; `lost_attempts` does not count this loss yet.
     max_attempts : int
-        Losses with which a job is given up.
+        Number of losses after which a job fails.
 
     Returns
     -------
     JobStatus
-        Dismissed where that was asked for, failed where it was lost too often, else accepted: it waits again.
+        Dismissed if that was requested, failed if it was lost too often, otherwise accepted: it waits again.
     """
     if job.dismiss_requested:
         return JobStatus.DISMISSED
@@ -44,7 +44,7 @@ def loss(job: Job) -> JobFailure:
     stage = f" (the last one at stage {job.stage})" if job.stage else ""
     return JobFailure(
         fault=Fault.LOST,
-        detail=f"{drivers} lost over this job{stage}, so it is not tried again. It may need more memory than the "
+        detail=f"{drivers} lost during this job{stage}, so it is not tried again. It may need more memory than the "
         "driver's machine has: submit it with fewer or smaller tiles, or ask the operator for the driver's log",
     )
 

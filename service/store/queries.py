@@ -25,11 +25,11 @@ class JobFilter:
     """Which jobs to list; the filters of OGC API - Processes."""
 
     owner: str | None = None
-    """Only this key's jobs; None for everybody's."""
+    """Only this key's jobs; None for the jobs of all keys."""
     statuses: Collection[JobStatus] = ()
-    """Only these; none given: all."""
+    """Only these; empty for all."""
     process_ids: Collection[str] = ()
-    """Only these; none given: all."""
+    """Only these; empty for all."""
     schedule_id: str | None = None
     """Only jobs of this schedule."""
     created_from: dt.datetime | None = None
@@ -37,13 +37,13 @@ class JobFilter:
     created_to: dt.datetime | None = None
     """Created at this time or earlier; with a time zone."""
     min_duration_s: float | None = None
-    """Ran for so many seconds or longer; a job that runs counts up to now, one that never ran does not count."""
+    """Ran for so many seconds or longer; a running job counts up to now, one that never ran does not count."""
     max_duration_s: float | None = None
-    """Ran for so many seconds or shorter; likewise."""
+    """Ran for at most so many seconds; counted in the same way."""
     limit: int = 100
-    """Most jobs to list."""
+    """Maximum number of jobs to list."""
     offset: int = 0
-    """Jobs to pass over."""
+    """Number of jobs to skip."""
 
 
 def no_such_job(job_id: str) -> NoSuchJobError:
@@ -125,7 +125,7 @@ _LONGEST_S = 1e9
 
 
 def _before(now: dt.datetime, seconds: float) -> dt.datetime:
-    """So long ago; anything longer than a lifetime is one."""
+    """The time so many seconds ago, limited to a lifetime."""
     return now - dt.timedelta(seconds=max(min(seconds, _LONGEST_S), -_LONGEST_S))
 
 
@@ -134,5 +134,5 @@ def _milliseconds(seconds: float) -> int:
 
 
 def _bounded(sequence: int) -> int:
-    """Within what a column of integers holds."""
+    """The number, limited to the range of an integer column."""
     return max(0, min(sequence, 2**31 - 1))

@@ -1,4 +1,4 @@
-"""What clients do with schedules: make, change, remove. Within a transaction."""
+"""The operations of clients on schedules: make, change, remove. Within a transaction."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def insert(connection: Connection, definition: Definition, *, owner: str | None,
     Raises
     ------
     TooManySchedulesError
-        The key already has the most that it may have.
+        The key has reached its limit.
     NoSuchUploadError
         It names an upload that is gone.
     """
@@ -37,7 +37,7 @@ def insert(connection: Connection, definition: Definition, *, owner: str | None,
     found = connection.execute(own).scalar_one()
     if found >= most:
         raise TooManySchedulesError(
-            f"there are {found} schedules and {most} may be: remove one, or raise GABLEWORK_MAX_SCHEDULES_PER_KEY"
+            f"there are {found} schedules, the limit is {most}: remove one, or raise GABLEWORK_MAX_SCHEDULES_PER_KEY"
         )
     schedule_id = uuid.uuid4().hex
     connection.execute(
@@ -89,7 +89,7 @@ def change(
     book = SlotBook(connection, row)
     values = _columns(definition) | {"version": version + 1, "updated_at": now}
     if _times_of(definition) != (row.cron, row.time_zone, row.is_paused):
-        # a time zone that this machine does not know is changed for that very reason
+        # an unknown time zone has no slots; the client changes it for that reason
         with contextlib.suppress(SettingsError):
             before = Rules(cron=Cron(row.cron, row.time_zone), is_paused=row.is_paused)
             why = "not decided before the times of the schedule were changed"

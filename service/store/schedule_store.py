@@ -15,13 +15,13 @@ from service.store.schedules import ScheduleFilter
 from service.store.ticks import QueueLimits
 
 MAX_PER_TICK = 200
-"""Schedules that one tick decides; the next tick goes on."""
+"""Maximum number of schedules that one tick decides; the next tick continues."""
 
 
 class ScheduleStore:
     """Schedules and their history; `JobStore.schedules`.
 
-    It goes by the clock of the database: replicas whose clocks differ agree on what is due.
+    It uses the clock of the database: replicas whose clocks differ agree on what is due.
 
     Parameters
     ----------
@@ -32,24 +32,24 @@ class ScheduleStore:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    # --- what clients do
+    # --- for clients
 
     def create(self, definition: Definition, *, owner: str | None, most: int) -> Schedule:
-        """Make a schedule; its first slot is the first one after now.
+        """Make a schedule; its first slot is the next one.
 
         Parameters
         ----------
         definition : Definition
-            Checked already.
+            Already checked.
         owner : str or None
             The key that makes it; None if keys are not used.
         most : int
-            Most schedules of the key, or in total if keys are not used.
+            Maximum number of schedules of the key, or in total if keys are not used.
 
         Raises
         ------
         TooManySchedulesError
-            The key already has the most that it may have.
+            The key has reached its limit.
         NoSuchUploadError
             The request names an upload that is gone.
         """
@@ -96,7 +96,7 @@ class ScheduleStore:
             return schedules.get(connection, schedule_id, owner)
 
     def remove(self, schedule_id: str, *, owner: str | None = None) -> None:
-        """Delete a schedule and its history; its jobs stay, and one that runs goes on.
+        """Delete a schedule and its history; its jobs stay, and a running one continues.
 
         Raises
         ------
@@ -120,7 +120,7 @@ class ScheduleStore:
             return schedules.runs(connection, schedule_id, owner, limit=limit, offset=offset)
 
     def run_now(self, schedule_id: str, *, owner: str | None = None, max_queued: int, max_queued_per_key: int) -> Job:
-        """Make a job now, whatever the clock says; also of a schedule that is paused.
+        """Make a job now, independent of the clock, also if the schedule is paused.
 
         Raises
         ------
@@ -142,7 +142,7 @@ class ScheduleStore:
         with self._database.read() as connection:
             return schedules.counts(connection)
 
-    # --- what drivers do
+    # --- for drivers
 
     def tick(
         self, *, max_queued: int, max_queued_per_key: int, now: dt.datetime | None = None
@@ -154,7 +154,7 @@ class ScheduleStore:
         Parameters
         ----------
         max_queued, max_queued_per_key : int
-            Most jobs that may wait, in total and per key.
+            Maximum number of waiting jobs, in total and per key.
         now : datetime, optional
             The present; by default the database's clock, read once.
 
@@ -163,7 +163,7 @@ class ScheduleStore:
         list of ScheduleRun
             New history.
         """
-        # most looks find nothing: they take no lock
+        # most checks find nothing: they take no lock
         with self._database.read() as connection:
             at = self._database.now(connection) if now is None else now
             if not ticks.something_is_due(connection, at):

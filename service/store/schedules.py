@@ -38,9 +38,9 @@ class ScheduleFilter:
     process_id: str | None = None
     """Only schedules of this process."""
     limit: int = 100
-    """Most schedules to list."""
+    """Maximum number of schedules to list."""
     offset: int = 0
-    """Schedules to pass over."""
+    """Number of schedules to skip."""
 
 
 def lock(connection: Connection, schedule_id: str, owner: str | None) -> sa.Row[Any]:

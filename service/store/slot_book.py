@@ -15,7 +15,7 @@ from service.store.schedules import COLUMN_OF, busy_job
 from service.store.tables import SCHEDULE_RUNS, SCHEDULES
 
 MAX_KEPT = 1000
-"""Entries per schedule that are stored; the counts include all."""
+"""Maximum number of stored entries per schedule; the counts include all."""
 
 
 class SlotBook:

@@ -1,4 +1,4 @@
-"""What clients do with jobs: submit, dismiss, remove. Within a transaction."""
+"""The operations of clients on jobs: submit, dismiss, remove. Within a transaction."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def check_queue(connection: Connection, owner: str | None, *, max_queued: int, m
     waiting = sa.select(sa.func.count()).select_from(JOBS).where(JOBS.c.status == JobStatus.ACCEPTED.value)
     total = connection.execute(waiting).scalar_one()
     if total >= max_queued:
-        raise QueueFullError(f"{total} jobs wait and {max_queued} may: submit again when some are done")
+        raise QueueFullError(f"{total} jobs wait, the limit is {max_queued}: submit again when some are done")
     if owner is None:
         return
     own = connection.execute(waiting.where(JOBS.c.owner == owner)).scalar_one()
     if own >= max_queued_per_key:
         raise QueueFullError(
-            f"{own} jobs of this key wait and {max_queued_per_key} may: submit again when some are done"
+            f"{own} jobs of this key wait, the limit is {max_queued_per_key}: submit again when some are done"
         )
 
 
@@ -115,7 +115,7 @@ def hold_uploads(connection: Connection, needed: Sequence[str]) -> None:
 
 
 def dismiss(connection: Connection, job_id: str, owner: str | None, now: dt.datetime) -> None:
-    """Dismiss a job that waits, ask the driver of one that runs, leave one that is over.
+    """Dismiss a waiting job, or ask the driver of a running one to stop; a job that is over stays as it is.
 
     Raises
     ------

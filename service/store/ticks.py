@@ -1,4 +1,4 @@
-"""Looks at the clock for schedules, and runs by hand. Within a transaction that holds the schedule's row.
+"""Decides due schedules, and runs them by hand. Within a transaction that holds the schedule's row.
 
 The driver that holds the row decides a slot, makes its job and writes both in one transaction. Two drivers never decide
 the same slot, and one that dies midway leaves everything as it was.
@@ -23,7 +23,7 @@ from service.store.submissions import check_queue, insert
 from service.store.tables import KEYS, SCHEDULES
 
 BROKEN_PAUSE = dt.timedelta(hours=1)
-"""Time after which a schedule that this machine cannot read is looked at again."""
+"""Time after which a schedule that this machine cannot read is tried again."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class QueueLimits:
     max_queued_per_key: int
     """Jobs of one key."""
     lock: Callable[[Connection], None]
-    """Excludes other makers of jobs until the transaction ends."""
+    """Keeps others from making jobs until the transaction ends."""
 
 
 def something_is_due(connection: Connection, now: dt.datetime) -> bool:
@@ -74,7 +74,7 @@ def decide_first(connection: Connection, *, now: dt.datetime, limits: QueueLimit
 def run_by_hand(
     connection: Connection, schedule_id: str, owner: str | None, *, now: dt.datetime, limits: QueueLimits
 ) -> str:
-    """Make a job now, whatever the clock says; its id.
+    """Make a job now, independent of the clock; returns its id.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def run_by_hand(
 
 
 def _fail_unreadable(book: SlotBook, now: dt.datetime, message: str) -> None:
-    """The schedule has a time zone that this machine does not know: its slots fail, and it is looked at again later."""
+    """The schedule has a time zone that this machine does not know: its slots fail, and it is tried again later."""
     row = book.row
     is_due = row.next_at <= now
     slots = [row.waiting_slot, row.next_at if is_due else None]
@@ -144,4 +144,4 @@ def _is_due(now: dt.datetime) -> sa.ColumnElement[bool]:
 
 def _lateness(slot: dt.datetime, now: dt.datetime) -> str:
     late_s = max(0.0, (now - slot).total_seconds())
-    return "in time" if late_s < 60.0 else f"{late_s:.0f} s after its time"
+    return "on time" if late_s < 60.0 else f"{late_s:.0f} s after its time"

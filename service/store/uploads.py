@@ -17,7 +17,7 @@ _NOT_OVER = [status.value for status in JobStatus if not status.is_over]
 
 
 def add(connection: Connection, upload: Upload) -> None:
-    """Store what is known of an upload."""
+    """Store the record of an upload."""
     connection.execute(
         sa.insert(UPLOADS).values(
             upload_id=upload.upload_id,
@@ -56,7 +56,7 @@ def listed(connection: Connection, owner: str | None, limit: int, offset: int) -
 
 
 def remove(connection: Connection, upload_id: str) -> None:
-    """Forget an upload; one that does not exist is no fault.
+    """Delete an upload; one that does not exist is ignored.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What all models share."""
+"""The base classes and helpers of all models."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ZonedTime = Annotated[dt.datetime, PlainSerializer(dt.datetime.isoformat)]
 
 
 def optional_members(schema: dict[str, Any]) -> None:
-    """Describe an optional member as one that may be absent; null is a value only of a member marked `nullable`."""
+    """Describe an optional member as one that may be absent; null is accepted only if the member is `nullable`."""
     for name, found in schema.get("properties", {}).items():
         found.pop("title", None)
         if name in schema.get("required", ()):
@@ -49,7 +49,7 @@ def optional_members(schema: dict[str, Any]) -> None:
 
 
 class Answer(BaseModel):
-    """A document that the service sends. A member with its default, None, is left out."""
+    """A document that the service sends. Members that are None by default are left out."""
 
     model_config = ConfigDict(json_schema_extra=optional_members)
 
@@ -101,13 +101,13 @@ class Request(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra=optional_members)
 
     NOUN: ClassVar[str] = "a member"
-    """What its members are called in faults."""
+    """The word for its members in faults."""
     HINTS: ClassVar[Mapping[str, str]] = {}
-    """What to give for a missing member."""
+    """The fix for a member that is missing, or has too few or too many entries."""
 
     @classmethod
     def prepared(cls, given: Any) -> Any:
-        """What is validated, from what was sent."""
+        """Turn the sent document into the one that is validated."""
         return given
 
     @model_validator(mode="wrap")
@@ -124,8 +124,8 @@ class Request(BaseModel):
         kind, context, message = fault["type"], fault.get("ctx", {}), fault["msg"]
         if kind == "extra_forbidden":
             kind, message = "unknown", f"is not {cls.NOUN}: use {', '.join(cls.model_fields)}"
-        elif kind == "missing" and len(fault["loc"]) == 1:
-            context = {"fix": cls.HINTS.get(fault["loc"][0], "give a value")}
+        elif kind in {"missing", "too_short", "too_long"} and len(fault["loc"]) == 1:
+            context = context | {"fix": hint} if (hint := cls.HINTS.get(fault["loc"][0])) else context
         if kind == "unknown" or "fix" in context:
             kind = PydanticCustomError(kind, message, context)
         return InitErrorDetails(type=kind, loc=fault["loc"], input=fault["input"], ctx=context)

@@ -1,4 +1,4 @@
-"""Sentences for what pydantic finds wrong: the path, the value and the fix."""
+"""Turns pydantic's errors into sentences with the path, the value and the fix."""
 
 from __future__ import annotations
 
@@ -63,6 +63,8 @@ def _fix(kind: str, context: Mapping[str, Any], message: str) -> str:
         return str(context["error"])
     if kind == "literal_error":
         return f"use one of {context['expected'].replace(chr(39), '').replace(' or ', ', ')}"
+    if "fix" in context:
+        return str(context["fix"])
     limits = {name: f"{value:g}" if isinstance(value, float) else value for name, value in context.items()}
     return FIXES.get(kind, message).format_map(limits)
 

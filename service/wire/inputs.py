@@ -19,7 +19,7 @@ from service.wire.faults import FaultsError, shortened
 from service.wire.files import Outlines, PointClouds
 
 MAX_METHODS = 8
-"""Most methods of one comparison."""
+"""Maximum number of methods of one comparison."""
 
 LARGEST_COORDINATE = 1e12
 """Bound of a rectangle's coordinates, far beyond every CRS; keeps differences finite."""
@@ -108,7 +108,7 @@ Meshes = Literal["building", "tile", "glb", "none"]
 
 
 def _word(name: str, title: str, description: str) -> Any:
-    """A general setting as an input of its own; what is not given comes from `settings` or is the default."""
+    """A general setting as a separate input; if absent, it comes from `settings` or is the default."""
     return Field(None, title=title, description=description, json_schema_extra={"default": getattr(DEFAULTS, name)})
 
 
@@ -159,13 +159,13 @@ class Inputs(Request):
     licence: Text | None = Field(
         None, title="Licence", description="Licence of the source data; goes into the results."
     )
-    title: Text | None = Field(None, title="Title", description="Your own words for the job.")
+    title: Text | None = Field(None, title="Title", description="Your own title for the job.")
     priority: int = Field(
         0,
         ge=-10,
         le=10,
         title="Priority",
-        description="Higher goes first; more than 0 needs a key with the scope admin, if keys are used.",
+        description="Higher runs first; more than 0 needs a key with the scope admin, if keys are used.",
     )
 
     @classmethod
@@ -238,7 +238,7 @@ class ReconstructInputs(Inputs):
     preset: Annotated[str, OneOf(*choices("preset"))] | None = _word(
         "preset",
         "Preset",
-        "Where the method's settings start: those that measured better (robust), or those that keep to its paper "
+        "Starting point of the method's settings: those that measured better (robust), or those of its paper "
         "(faithful).",
     )
     lods: Annotated[str, OneOf(*choices("lods"))] | None = _word(

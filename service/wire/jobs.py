@@ -84,14 +84,14 @@ class JobForm(Answer):
     """Fields of the form. They become the inputs of a process."""
 
     tile: Annotated[
-        list[File], Field(min_length=1, description="Point clouds. A field without a file name holds an href.")
+        list[File], Field(min_length=1, description="Point clouds. A field without a file name contains an href.")
     ]
-    footprints: File | None = Field(None, description="Building outlines; likewise.")
+    footprints: File | None = Field(None, description="Building outlines, as a file or an href.")
     crs: str | None = None
     verticalUnit: str | None = None
     bbox: str | None = Field(None, description="x_min,y_min,x_max,y_max in the tiles' CRS.")
     method: str | None = None
-    preset: str | None = Field(None, description="Where the method's settings start.")
+    preset: str | None = Field(None, description="Starting point of the method's settings.")
     lods: str | None = Field(None, description="Levels of detail with commas between them: 1.2, 1.3, 2.2.")
     methods: list[str] | None = Field(
         None,

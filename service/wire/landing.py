@@ -16,7 +16,7 @@ class LandingPage(Answer):
 
 
 class Conformance(Answer):
-    """The parts of OGC API - Processes that are met."""
+    """The implemented parts of OGC API - Processes."""
 
     conformsTo: list[str]
 

@@ -14,8 +14,8 @@ _MILLISECOND = dt.timedelta(microseconds=999)
 """The rest of the millisecond that a time in an answer names."""
 _LAST = dt.datetime.max.replace(tzinfo=dt.UTC)
 
-Limit = Annotated[int, Field(ge=1, le=1000, description="Most entries of the page.")]
-Offset = Annotated[int, Field(ge=0, le=2**31 - 1, description="Entries before the page.")]
+Limit = Annotated[int, Field(ge=1, le=1000, description="Maximum number of entries of the page.")]
+Offset = Annotated[int, Field(ge=0, le=2**31 - 1, description="Number of entries before the page.")]
 
 
 def words(allowed: Sequence[str] = ()) -> Callable[[list[str] | None], list[str] | None]:
@@ -91,18 +91,18 @@ class Page(BaseModel):
 class JobQuery(Page):
     """Which jobs."""
 
-    type: Words = Field(None, description="Only `process` exists here.")
+    type: Words = Field(None, description="The only type is `process`.")
     processID: Words = Field(None, description="Only jobs of these processes.")
     status: Annotated[list[str] | None, AfterValidator(words([word.value for word in JobStatus]))] = Field(
         None, description=f"Only jobs with these: {', '.join(JobStatus)}."
     )
     scheduleID: str | None = Field(None, description="Only jobs of this schedule.")
     datetime: Annotated[str | None, AfterValidator(_is_interval)] = Field(
-        None, description="Created then: an RFC 3339 time, or `a/b`, `../b`, `a/..`."
+        None, description="Time of creation: an RFC 3339 time, or `a/b`, `../b`, `a/..`."
     )
     minDuration: Seconds | None = None
     maxDuration: Seconds | None = None
-    limit: Annotated[int, Field(ge=1, le=10_000, description="Most jobs of the page.")] = 100
+    limit: Annotated[int, Field(ge=1, le=10_000, description="Maximum number of jobs of the page.")] = 100
 
 
 class ScheduleQuery(Page):
@@ -117,4 +117,4 @@ class EventQuery(BaseModel):
 
     f: Literal["json", "sse"] | None = Field(None, description="Overrides the header Accept.")
     after: int = Field(0, ge=0, le=2**31 - 1, description="Only events with a higher id.")
-    limit: int = Field(500, ge=1, le=500, description="Most events of a list.")
+    limit: int = Field(500, ge=1, le=500, description="Maximum number of events of a list.")

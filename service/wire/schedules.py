@@ -1,4 +1,4 @@
-"""Schedules: what clients send of them, and what they get."""
+"""Schedules as clients send and get them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from service.wire.faults import FaultsError
 from service.wire.inputs import Text
 
 LONGEST_GRACE_S = 30 * 86_400
-"""A month; a client that accepts a later start wants every slot to run."""
+"""A month; a client that accepts a later start wants to run every slot."""
 
 ProcessId = Literal["reconstruct", "compare"]
 Missed = Annotated[
@@ -67,7 +67,7 @@ Expression = Annotated[
     _cron(lambda text: Cron(text, "UTC")),
 ]
 TimeZone = Annotated[
-    str, Field(description="A name of the IANA database."), _cron(lambda text: Cron("* * * * *", text))
+    str, Field(description="Name of a time zone in the IANA database."), _cron(lambda text: Cron("* * * * *", text))
 ]
 
 
@@ -85,7 +85,7 @@ def _not_given() -> Any:
 
 
 class SchedulePatch(Request):
-    """A change of a schedule: what is not given stays."""
+    """A change of a schedule: members that are not given stay."""
 
     model_config = ConfigDict(json_schema_extra=_changes)
 
@@ -106,7 +106,7 @@ class SchedulePatch(Request):
     overlap: Overlap = "skip"
     processID: ProcessId = _not_given()
     execute: Execute = Field(default_factory=lambda: Execute())  # noqa: PLW0108 - mypy wants it
-    paused: bool = Field(False, description="Whether the clock is ignored.")
+    paused: bool = Field(False, description="Whether the schedule is paused: no slot runs.")
 
     @classmethod
     def prepared(cls, given: Any) -> Any:

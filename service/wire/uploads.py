@@ -31,7 +31,7 @@ class Preflight(BaseModel):
     kind: Literal["points", "footprints"]
     format: Literal["las", "laz", "copc", "ply", "ascii", "geopackage", "geojson", "geoparquet"]
     usable: bool = Field(description="Whether a job can use it without further inputs.")
-    problems: list[str] = Field(description="What a job can heal, such as degrees by `crs`.")
+    problems: list[str] = Field(description="Problems that a job can fix, such as degrees with `crs`.")
     warnings: list[str]
     crs: Crs | None = Field(None, description="Null if the file states none.")
     pointCount: int | None = Field(None, description="Number of lines for text that was not read through.")

@@ -412,7 +412,7 @@ def test_a_job_has_meshes_of_one_kind_and_names_it(client: TestClient, job_id: s
     for job, asked, there in ((job_id, "glb", "obj"), (glb_job, "obj", "glb")):
         answer = client.get(f"/jobs/{job}/buildings/{GABLE}", params={"f": asked})
         assert answer.status_code == 404
-        assert answer.json()["detail"].endswith(f"take building {GABLE} with f={there}")
+        assert answer.json()["detail"].endswith(f"request building {GABLE} with f={there}")
         assert client.get(f"/jobs/{job}/buildings/{GABLE}", params={"f": there}).status_code == 200
     failed = client.get(f"/jobs/{glb_job}/buildings/{FAILED}", params={"f": "glb"})
     assert failed.status_code == 404
@@ -474,7 +474,7 @@ def test_a_job_without_meshes_says_so(service: runs.Service) -> None:
     job = service.finished(lambda run_dir: runs.write_run(run_dir, meshes="none"), meshes="none")
     answer = service.client.get(f"/jobs/{job}/buildings/{GABLE}", params={"f": "obj"})
     assert answer.status_code == 404
-    assert "asked for no meshes" in answer.json()["detail"]
+    assert "left out the meshes" in answer.json()["detail"]
     assert service.client.get(f"/jobs/{job}/buildings/{GABLE}", params={"f": "cityjson"}).status_code == 200
 
 

@@ -28,6 +28,7 @@ from service.driver.attempt import compare_request
 from service.jobs import Fault, InputReference, JobRequest, JobStatus
 from service.outputs import COMPARISON_OUTPUTS, OUTPUTS
 from service.outputs.comparison import RUNS
+from service.run_settings import VARIANTS
 from service.settings import ServiceSettings
 
 TWO = ["fuzzy-sart", "fuzzy-sart:faithful"]
@@ -103,8 +104,8 @@ def test_jobs_are_listed_by_their_process(local_service) -> None:
     ("inputs", "words"),
     [
         ({}, "methods is missing: give 2 to 8 of arrangement"),
-        ({"methods": TWO[:1]}, "use at least 2 entries"),
-        ({"methods": "fuzzy-sart"}, "use at least 2 entries"),
+        ({"methods": TWO[:1]}, f"methods is {json.dumps(TWO[:1])}: give 2 to 8 of {', '.join(VARIANTS)}"),
+        ({"methods": "fuzzy-sart"}, "give 2 to 8 of arrangement, arrangement:robust"),
         ({"methods": ["fuzzy-sart", "guess"]}, 'methods[1] is "guess": use one of arrangement, arrangement:robust'),
         ({"methods": ["fuzzy-sart", "fuzzy-sart:loose"]}, "fuzzy-sart:loose"),
         ({"methods": ["fuzzy-sart", "fuzzy-sart:robust"]}, "methods holds fuzzy-sart twice: give each once"),
@@ -210,7 +211,7 @@ def test_a_process_that_a_driver_does_not_know_fails_with_those_that_it_does(ben
     done = bench.over(job)
     assert done.failure is not None
     assert done.failure.fault is Fault.INPUT
-    assert "knows no process paint: it knows reconstruct, compare" in done.failure.detail
+    assert "does not run the process paint, only reconstruct, compare" in done.failure.detail
 
 
 def request_of(tmp_path: Path, *methods: str, **settings: Any) -> compare.CompareRequest:

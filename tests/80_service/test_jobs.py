@@ -113,7 +113,7 @@ def test_a_lost_job_waits_again_until_it_was_lost_too_often(
 def test_a_loss_names_the_number_the_stage_and_the_fix() -> None:
     reported = loss(job(lost_attempts=2, stage="split"))
     assert reported.fault is Fault.LOST
-    assert reported.detail.startswith("3 drivers were lost over this job (the last one at stage split)")
+    assert reported.detail.startswith("3 drivers were lost during this job (the last one at stage split)")
     assert "smaller tiles" in reported.detail
 
 

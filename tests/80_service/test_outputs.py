@@ -89,7 +89,7 @@ def test_doing_it_again_gives_the_same_bytes_and_leaves_nothing_beside(
 def test_only_the_wanted_outputs_are_offered(run_dir: Path, tmp_path: Path) -> None:
     write_outputs(run_dir, tmp_path, ("report", "planes"))
     assert list(read_catalogue(tmp_path).outputs) == ["planes", "report"]
-    with pytest.raises(NoSuchOutputError, match=r"asked not to make geojson.*it has: planes, report"):
+    with pytest.raises(NoSuchOutputError, match=r"left out geojson.*it has: planes, report"):
         output_file(tmp_path, "geojson")
     with pytest.raises(NoSuchOutputError, match=r"no output 'everything'.*planes, report"):
         output_file(tmp_path, "everything")
@@ -123,7 +123,7 @@ def test_progress_counts_the_tiles(run_dir: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("status", [RunStatus.RUNNING, RunStatus.FAILED])
 def test_a_run_that_did_not_end_is_refused(tmp_path: Path, status: RunStatus) -> None:
     run_dir = runs.write_run(tmp_path / "run", status=status)
-    with pytest.raises(RunError, match=f"is {status.value}: outputs are made of runs that ended"):
+    with pytest.raises(RunError, match=f"is {status.value}: outputs need a finished run"):
         write_outputs(run_dir, tmp_path / "out")
 
 

@@ -100,6 +100,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Remove the tables, with all that is in them."""
+    """Remove the tables with their content."""
     for table in ("keys", "job_uploads", "uploads", "job_events", "jobs"):
         op.drop_table(table)

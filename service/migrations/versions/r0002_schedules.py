@@ -1,4 +1,4 @@
-"""Schedules, what became of their slots, and the uploads that they need; which schedule a job came of.
+"""Schedules, the history of their slots, and the uploads that they need; the schedule that made a job.
 
 Revision ID: 0002
 Revises: 0001
@@ -85,7 +85,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Remove the tables, with all that is in them; jobs stay."""
+    """Remove the tables with their content; jobs stay."""
     op.drop_index("jobs_by_schedule", "jobs")
     op.drop_column("jobs", "schedule_id")
     for table in ("schedule_uploads", "schedule_runs", "schedules"):
