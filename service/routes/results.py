@@ -175,5 +175,5 @@ def _check_range(request: Request, size: int) -> None:
         request.scope["headers"] = [entry for entry in request.scope["headers"] if entry[0] != b"range"]
         return
     if any(int(first) >= size if first else int(last) == 0 for first, last in ends):
-        problem = f"the range {text[:80]} starts beyond the end: the file has {size} bytes"
+        problem = f"the range {text[:80]} lies beyond the end: the file has {size} bytes"
         raise HTTPException(416, problem, {"Content-Range": f"bytes */{size}"})

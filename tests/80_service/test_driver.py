@@ -481,7 +481,7 @@ def test_workers_are_not_started_again_once_the_driver_has_ended(bench: Bench) -
     cluster.replace(cluster.engine())
     cluster.engine()
     cluster.close()
-    with pytest.raises(ClusterError, match="ends"):
+    with pytest.raises(ClusterError, match="driver is ending"):
         cluster.engine()
 
 

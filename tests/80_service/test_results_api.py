@@ -140,7 +140,7 @@ def test_a_range_behind_the_end_is_refused_with_the_size(client: TestClient, job
     path = f"/jobs/{job_id}/results/buildings"
     size = client.head(path).headers["content-length"]
     answer = client.get(path, headers={"Range": asked})
-    assert f"there are {size} bytes" in runs.problem(answer, 416, "about:blank")
+    assert f"the file has {size} bytes" in runs.problem(answer, 416, "about:blank")
     assert answer.headers["content-range"] == f"bytes */{size}"
 
 
