@@ -1,4 +1,4 @@
-"""Facets, planes, rings and neighbourhoods: geometry that all stages share.
+"""Facets, planes and neighbourhoods: geometry that all stages share.
 
 Planes are z = a x + b y + c. All sums run in the order of the points, one after the other, and not through BLAS: the
 result has the same bits on every machine. Equations are those of Shorter & Kasparis.
@@ -121,22 +121,6 @@ def vertical_residuals_m(points: FloatArray, coefficients: tuple[float, float, f
     """Height of points above the plane (a, b, c), (n,) float64 metres, signed."""
     a, b, c = coefficients
     return points[:, 2] - (a * points[:, 0] + b * points[:, 1] + c)
-
-
-# ----------------------------------------------------------------------------------------------------------- rings
-
-
-@kernel
-def ring_area_m2(ring: FloatArray) -> float:
-    """Signed area of a ring in plan, square metres: positive where it runs counter-clockwise.
-
-    Vertices are (n, 2) or (n, 3); the first may be repeated at the end. Fewer than three have no area.
-    """
-    area = 0.0
-    for k in range(1, len(ring) - 1):
-        area += (ring[k, 0] - ring[0, 0]) * (ring[k + 1, 1] - ring[0, 1])
-        area -= (ring[k, 1] - ring[0, 1]) * (ring[k + 1, 0] - ring[0, 0])
-    return 0.5 * area
 
 
 # -------------------------------------------------------------------------------------------------- neighbourhoods

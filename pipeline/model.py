@@ -367,7 +367,7 @@ class LodModel:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BuildingResult:
-    """Outcome of a candidate. Every candidate has one, also one that failed."""
+    """Outcome of a candidate. Every candidate has one, also one that failed: the defaults are those without a model."""
 
     building_id: str
     """As the candidate's."""
@@ -383,22 +383,22 @@ class BuildingResult:
     """The measured figure and the threshold; empty where ok."""
     method: str
     """Name of the method."""
-    roof_type: RoofType
+    roof_type: RoofType = RoofType.NONE
     """From the delivered planes; none where there is no model."""
-    lod: str
+    lod: str = ""
     """Level of detail of the model: the finest requested, 1.2 for a fallback block, empty where there is no model."""
     footprint: Polygon | MultiPolygon | None
     """2D outline of the delivered solids in local metres (failed: of the points where that is possible)."""
     footprint_share: float = math.nan
     """Area of that outline over the area of the given footprint: below 1 where a part of it, having no points, was left
     out; nan without a given footprint or without a model."""
-    planes: tuple[Plane, ...]
+    planes: tuple[Plane, ...] = ()
     """The delivered roof planes."""
-    faces: tuple[RoofFace, ...]
+    faces: tuple[RoofFace, ...] = ()
     """The delivered roof faces."""
-    solids: tuple[Solid, ...]
+    solids: tuple[Solid, ...] = ()
     """The delivered closed solids; empty where failed."""
-    validity_codes: tuple[int, ...]
+    validity_codes: tuple[int, ...] = ()
     """Codes of the faults that kept the method's own solid from delivery; empty where there were none."""
     ground_z_m: float
     """Local elevation of the floor."""
@@ -406,11 +406,11 @@ class BuildingResult:
     """Points of the candidate."""
     density_per_m2: float
     """Points a square metre of footprint; nan without one."""
-    rmse_m: float
+    rmse_m: float = math.nan
     """Root mean square vertical distance of all covered points to the top surface; nan without a model."""
-    p95_m: float
+    p95_m: float = math.nan
     """95th percentile of the absolute vertical distances; nan without a model."""
-    coverage: float
+    coverage: float = 0.0
     """Share of points that have a roof above or below them; 0 without a model."""
     quality: ModelQuality = ModelQuality()
     """How well the points support the model."""

@@ -86,12 +86,7 @@ class AsciiFile:
         self._header_lines, names, sample = self._look(path)
         self._columns = self._choose(columns, names, sample)
         self._is_pairs = "x2" in self._columns
-        self._facts = self._measure(sample) if facts is None else facts
-
-    @property
-    def facts(self) -> FileFacts:
-        """What a pass over the rows found."""
-        return self._facts
+        self.facts = self._measure(sample) if facts is None else facts
 
     def records(self, chunk_size: int, window: Window | None) -> Iterator[PointRecords]:
         """The records in file order; of a row with two echoes the first before the last."""

@@ -75,12 +75,7 @@ class LasFile:
                 self._copc = copc.octree_info(self._header)
             else:
                 self._check_room()
-        self._facts = self._read_facts() if facts is None else facts
-
-    @property
-    def facts(self) -> FileFacts:
-        """What the header and a sample of the points say."""
-        return self._facts
+        self.facts = self._read_facts() if facts is None else facts
 
     def records(self, chunk_size: int, window: Window | None) -> Iterator[PointRecords]:
         """The records in file order, in pieces of `chunk_size`; of COPC with a window only the nodes that meet it.

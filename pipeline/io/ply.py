@@ -102,12 +102,7 @@ class PlyFile:
         self._fields = self._find_fields()
         if self._byte_order:
             self._start = self._check_room()
-        self._facts = self._measure() if facts is None else facts
-
-    @property
-    def facts(self) -> FileFacts:
-        """What the header and a pass over the vertices say."""
-        return self._facts
+        self.facts = self._measure() if facts is None else facts
 
     def records(self, chunk_size: int, window: Window | None) -> Iterator[PointRecords]:
         """The vertices in file order."""

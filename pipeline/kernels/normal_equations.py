@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from pipeline.compiler import kernel
-from pipeline.model import FloatArray, LabelArray
+from pipeline.model import FloatArray, IntArray, LabelArray
 
 
 class Moments(NamedTuple):
@@ -46,6 +48,20 @@ def moments_of(points: FloatArray, index: LabelArray) -> Moments:
         xz += x * z
         yz += y * z
     return Moments(mean_x, mean_y, mean_z, xx, xy, yy, xz, yz)
+
+
+@kernel(inline="always")
+def add_to_sums(sums: FloatArray | IntArray, x: float, y: float, z: float | np.int64) -> None:
+    """Add one point to the first nine sums, in place: of 1, x, y, z, xx, xy, yy, xz, yz."""
+    sums[0] += 1
+    sums[1] += x
+    sums[2] += y
+    sums[3] += z
+    sums[4] += x * x
+    sums[5] += x * y
+    sums[6] += y * y
+    sums[7] += x * z
+    sums[8] += y * z
 
 
 @kernel

@@ -40,7 +40,7 @@ from pipeline.segmentation.kmeans_normals import (
     labels_around,
 )
 from pipeline.segmentation.plane_refinement import describe_planes
-from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
+from pipeline.segmentation.plane_regression import best_fit_planes
 from pipeline.segmentation.surrounding_ground import far_from
 from pipeline.tin.delaunay import triangulate
 
@@ -164,10 +164,10 @@ def planes_of(top: BuildingTop, settings: KMeansSettings) -> tuple[FloatArray, L
     labels = labels_around(top.points, top.tin.facets, clusters)
     shares = np.bincount(labels[labels >= 0], minlength=int(labels.max()) + 1) / len(labels)
     labels = np.where((labels >= 0) & (shares[labels] < settings.min_plane_share), -1, labels).astype(np.int32)
-    planes, labels = _best_fit_planes(top.points, labels)
+    planes, labels = best_fit_planes(top.points, labels, int(labels.max()) + 1)
     if len(planes) == 2 and _angle_deg(planes[0], planes[1]) < settings.one_plane_deg:
         # one plane: the clusters differed by noise alone
-        planes, labels = _best_fit_planes(top.points, np.zeros(len(labels), np.int32))
+        planes, labels = best_fit_planes(top.points, np.zeros(len(labels), np.int32), 1)
     return planes, labels
 
 
@@ -279,23 +279,12 @@ def _share_explained(top: BuildingTop, parts: LabelArray, fewest_points: int) ->
     labels = labels_around(top.points, top.tin.facets, parts)
     counts = np.bincount(labels[labels >= 0], minlength=int(parts.max()) + 1)
     labels[(labels >= 0) & (counts[labels] < fewest_points)] = -1
-    planes, labels = _best_fit_planes(top.points, labels)
+    planes, labels = best_fit_planes(top.points, labels, int(labels.max()) + 1)
     labelled = np.flatnonzero(labels >= 0)
     a, b, c = planes[labels[labelled]].T
     x, y, z = top.points[labelled].T
     off = np.abs(z - (a * x + b * y + c)) / np.sqrt(1.0 + a * a + b * b)
     return float((off <= top.distance_m).sum()) / len(top.points)
-
-
-def _best_fit_planes(points: FloatArray, labels: LabelArray) -> tuple[FloatArray, LabelArray]:
-    """Least-squares planes of the sets that have one, and the labels renumbered."""
-    count = int(labels.max()) + 1
-    sums = cluster_sums(points, labels.astype(np.int32), count)
-    fits = [best_fit_plane(one) for one in sums]
-    kept = [k for k, fit in enumerate(fits) if fit[3]]
-    number = np.full(count + 1, -1, np.int32)
-    number[kept] = np.arange(len(kept), dtype=np.int32)
-    return np.array([fits[k][:3] for k in kept]).reshape(len(kept), 3), number[labels]
 
 
 def _angle_deg(first: FloatArray, second: FloatArray) -> float:

@@ -22,7 +22,7 @@ from pipeline.segmentation.facet_clusters import labels_of_points
 from pipeline.segmentation.facet_parameters import about_barycentre, cluster_means, facet_parameters
 from pipeline.segmentation.parameter_boxes import coarse_clusters
 from pipeline.segmentation.plane_refinement import describe_planes
-from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
+from pipeline.segmentation.plane_regression import best_fit_planes, kept_clusters
 from pipeline.segmentation.point_assignment import vote_among_neighbours
 from pipeline.segmentation.region_growing import grow_regions
 from pipeline.segmentation.roof_trees import classify_2d, classify_3d, plausible_slopes
@@ -85,22 +85,7 @@ def segment_2d(cloud: PreparedCloud, settings: ParameterSpace2dSettings) -> Segm
 def segment_3d(cloud: PreparedCloud, settings: ParameterSpace3dSettings) -> Segmentation:
     """Roof planes and type of one building from clusters of its facets in all three parameters (section 4).
 
-    Parameters
-    ----------
-    cloud : PreparedCloud
-        Its points, and the terrain around it.
-    settings : ParameterSpace3dSettings
-        `ParameterSpace3dSettings()` or `ParameterSpace3dSettings.faithful()`.
-
-    Returns
-    -------
-    Segmentation
-        Without planes where no cluster of roof points is left.
-
-    Raises
-    ------
-    BuildingError
-        Reason ``too_few_points`` where hardly any are visible; ``too_complex`` beyond a limit of work.
+    Parameters, planes and errors are those of `segment_2d`.
     """
     facets = facets_of(cloud, settings)
     labels, centres = roof_clusters_3d(facets, settings)
@@ -124,7 +109,7 @@ def roof_clusters_2d(facets: BuildingFacets, settings: ParameterSpace2dSettings)
 
     # 3.3: clusters with a plausible slope are faces.
     kept = plausible_slopes(centres, settings.min_slope_deg, settings.max_slope_deg)
-    return _kept_clusters(labels, centres, kept & _not_terrain(facets, labels, len(centres), settings))
+    return kept_clusters(labels, centres, kept & _not_terrain(facets, labels, len(centres), settings))
 
 
 def roof_clusters_3d(facets: BuildingFacets, settings: ParameterSpace3dSettings) -> tuple[LabelArray, FloatArray]:
@@ -140,7 +125,7 @@ def roof_clusters_3d(facets: BuildingFacets, settings: ParameterSpace3dSettings)
     # 4.2: ground and walls are eliminated.
     kept = may_be_roof(refined.centres, settings)
     kept &= _not_terrain(facets, labels, len(refined.centres), settings)
-    return _kept_clusters(labels, refined.centres, kept)
+    return kept_clusters(labels, refined.centres, kept)
 
 
 def facets_of(cloud: PreparedCloud, settings: ParameterSpaceSettings) -> BuildingFacets:
@@ -209,13 +194,6 @@ def _not_terrain(
     return np.asarray(2 * own >= np.bincount(labels[labels >= 0], minlength=n_clusters))
 
 
-def _kept_clusters(labels: LabelArray, centres: FloatArray, kept: BoolArray) -> tuple[LabelArray, FloatArray]:
-    """The remaining clusters, renumbered in their order."""
-    number = np.full(len(kept) + 1, -1, np.int32)
-    number[:-1][kept] = np.arange(int(kept.sum()), dtype=np.int32)
-    return number[labels], centres[kept]
-
-
 def _primitive(
     cloud: PreparedCloud,
     facets: BuildingFacets,
@@ -232,22 +210,10 @@ def _primitive(
     if settings.point_groups == "region_growing":
         planes, groups = _grown(facets, groups, centres, settings)
     else:
-        planes, groups = _interpolated(facets.roof, groups, len(centres), settings.min_points)
+        planes, groups = best_fit_planes(facets.roof, groups, len(centres), settings.min_points)
     described = describe_planes(facets.roof, planes, groups)
     named = roof_type if settings.type_from == "tree" and len(planes) else None
     return cloud.segmentation(described, cloud.visible, groups, roof_type=named)
-
-
-def _interpolated(
-    roof: FloatArray, groups: LabelArray, n_groups: int, min_points: int
-) -> tuple[FloatArray, LabelArray]:
-    """Least-squares planes of groups of points; groups without a plane are dropped."""
-    sums = cluster_sums(roof, groups, n_groups)
-    fits = [best_fit_plane(row) for row in sums]
-    kept = np.array([fit[3] and row[0] >= min_points for fit, row in zip(fits, sums, strict=True)], np.bool_)
-    planes = np.array([fit[:3] for fit in fits]).reshape(-1, 3)
-    groups, planes = _kept_clusters(groups, planes, kept)
-    return planes, groups
 
 
 def _grown(
@@ -274,4 +240,4 @@ def _grown(
         settings.growing_vote,
         _VOTING_PASSES,
     )
-    return _interpolated(roof, labels, len(planes), settings.min_points)
+    return best_fit_planes(roof, labels, len(planes), settings.min_points)

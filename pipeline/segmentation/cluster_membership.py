@@ -17,6 +17,7 @@ from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import BoolArray, FloatArray, LabelArray, Reason
 from pipeline.segmentation.clustering_settings import ClusterMembershipSettings
+from pipeline.segmentation.plane_regression import kept_clusters
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -89,9 +90,8 @@ def refine_clusters(
     kept = counts >= settings.min_members
     for k in np.flatnonzero(kept).tolist():
         kept[k] = parameters[labels == k, 2].std() < settings.max_o_deviation_m
-    number = np.full(len(coarse) + 1, -1, np.int32)
-    number[:-1][kept] = np.arange(int(kept.sum()), dtype=np.int32)
-    return RefinedClusters(labels=number[labels], centres=centres[kept])
+    labels, centres = kept_clusters(labels, centres, kept)
+    return RefinedClusters(labels=labels, centres=centres)
 
 
 def may_be_roof(centres: FloatArray, settings: ClusterMembershipSettings) -> BoolArray:

@@ -191,6 +191,7 @@ def _chains_of_partners(pairs: IntArray, n: int) -> tuple[IntArray, IntArray, In
     return first, last, following, partner
 
 
+# It stays whole: its loop changes ten arrays and counters, which parts would pass around and compile apart.
 @kernel
 def merge_planes(
     sums: FloatArray,

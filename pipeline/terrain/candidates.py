@@ -11,6 +11,7 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 from enum import IntEnum
+from typing import assert_never
 
 import numpy as np
 
@@ -64,7 +65,7 @@ class Fault(IntEnum):
     """Ground, a step between levels, or a surface without points."""
 
 
-REASONS = {
+REASON_OF_FAULT = {
     Fault.TOO_SMALL: Reason.TOO_SMALL,
     Fault.TOO_LOW: Reason.TOO_LOW,
     Fault.CROWN: Reason.VEGETATION,
@@ -185,9 +186,9 @@ def verdicts(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> It
 
 
 def _verdict(fault: Fault, f: Mapping[str, float], settings: CandidateSettings) -> Verdict | None:
-    """A fault in words, with the figure and the threshold."""
+    """A fault in words, with the figure and the threshold; None where no rule is broken."""
     match fault:
-        case Fault.NONE:
+        case Fault.NONE | Fault.NOT_JUDGED:
             return None
         case Fault.TOO_SMALL:
             detail = f"area {f['area_m2']:.1f} m2, at least {f['min_m2']:g}"
@@ -204,10 +205,12 @@ def _verdict(fault: Fault, f: Mapping[str, float], settings: CandidateSettings) 
             detail = f"mean width {f['width_m']:.2f} m, at least {f['least_width_m']:g}"
         case Fault.NO_WALLS:
             detail = f"walls along {f['wall_share']:.2f} of the outline, at least {settings.min_wall_share:g}"
-        case _:
+        case Fault.BELOW_Z_AVG:
             detail = f"at the top of {f['top_share']:.2f} of its walls, at least {settings.min_top_share:g} "
             detail += f"(own {f['own']:.2f} m, Z_avg {f['z_avg']:.2f} m)"
-    return Verdict(reason=REASONS[fault], detail=detail)
+        case _:
+            assert_never(fault)
+    return Verdict(reason=REASON_OF_FAULT[fault], detail=detail)
 
 
 def are_objects(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> BoolArray:

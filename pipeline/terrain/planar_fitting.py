@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.compiler import kernel
-from pipeline.kernels.normal_equations import solve_plane_moments
+from pipeline.kernels.normal_equations import add_to_sums, solve_plane_moments
 from pipeline.model import BoolArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 
@@ -42,16 +42,7 @@ def plane_sums(elevation: Elevations, used: BoolArray) -> Sums:
         run = np.zeros(9, np.int64)
         for c in range(columns):
             if used[r, c]:
-                z = np.int64(elevation[r, c])
-                run[0] += 1
-                run[1] += c
-                run[2] += r
-                run[3] += z
-                run[4] += c * c
-                run[5] += c * r
-                run[6] += r * r
-                run[7] += c * z
-                run[8] += r * z
+                add_to_sums(run, c, r, np.int64(elevation[r, c]))
             for k in range(9):
                 sums[k, r + 1, c + 1] = sums[k, r, c + 1] + run[k]
     return sums

@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
-from pipeline.kernels.normal_equations import solve_plane_moments
+from pipeline.kernels.normal_equations import add_to_sums, solve_plane_moments
 from pipeline.model import FloatArray, IntArray, LabelArray, Tin
 from pipeline.terrain.binning import points_by_cell
 from pipeline.terrain.vegetation import smallest_eigenvalue
@@ -141,15 +141,7 @@ def local_planes(x: IntArray, y: IntArray, z: IntArray) -> FloatArray:
                     dx, dy, dz = float(x[j] - x[i]), float(y[j] - y[i]), float(z[j] - z[i])
                     if dx * dx + dy * dy > limit:
                         continue
-                    s[0] += 1
-                    s[1] += dx
-                    s[2] += dy
-                    s[3] += dz
-                    s[4] += dx * dx
-                    s[5] += dx * dy
-                    s[6] += dy * dy
-                    s[7] += dx * dz
-                    s[8] += dy * dz
+                    add_to_sums(s, dx, dy, dz)
                     s[9] += dz * dz
             if s[0] < MIN_POINTS:
                 continue
@@ -240,15 +232,7 @@ def grow_patches(vertices: RoofVertices, local: FloatArray, order: IntArray) -> 
                 label[w] = count
                 queue[tail] = w
                 tail += 1
-                s[0] += 1
-                s[1] += dx
-                s[2] += dy
-                s[3] += dz
-                s[4] += dx * dx
-                s[5] += dx * dy
-                s[6] += dy * dy
-                s[7] += dx * dz
-                s[8] += dy * dz
+                add_to_sums(s, dx, dy, dz)
                 if tail >= 2 * fitted:
                     na, nb, nl, found = solve_plane(s)
                     if found:

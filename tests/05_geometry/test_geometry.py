@@ -9,7 +9,6 @@ import pytest
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely import Polygon
 
 from pipeline import geometry
 from pipeline.model import FloatArray
@@ -126,21 +125,6 @@ def test_without_points_the_fit_refuses() -> None:
 
 def test_residuals_are_vertical() -> None:
     assert geometry.vertical_residuals_m(np.array([[0.0, 0, 2]]), (1.0, 0.0, 0.0))[0] == 2.0
-
-
-# ----------------------------------------------------------------------------------------------------------- rings
-
-
-def test_ring_areas_and_orientations_agree_with_shapely() -> None:
-    ring = np.array([[0.0, 0], [4, 0], [4, 3], [2, 1], [0, 3]])
-    for moved in (ring, ring[::-1], np.roll(ring, 2, axis=0), np.vstack((ring, ring[:1])), ring + 1e5):
-        polygon = Polygon(moved)
-        sign = 1 if polygon.exterior.is_ccw else -1
-        assert geometry.ring_area_m2(moved) == pytest.approx(sign * polygon.area)
-
-
-def test_a_line_has_no_area() -> None:
-    assert geometry.ring_area_m2(np.array([[0.0, 0], [1, 1]])) == 0.0
 
 
 # -------------------------------------------------------------------------------------------------- neighbourhoods

@@ -13,7 +13,7 @@ from pipeline.errors import SettingsError
 from pipeline.model import IntArray, Reason
 from pipeline.terrain.candidates import (
     NOWHERE,
-    REASONS,
+    REASON_OF_FAULT,
     Fault,
     Surfaces,
     Verdict,
@@ -220,7 +220,7 @@ def test_many_surfaces_are_judged_like_each_on_its_own(
             if verdict is None:
                 assert found[k] == (Fault.NONE if somewhere[k] else Fault.NOT_JUDGED)
             else:
-                assert REASONS[Fault(found[k])] == verdict.reason
+                assert REASON_OF_FAULT[Fault(found[k])] == verdict.reason
         else:
             assert found[k] == Fault.NOT_JUDGED
 

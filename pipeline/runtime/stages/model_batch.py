@@ -17,7 +17,7 @@ from pipeline.export.facts import CandidateFacts
 from pipeline.io.crs import SpatialReference
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.methods import METHODS, ReconstructSettings
-from pipeline.model import BuildingResult, Candidate, Reason, RoofType, Status
+from pipeline.model import BuildingResult, Candidate, Reason, Status
 from pipeline.runtime.cluster.memory_needs import building_bytes
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
 from pipeline.runtime.isolation.replay_bundle import Bundle, Incident, write_bundle
@@ -353,19 +353,10 @@ def failed_site(site: CandidateSite, method: str, reason: Reason, detail: str) -
         reason=reason,
         reason_detail=detail,
         method=method,
-        roof_type=RoofType.NONE,
-        lod="",
         footprint=site.footprint,
-        planes=(),
-        faces=(),
-        solids=(),
-        validity_codes=(),
         ground_z_m=math.nan,
         n_points=site.points,
         density_per_m2=math.nan,
-        rmse_m=math.nan,
-        p95_m=math.nan,
-        coverage=0.0,
         touches_data_edge=False,
     )
 
