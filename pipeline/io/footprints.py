@@ -125,7 +125,7 @@ def read_footprints(
     id_column : str, optional
         The column of ids; None to look for the common names, then for the file's own feature id.
     crs : str, optional
-        Stands above the file's CRS.
+        Overrides the file's CRS.
     area : Geometry, optional
         Where footprints are wanted, in metres of the run's CRS. Of a file that covers a country all others are passed
         over unread, but for features whose place is not known. The boxes around its parts decide, 100 m wider: who

@@ -57,7 +57,7 @@ def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None) 
     Parameters
     ----------
     path : str or Path
-        The file, or its URL: then it is fetched for as long as it is read. Its first bytes tell its format.
+        The file, or its URL: then it is fetched for as long as it is read. Its first bytes show its format.
     layer : str, optional
         The layer; of GeoParquet the geometry column.
     boxes : callable, optional

@@ -161,7 +161,7 @@ def facets_of(cloud: PreparedCloud, settings: ParameterSpaceSettings) -> Buildin
 def _one_a_square(roof: FloatArray, size_m: float) -> tuple[LabelArray, LabelArray]:
     """Indices of the points nearest to the middle of each square, ascending, and which of them represents each point.
 
-    Of equally near ones the lower index; all points where the size is 0.
+    The lower index of equally near ones; all points where the size is 0.
     """
     every = np.arange(len(roof), dtype=np.int32)
     if size_m <= 0.0:

@@ -48,9 +48,9 @@ def cluster_normals(
 ) -> FacetClusters:
     """K-means of unit normals (m, 3), at least one, with weights above 0, from farthest-point starts.
 
-    Of several starts that with the least inertia counts, of equal ones the first; the numbers of the clusters follow
-    it. There are fewer than `k` clusters where there are fewer different normals. Raises BuildingError ``too_complex``
-    where the products of facets with centres pass the limit.
+    The start with the least inertia counts, the first of equal ones; the numbers of the clusters follow it. There
+    are fewer than `k` clusters where there are fewer different normals. Raises BuildingError ``too_complex`` where the
+    products of facets with centres pass the limit.
     """
     normals, weights = np.ascontiguousarray(normals), np.ascontiguousarray(weights)
     farthest = farthest_point_start(normals, weights, k + settings.starts - 1)

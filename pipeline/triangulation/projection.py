@@ -33,8 +33,8 @@ def area_vector(corners: IntArray, start: int, stop: int) -> tuple[int, int, int
 def project_along_dominant_axis(corners: IntArray, outer_stop: int) -> tuple[IntArray, bool]:
     """Drop the coordinate in which the outer ring's normal is longest.
 
-    Of the corners of all rings, (n, 3) int64 in mm, the first `outer_stop` are the outer ring. Returns them in the
-    plane, (n, 2), the outer ring counter-clockwise; and False where it encloses no area.
+    The first `outer_stop` corners of all rings, (n, 3) int64 in mm, are the outer ring. Returns all in the plane,
+    (n, 2), the outer ring counter-clockwise; and False where it encloses no area.
     """
     x, y, z = area_vector(corners, 0, outer_stop)
     flat = np.empty((len(corners), 2), np.int64)
