@@ -1,6 +1,6 @@
 import { defineConfig } from "vite";
 
-const SERVICE = "http://127.0.0.1:8000"; // what `gablework serve` listens on; only for `npm run dev`
+const SERVICE = "http://127.0.0.1:8000"; // the address of `gablework serve`; only for `npm run dev`
 
 export default defineConfig(({ command }) => ({
   base: command === "build" ? "/viewer/" : "/",
@@ -13,7 +13,7 @@ export default defineConfig(({ command }) => ({
   },
   worker: { format: "es" as const },
   experimental: {
-    // the page is served at the service's root, its files below viewer/: relative, so that a path prefix of a proxy does no harm
+    // the page is served at the service's root, its files below viewer/: relative paths work with the path prefix of a proxy
     renderBuiltUrl: (filename, { hostType }) =>
       hostType === "html" ? `viewer/${filename}` : { relative: true },
   },

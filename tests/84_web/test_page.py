@@ -25,12 +25,12 @@ Open = Callable[..., Visit]
 
 JOB_S = 600.0
 STAGES = [
-    "Make the inputs ready",
+    "Prepare the inputs",
     "Plan the tiles",
     "Read the points",
     "Find ground and walls",
     "Join surfaces over borders",
-    "Draw touching buildings",
+    "Outline the buildings",
     "Model the buildings",
     "Write the results",
     "Assemble the downloads",

@@ -2,14 +2,14 @@
 
 export interface Place {
   job: string;
-  /** The run of a comparison whose models are shown, by its label; null for the first, and of other jobs. */
+  /** The run of a comparison whose models are shown, by its label; null for the first, and for other jobs. */
   method: string | null;
   building: string | null;
 }
 
 const PLACE = /^#\/jobs\/([^/]+)(?:\/methods\/([^/]+))?(?:\/buildings\/([^/]+))?/;
 
-/** `#/jobs/<job>`, then `/methods/<label>` and `/buildings/<building>` where they are named; null for the start. */
+/** `#/jobs/<job>`, then `/methods/<label>` and `/buildings/<building>` if they are named; null for the start. */
 export function placeOf(hash: string): Place | null {
   const found = PLACE.exec(hash);
   if (found === null) return null;
@@ -22,13 +22,13 @@ export function addressOf({ job, method, building }: Place): string {
   return "#" + parts.map(([name, value]) => (value === null ? "" : `/${name}/${encodeURIComponent(value)}`)).join("");
 }
 
-/** A path of the service, asked of one run of a comparison. */
+/** A path of the service for one run of a comparison. */
 export function ofRun(path: string, method: string | null): string {
   if (method === null) return path;
   return `${path}${path.includes("?") ? "&" : "?"}method=${encodeURIComponent(method)}`;
 }
 
-/** How a comparison names what it runs: the preset only where it is not the usual one. */
+/** The name of a variant in a comparison: the preset is named only if it is not the usual one. */
 export function variantOf(method: string, preset: string, usualPreset: string): string {
   return preset === "" || preset === usualPreset ? method : `${method}:${preset}`;
 }

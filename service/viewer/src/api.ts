@@ -38,11 +38,11 @@ export interface StatusInfo {
   updated?: string;
   title?: string;
   stage?: string;
-  /** The schedule that the job came of. */
+  /** The schedule that made the job. */
   scheduleID?: string;
   links?: Link[];
   request?: unknown;
-  /** Of a comparison: what came out of each run, by its label. */
+  /** The summary of each run of a comparison, by label. */
   summary?: { runs?: Record<string, unknown> };
   exception?: { title?: string; detail?: string };
 }
@@ -56,7 +56,7 @@ export interface Feature {
 
 export const isOver = (status: Status): boolean => status !== "accepted" && status !== "running";
 
-/** Where the service is: the folder of the page, so that a path prefix of a proxy does no harm. */
+/** The service's URL: the folder of the page, which includes the path prefix of a proxy. */
 export function serviceUrl(path: string): string {
   return new URL(path, new URL(".", document.baseURI)).href;
 }
@@ -79,7 +79,7 @@ export function authorization(): Record<string, string> {
 /**
  * One request; the answer's status is 2xx.
  *
- * @throws Problem for every other answer, and where there is none.
+ * @throws Problem for every other answer, and if there is none.
  */
 export async function request(path: string, options: RequestInit = {}): Promise<Response> {
   let response: Response;
@@ -123,7 +123,7 @@ function remedyOf(status: number, retryAfter: string | null): string {
     case 401:
       return "Enter a key that this service knows. Its operator makes one with gablework keys create.";
     case 403:
-      return "This key may not do that. Ask the service's operator for a key with the scope that is needed.";
+      return "This key may not do that. Ask the service's operator for a key with the required scope.";
     case 404:
     case 410:
       return "It may have been removed. Reload the list of jobs.";
@@ -144,11 +144,11 @@ function remedyOf(status: number, retryAfter: string | null): string {
   }
 }
 
-/** What the service read in a file's header. */
+/** An upload with the facts of its header. */
 export type Preflight = Record<string, unknown>;
 
 export interface UploadInfo {
-  /** How the inputs of an execution name it. */
+  /** Its reference in the inputs of an execution. */
   href: string;
   preflight: Preflight;
 }

@@ -2,7 +2,7 @@ import { buildingMesh, type SceneFrame } from "./building_mesh";
 import type { Building, SurfaceKind } from "./cityjson";
 import { CATEGORIES, bytesOf, categoryOf, type Category } from "./roof_types";
 
-/** What the page lists of a building; the whole record is asked for when it is opened. */
+/** The part of a building's record that the page lists; the whole record is loaded when it is opened. */
 export interface Listed {
   id: string;
   category: Category;
@@ -37,7 +37,7 @@ export class Batcher {
 
   constructor(private readonly frame: SceneFrame) {}
 
-  /** Take in one building; what is listed of it comes back. */
+  /** Add a building; returns its entry for the list. */
   add(building: Building): Listed {
     const { attributes } = building;
     const category = categoryOf(attributes["status"], attributes["roof_type"]);
@@ -86,7 +86,7 @@ class Gathered {
       edgeStarts,
       boxes: new Float32Array(6 * n),
       positions: new Float32Array(3 * corners),
-      normals: new Int8Array(4 * corners), // four bytes a corner: graphics cards want that alignment
+      normals: new Int8Array(4 * corners), // four bytes per corner: graphics cards need that alignment
       colours: new Uint8Array(4 * corners).fill(255),
       edges: new Float32Array(3 * edgeStarts[n]),
     };

@@ -6,7 +6,7 @@ import { CATEGORIES, type Category } from "./roof_types";
 
 const STEP = 100;
 
-/** The buildings as a list: what went wrong first, then the largest; the way to a record without a pointer. */
+/** The list of buildings: those with problems first, then the largest. It opens records without a pointer. */
 export class BuildingList {
   readonly element: HTMLElement;
   private buildings: Listed[] = [];
@@ -41,7 +41,7 @@ export class BuildingList {
     this.draw();
   }
 
-  /** The neighbour of a building in the list's order, around its end. */
+  /** The neighbour of a building in the list's order, which wraps around. */
   beside(id: string, step: number): string | null {
     const visible = this.visible();
     const at = visible.findIndex((building) => building.id === id);

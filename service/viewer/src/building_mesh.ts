@@ -21,7 +21,7 @@ export interface SceneFrame {
   verticalUnitM: number;
 }
 
-/** Faces that meet at less than this are one surface to the eye: no line is drawn between them. */
+/** Faces that meet at a smaller angle look like one surface: no line is drawn between them. */
 const SMOOTH = Math.cos((2 * Math.PI) / 180);
 
 /** The triangles and the edges of a building; a building without faces gives none. */

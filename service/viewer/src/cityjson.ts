@@ -1,4 +1,4 @@
-/** CityJSONSeq 2.0: a line of metadata, then one CityJSONFeature a building. */
+/** CityJSONSeq 2.0: a line of metadata, then one CityJSONFeature per building. */
 
 import { inOrder, levelShown } from "./levels_of_detail";
 
@@ -24,32 +24,32 @@ export interface Building {
   attributes: Record<string, unknown>;
   /** Easting, northing, elevation one after another. */
   vertices: Float64Array;
-  /** Those of one level of detail; empty where no model could be made. */
+  /** The faces of one level of detail; empty if no model could be made. */
   faces: Face[];
-  /** All levels of detail that there are of it, coarse to fine. */
+  /** All its levels of detail, coarse to fine. */
   levels: string[];
 }
 
 export interface Metadata {
   transform: Transform;
-  /** EPSG code without the authority; null where the CRS is unknown. */
+  /** EPSG code without the authority; null if the CRS is unknown. */
   epsg: string | null;
-  /** x_min, y_min, z_min, x_max, y_max, z_max; null where nothing was modelled. */
+  /** x_min, y_min, z_min, x_max, y_max, z_max; null if nothing was modelled. */
   extent: number[] | null;
 }
 
 const KINDS: Record<string, SurfaceKind> = { RoofSurface: "roof", GroundSurface: "ground", WallSurface: "wall" };
 
 /**
- * Reads the sequence line by line; a further line of metadata stands for the features that follow it.
+ * Reads the sequence line by line; a further line of metadata applies to the features that follow it.
  *
- * @throws Error when a line is no JSON, or a feature comes before the first line of metadata.
+ * @throws Error if a line is not JSON, or a feature comes before the first line of metadata.
  */
 export class SequenceReader {
   metadata: Metadata | null = null;
   private readonly several = new Set<string>();
 
-  /** @param lod The level of detail that is read: of each building the finest that is no finer; null for its finest. */
+  /** @param lod The level of detail to read: for each building the finest level up to this one; null for its finest. */
   constructor(private readonly lod: string | null = null) {}
 
   read(line: string): Building | null {
@@ -66,8 +66,8 @@ export class SequenceReader {
   }
 
   /**
-   * The levels of detail that can be chosen from, coarse to fine: those of buildings that have several. A block in the
-   * place of a model that could not be made is no level that the job was asked for.
+   * The levels of detail to choose from, coarse to fine: those of buildings that have several. A fallback block is not
+   * a requested level.
    */
   get levels(): string[] {
     return inOrder(this.several);
@@ -106,7 +106,7 @@ function featureOf(line: RawLine, { scale, translate }: Transform, lod: string |
   raw.forEach((xyz, i) => {
     for (let axis = 0; axis < 3; axis++) vertices[3 * i + axis] = xyz[axis] * scale[axis] + translate[axis];
   });
-  // one level of the whole building: the others stand at the same place
+  // one level of the whole building: the others are at the same place
   const geometries = Object.values(line.CityObjects ?? {}).flatMap(({ geometry }) => geometry ?? []);
   const levels = inOrder(geometries.map(levelOf));
   const shown = levelShown(levels, lod);

@@ -4,20 +4,20 @@ import { el } from "./elements";
 import { asProblem, problemNotice } from "./notices";
 import { bytes } from "./numbers";
 
-/** Outputs of the process, in the order in which people want them: label, what it is, name of the file. */
+/** Outputs of the process, the most wanted ones first: label, description, file name. */
 const OUTPUTS: Record<string, [string, string, string]> = {
   cityjson: ["CityJSON", "All models with semantics, CityJSONSeq 2.0", "buildings.city.jsonl"],
-  meshes: ["Meshes", "OBJ or GLB as the job was asked for, zipped", "meshes.zip"],
+  meshes: ["Meshes", "OBJ or GLB, as requested, zipped", "meshes.zip"],
   buildings: ["GeoParquet", "Every building's record with its footprint and solids", "buildings.parquet"],
   planes: ["GeoParquet, planes", "Every roof plane: slope, aspect, area, fit", "planes.parquet"],
-  rejected: ["GeoParquet, rejected", "What was judged to be no building, and why", "rejected.parquet"],
+  rejected: ["GeoParquet, rejected", "Objects that are not buildings, with reasons", "rejected.parquet"],
   geojson: ["GeoJSON", "Footprints with the record, for any GIS", "buildings.geojson"],
   report: ["Report", "Settings, inputs, counts, timings, digest", "report.json"],
 };
 
-/** Those of a comparison as a whole; its page is a link of its own. */
+/** Outputs of a comparison as a whole; its page has a separate link. */
 const COMPARED: typeof OUTPUTS = {
-  table: ["All methods, GeoParquet", "A row a building and method", "compared.parquet"],
+  table: ["All methods, GeoParquet", "One row per building and method", "compared.parquet"],
   summary: ["All methods, summary", "Presets, hashes, counts, seconds", "compare.json"],
   archive: ["All methods, zip", "The page, the table, every run", "comparison.zip"],
 };
@@ -44,11 +44,11 @@ async function save(path: string, filename: string): Promise<void> {
   const address = URL.createObjectURL(await response.blob());
   const link = el("a", { href: address, download: filename });
   link.click();
-  // the browser reads the blob after the click: it must not be gone by then
+  // the browser reads the blob after the click, so it must still exist then
   setTimeout(() => URL.revokeObjectURL(address), 60_000);
 }
 
-/** Shows the page of a comparison; with a key it can only be saved, and then opened. */
+/** A link to the page of a comparison; with a key the page can only be saved and then opened. */
 export function pageLink(jobPath: string, name: string): HTMLAnchorElement {
   const path = `${jobPath}/results/page`;
   if (currentKey() !== null) {
@@ -61,7 +61,7 @@ export function pageLink(jobPath: string, name: string): HTMLAnchorElement {
 
 type Offered = Record<string, Link & { bytes?: number }>;
 
-/** A menu of all outputs that the job has; of a comparison those of one run, then those of all. */
+/** A menu of all outputs of the job; for a comparison those of one run, then those of all. */
 export async function downloadMenu(jobPath: string, method: string | null, signal: AbortSignal): Promise<HTMLElement> {
   const offer = (of: string | null): Promise<Offered> => getJson<Offered>(ofRun(`${jobPath}/results`, of), { signal });
   const entries = listed(await offer(method), OUTPUTS, jobPath, method);
@@ -86,7 +86,7 @@ export async function downloadMenu(jobPath: string, method: string | null, signa
   return menu;
 }
 
-/** Entries of the menu: those that are known in their order, then any others. */
+/** Entries of the menu: known outputs in their order, then any others. */
 function listed(offered: Offered, known: typeof OUTPUTS, jobPath: string, method: string | null): HTMLElement[] {
   const names = [...Object.keys(known), ...Object.keys(offered).filter((name) => !(name in known))];
   return names

@@ -8,7 +8,7 @@ export interface ServerEvent {
   id: string;
 }
 
-/** Reads text/event-stream (WHATWG HTML, 9.2), however it is cut into pieces. */
+/** Reads text/event-stream (WHATWG HTML, 9.2) in pieces of any size. */
 export class EventStreamReader {
   private rest = "";
   private event = "";
@@ -46,11 +46,11 @@ export class EventStreamReader {
 }
 
 /**
- * Follows a stream of events until `onEvent` answers that it is over, connecting again where it breaks.
+ * Follows a stream of events until `onEvent` answers that it is over; reconnects if it breaks.
  *
  * EventSource would do the same, but sends no Authorization header.
  *
- * @throws Problem when the service refuses the stream for good, AbortError when cancelled.
+ * @throws Problem if the service refuses the stream permanently, AbortError if cancelled.
  */
 export async function follow(
   path: string,
@@ -65,7 +65,7 @@ export async function follow(
       const headers: Record<string, string> = { Accept: "text/event-stream" };
       if (last !== "") headers["Last-Event-ID"] = last;
       const response = await request(path, { headers, signal });
-      if (response.status === 204) return; // over, and all of it known
+      if (response.status === 204) return; // the job is over and all events are known
       onConnection(true);
       waitMs = 1000;
       const reader = new EventStreamReader();

@@ -43,7 +43,7 @@ function polygonsOf(geometry: Feature["geometry"]): Ring[][] {
   return [];
 }
 
-/** Whether a ring runs clockwise: many writers do not heed RFC 7946. */
+/** Whether a ring runs clockwise: many writers ignore RFC 7946. */
 function seenFromBelow(vertices: readonly number[], ring: readonly number[]): boolean {
   let area = 0;
   ring.forEach((from, i) => {
@@ -53,7 +53,7 @@ function seenFromBelow(vertices: readonly number[], ring: readonly number[]): bo
   return area < 0;
 }
 
-/** Lift all to the highest: a face must be plane. */
+/** Lift all vertices to the highest one: a face must be planar. */
 function level(vertices: number[]): void {
   let top = -Infinity;
   for (let i = 2; i < vertices.length; i += 3) top = Math.max(top, vertices[i]);

@@ -1,7 +1,7 @@
 import { Box3, Vector3 } from "three";
 
 /**
- * From where boxes just fill the frame of a perspective camera.
+ * The place from which boxes just fill the frame of a perspective camera.
  *
  * @param boxes At least one.
  * @param toCamera Unit vector from the target to the camera; not straight up.
@@ -41,10 +41,10 @@ export function framing(
 }
 
 /**
- * Where a camera must stand on one of its axes, so that all points are within its frame.
+ * The place of a camera on one of its axes that brings all points into its frame.
  *
  * A point p is left of the right border when (p - c)·axis <= tan (c - p)·forward: the border's constraint is linear in
- * the camera's place c, and the tightest of each side give both its middle and its least distance.
+ * the camera's place c, and the tightest constraint of each side gives both its middle and its minimum distance.
  */
 class Span {
   private high = -Infinity;

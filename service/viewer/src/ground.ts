@@ -23,9 +23,9 @@ interface Level {
  * Known nodes are averaged into ever coarser lattices and unknown ones filled from the next coarser one
  * ("pull-push", Gortler et al. 1996).
  *
- * @param floors x, y and floor height of places that are known, one after another; at least one.
+ * @param floors x, y and floor height of known places, one after another; at least one.
  * @param box x_min, y_min, x_max, y_max of the lattice.
- * @param cells About how many cells along the longer side.
+ * @param cells Approximate number of cells along the longer side.
  */
 export function groundThrough(floors: readonly number[], box: readonly number[], cells: number): Ground {
   const [xMin, yMin, xMax, yMax] = box;
@@ -61,7 +61,7 @@ function filled(fine: Level): Float32Array {
   return heights;
 }
 
-/** Four cells become one; weights saturate at 1, so that many near floors do not outvote a far one. */
+/** Four cells become one; weights saturate at 1: many near floors do not outvote a far one. */
 function coarser(fine: Level): Level {
   const coarse = level(Math.ceil(fine.nx / 2), Math.ceil(fine.ny / 2));
   for (let row = 0; row < fine.ny; row++) {

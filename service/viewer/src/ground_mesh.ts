@@ -9,7 +9,7 @@ export function groundMesh(ground: Ground): Mesh {
   for (let row = 0; row < ny; row++) {
     for (let column = 0; column < nx; column++) {
       const at = row * nx + column;
-      // a little below the floors, so that they do not flicker through
+      // a little below the floors, which would otherwise flicker through
       positions.set([ground.xMin + column * cellM, ground.yMin + row * cellM, ground.heights[at] - 0.06], 3 * at);
       const u = (2 * column) / (nx - 1) - 1;
       const v = (2 * row) / (ny - 1) - 1;

@@ -2,7 +2,7 @@ import type { MeshLambertMaterial } from "three";
 
 const SPACING_M = 1.6;
 
-/** Lays dark slanted stripes over a material, so that colour is not the only sign. */
+/** Draws dark slanted stripes over a material, as a sign in addition to the colour. */
 export function hatched(material: MeshLambertMaterial): MeshLambertMaterial {
   material.onBeforeCompile = (shader) => {
     shader.vertexShader = shader.vertexShader

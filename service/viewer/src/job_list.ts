@@ -15,7 +15,7 @@ export const STATUS_WORDS: Record<StatusInfo["status"], string> = {
   dismissed: "cancelled",
 };
 
-/** The jobs, newest first; looked at again while one of them is under way. */
+/** The jobs, newest first; reloaded while one of them is under way. */
 export class JobList {
   private jobs: StatusInfo[] = [];
   private current = "";
@@ -86,13 +86,13 @@ export class JobList {
   }
 }
 
-/** Of a comparison that is done, the way to its page. */
+/** The link to the page of a finished comparison. */
 function pageOf(job: StatusInfo): HTMLElement | null {
   if (job.links?.some(({ type }) => type === "text/html") !== true) return null;
   return el("div", { class: "job-page" }, pageLink(`jobs/${encodeURIComponent(job.jobID)}`, `Comparison of ${titleOf(job)}`));
 }
 
-/** The user's title of a job, else its inputs' names, else the beginning of its id. */
+/** The user's title of a job, otherwise the beginning of its id. */
 export function titleOf(job: StatusInfo): string {
   return job.title ?? `Job ${job.jobID.slice(0, 8)}`;
 }

@@ -6,16 +6,16 @@ import { titleOf } from "./job_list";
 import { announce, asProblem, problemNotice, warningNotice } from "./notices";
 import { count, duration } from "./numbers";
 
-/** What a job's view reports to the page. */
+/** The calls of a job's view to the page. */
 export interface Hooks {
-  /** The job is not what the list shows any more. */
+  /** The list no longer shows the job's state. */
   onChange: () => void;
   onProblem: (problem: Problem) => void;
 }
 
 interface JobEvent {
   kind: string;
-  /** The status that the job came to; only of the kind `status`. */
+  /** The new status; only for kind `status`. */
   status?: Status;
   stage: string;
   done: number;
@@ -24,22 +24,22 @@ interface JobEvent {
   message: string;
 }
 
-/** The stages of a job, in order: name, what happens, and what is counted. */
+/** The stages of a job, in order: name, description, and the counted unit. */
 const STAGES: [string, string, string][] = [
-  ["inputs", "Make the inputs ready", "files"],
+  ["inputs", "Prepare the inputs", "files"],
   ["plan", "Plan the tiles", ""],
   ["ingest", "Read the points", "files"],
   ["split", "Find ground and walls", "tiles"],
   ["join", "Join surfaces over borders", ""],
-  ["outline", "Draw touching buildings", ""],
+  ["outline", "Outline the buildings", ""],
   ["reconstruct", "Model the buildings", "buildings"],
   ["publish", "Write the results", "tiles"],
   ["outputs", "Assemble the downloads", ""],
 ];
 
-/** What a comparison does besides, before its downloads are assembled. */
+/** Further stages of a comparison, before its downloads are assembled. */
 const SIDE_BY_SIDE: typeof STAGES = [
-  ["records", "Put the runs side by side", ""],
+  ["records", "Compare the runs", ""],
   ["points", "Read points for the pictures", ""],
   ["pictures", "Draw the pictures", ""],
   ["page", "Write the page", ""],
@@ -49,7 +49,7 @@ function stagesOf(job: StatusInfo): typeof STAGES {
   return job.processID === "compare" ? [...STAGES.slice(0, -1), ...SIDE_BY_SIDE, ...STAGES.slice(-1)] : STAGES;
 }
 
-/** Show a job: its progress, why it failed, or what came out. What comes back ends the view. */
+/** Show a job: its progress, its failure or its results. Returns a function that ends the view. */
 export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => void {
   const calledOff = new AbortController();
   let leaveResults: () => void = () => undefined;
@@ -60,7 +60,7 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
     if (calledOff.signal.aborted) return;
     document.title = `${titleOf(job)} · gablework`;
     if (job.status === "successful") {
-      // the 3D library is only loaded where there is something to draw
+      // the 3D library is loaded only if there is something to draw
       const { showResults } = await import("./results_view");
       if (calledOff.signal.aborted) return;
       leaveResults = showResults(place, job, named, hooks);
@@ -102,9 +102,9 @@ function ended(job: StatusInfo): HTMLElement {
   const notice =
     job.status === "failed"
       ? problemNotice(
-          new Problem(0, failure?.title ?? "The job failed", failure?.detail ?? job.message ?? "", "Correct what is named and submit it again."),
+          new Problem(0, failure?.title ?? "The job failed", failure?.detail ?? job.message ?? "", "Fix the cause and submit it again."),
         )
-      : el("p", {}, "This job was cancelled; nothing of it is kept.");
+      : el("p", {}, "This job was cancelled; its files are removed.");
   return el("div", { class: "card" }, el("h1", {}, titleOf(job)), notice);
 }
 

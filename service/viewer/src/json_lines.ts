@@ -1,5 +1,5 @@
 /**
- * The lines of a stream of UTF-8 text, one after another, however the bytes are cut into chunks.
+ * The lines of a stream of UTF-8 text, one after another, for chunks of any size.
  *
  * Empty lines and the record separators of RFC 8142 are dropped.
  */

@@ -2,9 +2,9 @@ import { el, swatch } from "./elements";
 import { count } from "./numbers";
 import { CATEGORIES, CATEGORY_NAMES, type Category } from "./roof_types";
 
-/** The colours and how often each occurs; a click hides or shows the buildings of one. */
+/** The colours with their numbers of buildings; a click hides or shows the buildings of one colour. */
 export class Legend {
-  readonly element = el("div", { class: "legend", role: "group", "aria-label": "Roof types that are shown" });
+  readonly element = el("div", { class: "legend", role: "group", "aria-label": "Shown roof types" });
   private readonly rows = new Map<Category, { row: HTMLElement; tally: HTMLElement }>();
 
   constructor(onToggle: (category: Category, visible: boolean) => void) {

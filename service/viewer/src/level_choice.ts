@@ -1,13 +1,13 @@
 import { el } from "./elements";
 import { levelWords } from "./levels_of_detail";
 
-/** Buttons for the levels of detail of the models that are shown; not there where there is nothing to choose. */
+/** Buttons for the levels of detail of the shown models; hidden if there is nothing to choose. */
 export class LevelChoice {
   readonly element = el("div", { class: "tool-group levels", role: "group", "aria-label": "Level of detail", hidden: true });
 
   constructor(private readonly onChoice: (lod: string) => void) {}
 
-  /** The levels that there are, coarse to fine; the finest is what is shown. */
+  /** Set the available levels, coarse to fine; the finest is shown. */
   offer(lods: readonly string[]): void {
     this.element.replaceChildren(
       ...lods.map((lod) =>
@@ -18,7 +18,7 @@ export class LevelChoice {
     this.mark(lods[lods.length - 1] ?? "");
   }
 
-  /** Tell which level is shown. */
+  /** Mark the shown level. */
   mark(lod: string): void {
     for (const button of this.element.querySelectorAll("button")) {
       button.setAttribute("aria-pressed", String(button.value === lod));

@@ -1,8 +1,8 @@
-/** Levels of detail of the models, as Biljecki et al. (2016) number them. */
+/** Levels of detail of the models, numbered as in Biljecki et al. (2016). */
 
 const WORDS: Record<string, string> = { "1.2": "one block", "1.3": "level parts", "2.2": "roof faces" };
 
-/** What a model of this level is made of; empty for a level that the page does not know. */
+/** The parts of a model of this level; empty for an unknown level. */
 export function levelWords(lod: string): string {
   return WORDS[lod] ?? "";
 }
@@ -12,7 +12,7 @@ export function inOrder(lods: Iterable<string>): string[] {
   return [...new Set(lods)].sort((a, b) => Number(a) - Number(b));
 }
 
-/** The single levels among what the process takes: each alone, and several with commas between them. */
+/** The single levels among the values of the process: each alone, or several with commas between them. */
 export function levelsOffered(sets: readonly string[]): string[] {
   return inOrder(sets.flatMap((set) => set.split(",")));
 }
@@ -22,7 +22,7 @@ export function lodsInput(chosen: Iterable<string>): string {
   return inOrder(chosen).join(",");
 }
 
-/** The finest of some levels that is no finer than what is asked for, of null the finest; null where there is none. */
+/** The finest level up to the wanted one, or the finest of all for null; null if there is none. */
 export function levelShown(there: Iterable<string>, asked: string | null): string | null {
   const fitting = inOrder(there).filter((lod) => asked === null || Number(lod) <= Number(asked));
   return fitting[fitting.length - 1] ?? null;

@@ -1,4 +1,4 @@
-/** The page: what the address names is shown, the rest follows. */
+/** The page: it shows what the address names. */
 
 import { placeOf } from "./address";
 import { Problem, currentKey, getJson, keepKey } from "./api";
@@ -24,7 +24,7 @@ function route(): void {
   jobs.mark(place?.job ?? "");
   document.body.classList.toggle("has-job", place !== null);
   const run = place === null ? "" : `${place.job} ${place.method ?? ""}`;
-  if (run === shown && place !== null) return; // only the building changed: the job's view hears of it itself
+  if (run === shown && place !== null) return; // only the building changed: the job's view handles that itself
   leave();
   shown = run;
   if (place === null) {
@@ -39,7 +39,7 @@ function route(): void {
   });
 }
 
-/** A key that is missing or refused is asked for; everything else is shown where it happened. */
+/** Ask for a key that is missing or refused; show all other problems where they happened. */
 function onProblem(problem: Problem): void {
   if (problem.status === 401) askForKey(problem);
 }
@@ -63,7 +63,7 @@ function askForKey(problem: Problem | null): void {
     problem === null ? null : problemNotice(problem),
     el("label", { for: "key-field" }, "Bearer key"),
     field,
-    el("p", { class: "hint", id: "key-hint" }, "Kept in this tab until it is closed; sent as a header, never in an address."),
+    el("p", { class: "hint", id: "key-hint" }, "Stored in this tab until it is closed; sent as a header, never in an address."),
     el(
       "div",
       { class: "actions" },

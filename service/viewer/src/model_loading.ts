@@ -9,7 +9,7 @@ export interface ToLoading {
   /** Metres in a unit of the coordinates. */
   horizontalUnitM: number;
   verticalUnitM: number;
-  /** The level of detail that is shown; null for the finest of each building. */
+  /** The shown level of detail; null for the finest of each building. */
   lod: string | null;
 }
 
@@ -20,17 +20,17 @@ export type Reading = Omit<ToLoading, "bytes">;
 export type FromLoading =
   | { kind: "frame"; origin: [number, number, number] }
   | { kind: "buildings"; listed: Listed[]; batches: Batch[] }
-  /** The levels of detail that can be chosen from, coarse to fine; none where each building has one. */
+  /** The levels of detail to choose from, coarse to fine; empty if each building has one. */
   | { kind: "finished"; levels: string[] }
   | { kind: "failed"; detail: string };
 
 /**
- * Fetches models and has them read in a worker.
+ * Fetches models and reads them in a worker.
  *
  * The page fetches, since a worker's own requests are bound by the policy that its script was sent with.
  *
- * @returns The levels of detail that can be chosen from, coarse to fine; none where each building has one.
- * @throws Problem when they cannot be had, Error when they cannot be read, AbortError when cancelled.
+ * @returns The levels of detail to choose from, coarse to fine; empty if each building has one.
+ * @throws Problem if they cannot be fetched, Error if they cannot be read, AbortError if cancelled.
  */
 export async function loadModels(
   path: string,

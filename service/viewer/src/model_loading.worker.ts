@@ -1,4 +1,4 @@
-/** Reads and triangulates the models beside the page, so that it stays responsive. It fetches nothing itself. */
+/** Reads and triangulates the models in a worker, which keeps the page responsive. It fetches nothing itself. */
 
 import { Batcher } from "./batching";
 import { SequenceReader, type Building } from "./cityjson";
@@ -21,7 +21,7 @@ self.onmessage = ({ data }: MessageEvent<ToLoading>) => {
   });
 };
 
-/** What the page hands over, until its end. */
+/** The text that the page passes in, until its end. */
 async function* arriving(): AsyncGenerator<Uint8Array> {
   for (;;) {
     const bytes = given.shift();

@@ -13,7 +13,7 @@ export function problemNotice(problem: Problem, again?: () => void): HTMLElement
   );
 }
 
-/** Something odd but usable. */
+/** A warning. */
 export function warningNotice(...messages: string[]): HTMLElement {
   return el(
     "div",
@@ -25,10 +25,10 @@ export function warningNotice(...messages: string[]): HTMLElement {
 /** Anything that was thrown, as a problem. */
 export function asProblem(error: unknown): Problem {
   if (error instanceof Problem) return error;
-  return new Problem(0, "The page could not go on", error instanceof Error ? error.message : String(error), "Reload the page.");
+  return new Problem(0, "The page failed", error instanceof Error ? error.message : String(error), "Reload the page.");
 }
 
-/** Says something to those who listen rather than look. */
+/** Announces a text to screen readers. */
 export function announce(message: string): void {
   const status = document.getElementById("status");
   if (status !== null && status.textContent !== message) status.textContent = message;

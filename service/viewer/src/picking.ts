@@ -1,4 +1,4 @@
-/** What of a batch a ray can meet. */
+/** The part of a batch that a ray can hit. */
 export interface Pickable {
   boxes: Float32Array;
   positions: Float32Array;
@@ -15,9 +15,9 @@ export interface Hit<T extends Pickable> {
 type Vector = readonly [number, number, number];
 
 /**
- * The first building that a ray meets; null where it meets none.
+ * The first building that a ray hits; null if it hits none.
  *
- * Boxes first, then the triangles of the buildings whose box is met (Möller and Trumbore 1997), from either side.
+ * Boxes first, then the triangles of the buildings whose box is hit (Möller and Trumbore 1997), from either side.
  */
 export function pick<T extends Pickable>(batches: Iterable<T>, origin: Vector, direction: Vector): Hit<T> | null {
   let best: Hit<T> | null = null;
@@ -34,7 +34,7 @@ export function pick<T extends Pickable>(batches: Iterable<T>, origin: Vector, d
   return best;
 }
 
-/** Distance at which the ray enters the box, 0 from inside it, infinity where it misses. */
+/** Distance at which the ray enters the box, 0 from inside it, infinity if it misses. */
 function boxEntry(boxes: Float32Array, at: number, origin: Vector, direction: Vector): number {
   let enter = 0;
   let leave = Infinity;

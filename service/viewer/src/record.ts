@@ -18,7 +18,7 @@ const metres = (digits: number) => (value: unknown) => measure(value, digits, "m
 const percent = (value: unknown): string => (typeof value === "number" ? measure(100 * value, 1, "%") : "–");
 const whole = (value: unknown): string => (typeof value === "number" ? count(value) : "–");
 
-/** The columns of the record that people look at; the file has all of them. */
+/** The most important columns of the record; the file has all of them. */
 function groups(verticalUnit: string): [string, Row[]][] {
   const elevation = (value: unknown): string => measure(value, 2, verticalUnit);
   return [
@@ -47,10 +47,10 @@ function groups(verticalUnit: string): [string, Row[]][] {
         { label: "RMSE", column: "rmse_m", show: metres(3) },
         { label: "95th percentile", column: "p95_m", show: metres(3) },
         { label: "Points covered", column: "coverage", show: percent },
-        { label: "Given footprint filled", column: "footprint_share", show: percent },
+        { label: "Given footprint covered", column: "footprint_share", show: percent },
         { label: "Within 0.2 m of the roof", column: "share_within_0_2m", show: percent },
         { label: "Noise of the points", column: "noise_m", show: metres(3) },
-        { label: "Ridge known to (one sigma)", column: "ridge_z_sigma_m", show: metres(3) },
+        { label: "Ridge uncertainty (one sigma)", column: "ridge_z_sigma_m", show: metres(3) },
         { label: "Roof unexplained by points", column: "unexplained_m2", show: (v) => measure(v, 1, "m²") },
         { label: "Largest hole in the points", column: "largest_hole_m", show: metres(1) },
         { label: "Points", column: "n_points", show: whole },
@@ -61,16 +61,16 @@ function groups(verticalUnit: string): [string, Row[]][] {
 }
 
 const REASONS: Record<string, string> = {
-  too_few_points: "fewer points than a plane needs",
+  too_few_points: "too few points for a plane",
   no_plane: "no roof plane was found in its points",
   no_partition: "the roof planes could not be turned into faces",
-  invalid_solid: "the solid broke a rule of validity",
-  too_complex: "it took more work than one building may",
+  invalid_solid: "the solid is not valid",
+  too_complex: "it exceeded the work limit of one building",
   no_footprint: "no outline could be made from its points",
   internal_error: "a fault of the program in this one building",
-  crashed: "its work ended the process; it is kept as a bundle for a replay",
-  timed_out: "its work took too long; it is kept as a bundle for a replay",
-  out_of_memory: "its work took too much memory; it is kept as a bundle for a replay",
+  crashed: "it crashed its process; a bundle for a replay is kept",
+  timed_out: "it took too long; a bundle for a replay is kept",
+  out_of_memory: "it needed too much memory; a bundle for a replay is kept",
 };
 
 /** The reason of a building that is not `ok`, in words. */
@@ -78,7 +78,7 @@ export function reasonWords(reason: string): string {
   return REASONS[reason] ?? reason.replaceAll("_", " ");
 }
 
-/** Show the record of one building; what comes back stops the loading. */
+/** Show the record of one building; returns a function that stops the loading. */
 export function showRecord(
   place: HTMLElement,
   jobPath: string,

@@ -16,7 +16,7 @@ import { showRecord } from "./record";
 import { ModelScene } from "./scene";
 import type { Category } from "./roof_types";
 
-/** What the page reads of the report. */
+/** The part of the report that the page reads. */
 interface Report {
   crs?: { name?: string | null; horizontal_unit_m?: number | null; vertical_unit_m?: number | null };
   counts?: Record<string, number>;
@@ -24,7 +24,7 @@ interface Report {
   warnings?: string[];
 }
 
-/** Show what a job found: the models, the list and the records, the downloads. What comes back ends the view. */
+/** Show the results of a job: models, list, records and downloads. Returns a function that ends the view. */
 export function showResults(place: HTMLElement, job: StatusInfo, named: Place, hooks: Hooks): () => void {
   const view = new ResultsView(place, job, named.method, hooks);
   view.start(named.building).catch((error: unknown) => view.fail(error));
@@ -34,7 +34,7 @@ export function showResults(place: HTMLElement, job: StatusInfo, named: Place, h
 class ResultsView {
   private readonly calledOff = new AbortController();
   private readonly jobPath: string;
-  /** Labels of the runs of a comparison; empty of other jobs. */
+  /** Labels of the runs of a comparison; empty for other jobs. */
   private readonly methods: string[];
   /** The one whose models are shown. */
   private readonly method: string | null;
@@ -110,7 +110,7 @@ class ResultsView {
       this.scene = new ModelScene(this.canvas, (id) => this.open(id));
     } catch {
       this.note.replaceChildren(
-        warningNotice("This browser cannot draw in 3D (WebGL is missing or switched off). The list, the records and the downloads work all the same."),
+        warningNotice("This browser cannot draw in 3D (WebGL is missing or switched off). The list, the records and the downloads still work."),
       );
     }
     this.note.append(el("p", { class: "loading" }, "Loading the models…"));
@@ -142,9 +142,9 @@ class ResultsView {
     this.scene?.dispose();
   }
 
-  // --- what is there
+  // --- loading
 
-  /** The report, or nothing where the job was asked not to make it. */
+  /** The report; null if the request left it out. */
   private async loadReport(): Promise<Report> {
     try {
       return await getJson<Report>(ofRun(`${this.jobPath}/results/report`, this.method), { signal: this.calledOff.signal });
@@ -154,14 +154,14 @@ class ResultsView {
     }
   }
 
-  /** Read the models at a level of detail, null for the finest of each; those that there are come back. */
+  /** Read the models at a level of detail, null for the finest of each; returns the available levels. */
   private load(lod: string | null, onMessage: (message: FromLoading) => void, signal: AbortSignal): Promise<string[]> {
     const { crs } = this.report;
     const reading = { horizontalUnitM: crs?.horizontal_unit_m ?? 1, verticalUnitM: crs?.vertical_unit_m ?? 1, lod };
     return loadModels(ofRun(`${this.jobPath}/results/cityjson`, this.method), reading, onMessage, signal);
   }
 
-  /** The models at another level of detail, seen from the same place; what is there stays until they are read. */
+  /** Show the models at another level of detail from the same place; the old ones stay until the new ones are read. */
   private async showLevel(lod: string): Promise<void> {
     this.otherLevel.abort();
     const { signal } = (this.otherLevel = new AbortController());
@@ -205,7 +205,7 @@ class ResultsView {
     this.canvas.dataset["ready"] = "true";
   }
 
-  /** Footprints of those that have no model: only the records tell where they are. */
+  /** Draw the footprints of buildings without a model: only the records have their place. */
   private async drawFailed(): Promise<void> {
     const { crs } = this.report;
     const failed = ofRun(`${this.jobPath}/buildings?status=failed&limit=10000&crs=native`, this.method);
@@ -248,7 +248,7 @@ class ResultsView {
     this.facts.replaceChildren(facts, warnings.length === 0 ? "" : " · ", warnings.length === 0 ? "" : notice);
   }
 
-  /** An empty result says what to try. */
+  /** Say what to try if the result is empty. */
   private nothing(): HTMLElement {
     const rejected = this.report.counts?.["rejected"] ?? 0;
     return el(
@@ -260,22 +260,22 @@ class ResultsView {
         {},
         rejected > 0
           ? `${counted(rejected, "object")} ${rejected === 1 ? "was" : "were"} looked at and left out: too small, too low, too narrow, or vegetation. Each is in the download “rejected” with its reason and the measured figure.`
-          : "Nothing stood out of the ground.",
+          : "Nothing rises above the ground.",
       ),
       el(
         "ul",
         {},
-        el("li", {}, "Is the vertical unit right? Feet read as metres, or the other way round, move every threshold."),
-        el("li", {}, "Is the file classified in a way of its own? Try “Classes: ignore”."),
-        el("li", {}, "Do the points reach roofs and walls? Fewer than about one point per m² is too little."),
-        el("li", {}, "Footprints, where you have them, say where to look."),
+        el("li", {}, "Is the vertical unit right? Feet read as metres, or metres as feet, shift every threshold."),
+        el("li", {}, "Does the file use its own class codes? Try “Classes: ignore”."),
+        el("li", {}, "Do the points reach roofs and walls? Less than about one point per m² is too few."),
+        el("li", {}, "If you have footprints, add them: they say where to look."),
       ),
     );
   }
 
   // --- the methods of a comparison
 
-  /** Whose models are shown, and the way to the page that shows all side by side. */
+  /** The choice of the method whose models are shown, and the link to the page with all methods. */
   private comparison(): HTMLElement[] {
     if (this.methods.length === 0) return [];
     const choice = el(
@@ -299,7 +299,7 @@ class ResultsView {
     return addressOf({ job: this.job.jobID, method: this.named, building });
   }
 
-  /** A click in the scene: the address follows, and the rest follows the address. */
+  /** Handle a click in the scene: it changes the address, and the view follows the address. */
   private open(id: string | null): void {
     const hash = this.address(id);
     if (location.hash === hash) return;

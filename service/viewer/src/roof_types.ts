@@ -1,7 +1,7 @@
 /**
- * What a building is drawn as: its roof type, or why it has none.
+ * The category that a building is drawn in: its roof type, or fallback or failed.
  *
- * Colours are of the palette of Okabe and Ito (2008), distinguishable with every kind of colour blindness; fallback and
+ * Colours are from the palette of Okabe and Ito (2008), distinguishable with every kind of colour blindness; fallback and
  * failed are shown by hatching and outline, too.
  */
 export const CATEGORIES = {

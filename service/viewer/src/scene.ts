@@ -1,4 +1,4 @@
-/** The 3D view: what is drawn, where it is seen from, what is chosen. It knows no service and no lists. */
+/** The 3D view: drawing, camera and selection. It is independent of the service and of lists. */
 
 import {
   AmbientLight,
@@ -37,7 +37,7 @@ const START = new Vector3(-0.42, -1, 0.72); // seen from the south-south-west, h
 const TAN_HALF_FOV = Math.tan((FOV_DEG * Math.PI) / 360);
 const NEAREST_M = 12;
 const CLICK_PX = 5; // farther is a drag
-const SHADOW_M = 1500; // wider scenes get no shadows: their map would be too coarse to mean anything
+const SHADOW_M = 1500; // wider scenes get no shadows: their map would be too coarse
 const FLIGHT_MS = 450;
 
 interface Theme {
@@ -89,8 +89,8 @@ export class ModelScene {
 
   /**
    * @param canvas Fills its parent.
-   * @param onPick Gets the building that was clicked, null for a click beside all.
-   * @throws Error where the browser has no WebGL.
+   * @param onPick Gets the building that was clicked, null for a click beside all of them.
+   * @throws Error if the browser has no WebGL.
    */
   constructor(
     private readonly canvas: HTMLCanvasElement,
@@ -135,7 +135,7 @@ export class ModelScene {
     this.settle();
   }
 
-  /** Draw these models in the place of those that are there, seen from where they were; footprints alone stay. */
+  /** Replace the models by these, seen from the same place; footprints without a model stay. */
   replace(batches: readonly Batch[]): void {
     const staying = this.drawn.filter(({ batch }) => batch.category === "failed").map(({ batch }) => batch);
     for (const { mesh, edges } of this.drawn.splice(0)) {
@@ -172,7 +172,7 @@ export class ModelScene {
     }
   }
 
-  /** All that is there was added: draw the ground beneath it. */
+  /** All buildings are added: draw the ground below them. */
   finish(): void {
     if (this.bounds.isEmpty()) return;
     const floors = this.drawn.flatMap(({ batch }) =>
@@ -194,7 +194,7 @@ export class ModelScene {
     this.settle();
   }
 
-  /** Height of the drawn ground, 0 where there is none. */
+  /** Height of the drawn ground, 0 if there is none. */
   groundAt(x: number, y: number): number {
     return this.groundHeights === null ? 0 : heightAt(this.groundHeights, x, y);
   }
@@ -209,7 +209,7 @@ export class ModelScene {
     this.settle();
   }
 
-  /** Whether there is something to see of a building. */
+  /** Whether a building is drawn. */
   has(id: string): boolean {
     return this.places.has(id);
   }
@@ -273,7 +273,7 @@ export class ModelScene {
     this.request();
   }
 
-  /** Give everything back to the browser. */
+  /** Release all resources. */
   dispose(): void {
     cancelAnimationFrame(this.frame);
     this.frame = -1;
@@ -291,12 +291,12 @@ export class ModelScene {
 
   // --- drawing
 
-  /** Draw once, as soon as the browser does: nothing is drawn while nothing changes. */
+  /** Draw once, with the browser's next frame: nothing is drawn while nothing changes. */
   private request(): void {
     if (this.frame === 0) this.frame = requestAnimationFrame((now) => this.draw(now));
   }
 
-  /** What casts shadows has changed. */
+  /** Update the shadows after a change. */
   private settle(): void {
     const size = this.bounds.isEmpty() ? 0 : this.bounds.getSize(new Vector3()).length();
     this.sun.castShadow = size > 0 && size < SHADOW_M;
@@ -331,7 +331,7 @@ export class ModelScene {
     this.camera.near = Math.max(0.2, distance / 400);
     this.camera.far = distance + 6 * radius;
     this.camera.updateProjectionMatrix();
-    // lines of one pixel would cover what is small: they fade before they do
+    // lines of one pixel would cover small buildings: they fade before that
     const pixelsPerMetre = this.canvas.clientHeight / (2 * distance * TAN_HALF_FOV);
     this.line.opacity = Math.min(Math.max((pixelsPerMetre - 0.7) / 5, 0), 0.75);
     this.line.visible = this.line.opacity > 0.02;
@@ -373,9 +373,9 @@ export class ModelScene {
     object.geometry.dispose();
   }
 
-  // --- where it is seen from
+  // --- camera
 
-  /** The boxes of all buildings that are shown; of all where none is. */
+  /** The boxes of the shown buildings; of all buildings if none is shown. */
   private boxes(): Box3[] {
     const shown = this.drawn.filter(({ mesh }) => mesh.visible);
     return (shown.length > 0 ? shown : this.drawn).flatMap(({ batch }) => batch.ids.map((_, index) => boxOf(batch, index)));
@@ -386,7 +386,7 @@ export class ModelScene {
     return this.camera.position.clone().sub(this.controls.target);
   }
 
-  /** See boxes from a direction, `room` times as far as they need. */
+  /** See boxes from a direction, at `room` times the distance that they need. */
   private flyTo(boxes: readonly Box3[], direction: Vector3, room: number, animated = true): void {
     const { target, distance } = framing(boxes, direction.normalize(), TAN_HALF_FOV, this.camera.aspect);
     const position = target.clone().addScaledVector(direction, Math.max(1.06 * room * distance, NEAREST_M));
@@ -412,7 +412,7 @@ export class ModelScene {
     this.controls.update();
   }
 
-  // --- what is pointed at
+  // --- picking
 
   private under(event: PointerEvent): string | null {
     const frame = this.canvas.getBoundingClientRect();

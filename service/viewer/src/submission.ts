@@ -69,10 +69,10 @@ export class Submission {
     });
     this.options.append(
       el("summary", {}, "Options"),
-      field("CRS", this.crs, "Where the file names none or a wrong one."),
+      field("CRS", this.crs, "If the file has none or a wrong one."),
       field("Vertical unit", this.verticalUnit),
       field("Method", this.method),
-      field("Preset", this.preset, "What measured better, or what keeps to the method's paper."),
+      field("Preset", this.preset, "Settings that measured better, or those of the method's paper."),
       el(
         "fieldset",
         { class: "field", "aria-describedby": this.levelsHint.id },
@@ -81,8 +81,8 @@ export class Submission {
         this.levelsHint,
       ),
       el("fieldset", { class: "field" }, el("legend", {}, "Compare with"), this.others),
-      field("Classes of the file", this.classes, "Trusted, only compared with what is found, or not looked at."),
-      field("Footprints", footprintPicker, "GeoPackage, GeoJSON or GeoParquet: one model a polygon."),
+      field("Classes of the file", this.classes, "Trusted, only compared with the result, or ignored."),
+      field("Footprints", footprintPicker, "GeoPackage, GeoJSON or GeoParquet: one model per polygon."),
       this.footprintRow,
       field("Title", this.title),
     );
@@ -107,7 +107,7 @@ export class Submission {
     void this.describe();
   }
 
-  /** Fill what can be chosen from the process's own description. */
+  /** Fill the choices from the process's own description. */
   private async describe(): Promise<void> {
     try {
       const process = await getJson<{ inputs: Record<string, InputDescription> }>("processes/reconstruct");
@@ -128,7 +128,7 @@ export class Submission {
     }
   }
 
-  /** A box for every method with each of its presets: any that is set makes the job a comparison. */
+  /** A box for every method with each of its presets: a set box makes the job a comparison. */
   private offerOthers(variants: string[]): void {
     const words = variants.filter((variant) => !variant.endsWith(`:${this.usualPreset}`));
     this.others.replaceChildren(
@@ -153,12 +153,12 @@ export class Submission {
     this.draw();
   }
 
-  /** What is chosen of the levels of detail, as the process takes it; empty where nothing is. */
+  /** The chosen levels of detail, as the process takes them; empty if none is chosen. */
   private lods(): string {
     return lodsInput([...this.levels.querySelectorAll<HTMLInputElement>("input:checked")].map(({ value }) => value));
   }
 
-  /** All that is to be run; more than one is a comparison. */
+  /** All methods to run; more than one is a comparison. */
   private variants(): string[] {
     const boxes = [...this.others.querySelectorAll<HTMLInputElement>("input:checked")];
     return [...new Set([this.chosen(), ...boxes.map(({ value }) => value)])];
@@ -168,7 +168,7 @@ export class Submission {
     return variantOf(this.method.value, this.preset.value, this.usualPreset);
   }
 
-  /** Files may be dropped anywhere on the page: a miss by some pixels must not leave the page. */
+  /** Files may be dropped anywhere: a drop beside the form must not replace the page by the file. */
   private takeDrops(zone: HTMLElement): void {
     let depth = 0;
     const over = (on: boolean): void => void zone.classList.toggle("over", on);
@@ -307,7 +307,7 @@ export class Submission {
     this.onProblem(problem);
   }
 
-  /** The button says what it waits for. */
+  /** Make the button say what is missing. */
   private draw(): void {
     const files = this.footprints === null ? this.tiles : [...this.tiles, this.footprints];
     const refused = files.some(({ problem }) => problem !== null);
@@ -317,7 +317,7 @@ export class Submission {
     const noLevel = !comparison && levelBoxes.length > 0 && this.lods() === "";
     const ready = this.tiles.length > 0 && !refused && !waiting && !noLevel && !this.starting;
     for (const box of levelBoxes) box.disabled = comparison;
-    this.levelsHint.textContent = comparison ? "Comparisons are made at LoD2.2." : "One or several; the records tell the finest.";
+    this.levelsHint.textContent = comparison ? "Comparisons are made at LoD2.2." : "One or several; the records describe the finest.";
     const chosen = this.chosen();
     for (const box of this.others.querySelectorAll("input")) box.disabled = box.value === chosen;
     // not `disabled`: the button keeps its place in the tab order and its name says why it waits
@@ -348,7 +348,7 @@ function drawRow(sent: Sent, remove: () => void): void {
   if (problem !== null) {
     row.replaceChildren(head, problemNotice(problem));
   } else if (uploaded === null) {
-    // the same element while it moves: screen readers and transitions keep their place
+    // keep the same element: screen readers and transitions keep their place
     const bar = row.querySelector("progress") ?? el("progress", { max: 1, "aria-label": `Upload of ${file.name}` });
     bar.value = sent.share;
     if (!bar.isConnected) row.replaceChildren(head, bar);
@@ -357,7 +357,7 @@ function drawRow(sent: Sent, remove: () => void): void {
   }
 }
 
-/** What the service read in the header. */
+/** The facts that the service read in the header. */
 function preflight(known: Record<string, unknown>): HTMLElement[] {
   const crs = known["crs"] as { name?: string; epsg?: number | null } | null | undefined;
   const crsText = crs == null ? "no CRS" : crs.epsg == null ? (crs.name ?? "CRS without a code") : `EPSG:${crs.epsg}`;

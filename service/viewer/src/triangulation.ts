@@ -5,7 +5,7 @@ export type Normal = readonly [number, number, number];
 /**
  * Normal of a ring by Newell's sums, of length 1; a ring without area gives 0, 0, 0.
  *
- * The sums run over differences to the first vertex: coordinates of six and seven digits would eat the small areas.
+ * The sums run over differences to the first vertex: coordinates of six and seven digits would lose small areas to rounding.
  */
 export function ringNormal(vertices: Float64Array, ring: readonly number[]): Normal {
   let nx = 0;
@@ -30,7 +30,7 @@ export function ringNormal(vertices: Float64Array, ring: readonly number[]): Nor
 }
 
 /**
- * Triangles of a planar face with holes, as indices into the vertices, turned as the outer ring is.
+ * Triangles of a planar face with holes, as indices into the vertices, with the orientation of the outer ring.
  *
  * @param rings The outer ring first; holes turn the other way round.
  * @param normal Of the outer ring; a face without area gives no triangles.
@@ -39,7 +39,7 @@ export function triangulate(vertices: Float64Array, rings: readonly (readonly nu
   const outer = rings[0] ?? [];
   if (outer.length < 3 || (normal[0] === 0 && normal[1] === 0 && normal[2] === 0)) return [];
   if (outer.length === 3 && rings.length === 1) return [...outer];
-  // seen along the axis that the normal is nearest to, from the side that keeps the turn
+  // projected along the axis nearest to the normal, from the side that keeps the orientation
   const axis = nearestAxis(normal);
   const u = (axis + 1) % 3;
   const v = (axis + 2) % 3;

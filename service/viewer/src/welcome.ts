@@ -1,6 +1,6 @@
 import { el, svg } from "./elements";
 
-/** What stands where the models will be, before there is a job. */
+/** The content in place of the models, before there is a job. */
 export function welcome(): HTMLElement {
   return el(
     "div",
@@ -13,7 +13,7 @@ export function welcome(): HTMLElement {
       { class: "steps" },
       step("Drop a tile", "LAS, LAZ, COPC, PLY or plain x y z. Its header is checked at once."),
       step("Reconstruct", "Ground, roofs and walls are found; every step is shown."),
-      step("Look and take", "Models in 3D by roof type, each with its record; GeoParquet, CityJSON, OBJ, GeoJSON."),
+      step("View and download", "Models in 3D by roof type, each with its record; GeoParquet, CityJSON, OBJ, GeoJSON."),
     ),
   );
 }
@@ -27,11 +27,11 @@ type Place = readonly [number, number, number];
 const [LENGTH, WIDTH, EAVE, RIDGE] = [9.4, 6.8, 4.2, 7.6]; // metres of the drawn house
 const SCALE = 13;
 
-/** The same gable house twice: as measured points, and as the model made of them. */
+/** The same gable house twice: as measured points, and as the model made from them. */
 function drawing(): SVGElement {
   const points: SVGElement[] = [];
   for (let i = 0; i < 420; i++) {
-    // a fixed scatter that looks measured and is the same at every visit: two low-discrepancy sequences
+    // a scatter that looks measured and never changes: two low-discrepancy sequences
     const x = ((i * 0.754_877_666) % 1) * (LENGTH + 5) - 2.5;
     const y = ((i * 0.569_840_291) % 1) * (WIDTH + 5) - 2.5;
     const onRoof = x > 0 && x < LENGTH && y > 0 && y < WIDTH;
@@ -55,7 +55,7 @@ function drawing(): SVGElement {
   );
 }
 
-/** Seen from the north-east and above, in parallel. */
+/** Parallel projection, seen from the north-east and above. */
 function projected([x, y, z]: Place, middle: number): [string, string] {
   const [dx, dy] = [x - LENGTH / 2, y - WIDTH / 2];
   const u = middle + SCALE * (0.81 * dx - 0.59 * dy);
