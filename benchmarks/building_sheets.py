@@ -1,13 +1,13 @@
-"""Contact sheets of models over their points, to be looked at one by one.
+"""Contact sheets of models over their points, for checking buildings by eye.
 
     python -m benchmarks.building_sheets RUN [RUN ...] --points TILE [TILE ...] --out DIR [--crs CRS] [--most 200]
         [--outside FOOTPRINTS] [--edges] [--across 4] [--down 3]
 
 Every building is one cell: its points in plan by height, then the model of each run with the points over it, coloured
-by their distance to the roof (`report.section`). The share of its points within 0.2 m stands beneath. Of more
-buildings than `--most`, every k-th in the order of their ids is drawn: no choice by result. `--outside` leaves out what
-meets a polygon of a vector file in the CRS of the points; `--edges` draws the edges of the first run's faces into the
-plan, where no wall hides them. `sheets.md` in DIR lists the cells, for notes.
+by their distance to the roof (`report.section`). The share of its points within 0.2 m is below. If there
+are more buildings than `--most`, every k-th in the order of their ids is drawn: results do not influence the choice.
+`--outside` leaves out buildings that meet a polygon of a vector file in the CRS of the points; `--edges` draws the
+edges of the first run's faces into the plan, where no wall hides them. `sheets.md` in DIR lists the cells, for notes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a second run does again when some tiles of a city changed: tasks by stage, buildings modelled anew, time.
+"""Counts what a second run repeats after some tiles of a city changed: tasks by stage, buildings, time.
 
     python -m benchmarks.changed_tiles --out DIR [--tiles 100] [--changed 1] [--workers 2]
 
@@ -6,10 +6,10 @@ makes a city in tiles (`city_tiles.py`), runs it with a work folder, and then ag
 undone before the next:
 
 - touched: a file is written again with the same points;
-- one building: what is high within 6 m around a high point near the middle of a file lies 1 m higher;
+- one building: high points within 6 m of a high point near the middle of a file are raised by 1 m;
 - flown again: all points of a tile have other noise (1 cm), as after a new flight.
 
-A change is right when the digest afterwards is that of a run that knows nothing of any other; `--check` makes one.
+The second run is right if its digest equals that of an independent run; `--check` makes one.
 """
 
 from __future__ import annotations

@@ -1,19 +1,19 @@
-"""The engine at the scale of a city: efficiency, memory, what the driver costs, and what killed workers cost.
+"""The engine at the scale of a city: efficiency, memory, the cost of the driver and of killed workers.
 
     python -m benchmarks.city_scale --out DIR [--tiles 400] [--tile-size 0] [--workers 2]
                                     [--mode traced|plain|apart] [--kill-every 30] [--label NAME] [--keep]
 
 makes the city of `city_tiles.py` in DIR/city<tiles> (minutes), runs the pipeline over it in processes of their own,
-looks at them from outside, and writes DIR/<label>.md (tables), DIR/<label>.json and DIR/<label>.trace.json (a row a
-task; `scaling_simulation.py` reads it). `traced` is the run of `gablework reconstruct` with an executor that keeps what
-each task took; `plain` is the command itself, looked at from outside only; `apart` is `traced` with the scheduler and
-the workers (`gablework worker`) as processes of their own, so that driver and scheduler are measured separately. With
-`--kill-every S` a worker's process is killed every S seconds, in turns, from when the run has its workers.
+watches them from outside, and writes DIR/<label>.md (tables), DIR/<label>.json and DIR/<label>.trace.json (one row per
+task; `scaling_simulation.py` reads it). `traced` is the run of `gablework reconstruct` with an executor that records
+the cost of each task; `plain` is the command itself, watched only from outside; `apart` is `traced` with the scheduler
+and the workers (`gablework worker`) as separate processes, which measures driver and scheduler separately. With
+`--kill-every S` a worker's process is killed every S seconds, in turns, as soon as the run has its workers.
 
 Efficiency is the CPU time of all task bodies, their child processes included, over wall-clock time times workers. On a
-machine that others use too, it comes out too small: the wall grows, the CPU time does not. So the share of the time in
-which the workers had a task (occupancy) and the share of all CPU time that was spent in tasks are reported beside it;
-on a quiet machine efficiency is about their product.
+machine that others use too, it comes out too small: the wall-clock time grows, the CPU time does not. Two more figures
+are therefore reported: the share of the time in which the workers had a task (occupancy), and the share of all CPU time
+that was spent in tasks. On a quiet machine efficiency is about their product.
 """
 
 from __future__ import annotations
@@ -199,7 +199,7 @@ def sizes_reported(trace: Mapping[str, Any]) -> str:
         [stage, *(f"{statistics.fmean(found[what]):.0f}" if what in found else "" for what in ("task", "result"))]
         for stage, found in kept.items()
     ]
-    return markdown_table(["stage", "bytes a task", "bytes a result"], rows)
+    return markdown_table(["stage", "bytes per task", "bytes per result"], rows)
 
 
 def report(seen: Mapping[str, Any], trace: Mapping[str, Any] | None, run_dir: Path, workers: int) -> tuple[str, Any]:
@@ -246,7 +246,7 @@ def report(seen: Mapping[str, Any], trace: Mapping[str, Any] | None, run_dir: Pa
             f"efficiency {figures['efficiency']:.3f} ({held}; required {REQUIRED:g}, wanted {WANTED:g}), "
             f"occupancy {figures['occupancy']:.3f}, tasks' share of all CPU time {figures['task_share_of_cpu']:.3f}; "
             f"CPU of task bodies {cpu_s:.1f} s.  \n"
-            f"Scratch {figures['scratch_bytes_a_point']:.1f} bytes a point at most."
+            f"Scratch {figures['scratch_bytes_a_point']:.1f} bytes per point at most."
         )
         lines += ["", reported, "", stage_table(figures["stages"]), sizes_reported(trace)]
     lines += [
@@ -259,7 +259,7 @@ def report(seen: Mapping[str, Any], trace: Mapping[str, Any] | None, run_dir: Pa
             ],
         ),
         markdown_table(
-            ["results", "MB", "bytes a building"],
+            ["results", "MB", "bytes per building"],
             [[name, f"{size / 1e6:.1f}", f"{size / max(1, buildings):.0f}"] for name, size in results.items()],
         ),
     ]

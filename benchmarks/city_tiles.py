@@ -1,11 +1,11 @@
-"""Tiles of a simulated city of any size, written by several processes: what `city_scale.py` runs on.
+"""Tiles of a simulated city of any size, written by several processes: the input of `city_scale.py`.
 
     python -m benchmarks.city_tiles --out DIR [--tiles 400] [--tile-m 200] [--density 4.5] [--seed 1] [--processes 2]
 
 writes DIR/city_x<column>_y<row>.laz, a square of them, or as near to one as `--tiles` allows. The layout is that of the
 suite `city` (rows, courtyards, halls, towers, houses of all shapes, trees, cars, a plain and a hillside); each tile is
-made from what it can see, so the city is never held as a whole, and the same call gives the same bytes. A tile of 200 m
-holds 20 to 90 buildings, on average 53. Tiles that are there already are kept. No truth is written.
+made from its own surroundings, so the whole city is never in memory, and the same call gives the same bytes. A tile of
+200 m holds 20 to 90 buildings, on average 53. Existing tiles are kept. No truth is written.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class CityTiles:
     tile_m: float = 200.0
     """Side of a tile; whole hundreds lie on gablework's own lattice."""
     density_per_m2: float = 4.5
-    """Pulses a square metre; returns are about a quarter more."""
+    """Pulses per square metre; returns are about a quarter more."""
     seed: int = 1
     """Of layout and scanner."""
 
@@ -120,7 +120,7 @@ def _record(block: ScanBlock, header: laspy.LasHeader) -> laspy.ScaleAwarePointR
 
 
 def make_city(city: CityTiles, out: Path, processes: int) -> list[MadeTile]:
-    """Write all tiles, a row at a time a process.
+    """Write all tiles, one row at a time per process.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How many jobs a second drivers can claim and finish: `python benchmarks/claim_jobs.py URL [THREADS] [JOBS]`.
+"""Jobs per second that drivers can claim and finish: `python benchmarks/claim_jobs.py URL [THREADS] [JOBS]`.
 
 Without a URL a SQLite database in a temporary folder is used. The work itself takes no time: claim, renew, succeed.
 """

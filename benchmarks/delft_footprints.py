@@ -1,8 +1,8 @@
-"""Fuzzy SART over Delft's old town with the footprints and classes given: how good, how valid, how fast.
+"""Fuzzy SART over Delft's old town with given footprints and classes: quality, validity, speed.
 
     python benchmarks/delft_footprints.py --data ../shared/data [--faithful]
 
-Scored as the methods' page defines it: vertical distance of all building points (class 6) inside the reference
+The score is defined on the page of methods: vertical distance of all building points (class 6) inside the reference
 footprint to the delivered top surface; a point without a roof is a miss. *Top-visible* points have no other of the
 same footprint more than 1.1 m higher within 0.5 m in plan.
 """

@@ -1,12 +1,12 @@
-"""What scheduler and driver cost: a task, a byte of a result, a building of the join, by how many workers there are.
+"""Costs of scheduler and driver per task, byte of a result and building of the join, by number of workers.
 
     python -m benchmarks.engine_costs --out DIR [--workers 2 20 100 300] [--tasks 2000] [--city DIR/city36]
 
-A scheduler of its own process serves so many workers, all of them in one more process (they have nothing to do), and
-tasks that do nothing go through `DaskExecutor` as those of a run do. It reports the CPU seconds of the scheduler and of
-the driver a task, with small results and with large ones. With `--city` its tiles are split, what they hand on is
-laid side by side so many times, and the CPU time and the memory of the join are measured; a straight line is fitted
-to the logarithms. DIR/engine_costs.json is what `scaling_simulation.py` reads.
+A scheduler in a separate process serves the workers, which share one more process (they have nothing to do), and tasks
+that do nothing go through `DaskExecutor` like those of a run. It reports the CPU seconds of the scheduler and of the
+driver per task, with small results and with large ones. With `--city` the tiles of a city are split, copies of the
+results are placed side by side, and the CPU time and the memory of the join are measured; a straight line is fitted to
+the logarithms. `scaling_simulation.py` reads DIR/engine_costs.json.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def all_there(executor: DaskExecutor, count: int) -> None:
 
 
 def cost_of_tasks(count: int, tasks: int, size_bytes: int, log: Path) -> dict[str, Any]:
-    """CPU seconds a task of scheduler and driver, and the rate at which tasks went through."""
+    """CPU seconds per task of scheduler and driver, and the rate at which tasks went through."""
     from benchmarks.engine_costs import nothing as work  # not of __main__, which workers do not have
 
     with cluster_of(count, log) as (cluster, scheduler), cluster.executor() as executor:
@@ -258,7 +258,7 @@ def tables(costs: dict[str, Any]) -> str:
     """What was measured, as tables."""
     parts = [
         markdown_table(
-            ["workers", "bytes a result", "scheduler, ms a task", "driver, ms a task", "tasks a second"],
+            ["workers", "bytes per result", "scheduler, ms per task", "driver, ms per task", "tasks per second"],
             [
                 [str(row["workers"]), str(row["result_bytes"])]
                 + [f"{1e3 * row[name]:.2f}" for name in ("scheduler_s", "driver_s")]

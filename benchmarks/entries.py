@@ -1,15 +1,15 @@
-"""What is measured, and how: scenes and tiles, each modelled by several methods and held against its reference.
+"""The measured entries: scenes and tiles, each modelled by several methods and compared with its reference.
 
 The parts that the programs of this folder share: `ruler.py`, `hofmann_tables.py`, `sweep_limits.py`, `method_times.py`.
-All work in one folder, so that each finds what another made; what is there already is not done again,
-as long as the settings are the same (delete DIR after the code changed).
+All work in one folder, where each finds the results of the others; existing results are not computed again
+if the settings are the same (delete DIR after a change of the code).
 
     DIR/scenes/<entry>/           the simulated scene and its truth, made once for all methods
     DIR/<label>/<entry>/run/      the run directory of a method (label: METHOD, or METHOD-PRESET)
-    DIR/<label>/<entry>/report/   its measures as tables; with a page where the entry has one
+    DIR/<label>/<entry>/report/   its measures as tables; with a page if the entry has one
 
 A run is what `gablework compare` does: points are read, ground is found and candidates are isolated once for all
-methods, then each models the same candidates. Everything happens in one process an entry; entries share the processors.
+methods, then each models the same candidates. Each entry runs in one process; entries share the processors.
 """
 
 from __future__ import annotations

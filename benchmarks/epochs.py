@@ -1,11 +1,11 @@
-"""How well `gablework batch diff` finds what was changed: precision and recall a class, against simulated epochs.
+"""Precision and recall of `gablework batch diff` per class, against simulated epochs.
 
     python -m benchmarks.epochs --out DIR [--split dev|test] [--only suburb town] [--size 620] [--jobs 2]
                                 [--page docs/results/epochs.md]
 
 Scenes of the suites `suburb` and `town` are changed by `benchmarks.two_epochs`, scanned twice with other seeds
-of the scanner, in `suburb-mixed` with two kinds of survey, reconstructed without footprints and compared. Runs that lie
-in DIR are used again. Writes DIR/epochs_SPLIT.md and DIR/CASE-SPLIT/diff, and its lines into the page.
+of the scanner, in `suburb-mixed` with two kinds of survey, reconstructed without footprints and compared. Existing
+runs in DIR are used again. Writes DIR/epochs_SPLIT.md and DIR/CASE-SPLIT/diff, and its lines into the page.
 """
 
 from __future__ import annotations

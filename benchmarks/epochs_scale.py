@@ -1,9 +1,10 @@
-"""Time and memory of `gablework batch diff` on very many buildings: a lattice of gabled houses, written as runs are.
+"""Time and memory of `gablework batch diff` on very many buildings: a lattice of gabled houses in the form of runs.
 
     python -m benchmarks.epochs_scale --out DIR [--buildings 200000 1000000] [--page docs/results/epochs.md]
 
-Of each hundred houses one is new, gone, raised, lowered, longer; outlines and heights jitter by some centimetres. The
-comparison runs in a process of its own, whose peak is measured. Writes DIR/epochs_scale.md and its lines into the page.
+One house in a hundred each is new, gone, raised, lowered, longer; outlines and heights jitter by some centimetres. The
+comparison runs in a separate process, whose peak memory is measured. Writes DIR/epochs_scale.md and its lines into the
+page.
 """
 
 from __future__ import annotations

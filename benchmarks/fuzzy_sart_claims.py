@@ -1,11 +1,11 @@
-"""What Shorter and Kasparis claim for each step of their method, shown or refuted on houses with exact truth.
+"""Tests the claims of Shorter and Kasparis for each step of their method on houses with exact truth.
 
     python -m benchmarks.fuzzy_sart_claims [--out DIR] [--draws 25] [--only absorption cube] [--split test]
 
 Prints Markdown tables; `--out` writes them to DIR/claims.md and a figure to DIR/claims.png. Building and ground are
 given (points strewn at random over an exact roof) except in the chapter `product`, where scenes are scanned and go
-through `gablework` as a user's do. *All right*: as in `benchmarks/fuzzy_sart_roofs.py`. Shares are in percent with the
-95 % interval of Wilson, means with a 95 % bootstrap interval over the roofs.
+through `gablework` like those of a user. *All right*: as in `benchmarks/fuzzy_sart_roofs.py`. Shares are in percent
+with the 95 % interval of Wilson, means with a 95 % bootstrap interval over the roofs.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def with_absorption(settings: FuzzySartSettings, absorption: str) -> FuzzySartSe
 def absorbed(
     sample: Sample, settings: FuzzySartSettings, kinds: Sequence[str], density: float, noise_m: float
 ) -> list[Estimate]:
-    """Error of normals, clusters a plane, all right before and after the refinement."""
+    """Error of normals, clusters per plane, all right before and after the refinement."""
     errors, clusters, before, after = [], [], [], []
     for roof in sample.roofs(kinds, density, noise_m):
         seen = observe(roof.candidate, settings)
@@ -162,7 +162,7 @@ def absorbed(
 
 def absorption(sample: Sample) -> list[Table]:
     """Absorption against none, over surveys and over roofs."""
-    header = ["normals, deg", "clusters a plane", "all right by clusters", "all right at the end"]
+    header = ["normals, deg", "clusters per plane", "all right by clusters", "all right at the end"]
     tables: list[Table] = []
     for preset, settings in PRESETS.items():
         rows: Rows = []
@@ -172,14 +172,14 @@ def absorption(sample: Sample) -> list[Table]:
                     cells = absorbed(sample, with_absorption(settings, way), HOUSES, density, noise_m)
                     rows.append([f"{density:g}", f"{noise_m:.2f}", way, *cells])
         caption = f"Preset {preset}; flat, gable, hip and L-shaped houses together."
-        tables.append(Table(caption=caption, header=["points a m2", "noise, m", "absorption", *header], rows=rows))
+        tables.append(Table(caption=caption, header=["points per m2", "noise, m", "absorption", *header], rows=rows))
     for preset, settings in PRESETS.items():
         rows = []
         for kind in (*HOUSES, LARGE):
             for way in ("none", "bucket", "insert"):
                 cells = absorbed(sample, with_absorption(settings, way), (kind,), DENSITIES_PER_M2[0], NOISE_M)
                 rows.append([kind.replace("_", " "), way, *cells])
-        caption = f"Preset {preset} by roof; {DENSITIES_PER_M2[0]:g} points a m2, {NOISE_M:g} m of noise."
+        caption = f"Preset {preset} by roof; {DENSITIES_PER_M2[0]:g} points per m2, {NOISE_M:g} m of noise."
         tables.append(Table(caption=caption, header=["roof", "absorption", *header], rows=rows))
     return tables
 
@@ -213,7 +213,7 @@ def vector_row(
 VECTOR_HEADER = [
     "pairs of one plane that match, %",
     "of two planes, %",
-    "clusters a plane",
+    "clusters per plane",
     "all right by clusters",
     "all right at the end",
 ]
@@ -242,7 +242,7 @@ def translation(sample: Sample) -> list[Table]:
                     if kind == "unit_normal" and place not in CONTROLS:
                         continue
                     rows.append([kind, place, *vector_row(sample, HOUSES, density, chosen, centre=centre)])
-            caption = f"TIN and refinement of {preset}; {density:g} points a m2, {NOISE_M:g} m of noise."
+            caption = f"TIN and refinement of {preset}; {density:g} points per m2, {NOISE_M:g} m of noise."
             tables.append(Table(caption=caption, header=["vectors", "building", *VECTOR_HEADER], rows=rows))
     return tables
 
@@ -277,15 +277,13 @@ def scaling(sample: Sample) -> list[Table]:
             for name, (vectors, lowest) in SCALES.items():
                 chosen = dataclasses.replace(settings, vectors="spherical_scaled", vigilance=0.7, scaled_min=lowest)
                 rows.append([name, *vector_row(sample, HOUSES, density, chosen, vectors=vectors)])
-            caption = f"TIN and refinement of {preset}; {density:g} points a m2, {NOISE_M:g} m of noise."
+            caption = f"TIN and refinement of {preset}; {density:g} points per m2, {NOISE_M:g} m of noise."
             tables.append(Table(caption=caption, header=["r, theta, phi", *VECTOR_HEADER], rows=rows))
     rows = []
     for name, (vectors, lowest) in SCALES.items():
         chosen = dataclasses.replace(PRESETS["faithful"], scaled_min=lowest)
         rows.append([name, *weights(sample, HOUSES, DENSITIES_PER_M2[0], chosen, vectors)])
-    caption = (
-        f"What decides: rank correlation of 1 - VDM with the difference in a dimension; {DENSITIES_PER_M2[0]:g} a m2."
-    )
+    caption = f"Rank correlation of 1 - VDM with the difference in each dimension; {DENSITIES_PER_M2[0]:g} per m2."
     tables.append(Table(caption=caption, header=["r, theta, phi", "r", "theta", "phi"], rows=rows))
     return tables
 
@@ -309,7 +307,7 @@ def cube(sample: Sample) -> list[Table]:
                 residuals.append(rmse)
             reported = [share(single), share(within), mean(worst, 3), mean(residuals, 3)]
             rows.append([preset, f"{density:g}", *reported])
-    header = ["preset", "points a m2", "exactly one plane", "largest plane within 0.05 m everywhere"]
+    header = ["preset", "points per m2", "exactly one plane", "largest plane within 0.05 m everywhere"]
     header += ["farthest of it from the truth, m", "residuals of the points on it, m"]
     return [Table(caption=f"{CUBES} draws.", header=header, rows=rows)]
 
@@ -365,7 +363,7 @@ def refinement(sample: Sample) -> list[Table]:
                     reported = [share([right(*pair) for pair in both]), mean(planes)]
                     reported += [mean(rights, 0, 100.0), mean(ridge, 0, 100.0)]
                     rows.append([preset, f"{density:g}", name, *reported])
-        header = ["preset", "points a m2", "step", "all right", "planes a true plane"]
+        header = ["preset", "points per m2", "step", "all right", "planes per true plane"]
         header += ["points on their plane, %", "the same near ridges, %"]
         tables.append(Table(caption=f"{title}, {NOISE_M:g} m of noise.", header=header, rows=rows))
     return tables
@@ -400,7 +398,12 @@ def sensitivity(sample: Sample) -> list[Table]:
             cells.append(share([right(roof, segment(prepare_cloud(roof.candidate), one)) for roof in low]))
             rows.append(cells)
         caption = f"Preset {preset} (V = {settings.vigilance:g}, tau = {settings.tau_epochs}), dev draws: all right."
-        surveys = [".77 a m2, 0.05 m", ".77 a m2, 0.10 m", "8 a m2, 0.05 m", "gables of 8, 12, 18 deg, .77 a m2"]
+        surveys = [
+            ".77 per m2, 0.05 m",
+            ".77 per m2, 0.10 m",
+            "8 per m2, 0.05 m",
+            "gables of 8, 12, 18 deg, .77 per m2",
+        ]
         tables.append(Table(caption=caption, header=["V", "tau", *surveys], rows=rows))
     return tables
 
@@ -411,7 +414,7 @@ def sensitivity(sample: Sample) -> list[Table]:
 def product(sample: Sample) -> list[Table]:
     """Scanned scenes through `gablework`, measured by the ruler."""
     rows = large_and_small(sample.out, sample.split, share, mean)
-    header = ["buildings", "preset", "pulses a m2", "LoD2 delivered", "faces of 10 m2 found, %"]
+    header = ["buildings", "preset", "pulses per m2", "LoD2 delivered", "faces of 10 m2 found, %"]
     header += ["all planes right", "correct (and the roof type)"]
     return [Table(caption=f"One scene, {NOISE_M:g} m of noise.", header=header, rows=rows)]
 

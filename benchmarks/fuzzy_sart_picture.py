@@ -1,4 +1,4 @@
-"""Two pictures of Fuzzy SART: what its claims amount to, and its steps on one simulated building.
+"""Two pictures of Fuzzy SART: the results of its claims, and its steps on one simulated building.
 
     python -m benchmarks.fuzzy_sart_picture --out docs/methods/pictures/fuzzy_sart.png
 
@@ -105,12 +105,12 @@ def _product(axis: Any, rows: Sequence[Sequence[Any]]) -> None:
     axis.set_xscale("log")
     axis.set_xticks([0.7, 2.0, 8.0], ["0.7", "2", "8"])
     axis.minorticks_off()
-    axis.set(title="whole product: all planes right, %", xlabel="pulses a m2")
+    axis.set(title="whole product: all planes right, %", xlabel="pulses per m2")
     axis.legend(frameon=False, loc="lower right")
 
 
 def house(seed: int) -> SyntheticRoof:
-    """The building of the steps: an L of two gables, 4 points a m2, 0.05 m of noise, of the dev seeds."""
+    """The building of the steps: an L of two gables, 4 points per m2, 0.05 m of noise, of the dev seeds."""
     size = RoofDimensions(length_m=15.0, width_m=9.0, pitch_deg=35.0, wing_length_m=6.0, wing_width_m=7.0)
     return strewn("house", RoofShape.L_SHAPE, size, 4.0, 0.05, np.random.default_rng(seed))
 

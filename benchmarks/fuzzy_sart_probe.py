@@ -1,8 +1,8 @@
-"""The recipe of Fuzzy SART under observation: houses with exact truth, and what each step made of them.
+"""Observes the recipe of Fuzzy SART: houses with exact truth, and the result of each step.
 
-Nothing is copied from the recipe: `observe` runs `pipeline.methods.fuzzy_sart.segment` itself and notes what passes
-between its steps. What no setting turns off (the centring of Eq. 7, the scaling of spherical vectors) is replaced at
-the one function that does it.
+Nothing is copied from the recipe: `observe` runs `pipeline.methods.fuzzy_sart.segment` itself and records the data
+between its steps. Steps without a setting (the centring of Eq. 7, the scaling of spherical vectors) are turned off by
+replacing their function.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def strewn_house(
     kind : str
         As `dimensions_of` knows it.
     density_per_m2 : float
-        Points a square metre in plan.
+        Points per square metre in plan.
     noise_m : float
         Standard deviation of their elevations.
     draw : int

@@ -1,8 +1,8 @@
-"""How often Fuzzy SART finds all planes of a roof: synthetic gables, hips, flat and L-shaped roofs with exact truth.
+"""Share of roofs with all planes found by Fuzzy SART: gables, hips, flat and L-shaped roofs with exact truth.
 
-Building and ground are given, so this measures TIN, clustering and refinement alone. A roof is *all right* where
+Building and ground are given, so this measures TIN, clustering and refinement alone. A roof is *all right* if
 
-- every true face of at least 10 m2 and 11 points has a found plane of its own: most of the points of either lie in the
+- every true face of at least 10 m2 and 11 points has its own found plane: most of the points of either lie in the
   other (mutual overlap of at least half), the normals are within 5 degrees, and the planes are within 0.3 m of one
   another (root mean square over the points of the true face);
 - every found plane of at least 10 m2 and 11 points is the match of a true face.
@@ -50,7 +50,7 @@ class SyntheticRoof:
     labels: IntArray
     """(n,) int64, true plane of every point."""
     density_per_m2: float
-    """Points a square metre in plan."""
+    """Points per square metre in plan."""
 
 
 def simulate_roof(

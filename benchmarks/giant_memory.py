@@ -1,10 +1,10 @@
-"""Memory that one building takes in its child process, by its points: the figures of `cluster/needs.py`.
+"""Memory of one building in its child process by number of points: the figures of `cluster/needs.py`.
 
     .venv/bin/python benchmarks/giant_memory.py [--points 50000 200000 1000000 3000000] [--method arrangement]
 
-Three synthetic giants with the same points: a flat hall, a hall with a saw-tooth roof of 60 m2 a face, and a hall with
-200 things on its roof. Each is modelled in a process of its own with all methods loaded, as the supervised child
-has them. It reports the largest resident size above the size before the building came, and bytes a point.
+Three synthetic giants with the same points: a flat hall, a hall with a saw-tooth roof of 60 m2 per face, and a hall
+with 200 things on its roof. Each is modelled in a separate process with all methods loaded, like the supervised child.
+It reports the largest resident size minus the size before the building, and bytes per point.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def main() -> None:
     parser.add_argument("--points", type=int, nargs="+", default=[50_000, 200_000, 1_000_000, 3_000_000])
     parser.add_argument("--method", default="arrangement", choices=list(METHODS))
     given = parser.parse_args()
-    print(f"| {given.method} | points | before, MiB | peak, MiB | bytes a point | s | outcome |", flush=True)
+    print(f"| {given.method} | points | before, MiB | peak, MiB | bytes per point | s | outcome |", flush=True)
     print("| --- | ---: | ---: | ---: | ---: | ---: | --- |", flush=True)
     fresh = multiprocessing.get_context("spawn")
     for kind in KINDS:

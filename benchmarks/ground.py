@@ -93,7 +93,7 @@ def samples(data: Path) -> Iterator[Scene]:
 
 
 def drawn_scenes(densities: Sequence[float] = DENSITIES, draw: int = 0) -> Iterator[Scene]:
-    """The scenes with exact ground, at some densities in points a square metre."""
+    """The scenes with exact ground, at some densities in points per square metre."""
     for number, (name, kind) in enumerate(KINDS.items()):
         for density in densities:
             x, y, z, is_ground = kind(np.random.default_rng([draw, number, round(100 * density)]), density)

@@ -1,7 +1,7 @@
-"""Small scenes with exact ground, each of one difficulty, for `benchmarks/ground.py`.
+"""Small scenes with exact ground, each with one difficulty, for `benchmarks/ground.py`.
 
-Terrain, buildings and vegetation are formulae in metres; points fall at random places, one last return a pulse. They
-are harder than a survey in one respect each and simpler in all others, so that a figure shows what goes wrong.
+Terrain, buildings and vegetation are formulae in metres; points fall at random places, one last return per pulse. Each
+scene is harder than a survey in one respect and simpler in all others, so a figure shows what goes wrong.
 """
 
 from __future__ import annotations

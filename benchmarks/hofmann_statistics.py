@@ -1,11 +1,11 @@
-"""The statistics of `hofmann310` beside those that Hofmann, Maas and Streilein (2003) tell of their data.
+"""The statistics of `hofmann310` beside those of the data of Hofmann, Maas and Streilein (2003).
 
     python benchmarks/hofmann_statistics.py [--split test] [--draws 5] [--json]
 
 For every building its point cloud is what the paper describes: the returns over it and over some of the ground around
-it, reduced to barycentric coordinates and triangulated (Delaunay, in plan). Facets belong to a roof face where all of
-their three points were returned by it alone. Each facet has a slope, an orientation and an O-distance (the distance of
-its plane from the origin); the *spread* of a roof face is the range that 95 % of its facets lie in.
+it, reduced to barycentric coordinates and triangulated (Delaunay, in plan). A facet belongs to a roof face if all
+three points were returned by that face alone. Each facet has a slope, an orientation and an O-distance (the distance of
+its plane from the origin); the *spread* of a roof face is the range of 95 % of its facets.
 """
 
 from __future__ import annotations

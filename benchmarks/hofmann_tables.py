@@ -1,19 +1,19 @@
-"""The tables of Hofmann, Maas and Streilein (2003) again, for every method and preset, beside the printed ones.
+"""The tables of Hofmann, Maas and Streilein (2003) for every method and preset, beside the printed ones.
 
     python benchmarks/hofmann_tables.py --out DIR [--split test] [--draws 3] [--methods METHOD[:PRESET] ...] [--jobs 2]
 
-Table 3-1 (2D parameter space, all 310 buildings), table 4-1 (3D, all), table 4-2 (3D, the 197 that nothing makes hard):
+Table 3-1 (2D parameter space, all 310 buildings), table 4-1 (3D, all), table 4-2 (3D, the 197 without difficulties):
 buildings correct, passable and false by roof type, on draws of `hofmann310`. Writes DIR/hofmann_tables.md.
 
-- An outcome is the ruler's: correct is a building of which all roof faces and only those are found *and* whose roof
-  type is right; passable, at least half of the faces; false, the rest. A building that was not found is false.
-- True buildings stand where the survey saw them (as `evaluate --as-surveyed`). The strips of this survey are off by
-  0.3 m in plan and 0.2 m in elevation, as the paper says of its data, and a roof face counts as found within 0.3 m:
-  without this the error of the GPS would be held against the method. The paper looked at clusters, which a common
-  shift of all points of a building does not touch.
+- Outcomes are those of the evaluation. Correct: all roof faces and no others are found *and* the roof type is right.
+  Passable: at least half of the faces are found. False: the rest, including buildings that were not found.
+- True buildings are where the survey saw them (as in `evaluate --as-surveyed`). The strips of this survey are off by
+  0.3 m in plan and 0.2 m in elevation, like those of the paper, and a roof face counts as found within 0.3 m: without
+  this the method would be blamed for the error of the GPS. The paper judged clusters, which a common shift of all
+  points of a building does not affect.
 - Counts are means of the draws, shares and 95 % bootstrap intervals are over the buildings of all draws together.
 
-The last part computes whether the pattern of the paper shows: each sentence is tested on the figures, never assumed.
+The last part tests whether the figures show the pattern of the paper, sentence by sentence.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ PAPER: Mapping[str, Mapping[str, PrintedRow]] = MappingProxyType(
 """The printed tables, misprints and all."""
 LEVEL_DEG = 7.0
 """Slope from which terrain is a plausible roof to the paper's 2D tree."""
-SUBSETS = {"all 310 buildings": ("3-1", "4-1"), "the 197 that nothing makes hard": ("4-2",)}
+SUBSETS = {"all 310 buildings": ("3-1", "4-1"), "the 197 without difficulties": ("4-2",)}
 """The tables of each subset."""
 
 
@@ -329,11 +329,11 @@ def terrain_table(found: Mapping[str, Outcomes]) -> str:
 
 def document(found: Mapping[str, Outcomes], split: str, draws: int) -> str:
     """All tables as Markdown."""
-    parts = [f"`hofmann310`, {split} seeds, {draws} draws; counts are means a draw.\n"]
+    parts = [f"`hofmann310`, {split} seeds, {draws} draws; counts are means per draw.\n"]
     for title, printed in SUBSETS.items():
         good_only = "4-2" in printed
         parts += [
-            f"### Of {title}\n",
+            f"### {title[0].upper()}{title[1:]}\n",
             counts_table(found, printed, good_only=good_only),
             percent_table(found, printed, good_only=good_only),
             interval_table(found, good_only=good_only),

@@ -1,11 +1,11 @@
-"""What supervised children and Dask cost: one tile serially and on two workers, each with and without children.
+"""Cost of supervised children and Dask: one tile serially and on two workers, each with and without children.
 
     python benchmarks/isolation.py ../shared/data/ahn3/delft_west.laz --crs EPSG:7415 [--rounds 5] [--json]
 
-All ways take turns in one process, so a busy machine slows all alike. The first round of each is reported apart: it
-starts children and loads compiled kernels (and compiles them, where `gablework warm-up` was not run). Of the others
-medians are reported, in seconds of wall clock, and in processor seconds of all processes together, which a busy machine
-blurs less; then the overhead over the serial way in percent. All digests must agree.
+All ways take turns in one process, so a busy machine slows all alike. The first round of each is reported separately:
+it starts children and loads compiled kernels (and compiles them if `gablework warm-up` did not run). For the others,
+medians are reported in seconds of wall clock and in processor seconds of all processes together, which a busy machine
+affects less; then the overhead over the serial way in percent. All digests must agree.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Writes pipeline/compiler/kernels.json: the kernels that Python calls, with which signatures, by what needs them.
+"""Writes pipeline/compiler/kernels.json: the kernels that Python calls, with their signatures and users.
 
     make kernels
 
 runs commands that reach all parts of the product in an empty folder of kernels, and lists what they compiled. Run it
-after a kernel was added or removed, or is called with other types. It takes some minutes. What the list lacks is
-compiled when it is first called, so an old list costs time and nothing else.
+after a kernel was added or removed, or is called with other types. It takes some minutes. A kernel that
+the list lacks is compiled at its first call, so an old list costs only time.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
-"""Seconds a building of every method: `python benchmarks/method_times.py --out DIR [--data ../shared/data]`.
+"""Seconds per building for every method: `python benchmarks/method_times.py --out DIR [--data ../shared/data]`.
 
     [--split test] [--methods METHOD[:PRESET] ...] [--repeat 1] [--most 400]
 
 The candidates of a simulated scene (`hofmann310`), of `delft_west` (AHN3) and of `hdf_870000` (LiDAR HD), the real
-tiles where they are there, are found by the stages of a run: ingest, split, join, gather. Then everything happens in
-this one process. Each method models one building before the clock starts, so that its kernels are there. Then the
-methods take turns candidate by candidate, each time another one first, so that whatever else the machine does falls on
-all alike and the ratios are fair. Time is processor time of this process.
+tiles if they exist, are found by the stages of a run: ingest, split, join, gather. Then everything happens in
+this one process. Each method models one building before the clock starts, so its kernels are loaded. Then the
+methods take turns candidate by candidate, each time another one first: other work on the machine then slows all alike
+and the ratios are fair. Time is processor time of this process.
 
-Segmentation is the method itself, from the candidate to planes and labels (or faces); solids is all that follows: roof
+Segmentation is the method itself, from the candidate to planes and labels (or faces); solids is the rest: roof
 faces, extrusion, validity, residuals. Prints, and writes to DIR/method_times.md, median, mean and the 95 % quantile in
-milliseconds a building. Of more than `--most` candidates every second, third ... is taken.
+milliseconds per building. If there are more than `--most` candidates, every second, third ... is taken.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Times:
     """What a method took on the candidates of an entry."""
 
     segmentation_s: FloatArray
-    """(n,) float64, processor seconds a building."""
+    """(n,) float64, processor seconds per building."""
     solids_s: FloatArray
     """(n,) float64, all that follows."""
     statuses: tuple[str, ...]
@@ -133,7 +133,7 @@ def times_table(found: dict[str, Times]) -> str:
                 f"{1000 * float(together.mean()):.1f}",
             ]
         )
-    return markdown_table(["ms a building", "ok/block/failed", *heads, "together, mean"], rows)
+    return markdown_table(["ms per building", "ok/block/failed", *heads, "together, mean"], rows)
 
 
 def entries(data: Path, split: str) -> list[Entry]:

@@ -1,11 +1,11 @@
-"""What publishing into an object store costs, and how a tile elsewhere is best read.
+"""Cost of publishing into an object store, and of the ways to read a remote tile.
 
     .venv/bin/python benchmarks/object_storage.py RUN [TILE]
 
 RUN is a finished run in a folder. Its files are put again, tile by tile as `publish` does, into a folder and into
-moto's S3 server, which runs in a process of its own. TILE is a LAZ file: its points are read from the disk, through
-buffered ranges and after fetching it. Moto answers from the memory of the same machine by Python, so that its figures
-are mostly its own work; what a delay of so many milliseconds before each answer adds is measured beside it.
+moto's S3 server, which runs in a separate process. TILE is a LAZ file: its points are read from the disk, through
+buffered ranges and after fetching it. Moto is written in Python and answers from the memory of the same machine,
+so its figures are mostly its own work; the effect of a delay before each answer is also measured.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@
     python -m benchmarks.outlines delft [--data ../shared/data] [--outline eaves|walls]
 
 `sweep` draws the outlines of the sweep's scenes over densities and noises, `beams` those of a city of 200 m by 200 m
-surveyed with beams of several radii, along and across the streets. The classes of the points are believed, so that
-little but the outlines is judged. Compared are blocks of true buildings that touch, of at least 16 m2.
+surveyed with beams of several radii, along and across the streets. The classes of the points are used, so little
+except the outlines is judged. Blocks of true buildings that touch are compared, from 16 m2 on.
 
 `delft` compares walls: along every straight facade of the given footprints of 5 m or more, how far outside it the
 outline lies, and where the split pulses lie: those that met a roof and came back from below as well lie on a band

@@ -1,7 +1,7 @@
-"""Who spends what in a tree of processes: CPU time and peak memory by role, looked at from outside.
+"""CPU time and peak memory of a tree of processes by role, measured from outside.
 
-Looks come four times a second. The last one at a process that dies is at most a quarter of a second old, so its CPU
-time comes out a little too small.
+It looks four times per second. The last look at a process that dies is up to a quarter of a second old, so its CPU time
+comes out a little too small.
 """
 
 from __future__ import annotations

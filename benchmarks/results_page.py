@@ -1,8 +1,8 @@
-"""Put what was measured into docs/results/methods.md: `python benchmarks/results_page.py --out DIR [--page FILE]`.
+"""Put measured tables into docs/results/methods.md: `python benchmarks/results_page.py --out DIR [--page FILE]`.
 
-The page holds pairs of marks, `<!-- begin NAME -->` and `<!-- end NAME -->`. What stands between them is replaced by
-DIR/NAME as `ruler.py`, `hofmann_tables.py`, `sweep_limits.py` and `method_times.py` wrote it; a part whose file is not
-there stays as it is. The plot goes beside the page. Prose is left alone: read it again when the figures change.
+The page holds pairs of marks, `<!-- begin NAME -->` and `<!-- end NAME -->`. The text between them is replaced by
+DIR/NAME as `ruler.py`, `hofmann_tables.py`, `sweep_limits.py` and `method_times.py` wrote it; a part without a file
+stays as it is. The plot goes beside the page. Prose is left alone: read it again when the figures change.
 """
 
 from __future__ import annotations

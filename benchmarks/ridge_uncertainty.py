@@ -1,13 +1,13 @@
-"""How often a ridge is as near to the truth as its record says: `ridge_z_sigma_m` against simulated scenes.
+"""Share of ridges that are as near to the truth as their records say: `ridge_z_sigma_m` against simulated scenes.
 
     python -m benchmarks.ridge_uncertainty --out DIR [--split dev|test] [--method arrangement]
                                            [--only hofmann310 sweep-d8] [--jobs 2]
                                            [--page docs/results/ridge_uncertainty.md]
 
 All cells of `sweep` and the first draw of `hofmann310`, without footprints; runs are those of `benchmarks/ruler.py` and
-lie where it puts them. A model is held against the true building that it stands for (IoU of the footprints of at least
-one half), moved to where the survey saw it: what a whole strip is off by is in no record. Blocks have no ridge and are
-left out, as is what the edge of the data cuts. Writes DIR/ridge_uncertainty_SPLIT.md, and its lines into the page.
+lie where it puts them. A model is compared with its true building (IoU of the footprints of at least one half), moved
+to where the survey saw it, since no record includes the shift of a whole strip. Blocks have no ridge and are left out,
+like buildings that the edge of the data cuts. Writes DIR/ridge_uncertainty_SPLIT.md, and its lines into the page.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def groups_of(found: Sequence[tuple[Entry, Sequence[RidgeError]]]) -> list[tuple
     groups.append(("sweep, all", [one for _, errors in cells for one in errors]))
     for density in sorted({cell.density_per_m2 for cell, _ in cells}):
         errors = [one for cell, some in cells if cell.density_per_m2 == density for one in some]
-        groups.append((f"sweep, {density:g} pulses a m2", errors))
+        groups.append((f"sweep, {density:g} pulses per m2", errors))
     for noise in sorted({cell.noise_m for cell, _ in cells}):
         errors = [one for cell, some in cells if cell.noise_m == noise for one in some]
         groups.append((f"sweep, {noise:.2f} m of noise", errors))

@@ -4,18 +4,18 @@
 
 roofer's figures were measured once on `delft_west` and `delft_east` with the given footprints and the file's classes;
 its times were those of another machine and are left out. The methods are run here. A survey without given footprints is
-held against the outlines of its own class 6, and has no figures of roofer.
+compared with the outlines of its own class 6, and has no figures of roofer.
 
-- Processor seconds are those of a whole run of the command line, serial, in a process of its own, with all that it
-  starts: the least of `--repeat` runs after one that compiled what was missing. `--cold` measures one run with empty
-  caches of kernels and bytecode as well. GABLEWORK_PYTHON names the interpreter of another environment, such as one
-  without the tools of the tests, which some libraries load where they find them.
-- Milliseconds a building are processor time of `reconstruct_building` in this process, for the candidates as the
-  stages of a run find them; of `--repeat` times over the shortest of each building counts.
-- Delivered is what is ok and LoD2.2; valid are those whose solids keep all rules, by this program's own checker, and
-  by val3dity where GABLEWORK_VAL3DITY names that program.
-- Scores are over all points of class 6 inside the outlines, against the highest roof there; a point without a roof is
-  a miss. Top-visible points have no other one of the same building more than 1.1 m higher within 0.5 m in plan.
+- Processor seconds are those of a whole run of the command line, serial, in a separate process, including its children:
+  the minimum of `--repeat` runs after one that compiled what was missing. `--cold` measures one run with empty caches
+  of kernels and bytecode as well. GABLEWORK_PYTHON names the interpreter of another environment, such as one without
+  the tools of the tests, which some libraries load where they find them.
+- Milliseconds per building are processor time of `reconstruct_building` in this process, for the candidates that the
+  stages of a run find; the minimum of `--repeat` times of each building counts.
+- Delivered buildings are ok and LoD2.2; valid ones have solids that keep all rules, by our own checker, and by val3dity
+  if GABLEWORK_VAL3DITY names that program.
+- Scores are over all points of class 6 inside the outlines, against the highest roof there; a point without a roof is a
+  miss. Top-visible points have no other one of the same building more than 1.1 m higher within 0.5 m in plan.
 - Buildings that differ are those of a serial run and one of two workers, by all columns that `gablework digest` counts.
 - Thinned surveys keep the points whose hash of their place is small, of all classes alike (`thinned_surveys.py`), so
   that class 6 inside the outlines has the stated density; the score is over the points of the whole survey.
@@ -254,7 +254,7 @@ THINNED: Mapping[float, tuple[tuple[str, str, str], tuple[str, str, str]]] = {
     1.0: (("63", "130", "155"), (".34", ".55", ".62")),
     0.5: (("0", "80", "140"), ("", ".40", ".50")),
 }
-"""By class-6 points a square metre: roofer, required and stretch of what is delivered, and of points within 0.2 m."""
+"""By class-6 points per square metre: roofer, required and stretch of what is delivered, and of points within 0.2 m."""
 TOLD_LESS: Mapping[str, str] = {NO_CLASS_6: "no class 6", NO_FOOTPRINTS: "no footprints", NEITHER: "neither"}
 """The input that is left out, and what the table calls it."""
 
@@ -266,13 +266,13 @@ def _row(label: str, printed: tuple[str, str, str], cell: Callable[[Figures], st
 
 def _thinned_rows() -> Iterator[Row]:
     for density, (delivered, _) in THINNED.items():
-        yield _row(f"{density:g} class-6 points a m2: LoD2.2", delivered, partial(_poorer, f"{density:g}", _lod2))
+        yield _row(f"{density:g} class-6 points per m2: LoD2.2", delivered, partial(_poorer, f"{density:g}", _lod2))
         yield Row(
-            label=f"{density:g} class-6 points a m2: what kept the others",
+            label=f"{density:g} class-6 points per m2: reasons of the others",
             cell=partial(_poorer, f"{density:g}", _reasons),
         )
     for density, (_, within) in THINNED.items():
-        label = f"{density:g} class-6 points a m2: within 0.2 m of the full cloud"
+        label = f"{density:g} class-6 points per m2: within 0.2 m of the full cloud"
         yield _row(label, within, partial(_poorer, f"{density:g}", _within))
 
 
@@ -394,7 +394,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     density = roof_density(reference)
     head = (
         f"{entry.name}: {len(reference.buildings)} outlines ({reference.outlines}), {density.points} points of "
-        f"class 6 in {density.area_m2:.0f} m2 of them, {density.per_m2:.2f} a m2; {os.cpu_count()} cores, "
+        f"class 6 in {density.area_m2:.0f} m2 of them, {density.per_m2:.2f} per m2; {os.cpu_count()} cores, "
         f"{platform.machine()}, load {os.getloadavg()[0]:.1f} before.\n"
     )
     print(head, flush=True)

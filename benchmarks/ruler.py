@@ -1,12 +1,12 @@
-"""All methods, held to one ruler: every suite and every real tile.
+"""Measures all methods on every suite and every real tile.
 
     python benchmarks/ruler.py --out DIR [--data ../shared/data] [--split test] [--only hofmann310 delft] [--jobs 2]
                                [--methods METHOD[:PRESET] ...] [--no-pages]
 
-By default every method with its default settings. An entry of the table below is simulated once (suites), its
-candidates are found once, each method models them, and each run is measured; `benchmarks/entries.py` says where
-everything lies. DIR/methods.md then holds one line an entry and method, DIR/sweep.md a table a method: the roof faces
-of at least 10 m2 by density and noise. What is there already is not done again: delete it to repeat it.
+The default is every method with its default settings. An entry of the table below is simulated once (suites), its
+candidates are found once, each method models them, and each run is measured; `benchmarks/entries.py` describes the
+folders. DIR/methods.md then holds one line per entry and method, DIR/sweep.md one table per method: the roof faces of
+at least 10 m2 by density and noise. Existing results are not computed again: delete them to repeat them.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def sweep_table(qualities: Mapping[tuple[float, float], float]) -> str:
         ]
         for density in sorted({density for density, _ in qualities})
     ]
-    return markdown_table(["pulses a m2", *(f"{noise:g} m of noise" for noise in noises)], lines)
+    return markdown_table(["pulses per m2", *(f"{noise:g} m of noise" for noise in noises)], lines)
 
 
 def sweep_qualities(

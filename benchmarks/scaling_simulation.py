@@ -1,18 +1,19 @@
-"""Where the engine stops scaling: a simulation of its task graph with measured times, up to 1,000 workers.
+"""Simulates the engine's task graph with measured times for up to 1,000 workers, to find where it stops scaling.
 
     python -m benchmarks.scaling_simulation --traces DIR/run.trace.json [more] --costs DIR/engine_costs.json --out DIR
                                             [--buildings 20000 1000000 10000000] [--workers 1 2 8 32 100 300 1000]
                                             [--storage-mb-s 0] [--tile-size 500] [--figure FILE.png]
 
 The traces come from `city_scale.py`, the costs from `engine_costs.py`. A stage's tasks draw their CPU times from those
-of the first trace, as many a building as there were; the engine's order (largest first), its window of tasks in flight,
-its barriers between stages and its steps in the driver are kept. Driver, scheduler and storage serve one after the
-other: a task costs the driver what the driver's CPU time in its stage of the first trace comes to (keys, packing,
-submission, result; never less than a task that does nothing), the scheduler an assignment and a completion, a byte of a
-result its way through both, a byte of scratch its share of the bandwidth. `--storage-mb-s 0` sets no limit to it.
+of the first trace, with the same number per building. The simulation keeps the engine's order (largest first), its
+window of tasks in flight, its barriers between stages and its steps in the driver. Driver, scheduler and storage each
+serve one request after the other. A task costs the driver its CPU time per task in that stage of the first trace (keys,
+packing, submission, result; at least that of a task that does nothing), and the scheduler an assignment and a
+completion. A byte of a result passes through both, and a byte of scratch takes its share of the bandwidth;
+`--storage-mb-s 0` means no limit.
 
-Every trace is also replayed: its own tasks with the wall-clock times that they had there, by as many workers. How far
-the simulated wall is from the measured one is the reported error.
+Every trace is also replayed: its own tasks with their measured wall-clock times on the same number of workers. The
+reported error is the difference between the simulated and the measured wall-clock time.
 """
 
 from __future__ import annotations
@@ -516,7 +517,7 @@ def tables(
     for mb_s in (math.inf, 10_000.0, 3_000.0, 1_000.0, 300.0):
         limited = city_run(engine, middle, most, ALL, mb_s * 1e6)
         rows.append(["none" if math.isinf(mb_s) else f"{mb_s:g}", *outcome_cells(limited)[:2]])
-    parts.append(markdown_table(["MB a second", "wall, min", "efficiency"], rows))
+    parts.append(markdown_table(["MB per second", "wall, min", "efficiency"], rows))
     return "\n".join(parts)
 
 

@@ -1,4 +1,4 @@
-"""Speed of the simulated scanner, in million returns a second: warm, median of some runs.
+"""Speed of the simulated scanner in million returns per second: warm, median of several runs.
 
 python -m benchmarks.scanner [--density D …] [--size METRES] [--threads N] [--repeat R]
 python -m benchmarks.scanner --write [--density D …] [--size METRES]     scan, write LAZ, labels and truth
@@ -92,7 +92,7 @@ def report_writing(densities: list[float], size_m: float) -> None:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--density", type=float, nargs="+", default=list(DENSITIES_PER_M2), help="pulses a m2")
+    parser.add_argument("--density", type=float, nargs="+", default=list(DENSITIES_PER_M2), help="pulses per m2")
     parser.add_argument("--size", type=float, default=400.0, help="edge of the scenes in metres")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeat", type=int, default=3)

@@ -1,6 +1,6 @@
-"""How well a scene was split into buildings: outlines of the candidates against a reference, by the ruler's measures.
+"""Quality of the split into buildings: outlines of candidates against a reference, by the ruler's measures.
 
-No building is modelled. A candidate's outline is the one that its model would stand on: the same function draws it.
+No building is modelled. A candidate's outline is that of its model: the same function draws it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How fast a scene is split into candidates, and in how much memory: ingest, split and join.
+"""Time and memory of splitting a scene into candidates: ingest, split and join.
 
     python -m benchmarks.scene_speed clock --out DIR [--data ../shared/data] [--tile ahn3/delft_west.laz] [--rounds 7]
                                            [--workers 0 2] [--top 25]
@@ -6,10 +6,10 @@
                                            [--simulate-only] [--keep]
 
 `clock` runs the three stages again and again over one tile, read without its classes. The first round, which compiles
-or loads the kernels and starts the workers, does not count. It reports the median of the rounds by stage, points a
+or loads the kernels and starts the workers, does not count. It reports the median of the rounds by stage, points per
 second, and of the serial run the functions that take most CPU time (cProfile). `large` writes one LAS file of about a
-hundred million points, a piece of a simulated city laid side by side, splits it, and reports the peak memory of every
-process; the file is removed afterwards. DIR/speed.md and DIR/large.md hold the tables.
+hundred million points, copies of a piece of a simulated city side by side, splits it, and reports the peak memory of
+every process; the file is removed afterwards. DIR/speed.md and DIR/large.md hold the tables.
 """
 
 from __future__ import annotations
@@ -160,9 +160,9 @@ def speed_row(label: str, found: Sequence[Lap]) -> list[str]:
 
 
 def speed_table(rows: Sequence[Sequence[str]]) -> str:
-    """Seconds by stage and points a second."""
+    """Seconds by stage and points per second."""
     heads = ["", "points", *(f"{stage}, s" for stage in STAGES), "together, s", "range, s"]
-    heads += ["million points a second", "CPU, s"]
+    heads += ["million points per second", "CPU, s"]
     return markdown_table(heads, rows)
 
 
@@ -182,7 +182,7 @@ def run_clock(arguments: argparse.Namespace) -> int:
             best = max(best, found[0].points / statistics.median(lap.total_s for lap in found))
         reported = profile([str(tile)], arguments.crs, folder, arguments.top) if arguments.top else ""
     held = [
-        f"{'reached' if best >= limit else 'missed'}: {name} of {limit / 1e6:g} million points a second"
+        f"{'reached' if best >= limit else 'missed'}: {name} of {limit / 1e6:g} million points per second"
         for name, limit in (("required", REQUIRED_POINTS_A_SECOND), ("wanted", WANTED_POINTS_A_SECOND))
     ]
     text = f"`{tile.name}`, {arguments.rounds} rounds after the first.\n\n{speed_table(rows)}\n{'; '.join(held)}.\n"
@@ -207,7 +207,7 @@ def large_file(folder: Path, piece_m: Sequence[float], repeats: Sequence[int], d
     repeats : (2,) int
         How often.
     density : float
-        Pulses a square metre.
+        Pulses per square metre.
     """
     made = simulate(
         "city", folder / "piece", seed_of("dev", 0), size_m=(piece_m[0], piece_m[1]), density_per_m2=density
@@ -279,7 +279,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """Clock and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     kinds = parser.add_subparsers(required=True)
-    clock = kinds.add_parser("clock", help="points a second over one tile")
+    clock = kinds.add_parser("clock", help="points per second over one tile")
     clock.add_argument("--data", type=Path, default=Path("../shared/data"))
     clock.add_argument("--tile", default="ahn3/delft_west.laz", help="below the data folder")
     clock.add_argument("--crs", default="EPSG:7415")
@@ -290,7 +290,7 @@ def main(words: Sequence[str] | None = None) -> int:
     large = kinds.add_parser("large", help="a hundred million simulated points in bounded memory")
     large.add_argument("--piece", type=float, nargs=2, default=[500.0, 1000.0], metavar=("EAST", "NORTH"))
     large.add_argument("--repeats", type=int, nargs=2, default=[6, 3], metavar=("EAST", "NORTH"))
-    large.add_argument("--density", type=float, default=10.5, help="pulses a square metre")
+    large.add_argument("--density", type=float, default=10.5, help="pulses per square metre")
     large.add_argument("--workers", type=int, default=2)
     large.add_argument("--simulate-only", action="store_true", help="make the city and leave it for the next call")
     large.add_argument("--keep", action="store_true", help="leave the city there")

@@ -3,11 +3,11 @@
     python -m benchmarks.scenes suites --out DIR [--split dev|test] [--jobs 2] [--slopes 0 30] [--densities 1 8]
                                        [--known] [--page docs/results/scenes.md]
 
-A city of 300 m by 300 m stands on ground of one slope (0, 10, 20, 30 deg; from 9 deg on only detached houses and parks
-are built) and is surveyed with 0.5 to 30 pulses a m2, without classes. Scenes are made once, below DIR/SPLIT. Compared
-are blocks: true buildings that touch count as one. The ground is that of the run's filter, judged on last returns. One
-default setting serves for all. DIR/scenes.md holds the tables, DIR/scenes.png the plots, DIR/SPLIT/*.json the figures:
-`--known` makes tables and plots of these alone.
+A city of 300 m by 300 m is on ground of one slope (0, 10, 20, 30 deg; from 9 deg on only detached houses and parks are
+built) and is surveyed with 0.5 to 30 pulses per m2, without classes. Scenes are made once, below DIR/SPLIT. Blocks are
+compared: true buildings that touch count as one. The ground is that of the run's filter, judged on last returns. All
+scenes use the default settings. DIR/scenes.md holds the tables, DIR/scenes.png the plots, DIR/SPLIT/*.json the
+figures; `--known` makes tables and plots from these alone.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ from pipeline.settings import RunSettings
 
 SLOPES_DEG = (0.0, 10.0, 20.0, 30.0)
 DENSITIES = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
-"""Pulses a square metre."""
+"""Pulses per square metre."""
 SIZE_M = (300.0, 300.0)
 COVER_M = 4.0
-"""Side of the cells that tell where the survey saw anything: at 0.5 pulses a m2 eight fall into one."""
+"""Side of the cells that show where the survey saw anything: at 0.5 pulses per m2 eight fall into one."""
 PICTURED = ((0.0, 8.0), (30.0, 8.0), (0.0, 1.0), (20.0, 1.0))
 """Slope and density of the scenes that are drawn."""
 
@@ -182,7 +182,7 @@ FIGURES: Mapping[str, tuple[str, Figure]] = {
 
 
 def suite_table(scores: Iterable[SuiteScore], name: str) -> str:
-    """One figure: a row a slope, a column a density."""
+    """One figure: one row per slope, one column per density."""
     label, figure = FIGURES[name]
     values = {(s.scene.slope_deg, s.scene.density_per_m2): figure(s) for s in scores}
     densities = sorted({density for _, density in values})
@@ -191,7 +191,7 @@ def suite_table(scores: Iterable[SuiteScore], name: str) -> str:
     for slope in sorted({slope for slope, _ in values}):
         cells = [values.get((slope, density), math.nan) for density in densities]
         rows.append([f"{slope:g} deg", *("" if math.isnan(one) else f"{one:.{digits}f}" for one in cells)])
-    return markdown_table([label, *(f"{density:g} a m2" for density in densities)], rows)
+    return markdown_table([label, *(f"{density:g} per m2" for density in densities)], rows)
 
 
 def suite_tables(scores: Sequence[SuiteScore], split: str) -> str:
@@ -201,7 +201,9 @@ def suite_tables(scores: Sequence[SuiteScore], split: str) -> str:
     reported = ", ".join(
         f"{blocks[slope]} blocks of {houses[slope]} houses on {slope:g} deg" for slope in sorted(blocks)
     )
-    head = f"`city` of {SIZE_M[0]:g} m x {SIZE_M[1]:g} m, {split} seed {seed_of(split, 0)}: {reported}; pulses a m2.\n"
+    head = (
+        f"`city` of {SIZE_M[0]:g} m x {SIZE_M[1]:g} m, {split} seed {seed_of(split, 0)}: {reported}; pulses per m2.\n"
+    )
     return "\n".join((head, *(suite_table(scores, name) for name in FIGURES)))
 
 
@@ -240,7 +242,7 @@ def draw_scores(scores: Sequence[SuiteScore], path: Path) -> None:
                 low = min((figure(s) for s in scores if not math.isnan(figure(s))), default=0.0)
                 panel.set_ylim(min(0.7, math.floor(low * 10) / 10), 1.01)
         for panel in panels[-1]:
-            panel.set_xlabel("pulses a m2")
+            panel.set_xlabel("pulses per m2")
         panels[0, 0].legend(frameon=False, loc="lower right")
         path.parent.mkdir(parents=True, exist_ok=True)
         canvas.savefig(path)

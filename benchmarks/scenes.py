@@ -1,11 +1,11 @@
-"""Scenes split into buildings, held to the ruler: the real tiles without their classes, and cities with truth.
+"""Measures scenes split into buildings: the real tiles without their classes, and cities with truth.
 
     python -m benchmarks.scenes real --out DIR [--data ../shared/data] [--tiles delft_west hd ...] [--settings FILE]
     python -m benchmarks.scenes suites --out DIR [--split dev|test] [--jobs 2] [--page docs/results/scenes.md]
 
 `real` reads each tile as if it had no classes, runs ingest, split and join in this process, draws the outline of every
-candidate as its model would have it, and compares: by area on the raster of class 6 with and without the ring at its
-edges, by objects of at least 16 m2, and where given footprints cover by IoU and area of blocks of touching ones.
+candidate as for its model, and compares: by area on the raster of class 6 with and without the ring at its
+edges, by objects of at least 16 m2, and under given footprints by IoU and area of blocks of touching ones.
 Nothing is modelled, so it takes seconds. DIR/real.md holds the tables, DIR/TILE.md what is missed and wrong one by
 one, DIR/TILE.png a picture: green found, red missed, blue false. `suites` is described in `benchmarks/scene_suites.py`.
 """

@@ -1,8 +1,8 @@
-"""Many uploads at once beside many pollers, against a `gablework serve` of its own.
+"""Many uploads at once beside many pollers, against a separate `gablework serve`.
 
     python benchmarks/service_load.py [--tile FILE] [--uploads 50] [--pollers 200] [--with-driver]
 
-Sends the tile as so many jobs at once while pollers ask for the status of what was submitted. Checks that no job and
+Sends the tile as many jobs at once while pollers request the status of the submitted jobs. Checks that no job and
 no upload is lost or doubled and that every stored file has the SHA-256 of the tile; reports the peak memory of the API
 process (the kernel's own high-water mark) and the duration of the status calls. Fails above the limits of the design.
 """

@@ -2,11 +2,11 @@
 
     python benchmarks/simulated_against_real.py [--data ../shared/data] [--split dev] [--draw 0] [--json]
 
-The real tiles are `delft_west` (AHN3) and `CSite2` (ISPRS filter test, Stuttgart). Beside each stand the cells of
+The real tiles are `delft_west` (AHN3) and `CSite2` (ISPRS filter test, Stuttgart). Beside each are the cells of
 `sweep` whose survey is nearest, and a quarter of a square kilometre of `city` flown the same way, since the sweep is a
 field of detached houses and the real tiles are old towns. Measured alike everywhere:
 
-- distance to the nearest neighbour in plan, among the first returns (5 %, median, 95 %), and points a square metre;
+- distance to the nearest neighbour in plan, among the first returns (5 %, median, 95 %), and points per square metre;
 - sigma of the plane through each point and its eight nearest neighbours in plan, over buildings (median, 90 %), the
   orthogonal residuals with six degrees of freedom. Buildings are class 6; where a tile has no classes, on both sides
   all last returns more than 3 m over the lowest within 12 m: roofs, and crowns that nothing penetrated;
@@ -142,8 +142,8 @@ def measured(points: Points) -> dict[str, str]:
     sigmas = np.percentile(local_sigmas(points.xyz[building]), [50, 90])
     several = points.is_several[first]
     figures = {
-        "pulses a m2": f"{first.sum() / area:.1f}",
-        "returns a m2": f"{len(first) / area:.1f}",
+        "pulses per m2": f"{first.sum() / area:.1f}",
+        "returns per m2": f"{len(first) / area:.1f}",
         "nearest first return, 5 %": f"{away[0]:.2f} m",
         "nearest first return, median": f"{away[1]:.2f} m",
         "nearest first return, 95 %": f"{away[2]:.2f} m",
@@ -194,7 +194,7 @@ def compared(data: Path, seed: int) -> dict[str, dict[str, dict[str, str]]]:
         delft[f"sweep {cell_name(density, 0.02)}"] = measured(
             simulated_points(fields, settings, seed, with_classes=True)
         )
-    delft["city, two strips of 6 a m2"] = measured(
+    delft["city, two strips of 6 per m2"] = measured(
         simulated_points(city_part(seed, like_ahn3), like_ahn3, seed, with_classes=True)
     )
     stuttgart = {"CSite2": measured(real_points(data / "isprs" / "CSite2_orig-utm.laz"))}
@@ -202,7 +202,7 @@ def compared(data: Path, seed: int) -> dict[str, dict[str, dict[str, str]]]:
         stuttgart[f"sweep {cell_name(1.0, noise)}"] = measured(
             simulated_points(fields, cell(1.0, noise), seed, with_classes=False)
         )
-    stuttgart["city, 0.8 a m2, irregular"] = measured(
+    stuttgart["city, 0.8 per m2, irregular"] = measured(
         simulated_points(city_part(seed, like_isprs), like_isprs, seed, with_classes=False)
     )
     return {"delft_west": delft, "CSite2": stuttgart}

@@ -1,13 +1,13 @@
-"""What starting up and small jobs cost, beside an earlier version on the same machine within the same hour.
+"""Cost of starting up and of small jobs, beside an earlier version on the same machine within the same hour.
 
     python -m benchmarks.start_up --baseline CHECKOUT --out DIR [--data ../shared/data] [--rows NAME ...] [--repeat 3]
 
 CHECKOUT is another checkout of this repository with its environment (`make .venv/.run-stamp`), `d53c62d` for the
-table in docs/results/start_up.md. Both versions run in turns, the medians of their runs are divided. Processor
+table in docs/results/start_up.md. Both versions run in turns; the ratio is that of the medians. Processor
 seconds are those of a command and of everything that it starts, also of what outlives it for a moment: such processes
-are waited for. Compiled kernels are there, but for the rows of the demo, which clone both checkouts and begin with
+are waited for. Kernels are compiled already, except for the rows of the demo, which clone both checkouts and begin with
 nothing. A machine that others use at the same time still gives valid ratios of processor seconds; those of wall
-seconds want a quiet one.
+seconds need a quiet one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Down to what density and up to what noise each method holds: all cells of `sweep`, as a table and a plot.
+"""The lowest density and the highest noise at which each method holds: all cells of `sweep`, as a table and a plot.
 
     python benchmarks/sweep_limits.py --out DIR [--plot FILE] [--split test] [--methods METHOD[:PRESET] ...] [--jobs 2]
                                       [--sparsest D] [--densest D] [--densest-faithful D]
@@ -31,7 +31,7 @@ LEVELS = (0.8, 0.5)
 NOISE_COLOURS = ("#1b6ca8", "#2a9d55", "#d1495b")
 """One a noise, from clean to noisy."""
 DENSEST_FAITHFUL = 16.0
-"""Pulses a square metre up to which the papers' own settings are measured: with noise at many points Fuzzy SART makes
+"""Pulses per square metre up to which the papers' own settings are measured: with noise at many points Fuzzy SART makes
 many clusters of many facets, and its time grows with the product."""
 
 Qualities = Mapping[tuple[float, float], float]
@@ -146,7 +146,7 @@ def density_table(found: Mapping[str, Qualities]) -> str:
             for noise in noises
         ]
         rows.append([label, *cells])
-    return markdown_table(["pulses a m2 at which it holds", *heads], rows)
+    return markdown_table(["pulses per m2 at which it holds", *heads], rows)
 
 
 def noise_table(found: Mapping[str, Qualities]) -> str:
@@ -160,7 +160,7 @@ def noise_table(found: Mapping[str, Qualities]) -> str:
                 noises, values = along_noise(qualities, density)
                 cells.append(reported_ranges(held_ranges(noises, values, level, logarithmic=False)) if noises else "")
             rows.append([label, f"{100 * level:.0f} %", *cells])
-    return markdown_table(["m of noise at which it holds", "level", *(f"{one:g} a m2" for one in densities)], rows)
+    return markdown_table(["m of noise at which it holds", "level", *(f"{one:g} per m2" for one in densities)], rows)
 
 
 def quality_table(found: Mapping[str, Qualities]) -> str:
@@ -177,7 +177,7 @@ def quality_table(found: Mapping[str, Qualities]) -> str:
         for label, qualities in found.items()
     ]
     noises = " / ".join(f"{noise:g}" for noise in _noises(found))
-    return markdown_table([f"percent at {noises} m of noise", *(f"{one:g} a m2" for one in densities)], rows)
+    return markdown_table([f"percent at {noises} m of noise", *(f"{one:g} per m2" for one in densities)], rows)
 
 
 def _noises(found: Mapping[str, Qualities]) -> list[float]:
@@ -214,7 +214,7 @@ def _density_axis(panel: Any, densities: Sequence[float]) -> None:
     panel.set_xticks(densities, [f"{density:g}" for density in densities])
     panel.set_xticks([], minor=True)
     panel.set_xlim(densities[0] / 1.2, densities[-1] * 1.2)
-    panel.set_xlabel("pulses a m²", fontsize=9)
+    panel.set_xlabel("pulses per m²", fontsize=9)
     panel.tick_params(labelsize=8)
     for side in ("top", "right"):
         panel.spines[side].set_visible(False)
@@ -269,8 +269,8 @@ def main() -> int:
     parser.add_argument("--plot", type=Path, help="PNG or SVG; default DIR/sweep_limits.png")
     parser.add_argument("--split", choices=("dev", "test"), default="test")
     parser.add_argument("--methods", nargs="*", metavar="METHOD[:PRESET]", help="default: all methods, both presets")
-    parser.add_argument("--sparsest", type=float, default=0.0, help="leave out cells of fewer pulses a m2")
-    parser.add_argument("--densest", type=float, default=math.inf, help="leave out cells of more pulses a m2")
+    parser.add_argument("--sparsest", type=float, default=0.0, help="leave out cells of fewer pulses per m2")
+    parser.add_argument("--densest", type=float, default=math.inf, help="leave out cells of more pulses per m2")
     parser.add_argument(
         "--densest-faithful", type=float, default=DENSEST_FAITHFUL, help="the same of the faithful presets alone"
     )

@@ -1,7 +1,7 @@
-"""Point files as a poorer survey would give them: fewer points, or no buildings among the classes.
+"""Point files like those of a poorer survey: fewer points, or no buildings among the classes.
 
-A point stays where the hash of its place in whole millimetres lies below the wanted share: which points stay depends
-on no order, no file and no random generator, and what a sparse survey keeps every denser one keeps too. All classes
+A point stays if the hash of its place in whole millimetres is below the wanted share. The choice does not depend on
+order, files or a random generator, and every denser survey contains the points of a sparser one. All classes
 are thinned alike, for a sparser survey has less ground too. The points left are as irregular as drawn ones: a flight
 that is planned for that density is more even.
 """
@@ -42,7 +42,7 @@ class RoofDensity:
 
     @property
     def per_m2(self) -> float:
-        """Points a square metre."""
+        """Points per square metre."""
         return self.points / self.area_m2
 
 

@@ -1,4 +1,4 @@
-"""Throughput of triangulation, greedy insertion and neighbour search, in million points a second of one thread.
+"""Throughput of triangulation, greedy insertion and neighbour search, in million points per second of one thread.
 
 python -m benchmarks.tin [--points N] [--repeat R]
 """
@@ -41,7 +41,7 @@ def point_sets(n: int) -> dict[str, IntArray]:
 
 
 def gables(n: int, noise_m: float) -> FloatArray:
-    """Rows of gable roofs on a plain, 4 points a square metre."""
+    """Rows of gable roofs on a plain, 4 points per square metre."""
     rng = np.random.default_rng(2)
     side = math.sqrt(n / 4.0)
     u, v = rng.uniform(0, side, (2, n))

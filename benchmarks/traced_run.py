@@ -1,10 +1,10 @@
-"""One run of the pipeline that writes down every task: `city_scale.py` starts it as a process of its own.
+"""One run of the pipeline that records every task; `city_scale.py` starts it as a separate process.
 
     python -m benchmarks.traced_run INPUT --out RUN --trace trace.json [--workers 2] [--scheduler ADDRESS]
                                     [--tile-size M]
 
-It does what `gablework reconstruct` does, by the same function, with an executor that hands tasks on and keeps what
-`Measured` reports of each. Of every eighth task the sizes of task and result are taken, too.
+It calls the function of `gablework reconstruct` with an executor that passes tasks on and stores the measurements of
+`Measured`. For every eighth task it also takes the sizes of task and result.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class TracingExecutor:
     def __init__(self, inner: Executor) -> None:
         self._inner = inner
         self.tasks: list[dict[str, Any]] = []
-        """One row a task, in the order in which they came back."""
+        """One row per task, in the order in which they came back."""
         self.sizes: list[dict[str, Any]] = []
         """Bytes of some tasks and of their results, as they travel."""
         self.sizing_s = 0.0

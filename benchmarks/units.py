@@ -1,12 +1,12 @@
-"""How well touching buildings are separated: candidates against the houses of a simulated city, or given footprints.
+"""Separation of touching buildings: candidates against the houses of a simulated city, or given footprints.
 
     python -m benchmarks.units city --out DIR [--split dev|test] [--densities 1 4 10] [--size 600 500]
     python -m benchmarks.units real TILES… --crs EPSG:n --footprints FILE
 
-A candidate and a house belong together where they share more than a fifth of the points of either. Counted are pairs
+A candidate and a house belong together if they share more than a fifth of the points of either. It counts pairs
 that belong to each other alone (1:1), candidates of several houses (1:N) with the houses in them, and houses in several
 candidates (N:1): before blocks are split into units, with steps alone, and with the default settings. Only houses with
-points in some candidate count; detection is measured elsewhere. Classes are not looked at.
+points in some candidate count; detection is measured elsewhere. Classes are not used.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@
 
 Options are handed on: `worker --scheduler tcp://scheduler:8786`. Needs the standard library only.
 """
-# ruff: noqa: INP001 - a script, no package
+# ruff: noqa: INP001 - a script, not a package
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from urllib.parse import quote, urlsplit, urlunsplit
 
 @dataclasses.dataclass(frozen=True)
 class Role:
-    """What a container does."""
+    """The role of a container."""
 
     command: tuple[str, ...]
     """Program and its first arguments."""
     path: str = ""
     """HTTP path that answers 200 while the role is alive, on the port `GABLEWORK_PORT`."""
     port_option: str = ""
-    """Option that names the port on which the role listens; without one it is as healthy as its process."""
+    """Option that names the port on which the role listens; without one it is healthy while its process runs."""
 
 
 ROLES: Mapping[str, Role] = {
@@ -47,7 +47,7 @@ ROLES: Mapping[str, Role] = {
 
 
 def command_of(arguments: Sequence[str]) -> tuple[str, ...]:
-    """What to run.
+    """The command to run.
 
     >>> command_of(["worker", "--scheduler", "tcp://scheduler:8786"])
     ('gablework', 'worker', '--scheduler', 'tcp://scheduler:8786')
@@ -77,11 +77,11 @@ DASK_TLS: Mapping[str, tuple[str, ...]] = {
     "GABLEWORK_TLS_CERT": ("SCHEDULER__CERT", "WORKER__CERT", "CLIENT__CERT"),
     "GABLEWORK_TLS_KEY": ("SCHEDULER__KEY", "WORKER__KEY", "CLIENT__KEY"),
 }
-"""What Dask's own scheduler calls the certificates of the cluster."""
+"""The names of the cluster's certificates in Dask's own scheduler."""
 
 
 def dask_tls_of(given: Mapping[str, str]) -> dict[str, str]:
-    """Our names of the certificates in Dask's words, so that all roles use the same variables; then it uses TLS only.
+    """Translate our names of the certificates into Dask's, which then uses TLS only; all roles use the same variables.
 
     >>> dask_tls_of({"GABLEWORK_TLS_CA": "/run/secrets/ca"})
     {'DASK_DISTRIBUTED__COMM__TLS__CA_FILE': '/run/secrets/ca', 'DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION': 'True'}
@@ -116,7 +116,7 @@ def role_file() -> Path:
 
 
 def fault_of(arguments: Sequence[str], given: Mapping[str, str]) -> str:
-    """Why the role that was started with these arguments is not healthy; empty where it is."""
+    """Why the role that was started with these arguments is not healthy; empty if it is."""
     role = ROLES[arguments[0]]
     try:
         if role.path:
@@ -132,7 +132,7 @@ def fault_of(arguments: Sequence[str], given: Mapping[str, str]) -> str:
 
 
 def main(arguments: Sequence[str]) -> NoReturn:
-    """Become the role, or end with what the health check found."""
+    """Become the role, or end with the result of the health check."""
     if list(arguments) == ["healthy"]:
         sys.exit(fault_of(role_file().read_text(encoding="utf-8").split("\n"), os.environ) or None)
     role = ROLES.get(arguments[0]) if arguments else None

@@ -17,7 +17,7 @@ def candidate_of(points: FloatArray) -> Candidate:
 
 @pytest.fixture
 def halves() -> tuple[Candidate, LabelArray]:
-    """A flat roof of 20 m by 10 m, its right half 3 m higher, 1.6 points a m2."""
+    """A flat roof of 20 m by 10 m, its right half 3 m higher, 1.6 points per m2."""
     random = np.random.default_rng(8)
     xy = random.uniform((0, 0), (20, 10), (320, 2)).round(3)
     unit = (xy[:, 0] > 10.0).astype(np.int32)

@@ -20,7 +20,7 @@ from pipeline.roof.settings import RoofSettings
 
 
 def gable(seed: int = 0) -> Candidate:
-    """A gable of 12 m by 8 m with the eaves at 5 m, 10 points a m2."""
+    """A gable of 12 m by 8 m with the eaves at 5 m, 10 points per m2."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(0, 12, 960), rng.uniform(0, 8, 960)
     z = 5.0 + 0.7 * np.minimum(y, 8.0 - y) + rng.normal(0, 0.02, 960)

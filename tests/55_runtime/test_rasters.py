@@ -48,7 +48,7 @@ def slope(x: Any, y: Any) -> Any:
 
 @pytest.fixture(scope="session")
 def plateau(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A slope of 60 x 60 m at 6 points a square metre, with a flat roof of 20 x 12 m and a hole in the data."""
+    """A slope of 60 x 60 m at 6 points per square metre, with a flat roof of 20 x 12 m and a hole in the data."""
     rng = np.random.default_rng(2)
     x, y = rng.uniform(0, 60, (2, 60 * 60 * 6))
     hole = (np.abs(x - 45) < 6) & (np.abs(y - 15) < 6)

@@ -45,4 +45,4 @@ def test_buildings_are_gathered_by_suite_density_and_noise() -> None:
     groups = dict(groups_of([(hofmann, [*errors([0.1]), *hard]), *((entry, errors([0.0])) for entry in sweep)]))
     assert (len(groups["hofmann310, all"]), len(groups["hofmann310, good ones"])) == (2, 1)
     assert len(groups["sweep, all"]) == len(sweep) == 21
-    assert (len(groups["sweep, 8 pulses a m2"]), len(groups["sweep, 0.05 m of noise"])) == (3, 7)
+    assert (len(groups["sweep, 8 pulses per m2"]), len(groups["sweep, 0.05 m of noise"])) == (3, 7)

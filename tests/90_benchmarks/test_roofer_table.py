@@ -243,8 +243,8 @@ def test_only_what_was_measured_has_a_line_and_roofer_stands_beside_delft_alone(
         "| CPU seconds in all, warm |  |  |  | 2.5 |  |",
         "| reconstruction of a building, ms, mean / median |  | 10 / 5 | 3 / 1.5 | 4.0 / 2.0 |  |",
         "| buildings that differ between runs | 2 to 5 | 0 | 0 | 0 |  |",
-        "| 2 class-6 points a m2: within 0.2 m of the full cloud | .53 | .70 | .75 | 0.750 |  |",
-        "| 2 class-6 points a m2: what kept the others |  |  |  | 1 no_plane |  |",
+        "| 2 class-6 points per m2: within 0.2 m of the full cloud | .53 | .70 | .75 | 0.750 |  |",
+        "| 2 class-6 points per m2: reasons of the others |  |  |  | 1 no_plane |  |",
         "| neither: buildings that lose at most 5 / 2 points |  |  |  | 0 / 0 of 1 |  |",
         "| neither: points that a building loses, mean / median |  | 5 | 2 | 10.0 / 10.0 |  |",
     ):

@@ -181,7 +181,7 @@ def _single_suite(shape: RoofShape) -> Suite:
 
     return Suite(
         name=str(shape),
-        summary=f"one {str(shape).replace('_', '-')} building on level ground, 4 points a m2, 3 cm of noise",
+        summary=f"one {str(shape).replace('_', '-')} building on level ground, 4 points per m2, 3 cm of noise",
         make=make,
         scanner=ScannerSettings(pulse_density_per_m2=4.0),
         size_m=(40.0, 40.0),
@@ -234,7 +234,7 @@ SUITES: dict[str, Suite] = {
         ),
         Suite(
             name="sweep",
-            summary="all roof shapes under 21 surveys: 0.5 to 50 pulses a m2, 2 to 10 cm of noise; a data set each",
+            summary="all roof shapes under 21 surveys: 0.5 to 50 pulses per m2, 2 to 10 cm of noise; a data set each",
             make=_sweep,
             scanner=SWEEP_SCANNER,
             size_m=(300.0, 250.0),
