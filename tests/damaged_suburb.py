@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pyarrow as pa
 import shapely
-from roofs_by_hand import points_of
+from roofs_by_hand import lifted, points_of
 from shapely import affinity
 
 from pipeline.model import RoofType, Status
@@ -21,72 +21,34 @@ from pipeline.ruler.simulation.suburb import suburb
 
 WITHIN_M = 0.2
 DEFINITIONS = {
-    definition.name: definition
-    for definition in (
-        Definition(
-            name="delivery.lod2",
-            group=Group.DELIVERY,
-            label="buildings with an LoD2 model",
-            unit="share",
-            better=Better.HIGHER,
-            formula="buildings with a model / all buildings",
+    name: Definition(name=name, group=Group(name.split(".")[0]), label=label, unit=unit, better=better, formula=formula)
+    for name, label, unit, better, formula in (
+        (
+            "delivery.lod2",
+            "buildings with an LoD2 model",
+            "share",
+            Better.HIGHER,
+            "buildings with a model / all buildings",
         ),
-        Definition(
-            name="delivery.false_models",
-            group=Group.DELIVERY,
-            label="models where no building is",
-            unit="count",
-            better=Better.LOWER,
-            formula="models that stand on no reference building",
+        (
+            "delivery.false_models",
+            "models where no building is",
+            "count",
+            Better.LOWER,
+            "models that stand on no reference building",
         ),
-        Definition(
-            name="residuals.within_0_2m",
-            group=Group.RESIDUALS,
-            label="points within 0.2 m",
-            unit="share",
-            better=Better.HIGHER,
-            formula="`n_within / n_points` where |dz| < 0.2 m & a roof is there",
+        (
+            "residuals.within_0_2m",
+            "points within 0.2 m",
+            "share",
+            Better.HIGHER,
+            "`n_within / n_points` where |dz| < 0.2 m & a roof is there",
         ),
-        Definition(
-            name="residuals.rmse",
-            group=Group.RESIDUALS,
-            label="RMSE",
-            unit="m",
-            better=Better.LOWER,
-            formula="root of the mean of squares",
-        ),
-        Definition(
-            name="residuals.bias",
-            group=Group.RESIDUALS,
-            label="mean distance",
-            unit="m",
-            better=Better.ZERO,
-            formula="mean of dz",
-        ),
-        Definition(
-            name="faces.completeness_10m2",
-            group=Group.FACES,
-            label="true faces >= 10 m2 found",
-            unit="share",
-            better=Better.HIGHER,
-            formula="TP / (TP + FN)",
-        ),
-        Definition(
-            name="roof_types.correct",
-            group=Group.ROOF_TYPES,
-            label="outcome correct",
-            unit="share",
-            better=Better.HIGHER,
-            formula="correct / all",
-        ),
-        Definition(
-            name="footprints.iou_median",
-            group=Group.FOOTPRINTS,
-            label="footprint IoU, median",
-            unit="",
-            better=Better.HIGHER,
-            formula="median of IoU",
-        ),
+        ("residuals.rmse", "RMSE", "m", Better.LOWER, "root of the mean of squares"),
+        ("residuals.bias", "mean distance", "m", Better.ZERO, "mean of dz"),
+        ("faces.completeness_10m2", "true faces >= 10 m2 found", "share", Better.HIGHER, "TP / (TP + FN)"),
+        ("roof_types.correct", "outcome correct", "share", Better.HIGHER, "correct / all"),
+        ("footprints.iou_median", "footprint IoU, median", "", Better.HIGHER, "median of IoU"),
     )
 }
 """Stand for those of the measure modules, so that a test says what it expects."""
@@ -121,13 +83,10 @@ def damaged(truth: list[RoofModel]) -> list[RoofModel]:
         if number % 7 == 3:
             continue
         if number % 7 == 1:
-            surfaces = tuple(
-                dataclasses.replace(s, coefficients=(s.coefficients[0], s.coefficients[1], s.coefficients[2] + 0.4))
-                for s in model.surfaces
-            )
+            surfaces = tuple(lifted(surface, 0.4) for surface in model.surfaces)
+            raised = [solid.vertices + np.array([0.0, 0.0, 0.4]) for solid in model.solids]
             solids = tuple(
-                dataclasses.replace(solid, vertices=solid.vertices + np.array([0.0, 0.0, 0.4]))
-                for solid in model.solids
+                dataclasses.replace(solid, vertices=v) for solid, v in zip(model.solids, raised, strict=True)
             )
             copy = dataclasses.replace(copy, surfaces=surfaces, solids=solids)
         if number % 7 == 5:
@@ -135,9 +94,8 @@ def damaged(truth: list[RoofModel]) -> list[RoofModel]:
             x, y = model.footprint.centroid.x, model.footprint.centroid.y
             height = float(np.nanmean(model.top(np.array([x]), np.array([y])))) - 1.0
             block = RoofSurface(polygon=model.footprint, coefficients=(0.0, 0.0, min(height, top + 1e6)), plane_id=0)
-            copy = dataclasses.replace(
-                copy, surfaces=(block,), solids=(), roof_type=RoofType.FLAT, status=Status.FALLBACK, lod="1.2"
-            )
+            outcome = {"roof_type": RoofType.FLAT, "status": Status.FALLBACK, "lod": "1.2"}
+            copy = dataclasses.replace(copy, surfaces=(block,), solids=(), **outcome)
         if number % 7 == 6 and len(model.surfaces) > 1:
             copy = dataclasses.replace(copy, surfaces=model.surfaces[1:], solids=())
         made.append(copy)
@@ -197,20 +155,13 @@ def damaged_evaluation(*, points: bool = True, has_faces: bool = True, reference
     if not reference:
         table = pa.table({"model_id": [m.building_id for m in models], "role": [None] * len(models)})
         share = Measure(name="delivery.lod2", value=0.9, n=len(models))
-        return Evaluation(
-            models=model_set(models), reference=None, measures=(share,), tables={"models": table}, notes=()
-        )
+        tables = {"models": table}
+        return Evaluation(models=model_set(models), reference=None, measures=(share,), tables=tables, notes=())
     held = reference_of(truth, points=points, has_faces=has_faces)
     rows = [building_row(number, one, models, held) for number, one in enumerate(truth)]
-    tables = {
-        "buildings": pa.Table.from_pylist(rows),
-        "models": pa.table(
-            {
-                "model_id": [m.building_id for m in models],
-                "role": ["false" if m.building_id == "model-elsewhere" else "matched" for m in models],
-            }
-        ),
-    }
+    names = [m.building_id for m in models]
+    roles = ["false" if name == "model-elsewhere" else "matched" for name in names]
+    tables = {"buildings": pa.Table.from_pylist(rows), "models": pa.table({"model_id": names, "role": roles})}
     if has_faces:
         tables |= face_tables(truth, models)
         tables["outcomes"] = outcome_table(rows)
@@ -325,9 +276,8 @@ def outcome_table(rows: list[dict[str, object]]) -> pa.Table:
 def confusion_table(rows: list[dict[str, object]]) -> pa.Table:
     """Pairs of types."""
     pairs = [(str(row["true_type"]), str(row["model_type"] or "none")) for row in rows]
-    return pa.Table.from_pylist(
-        [{"true_type": a, "model_type": b, "buildings": pairs.count((a, b))} for a, b in sorted(set(pairs))]
-    )
+    counts = [{"true_type": a, "model_type": b, "buildings": pairs.count((a, b))} for a, b in sorted(set(pairs))]
+    return pa.Table.from_pylist(counts)
 
 
 def histogram_table(rows: list[dict[str, object]], truth: list[RoofModel], models: list[RoofModel]) -> pa.Table:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import pytest
 from migrated import with_tables
+from processes import LONG_S, wait_for
 
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.compare import CompareRequest, CompareSummary
@@ -21,23 +21,11 @@ from service.driver.process import Driver
 from service.driver.shared_cluster import SharedCluster
 from service.fetching import Fetched
 from service.files import StateFolder
-from service.jobs import InputReference, Job, JobRequest, JobStatus
+from service.jobs import InputReference, Job, JobFailure, JobRequest, JobStatus
 from service.settings import ServiceSettings
 from service.store import JobStore
 
-Value = TypeVar("Value")
-
-DEADLINE_S = 60.0
-
-
-def until(condition: Callable[[], Value | None], what: str) -> Value:
-    end = time.monotonic() + DEADLINE_S
-    while True:
-        value = condition()
-        if value:
-            return value
-        assert time.monotonic() < end, f"waited in vain for {what}"
-        time.sleep(0.01)
+Telling = Callable[[int, int], None]
 
 
 class Engine:
@@ -55,6 +43,13 @@ class Engine:
 
     def __exit__(self, *raised: object) -> None:
         type(self).stopped += 1
+
+
+def run_summary(**values: Any) -> RunSummary:
+    """The summary of a run of two buildings, with other values where some are given."""
+    known = {"run_dir": "", "digest": "d" * 64, "statuses": {"ok": 2}, "reasons": {}, "rejected": {"tree": 1}}
+    known |= {"roof_types": {"gable": 2}, "counts": {"points": 6}, "timings_s": {"total": 0.5}}
+    return RunSummary(**{**known, "peak_memory_bytes": {"host:1": 5}, "warnings": (), **values})
 
 
 class Script:
@@ -86,7 +81,7 @@ class Script:
         on_event(Event(kind="warning", stage="split", message=f"{request.inputs[0]}: odd, see {request.out}/run.json"))
         if len(self.steps) >= self.runs:
             self.steps[self.runs - 1](request, on_event, cancelled)
-        return self._summary(request)
+        return run_summary(run_dir=request.out, warnings=(f"{request.inputs[0]}: odd",))
 
     def compare(
         self, request: CompareRequest, on_event: Callable[[Event], None], executor: Any, cancelled: Any
@@ -99,34 +94,13 @@ class Script:
         self.compared.append(request)
         return CompareSummary(out=request.run.out, runs=dict.fromkeys(labels, summary), seconds={})
 
-    @staticmethod
-    def _summary(request: Any) -> RunSummary:
-        return RunSummary(
-            run_dir=request.out,
-            digest="d" * 64,
-            statuses={"ok": 2},
-            reasons={},
-            rejected={"tree": 1},
-            roof_types={"gable": 2},
-            counts={"points": 6},
-            timings_s={"total": 0.5},
-            peak_memory_bytes={"host:1": 5},
-            warnings=(f"{request.inputs[0]}: odd",),
-        )
-
-    def write_outputs(
-        self, _run_dir: Path, out_dir: Path, _wanted: Any, on_progress: Callable[[int, int], None]
-    ) -> None:
+    def write_outputs(self, _run_dir: Path, out_dir: Path, _wanted: Any, on_progress: Telling) -> None:
         out_dir.mkdir()
         (out_dir / "outputs.json").write_text("{}")
         on_progress(1, 1)
 
-    def write_comparison(
-        self, _folder: Path, labels: Any, out_dir: Path, _wanted: Any, on_progress: Callable[[int, int], None]
-    ) -> None:
-        out_dir.mkdir()
-        (out_dir / "outputs.json").write_text("{}")
-        on_progress(len(labels), len(labels))
+    def write_comparison(self, folder: Path, _labels: Any, out_dir: Path, wanted: Any, on_progress: Telling) -> None:
+        self.write_outputs(folder, out_dir, wanted, on_progress)
 
     def raises(self, error: Exception) -> None:
         """The next run raises."""
@@ -152,7 +126,8 @@ class Script:
 class Bench:
     """A store, a state folder, and drivers in threads."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
+        self.patch = patch
         self.script = Script()
         self.settings = ServiceSettings(
             state=folder, poll_s=0.02, lease_s=30.0, driver_jobs=1, drain_s=30.0, max_attempts=3
@@ -187,13 +162,40 @@ class Bench:
             found = self.store.get(job.job_id)
             return found if found.status in statuses else None
 
-        return until(there, f"{statuses}, it is {self.store.get(job.job_id)}")
+        return wait_for(there, f"{statuses}, it is {self.store.get(job.job_id)}")
 
     def over(self, job: Job) -> Job:
         return self.becomes(job, *(status for status in JobStatus if status.is_over))
 
+    def done(self, *errors: Exception) -> Job:
+        """A job as a driver leaves it whose runs raise these errors, one after the other."""
+        job = self.submit()
+        for error in errors:
+            self.script.raises(error)
+        self.driver()
+        return self.over(job)
+
+    def failure(self, *errors: Exception) -> JobFailure:
+        """Why such a job failed."""
+        failure = self.done(*errors).failure
+        assert failure is not None
+        return failure
+
+    def under_way(self, **options: Any) -> tuple[Job, Driver]:
+        """A job whose run goes on until the test says so, and its driver, with these options."""
+        job = self.submit()
+        self.script.waits()
+        driver = self.driver(**options)
+        self.runs()
+        return job, driver
+
     def runs(self, number: int = 1) -> None:
-        until(lambda: self.script.runs >= number, f"run {number}")
+        wait_for(lambda: self.script.runs >= number, f"run {number}")
+
+    def end_leases(self) -> None:
+        """Let the leases of all jobs lie in the past."""
+        with self.store._database.write() as connection:
+            connection.exec_driver_sql("UPDATE jobs SET lease_until = '2020-01-01 00:00:00.000000'")
 
     def end(self, *, at_once: bool = True) -> None:
         for driver, _ in self._running:
@@ -202,13 +204,13 @@ class Bench:
 
     def join(self) -> None:
         for _, thread in self._running:
-            thread.join(DEADLINE_S)
+            thread.join(LONG_S)
             assert not thread.is_alive()
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    one = Bench(tmp_path / "state")
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    one = Bench(tmp_path / "state", monkeypatch)
     try:
         yield one
     finally:

@@ -1,7 +1,4 @@
-"""The application under a real server on a free port, for tests that speak HTTP; and small files to send.
-
-A folder of tests takes what it needs: put this folder on `sys.path`, then `from live_service import serving`.
-"""
+"""The application under a real server on a free port, for tests that speak HTTP; and small files to send."""
 
 from __future__ import annotations
 
@@ -9,7 +6,6 @@ import contextlib
 import io
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,11 +15,15 @@ import laspy
 import numpy as np
 import pyproj
 import uvicorn
+from processes import wait_for
 
 from service.app import create_app
 from service.keys import Scope, new_key
 from service.settings import ServiceSettings
 from service.store import JobStore
+
+POINTS = b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(20) for y in range(20))
+"""A point cloud as text, small and valid."""
 
 DEADLINE_S = 60.0
 """For what takes a moment on a quiet machine; not a promise of speed."""
@@ -43,11 +43,8 @@ def serving(settings: ServiceSettings) -> Iterator[str]:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         try:
-            until_s = time.monotonic() + DEADLINE_S
-            while not server.started:
-                assert thread.is_alive(), "the server ended while it started"
-                assert time.monotonic() < until_s, "the server does not start"
-                time.sleep(0.01)
+            wait_for(lambda: server.started or not thread.is_alive(), "the start of the server")
+            assert server.started, "the server ended while it started"
             yield f"http://127.0.0.1:{listener.getsockname()[1]}"
         finally:
             server.should_exit = True

@@ -1,8 +1,4 @@
-"""Real programs for tests: found or skipped, each logged in its own process group and ended by id.
-
-To use them in a conftest: put this folder on `sys.path`, then
-`from processes import postgres_server, postgres_url, programs`.
-"""
+"""Real programs for tests: found or skipped, each logged in its own process group and ended by id."""
 
 from __future__ import annotations
 
@@ -19,7 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 from urllib.parse import quote
 
 import psutil
@@ -95,6 +91,11 @@ def lives(process: psutil.Process) -> bool:
         return False
 
 
+def as_user(user: str | int | None) -> dict[str, Any]:
+    """Options by which a process runs with the rights of a user alone; None is this user."""
+    return {"user": user, "group": user, "extra_groups": None if user is None else []}
+
+
 class Program:
     """One started program; its standard output and standard error go to the file `log`."""
 
@@ -119,10 +120,8 @@ class Program:
                 stderr=subprocess.STDOUT,
                 env=None if env is None else dict(env),
                 cwd=cwd,
-                user=user,
-                group=user,
-                extra_groups=None if user is None else [],
                 start_new_session=True,
+                **as_user(user),
             )
         self._seen: set[psutil.Process] = set()
 
@@ -209,22 +208,19 @@ class Programs:
         self._folder = folder
         self.started: list[Program] = []
 
-    def start(
-        self,
-        name: str,
-        command: Sequence[str],
-        *,
-        env: Mapping[str, str] | None = None,
-        cwd: Path | None = None,
-        user: str | int | None = None,
-        inherit: bool = True,
-    ) -> Program:
-        """Start a program; `env` goes on top of this process's environment, or is all there is."""
-        log = self._folder / f"{name}.log"
-        whole = {**(os.environ if inherit else {}), **(env or {})}
-        one = Program(name, command, log, env=whole, cwd=cwd, user=user)
+    def start(self, name: str, command: Sequence[str], *, inherit: bool = True, **options: Any) -> Program:
+        """Start a program; its `env` goes on top of this process's environment, or is all there is."""
+        env = {**(os.environ if inherit else {}), **(options.pop("env", None) or {})}
+        one = Program(name, command, self._folder / f"{name}.log", env=env, **options)
         self.started.append(one)
         return one
+
+    def start_scheduler(self, port: int, *options: str, **more: Any) -> Program:
+        """Start `dask scheduler` on the loopback, and wait until it listens."""
+        command = [str(program("dask")), "scheduler", "--host", "127.0.0.1", "--port", str(port)]
+        started = self.start("scheduler", [*command, "--dashboard-address", "127.0.0.1:0", *options], **more)
+        started.wait_for_port(port)
+        return started
 
     def end(self) -> None:
         """End all, the last first; what is printed here shows up in the report of a failed test."""
@@ -279,9 +275,7 @@ class PostgresServer:
             check=True,
             capture_output=True,
             cwd="/",
-            user=self._account,
-            group=self._account,
-            extra_groups=None if self._account is None else [],
+            **as_user(self._account),
         )
 
     def _started(self) -> Program:

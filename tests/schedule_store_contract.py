@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime as dt
+import functools
+import itertools
 import os
 import subprocess
 import sys
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -77,6 +79,23 @@ def end(store: JobStore, job: Job) -> None:
     assert store.get(job.job_id).status is JobStatus.DISMISSED
 
 
+def assert_not_there(store: JobStore, schedule_id: str, **owner: str) -> None:
+    """To all questions the answer is that there is no such schedule."""
+    book = store.schedules
+    run_now = functools.partial(book.run_now, **LIMITS)
+    change = functools.partial(book.change, definition=definition(), version=1)
+    for ask in (book.get, book.remove, book.runs, run_now, change):
+        with pytest.raises(NoSuchScheduleError, match="no schedule"):
+            ask(schedule_id, **owner)
+
+
+def migrate(connection: sa.Connection, step: Callable[..., None], revision: str) -> None:
+    """Bring a database to a revision, by one of Alembic's commands."""
+    config = migrations._config()
+    config.attributes["connection"] = connection
+    step(config, revision)
+
+
 class InDatabase:
     """A schedule of a store, for the contract that all storages of schedules meet."""
 
@@ -116,9 +135,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
             if store._database.is_sqlite:
                 Path(store._database._url.database or "").parent.mkdir(parents=True)
             with store._database.write() as connection:
-                config = migrations._config()
-                config.attributes["connection"] = connection
-                command.upgrade(config, "0001")
+                migrate(connection, command.upgrade, "0001")
                 job_id, at = "a" * 32, dt.datetime(2026, 1, 1, tzinfo=dt.UTC)
                 values = {"job_id": job_id, "process_id": "reconstruct", "status": "accepted", "priority": 0}
                 values |= {"request": request().as_dict(), "message": "waits", "progress": 0, "stage": ""}
@@ -135,8 +152,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
             assert (found.schedule_id, found.created_at, found.request) == (None, at, request())
             assert claim(store).job_id == job_id
             with store._database.write() as connection:
-                config.attributes["connection"] = connection
-                command.downgrade(config, "0001")
+                migrate(connection, command.downgrade, "0001")
                 assert "schedules" not in sa.inspect(connection).get_table_names()
                 assert connection.execute(sa.select(table.c.job_id)).scalar_one() == job_id
 
@@ -147,9 +163,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         job_id = submit(store, settings=old).job_id
         schedule_id = make(store, request=stored).schedule_id
         with store._database.write() as connection:
-            config = migrations._config()
-            config.attributes["connection"] = connection
-            command.stamp(config, "0002")
+            migrate(connection, command.stamp, "0002")
         store.migrate()
         assert store.get(job_id).request.settings == new
         assert store.schedules.get(schedule_id).definition.request.settings == new
@@ -179,24 +193,11 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
 
     @pytest.mark.parametrize("schedule_id", ["", "x", "0" * 32, "0" * 31 + "\0", "\ud800" * 32])
     def test_a_schedule_that_does_not_exist_is_reported(self, store: JobStore, schedule_id: str) -> None:
-        book = store.schedules
-        for ask in (book.get, book.remove, book.runs):
-            with pytest.raises(NoSuchScheduleError, match="no schedule"):
-                ask(schedule_id)
-        with pytest.raises(NoSuchScheduleError):
-            book.run_now(schedule_id, **LIMITS)
-        with pytest.raises(NoSuchScheduleError):
-            book.change(schedule_id, definition(), version=1)
+        assert_not_there(store, schedule_id)
 
     def test_the_schedules_of_other_keys_do_not_exist(self, store: JobStore) -> None:
         made, book = make(store, owner="mine"), store.schedules
-        for ask in (book.get, book.remove, book.runs):
-            with pytest.raises(NoSuchScheduleError):
-                ask(made.schedule_id, owner="other")
-        with pytest.raises(NoSuchScheduleError):
-            book.run_now(made.schedule_id, owner="other", **LIMITS)
-        with pytest.raises(NoSuchScheduleError):
-            book.change(made.schedule_id, definition(), version=1, owner="other")
+        assert_not_there(store, made.schedule_id, owner="other")
         assert book.list(ScheduleFilter(owner="other")) == []
         assert [one.schedule_id for one in book.list(ScheduleFilter(owner="mine"))] == [made.schedule_id]
 
@@ -260,7 +261,6 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         assert tick(store, changed.updated_at) == []
         (missed,) = runs_of(store, made)
         passed = passed_slots(made.definition.cron, made.decided_until, changed.updated_at)
-        assert passed is not None
         assert (missed.outcome, missed.first_slot, missed.slot) == (Outcome.MISSED, passed.first, passed.latest)
         assert changed.counts[Outcome.MISSED] == missed.slots == passed.earlier + 1 >= 3
         assert jobs_of(store, made) == []
@@ -275,7 +275,6 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         assert paused.next_at is None
         assert tick(store, store.now() + 10 * DAY) == []
         resumed = store.schedules.change(made.schedule_id, made.definition, version=2)
-        assert resumed.next_at is not None
         assert resumed.next_at > resumed.decided_until >= paused.decided_until
         assert tick(store, resumed.decided_until) == []
         assert resumed.counts[Outcome.MISSED] == 0
@@ -330,7 +329,6 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         assert (job.owner, job.priority, job.schedule_id, job.request.title) == ("k", -2, made.schedule_id, "hourly")
         found = store.schedules.get(made.schedule_id)
         assert (found.next_at, found.decided_until) == (NOON + 2 * HOUR, NOON + HOUR)
-        assert found.last_run is not None
         assert (found.last_run.job_id, found.last_run.slot) == (job.job_id, NOON + HOUR)
         assert (found.last_run.trigger, found.last_run.at) == (Trigger.CLOCK, NOON + HOUR)
         assert found.counts[Outcome.SUBMITTED] == 1
@@ -405,12 +403,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
             (Outcome.SUBMITTED, NOON + 30 * HOUR, 1),
         ]
         submitted, missed = runs_of(store, made)
-        assert (missed.first_slot, missed.slot, missed.slots, missed.is_counted) == (
-            NOON + HOUR,
-            NOON + 29 * HOUR,
-            29,
-            True,
-        )
+        assert (missed.first_slot, missed.is_counted) == (NOON + HOUR, True)
         assert "the clock was not looked at" in missed.message
         assert submitted.message == "1200 s after its time"
         assert store.schedules.get(made.schedule_id).counts[Outcome.MISSED] == 29
@@ -476,12 +469,8 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         job = store.schedules.run_now(made.schedule_id, owner="k", **LIMITS)
         assert (job.status, job.schedule_id, job.request.title) == (JobStatus.ACCEPTED, made.schedule_id, "by the hour")
         (run,) = runs_of(store, made)
-        assert (run.trigger, run.outcome, run.slot, run.job_id) == (
-            Trigger.HAND,
-            Outcome.SUBMITTED,
-            None,
-            job.job_id,
-        )
+        assert (run.trigger, run.outcome) == (Trigger.HAND, Outcome.SUBMITTED)
+        assert (run.slot, run.job_id) == (None, job.job_id)
         found = store.schedules.get(made.schedule_id)
         assert (found.next_at, found.decided_until, found.version) == (made.next_at, made.decided_until, 1)
 
@@ -583,14 +572,12 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
             return subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
 
         def may_go_on(one: subprocess.Popen[bytes], laps: int = 1) -> None:
-            assert one.stdin is not None
             one.stdin.write(b"\n" * laps)
 
         def end(one: subprocess.Popen[bytes]) -> None:
             one.kill()
             one.wait()
             for stream in (one.stdin, one.stdout):
-                assert stream is not None
                 stream.close()
 
         steady = [started("left"), started("right")]
@@ -600,7 +587,6 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
                 try:
                     # the others wait for this lap to begin: here at the latest it makes a job, and never comes farther
                     may_go_on(victim, number + 1)
-                    assert victim.stdout is not None
                     assert victim.stdout.readline()
                     for one in steady:
                         may_go_on(one)
@@ -608,7 +594,6 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
                     end(victim)
             for one in steady:
                 # what it prints would fill its pipe
-                assert one.stdout is not None
                 one.stdout.read()
                 one.wait()
         finally:
@@ -618,23 +603,15 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         until = start + (ticks - 1) * step * MINUTE
         tick(store, until)
         for schedule in made:
-            times = schedule.definition.cron.times(start)
-            expected = set()
-            for at in times:
-                if at.astimezone(dt.UTC) > until:
-                    break
-                expected.add(at.astimezone(dt.UTC))
+            times = (at.astimezone(dt.UTC) for at in schedule.definition.cron.times(start))
+            expected = set(itertools.takewhile(lambda at: at <= until, times))
             with store._database.read() as connection:
                 query = sa.select(SCHEDULE_RUNS).where(SCHEDULE_RUNS.c.schedule_id == schedule.schedule_id)
                 rows = connection.execute(query).all()
             singles = [row.slot for row in rows if row.first_slot is None]
             assert len(set(singles)) == len(singles)
-            stretches = [
-                {at for at in expected if row.first_slot <= at <= row.slot}
-                for row in rows
-                if row.first_slot is not None
-            ]
-            decided = Counter([*singles, *(at for stretch in stretches for at in stretch)])
+            stretches = [(row.first_slot, row.slot) for row in rows if row.first_slot is not None]
+            decided = Counter([*singles, *(at for low, high in stretches for at in expected if low <= at <= high)])
             assert set(decided) == expected
             assert max(decided.values()) == 1
             jobs = [row.job_id for row in rows if row.outcome == Outcome.SUBMITTED]

@@ -62,6 +62,12 @@ def _figures(sums: IntArray) -> dict[str, float]:
 
 def slowly_judged(kind: int, sums: IntArray, settings: CandidateSettings) -> Verdict | None:
     """Why one whole surface is no candidate; None where it is one."""
+    fault = _fault(kind, sums, settings)
+    return None if fault is None else Verdict(reason=fault[0], detail=fault[1])
+
+
+def _fault(kind: int, sums: IntArray, settings: CandidateSettings) -> tuple[Reason, str] | None:
+    """The reason and its detail."""
     f = _figures(sums)
     sure = f["judged"] > 0 and f["planar_share"] >= settings.sure_planar_share
     sure = sure and f["canopy_share"] <= settings.max_canopy_share
@@ -71,45 +77,29 @@ def slowly_judged(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
     if kind != FacetKind.BUILDING and not sure:
         min_m2 = max(min_m2, settings.doubtful_area_m2)
     if f["area_m2"] < min_m2:
-        return Verdict(reason=Reason.TOO_SMALL, detail=f"area {f['area_m2']:.1f} m2, at least {min_m2:g}")
+        return Reason.TOO_SMALL, f"area {f['area_m2']:.1f} m2, at least {min_m2:g}"
     if kind == FacetKind.BUILDING:
         return None
     if f["top_m"] < settings.min_height_m:
-        return Verdict(
-            reason=Reason.TOO_LOW,
-            detail=f"top {f['top_m']:.2f} m above the terrain, at least {settings.min_height_m:g}",
-        )
+        return Reason.TOO_LOW, f"top {f['top_m']:.2f} m above the terrain, at least {settings.min_height_m:g}"
     if kind == FacetKind.CROWN:
-        return Verdict(
-            reason=Reason.VEGETATION,
-            detail=f"a crown: most of what surrounds its vertices is rough, planar share {f['planar_share']:.2f}",
-        )
+        rough = "a crown: most of what surrounds its vertices is rough"
+        return Reason.VEGETATION, f"{rough}, planar share {f['planar_share']:.2f}"
     if f["judged"] > 0 and f["planar_share"] < settings.min_planar_share:
-        return Verdict(
-            reason=Reason.VEGETATION,
-            detail=f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}",
-        )
+        return Reason.VEGETATION, f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}"
     if f["canopy_share"] > settings.max_canopy_share:
-        return Verdict(
-            reason=Reason.VEGETATION,
-            detail=f"canopy share {f['canopy_share']:.2f}, at most {settings.max_canopy_share:g}",
-        )
+        return Reason.VEGETATION, f"canopy share {f['canopy_share']:.2f}, at most {settings.max_canopy_share:g}"
     width_m = settings.min_width_m * (0.5 if sure else 1.0)
     if f["width_m"] < width_m:
-        return Verdict(reason=Reason.TOO_NARROW, detail=f"mean width {f['width_m']:.2f} m, at least {width_m:g}")
+        return Reason.TOO_NARROW, f"mean width {f['width_m']:.2f} m, at least {width_m:g}"
     if f["wall_share"] < settings.min_wall_share:
-        return Verdict(
-            reason=Reason.NO_WALLS,
-            detail=f"walls along {f['wall_share']:.2f} of the outline, at least {settings.min_wall_share:g}",
-        )
+        share = f["wall_share"]
+        return Reason.NO_WALLS, f"walls along {share:.2f} of the outline, at least {settings.min_wall_share:g}"
     if not sure and f["top_share"] < settings.min_top_share:
         z_avg = float(sums[Sum.WALLS_Z_MX]) / max(1, int(sums[Sum.WALLS])) / 1000.0
         own = float(sums[Sum.WALLS_OWN_Z]) / max(1, int(sums[Sum.WALLS])) / 1000.0
-        return Verdict(
-            reason=Reason.BELOW_Z_AVG,
-            detail=f"at the top of {f['top_share']:.2f} of its walls, at least {settings.min_top_share:g} "
-            f"(own {own:.2f} m, Z_avg {z_avg:.2f} m)",
-        )
+        detail = f"at the top of {f['top_share']:.2f} of its walls, at least {settings.min_top_share:g}"
+        return Reason.BELOW_Z_AVG, f"{detail} (own {own:.2f} m, Z_avg {z_avg:.2f} m)"
     return None
 
 
@@ -134,10 +124,7 @@ def _joins(kind: int, sums: IntArray, verdict: Verdict | None, settings: Candida
 def slowly_united(surfaces: Surfaces, verdicts: list[Verdict | None], settings: CandidateSettings) -> IntArray:
     """The candidate that each surface belongs to: its own index, or that of a larger roof across a step.
 
-    Returns
-    -------
-    (k,) int64
-        Index of the surface that leads the candidate; -1 for surfaces that belong to none.
+    (k,) int64, the index of the surface that leads the candidate; -1 for surfaces that belong to none.
     """
     count = len(surfaces.kind)
     leader = np.array([k if verdicts[k] is None else -1 for k in range(count)], np.int64)
@@ -215,16 +202,10 @@ def _crossing_pairs(splits: Sequence[WholeSplit], offsets: npt.NDArray[np.int64]
 
 
 def whole_surfaces(splits: Sequence[WholeSplit]) -> tuple[Surfaces, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Unite the fragments of all tiles.
+    """The surfaces of all tiles, whole, with their sums.
 
-    Returns
-    -------
-    Surfaces
-        Whole surfaces with their sums.
-    (f,) int64
-        The surface of every fragment, tile after tile.
-    (t + 1,) int64
-        Where each tile's fragments start in that list.
+    Beside them the surface of every fragment, (f,) int64, tile after tile, and where each tile's fragments start in
+    that list, (t + 1,) int64.
     """
     counts = [len(s.fragments.kind) for s in splits]
     offsets = np.concatenate(([0], np.cumsum(counts))).astype(np.int64)
@@ -253,11 +234,8 @@ def whole_surfaces(splits: Sequence[WholeSplit]) -> tuple[Surfaces, npt.NDArray[
     points = np.concatenate([f.lowest_point_mm for f in described])
     order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], surface))
     _, first = np.unique(surface[order], return_index=True)
-    along = [
-        f.along_steps + np.array([offset, offset, 0])
-        for f, offset in _with_offsets(splits, offsets)
-        if len(f.along_steps)
-    ]
+    starts = zip(described, offsets.tolist(), strict=False)
+    along = [f.along_steps + np.array([offset, offset, 0]) for f, offset in starts if len(f.along_steps)]
     pairs = _summed_pairs(np.concatenate(along), surface) if along else np.empty((0, 3), np.int64)
     whole = Surfaces(
         kind=np.concatenate([f.kind for f in described])[members],
@@ -267,11 +245,6 @@ def whole_surfaces(splits: Sequence[WholeSplit]) -> tuple[Surfaces, npt.NDArray[
         along_steps=pairs,
     )
     return whole, surface.astype(np.int64), offsets
-
-
-def _with_offsets(splits: Sequence[WholeSplit], offsets: npt.NDArray[np.int64]) -> list[tuple[Fragments, int]]:
-    """Each tile's fragments and where they start."""
-    return [(s.fragments, int(o)) for s, o in zip(splits, offsets, strict=False)]
 
 
 def _summed_pairs(along: IntArray, surface: npt.NDArray[np.int64]) -> IntArray:
@@ -290,9 +263,8 @@ def _ranges_by_key(splits: Sequence[WholeSplit], surface_of: dict[tuple[int, int
         for j, key in enumerate(s.keys.tolist()):
             where = surface_of.get((t, key))
             if where is not None:
-                ranges.setdefault(where, []).append(
-                    PointRange(tile=s.tile, start=int(s.starts[j]), stop=int(s.starts[j + 1]))
-                )
+                held = PointRange(tile=s.tile, start=int(s.starts[j]), stop=int(s.starts[j + 1]))
+                ranges.setdefault(where, []).append(held)
     return ranges
 
 

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +15,7 @@ from typing import Any, TypeVar
 from uuid import uuid4
 
 import pytest
+from processes import LONG_S, wait_for
 
 from service import migrations
 from service.errors import (
@@ -35,7 +35,6 @@ from service.store.tables import METADATA
 
 Value = TypeVar("Value")
 
-DEADLINE_S = 300.0
 HOUR_S = 3600.0
 SOON_S = 0.02
 """A lease that is over at once."""
@@ -43,13 +42,7 @@ SOON_S = 0.02
 
 def until(condition: Callable[[], Value | None]) -> Value:
     """What the condition returns once it is true."""
-    end = time.monotonic() + DEADLINE_S
-    while True:
-        value = condition()
-        if value:
-            return value
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.01)
+    return wait_for(condition, "what the database is to hold", interval_s=0.01)
 
 
 def request(value: str = "/data/tile.laz", kind: Any = "path", **others: Any) -> JobRequest:
@@ -66,14 +59,20 @@ def claim(store: JobStore, driver: str = "a", *, lease_s: float = HOUR_S, max_at
     return job
 
 
+def running(store: JobStore, driver: str = "a", *, lease_s: float = HOUR_S) -> Job:
+    """A job that a driver holds."""
+    submit(store)
+    return claim(store, driver, lease_s=lease_s)
+
+
 def happened(kind: str = "warning", **values: Any) -> JobEvent:
     return JobEvent(sequence=0, at=dt.datetime(2020, 1, 1, tzinfo=dt.UTC), kind=kind, **values)
 
 
-def upload(store: JobStore, *, owner: str | None = None, days: float = 1.0) -> Upload:
+def upload(store: JobStore, *, owner: str | None = None, days: float = 1.0, upload_id: str | None = None) -> Upload:
     now = store.now()
     one = Upload(
-        upload_id=uuid4().hex,
+        upload_id=upload_id or uuid4().hex,
         owner=owner,
         filename="tile.laz",
         size_bytes=5 * 2**30,
@@ -84,6 +83,11 @@ def upload(store: JobStore, *, owner: str | None = None, days: float = 1.0) -> U
     )
     store.add_upload(one)
     return one
+
+
+def ids(store: JobStore, **criteria: Any) -> set[str]:
+    """The jobs that a filter finds."""
+    return {job.job_id for job in store.list(JobFilter(**criteria))}
 
 
 def statuses(store: JobStore, job: Job) -> list[JobStatus | None]:
@@ -102,6 +106,11 @@ class DatabaseContract:
         with JobStore(url) as store:
             store.migrate()
             yield store
+
+    @pytest.fixture
+    def held(self, store: JobStore) -> Job:
+        """A job that a driver holds."""
+        return running(store)
 
 
 class StoreContract(DatabaseContract):
@@ -168,8 +177,6 @@ class StoreContract(DatabaseContract):
         store.succeed(held, message="", summary={})
         after = store.now()
         done = store.get(job.job_id)
-        assert done.started_at is not None
-        assert done.finished_at is not None
         times = [before, job.created_at, done.started_at, done.finished_at, after]
         assert times == sorted(times)
         assert {time.utcoffset() for time in times} == {dt.timedelta(0)}
@@ -197,7 +204,6 @@ class StoreContract(DatabaseContract):
         store.record(held, [happened(message="nul \0 and surrogate \ud800", stage="s" * 100)])
         store.fail(held, JobFailure(fault=Fault.INPUT, detail="bad \0 value"))
         failure = store.get(held.job_id).failure
-        assert failure is not None
         assert failure.detail == "bad \ufffd value"
 
     def test_a_full_line_refuses_and_running_jobs_do_not_count(self, store: JobStore) -> None:
@@ -250,37 +256,31 @@ class StoreContract(DatabaseContract):
         until(lambda: store.now() > first.created_at)
         other = submit(store, process_id="echo")
 
-        def ids(**criteria: Any) -> set[str]:
-            return {job.job_id for job in store.list(JobFilter(**criteria))}
-
         held = claim(store)
         assert held.job_id == first.job_id
-        assert ids(statuses=[JobStatus.RUNNING]) == {first.job_id}
-        assert ids(statuses=[JobStatus.RUNNING, JobStatus.ACCEPTED]) == {first.job_id, other.job_id}
-        assert ids(process_ids=["echo"]) == {other.job_id}
-        assert ids(process_ids=["e\0cho"]) == set()
-        assert ids(created_from=other.created_at) == {other.job_id}
-        assert ids(created_to=first.created_at) == {first.job_id}
+        assert ids(store, statuses=[JobStatus.RUNNING]) == {first.job_id}
+        assert ids(store, statuses=[JobStatus.RUNNING, JobStatus.ACCEPTED]) == {first.job_id, other.job_id}
+        assert ids(store, process_ids=["echo"]) == {other.job_id}
+        assert ids(store, process_ids=["e\0cho"]) == set()
+        assert ids(store, created_from=other.created_at) == {other.job_id}
+        assert ids(store, created_to=first.created_at) == {first.job_id}
         east = dt.timezone(dt.timedelta(hours=5))
-        assert ids(created_to=first.created_at.astimezone(east)) == {first.job_id}
+        assert ids(store, created_to=first.created_at.astimezone(east)) == {first.job_id}
 
     def test_lists_are_filtered_by_duration_up_to_now_for_jobs_that_run(self, store: JobStore) -> None:
         waiting, done = submit(store, priority=0), submit(store, priority=1)
         held = claim(store)
         assert held.job_id == done.job_id
 
-        def ids(**criteria: Any) -> set[str]:
-            return {job.job_id for job in store.list(JobFilter(**criteria))}
-
         for _ in range(2):
-            assert ids(min_duration_s=0) == {done.job_id}
-            assert ids(max_duration_s=HOUR_S) == {done.job_id}
-            assert ids(min_duration_s=HOUR_S) == set()
-            assert ids(max_duration_s=-1.0) == set()
-            assert ids(min_duration_s=float("inf")) == set()
+            assert ids(store, min_duration_s=0) == {done.job_id}
+            assert ids(store, max_duration_s=HOUR_S) == {done.job_id}
+            assert ids(store, min_duration_s=HOUR_S) == set()
+            assert ids(store, max_duration_s=-1.0) == set()
+            assert ids(store, min_duration_s=float("inf")) == set()
             if store.get(done.job_id).status is JobStatus.RUNNING:
                 store.succeed(held, message="", summary={})
-        assert waiting.job_id not in ids(max_duration_s=1e300)
+        assert waiting.job_id not in ids(store, max_duration_s=1e300)
 
     # --- the line
 
@@ -292,33 +292,25 @@ class StoreContract(DatabaseContract):
         assert store.claim("a", lease_s=1.0, max_attempts=3) is None
 
     def test_a_claimed_job_is_held_with_a_lease(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store, "driver-1", lease_s=100.0)
+        held = running(store, "driver-1", lease_s=100.0)
         assert (held.status, held.lease_owner, held.attempt) == (JobStatus.RUNNING, "driver-1", 1)
-        assert held.lease_until is not None
-        assert held.started_at is not None
         assert held.lease_until - held.started_at == dt.timedelta(seconds=100)
         assert store.get(held.job_id) == held
 
     def test_renewing_lengthens_the_lease(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store, lease_s=1.0)
+        held = running(store, lease_s=1.0)
         assert store.renew(held, lease_s=HOUR_S) is False
         renewed = store.get(held.job_id)
-        assert renewed.lease_until is not None
-        assert held.lease_until is not None
         assert renewed.lease_until > held.lease_until + dt.timedelta(minutes=30)
 
     def test_a_lease_that_was_not_taken_can_still_be_renewed(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store, lease_s=SOON_S)
+        held = running(store, lease_s=SOON_S)
         until(lambda: held.lease_until is not None and store.now() > held.lease_until)
         assert store.renew(held, lease_s=HOUR_S) is False
         assert store.claim("b", lease_s=1.0, max_attempts=3) is None
 
     def test_an_expired_lease_passes_to_the_next_driver_and_the_first_can_write_no_more(self, store: JobStore) -> None:
-        submit(store)
-        first = claim(store, "a", lease_s=SOON_S)
+        first = running(store, "a", lease_s=SOON_S)
         second = until(lambda: store.claim("b", lease_s=HOUR_S, max_attempts=3))
         assert (second.job_id, second.attempt, second.lost_attempts) == (first.job_id, 2, 1)
         assert second.started_at == first.started_at
@@ -338,8 +330,7 @@ class StoreContract(DatabaseContract):
         assert any("a was silent" in event.message for event in store.events(first.job_id))
 
     def test_the_same_driver_with_an_older_attempt_can_write_no_more(self, store: JobStore) -> None:
-        submit(store)
-        first = claim(store, "a", lease_s=SOON_S)
+        first = running(store, "a", lease_s=SOON_S)
         until(lambda: store.claim("a", lease_s=HOUR_S, max_attempts=3))
         with pytest.raises(LeaseLostError):
             store.succeed(first, message="", summary={})
@@ -357,7 +348,6 @@ class StoreContract(DatabaseContract):
         until(lambda: store.claim("c", lease_s=9, max_attempts=2) or store.get(job.job_id).status.is_over)
         failed = store.get(job.job_id)
         assert failed.status is JobStatus.FAILED
-        assert failed.failure is not None
         assert failed.failure.fault is Fault.LOST
         assert "2 drivers" in failed.failure.detail
         assert failed.lost_attempts == 2
@@ -365,29 +355,23 @@ class StoreContract(DatabaseContract):
         assert statuses(store, job) == ["accepted", "running", "accepted", "running", "failed"]
 
     def test_a_released_job_is_claimed_again_at_once_and_loses_nothing(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store, "a")
+        held = running(store, "a")
         store.release(held, lost=False, message="the driver stops")
         waiting = store.get(held.job_id)
         assert (waiting.status, waiting.message) == (JobStatus.ACCEPTED, "the driver stops")
         again = claim(store, "b")
         assert (again.attempt, again.lost_attempts, again.lease_owner) == (2, 0, "b")
 
-    def test_a_job_released_for_later_waits_until_then(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store)
+    def test_a_job_released_for_later_waits_until_then(self, store: JobStore, held: Job) -> None:
         store.release(held, lost=True, retry_after_s=HOUR_S)
         assert store.claim("b", lease_s=1.0, max_attempts=3) is None
-        submit(store)
-        held = claim(store)
+        held = running(store)
         store.release(held, lost=True, retry_after_s=0.05)
         assert until(lambda: store.claim("b", lease_s=HOUR_S, max_attempts=3)).lost_attempts == 1
 
     # --- the end
 
-    def test_a_success_has_its_summary_and_is_final(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store)
+    def test_a_success_has_its_summary_and_is_final(self, store: JobStore, held: Job) -> None:
         store.succeed(held, message="80 buildings", summary={"counts": {"ok": 80}, "total_s": 1.5})
         done = store.get(held.job_id)
         assert (done.status, done.progress, done.message) == (JobStatus.SUCCESSFUL, 100, "80 buildings")
@@ -402,9 +386,7 @@ class StoreContract(DatabaseContract):
                 write()
         assert store.dismiss(held.job_id) == done
 
-    def test_a_failure_has_its_cause(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store)
+    def test_a_failure_has_its_cause(self, store: JobStore, held: Job) -> None:
         failure = JobFailure(fault=Fault.SETTINGS, detail="cell_size_m is 0")
         store.fail(held, failure)
         failed = store.get(held.job_id)
@@ -416,9 +398,7 @@ class StoreContract(DatabaseContract):
         assert store.claim("a", lease_s=1.0, max_attempts=3) is None
         assert statuses(store, job) == ["accepted", "dismissed"]
 
-    def test_the_driver_of_a_running_job_is_asked_to_let_go(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store)
+    def test_the_driver_of_a_running_job_is_asked_to_let_go(self, store: JobStore, held: Job) -> None:
         asked = store.dismiss(held.job_id)
         assert (asked.status, asked.dismiss_requested) == (JobStatus.RUNNING, True)
         assert store.dismiss(held.job_id).status is JobStatus.RUNNING
@@ -426,16 +406,13 @@ class StoreContract(DatabaseContract):
         store.dismissed(held)
         assert store.get(held.job_id).status is JobStatus.DISMISSED
 
-    def test_a_released_job_that_was_to_be_dismissed_is_dismissed(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store)
+    def test_a_released_job_that_was_to_be_dismissed_is_dismissed(self, store: JobStore, held: Job) -> None:
         store.dismiss(held.job_id)
         store.release(held, lost=False)
         assert store.get(held.job_id).status is JobStatus.DISMISSED
 
     def test_a_job_whose_driver_died_while_it_was_to_be_dismissed_is_dismissed(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store, lease_s=1.0)
+        held = running(store, lease_s=1.0)
         store.dismiss(held.job_id)
 
         def over() -> bool:
@@ -445,8 +422,7 @@ class StoreContract(DatabaseContract):
         assert until(over)
 
     def test_a_job_whose_driver_is_lost_is_dismissed_at_once(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store, lease_s=SOON_S)
+        held = running(store, lease_s=SOON_S)
         until(lambda: held.lease_until is not None and store.now() > held.lease_until)
         assert store.dismiss(held.job_id).status is JobStatus.DISMISSED
         with pytest.raises(LeaseLostError):
@@ -478,13 +454,9 @@ class StoreContract(DatabaseContract):
 
     # --- events
 
-    def test_events_carry_progress_stage_and_message_to_the_job(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store)
-        store.record(
-            held,
-            [happened("stage", stage="split"), happened("progress", stage="split", done=1, total=4, progress=20)],
-        )
+    def test_events_carry_progress_stage_and_message_to_the_job(self, store: JobStore, held: Job) -> None:
+        split = happened("progress", stage="split", done=1, total=4, progress=20)
+        store.record(held, [happened("stage", stage="split"), split])
         store.record(held, [happened("progress", progress=10, message="two workers are back")])
         job = store.get(held.job_id)
         assert (job.progress, job.stage, job.message) == (20, "split", "two workers are back")
@@ -492,17 +464,13 @@ class StoreContract(DatabaseContract):
         assert last.at >= job.created_at
         assert last.progress == 20
 
-    def test_progress_starts_again_with_the_next_attempt(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store)
+    def test_progress_starts_again_with_the_next_attempt(self, store: JobStore, held: Job) -> None:
         store.record(held, [happened("progress", stage="split", progress=60)])
         store.release(held, lost=False)
         again = claim(store)
         assert (again.progress, again.stage) == (0, "")
 
-    def test_the_latest_progress_of_each_stage_is_kept(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store)
+    def test_the_latest_progress_of_each_stage_is_kept(self, store: JobStore, held: Job) -> None:
         for done in range(1, 6):
             for stage in ("ingest", "split"):
                 store.record(held, [happened("progress", stage=stage, done=done, total=5, progress=done)])
@@ -510,9 +478,7 @@ class StoreContract(DatabaseContract):
         assert kept == [("ingest", 5), ("split", 5)]
         assert [event.sequence for event in store.events(held.job_id)] == [1, 2, 11, 12]
 
-    def test_the_events_of_a_job_stay_few(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store)
+    def test_the_events_of_a_job_stay_few(self, store: JobStore, held: Job) -> None:
         for number in range(5):
             store.record(held, [happened(message=f"{number}.{k}") for k in range(MAX_KEPT // 2)])
         kept = store.events(held.job_id, limit=10 * MAX_KEPT)
@@ -520,22 +486,16 @@ class StoreContract(DatabaseContract):
         assert len(kept) == 2 + MAX_KEPT
         assert kept[-1].message == f"4.{MAX_KEPT // 2 - 1}"
 
-    def test_events_are_read_on_from_a_number_and_in_pages(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store)
+    def test_events_are_read_on_from_a_number_and_in_pages(self, store: JobStore, held: Job) -> None:
         store.record(held, [happened(message=str(n)) for n in range(5)])
         assert [event.sequence for event in store.events(held.job_id, after=3, limit=2)] == [4, 5]
         assert store.events(held.job_id, after=7) == []
         assert store.events(held.job_id, after=10**30) == []
         assert len(store.events(held.job_id, after=-5)) == 7
 
-    def test_events_have_numbers_without_gaps_however_many_write(self, store: JobStore) -> None:
-        submit(store)
-        held = claim(store)
+    def test_events_have_numbers_without_gaps_however_many_write(self, store: JobStore, held: Job) -> None:
         with ThreadPoolExecutor(12) as crew:
-            list(
-                crew.map(lambda n: store.record(held, [happened(message=f"{n}"), happened(message=f"{n}")]), range(60))
-            )
+            list(crew.map(lambda n: store.record(held, [happened(message=f"{n}")] * 2), range(60)))
         found = store.events(held.job_id)
         assert [event.sequence for event in found] == list(range(1, 123))
         # what was recorded together stands together
@@ -607,7 +567,6 @@ class StoreContract(DatabaseContract):
         assert store.key_by_digest(digest_of("other")) is None
         store.revoke_key(key.key_id)
         found = store.key_by_digest(digest_of(secret))
-        assert found is not None
         assert found.revoked_at is not None
         store.revoke_key(key.key_id)
         assert store.keys() == [found]
@@ -627,13 +586,11 @@ class StoreContract(DatabaseContract):
 
         with ThreadPoolExecutor(8) as crew:
             claimed = [job_id for found in crew.map(drain, map(str, range(8))) for job_id in found]
-        assert len(claimed) == 60
-        assert len(set(claimed)) == 60
+        assert len(set(claimed)) == len(claimed) == 60
 
     def test_only_one_of_many_finishes_a_job(self, store: JobStore) -> None:
         for _ in range(10):
-            submit(store)
-            held = claim(store)
+            held = running(store)
             gate = threading.Barrier(6)
 
             def finish(number: int, held: Job = held, gate: threading.Barrier = gate) -> bool:
@@ -678,7 +635,7 @@ class StoreContract(DatabaseContract):
                 crew[number % 3].wait()
                 crew[number % 3] = start(f"q{number}")
             for one in crew:
-                assert one.wait(DEADLINE_S) == 0
+                assert one.wait(LONG_S) == 0
         finally:
             for one in crew:
                 one.kill()

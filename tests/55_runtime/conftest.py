@@ -16,6 +16,7 @@ from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate
 from pipeline.reconstruct import reconstruct_building
 from pipeline.ruler.simulation.dataset import simulate
+from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.monitoring.measurement import Measured, measure
 from pipeline.runtime.request import RunRequest
@@ -27,17 +28,13 @@ from pipeline.settings import RunSettings
 @pytest.fixture(scope="session")
 def suburb(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A LAZ tile of about 70 x 70 m with a few houses and trees."""
-    folder = tmp_path_factory.mktemp("suburb")
-    simulate("suburb", folder, 3, size_m=(70.0, 70.0), density_per_m2=4.0)
-    return folder / "suburb.laz"
+    return simulate("suburb", tmp_path_factory.mktemp("suburb"), 3, size_m=(70.0, 70.0), density_per_m2=4.0).laz
 
 
 @pytest.fixture(scope="session")
 def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A LAZ tile of about 220 x 200 m: rows of touching houses at several levels, streets, trees."""
-    folder = tmp_path_factory.mktemp("town")
-    simulate("town", folder, 5, size_m=(220.0, 200.0), density_per_m2=3.0)
-    return folder / "town.laz"
+    return simulate("town", tmp_path_factory.mktemp("town"), 5, size_m=(220.0, 200.0), density_per_m2=3.0).laz
 
 
 @pytest.fixture(scope="session")
@@ -94,6 +91,24 @@ def reconstruct(tmp_path: Path) -> Reconstruct:
             **fields,
         )
         return run(request, executor=executor)
+
+    return go
+
+
+@pytest.fixture
+def run_classify(tmp_path: Path) -> Callable[..., ClassifySummary]:
+    """Classify serially, classes ignored, into a fresh folder, as `reconstruct` does."""
+    numbers = iter(range(1000))
+
+    def go(*paths: Path, settings: dict[str, Any] | None = None, executor: Any = None, **fields: Any) -> Any:
+        request = ClassifyRequest(
+            inputs=tuple(str(path) for path in paths),
+            out=fields.pop("out", str(tmp_path / f"classified-{next(numbers)}")),
+            settings=RunSettings.from_mapping({"classes": "ignore", **(settings or {})}),
+            resources=Resources(workers=fields.pop("workers", 0)),
+            **fields,
+        )
+        return classify(request, executor=executor)
 
     return go
 

@@ -96,16 +96,18 @@ class ClumsyExecutor(SerialExecutor):
             yield ways[0].result()
 
 
+Start = Callable[..., RunSummary]
+Tasks = dict[str, list[Any]]
+
+
 @pytest.fixture
-def start(suburb: Path, tmp_path: Path) -> Callable[..., RunSummary]:
+def start(suburb: Path, tmp_path: Path) -> Start:
     """Run the suburb serially into `tmp_path/run`, in tiles of 40 m."""
 
     def go(out: str = "run", **options: Any) -> RunSummary:
         settings = RunSettings.from_mapping({"tile_size_m": 40.0})
-        request = RunRequest(
-            inputs=(str(suburb),), out=str(tmp_path / out), settings=settings, resources=SERIAL, overwrite=True
-        )
-        return run(request, **options)
+        place = {"inputs": (str(suburb),), "out": str(tmp_path / out), "overwrite": True}
+        return run(RunRequest(**place, settings=settings, resources=SERIAL), **options)
 
     return go
 
@@ -123,7 +125,7 @@ def results_of(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_run_is_cancelled_in_any_stage(
-    stage: str, start: Callable[..., RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stage: str, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reached = threading.Event()
     marked = threading.Event()
@@ -148,14 +150,14 @@ def test_a_run_is_cancelled_in_any_stage(
     assert "scratch" not in {path.name.lstrip(".").split(".")[0] for path in (tmp_path / "run").iterdir()}
 
 
-def test_a_run_that_was_cancelled_can_be_started_again(start: Callable[..., RunSummary]) -> None:
+def test_a_run_that_was_cancelled_can_be_started_again(start: Start) -> None:
     whole = start("whole")
     with pytest.raises(RunCancelledError):
         start(cancelled=lambda: True)
     assert start().digest == whole.digest
 
 
-def test_an_interrupt_from_the_keyboard_is_a_cancelled_run(start: Callable[..., RunSummary], tmp_path: Path) -> None:
+def test_an_interrupt_from_the_keyboard_is_a_cancelled_run(start: Start, tmp_path: Path) -> None:
     def on_event(event: Event) -> None:
         if event.kind == "progress" and event.stage == "split":
             raise KeyboardInterrupt
@@ -166,7 +168,7 @@ def test_an_interrupt_from_the_keyboard_is_a_cancelled_run(start: Callable[..., 
     assert not (tmp_path / "run" / "scratch").exists()
 
 
-def test_a_listener_that_fails_fails_the_run(start: Callable[..., RunSummary], tmp_path: Path) -> None:
+def test_a_listener_that_fails_fails_the_run(start: Start, tmp_path: Path) -> None:
     def on_event(event: Event) -> None:
         if event.stage == "reconstruct":
             raise LookupError("the job is another driver's")
@@ -180,14 +182,14 @@ def test_a_listener_that_fails_fails_the_run(start: Callable[..., RunSummary], t
 
 
 @pytest.fixture
-def late(start: Callable[..., RunSummary]) -> dict[str, list[Any]]:
+def late(start: Start) -> Tasks:
     """The tasks of a run that is over."""
     executor = RecordingExecutor()
     start(executor=executor)
     return executor.tasks
 
 
-def test_no_late_task_changes_a_run_that_is_over(late: dict[str, list[Any]], tmp_path: Path) -> None:
+def test_no_late_task_changes_a_run_that_is_over(late: Tasks, tmp_path: Path) -> None:
     before = files_below(tmp_path / "run")
     for tasks in late.values():
         for task in tasks:
@@ -196,9 +198,7 @@ def test_no_late_task_changes_a_run_that_is_over(late: dict[str, list[Any]], tmp
     assert files_below(tmp_path / "run") == before
 
 
-def test_a_late_task_does_not_meet_the_scratch_of_the_next_run(
-    late: dict[str, list[Any]], start: Callable[..., RunSummary]
-) -> None:
+def test_a_late_task_does_not_meet_the_scratch_of_the_next_run(late: Tasks, start: Start) -> None:
     refused = []
 
     def on_event(event: Event) -> None:
@@ -232,7 +232,7 @@ def test_scratch_that_is_gone_is_not_made_again(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_tasks_that_died_half_way_and_tasks_that_run_twice_at_once_change_nothing(
-    start: Callable[..., RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = start("whole")
     clumsy = ClumsyExecutor(Deaths(monkeypatch))

@@ -26,32 +26,11 @@ from pipeline.io import open_source
 from pipeline.io.las_frame import read_frame
 from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.runtime.monitoring.events import Event
-from pipeline.runtime.resources import SERIAL, Resources
+from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
-from pipeline.settings import RunSettings
 
 Classify = Callable[..., ClassifySummary]
 NAMES = {1: "other", 2: "ground", 5: "vegetation", 6: "building", 7: "noise"}
-
-
-@pytest.fixture
-def run_classify(tmp_path: Path) -> Classify:
-    """Classify serially into a fresh folder: `run_classify(*paths, settings={...}, executor=..., **fields)`."""
-    numbers = iter(range(1000))
-
-    def go(
-        *paths: Path, settings: dict[str, Any] | None = None, executor: Any = None, **fields: Any
-    ) -> ClassifySummary:
-        request = ClassifyRequest(
-            inputs=tuple(str(path) for path in paths),
-            out=fields.pop("out", str(tmp_path / f"classified-{next(numbers)}")),
-            settings=RunSettings.from_mapping(settings or {"classes": "ignore"}),
-            resources=Resources(workers=fields.pop("workers", 0)),
-            **fields,
-        )
-        return classify(request, executor=executor)
-
-    return go
 
 
 def classes_in(summary: ClassifySummary, number: int = 0) -> np.ndarray[Any, Any]:
@@ -138,10 +117,10 @@ def test_every_record_of_the_header_is_kept_byte_for_byte(rich: Path, run_classi
 def test_tiles_order_and_files_do_not_change_a_class(
     size_m: float, true_suburb: Path, run_classify: Classify, shuffled: Any, tmp_path: Path
 ) -> None:
-    whole = classes_in(run_classify(true_suburb, settings={"classes": "ignore", "tile_size_m": 1000.0}))
+    whole = classes_in(run_classify(true_suburb, settings={"tile_size_m": 1000.0}))
     cut = run_classify(
         true_suburb,
-        settings={"classes": "ignore", "tile_size_m": size_m, "lattice_x_m": 7.3, "lattice_y_m": -11.9},
+        settings={"tile_size_m": size_m, "lattice_x_m": 7.3, "lattice_y_m": -11.9},
         executor=shuffled(3),
     )
     assert (classes_in(cut) == whole).all()
@@ -154,7 +133,7 @@ def test_tiles_order_and_files_do_not_change_a_class(
         part = laspy.LasData(las.header)
         part.points = las.points[chosen]
         part.write(tmp_path / f"{name}.laz")
-    both = run_classify(tmp_path / "a.laz", tmp_path / "b.laz", settings={"classes": "ignore", "tile_size_m": size_m})
+    both = run_classify(tmp_path / "a.laz", tmp_path / "b.laz", settings={"tile_size_m": size_m})
     for number, chosen in enumerate(parts):
         assert (classes_in(both, number) == whole[chosen]).all()
 
@@ -163,7 +142,7 @@ def test_tiles_order_and_files_do_not_change_a_class(
 def test_delft_in_two_grids_gets_the_same_classes(shared_data: Path, run_classify: Classify) -> None:
     tiles = [shared_data / "ahn3" / name for name in ("delft_west.laz", "delft_east.laz")]
     grids = {"tile_size_m": 1000.0}, {"tile_size_m": 83.7, "lattice_x_m": 31.4, "lattice_y_m": -15.9}
-    runs = [run_classify(*tiles, crs="EPSG:7415", settings={"classes": "ignore", **grid}) for grid in grids]
+    runs = [run_classify(*tiles, crs="EPSG:7415", settings=grid) for grid in grids]
     for number, tile in enumerate(sorted(tiles)):
         old, (one, two) = laspy.read(tile), (classes_in(run, number) for run in runs)
         assert (one == two).all()
@@ -174,7 +153,7 @@ def test_delft_in_two_grids_gets_the_same_classes(shared_data: Path, run_classif
 
 @pytest.mark.slow
 def test_two_dask_workers_write_the_bytes_of_a_serial_run(true_suburb: Path, run_classify: Classify) -> None:
-    tiles = {"classes": "ignore", "tile_size_m": 40.0}
+    tiles = {"tile_size_m": 40.0}
     serial, cluster = run_classify(true_suburb, settings=tiles), run_classify(true_suburb, settings=tiles, workers=2)
     assert Path(serial.files[0].path).read_bytes() == Path(cluster.files[0].path).read_bytes()
 
@@ -321,10 +300,26 @@ def test_an_interruption_leaves_whole_files_and_no_scratch(
     assert [path.name for path in (tmp_path / "out").iterdir()] == left
 
 
-def test_a_copc_file_becomes_plain_laz(
-    true_suburb: Path, run_classify: Classify, shared_copc: Callable[[Path, Path], Path], tmp_path: Path
-) -> None:
-    path = shared_copc(true_suburb, tmp_path / "suburb.copc.laz")
+def write_copc(source: Path, target: Path) -> Path:
+    """A LAZ file made to look like COPC: the info record first, and a hierarchy page of one node as extended record."""
+    las = laspy.read(source)
+    modern = laspy.convert(las, point_format_id=6, file_version="1.4")
+    modern.header.add_crs(pyproj.CRS.from_epsg(7415))
+    low, high = np.array(las.header.mins), np.array(las.header.maxs)
+    center, half = (low + high) / 2.0, float((high - low).max()) / 2.0 + 0.01
+    plain = target.with_name("plain.laz")
+    modern.write(plain)
+    size = plain.stat().st_size + 54 + 160
+    page = struct.pack("<iiiiQii", 0, 0, 0, 0, 0, 0, 0)
+    info = struct.pack("<5dQQ2d", *center, half, 1.0, size + 60, len(page), 0.0, 0.0) + b"\0" * 88
+    modern.header.vlrs.insert(0, laspy.VLR("copc", 1, "", info))
+    modern.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("copc", 1000, "", page)])
+    modern.write(target)
+    return target
+
+
+def test_a_copc_file_becomes_plain_laz(true_suburb: Path, run_classify: Classify, tmp_path: Path) -> None:
+    path = write_copc(true_suburb, tmp_path / "suburb.copc.laz")
     assert open_source(path).info.format == "copc"
     summary = run_classify(path)
     assert Path(summary.files[0].path).name == "suburb.laz"
@@ -333,29 +328,6 @@ def test_a_copc_file_becomes_plain_laz(
     assert frame.extended == ()
     old, new = laspy.read(path), laspy.read(summary.files[0].path)
     assert (np.asarray(new.X) == np.asarray(old.X)).all()
-
-
-@pytest.fixture
-def shared_copc() -> Callable[[Path, Path], Path]:
-    """Makes a LAZ file look like COPC: the info record first, and a hierarchy page of one node as extended record."""
-
-    def make(source: Path, target: Path) -> Path:
-        las = laspy.read(source)
-        modern = laspy.convert(las, point_format_id=6, file_version="1.4")
-        modern.header.add_crs(pyproj.CRS.from_epsg(7415))
-        low, high = np.array(las.header.mins), np.array(las.header.maxs)
-        center, half = (low + high) / 2.0, float((high - low).max()) / 2.0 + 0.01
-        plain = target.with_name("plain.laz")
-        modern.write(plain)
-        size = plain.stat().st_size + 54 + 160
-        page = struct.pack("<iiiiQii", 0, 0, 0, 0, 0, 0, 0)
-        info = struct.pack("<5dQQ2d", *center, half, 1.0, size + 60, len(page), 0.0, 0.0) + b"\0" * 88
-        modern.header.vlrs.insert(0, laspy.VLR("copc", 1, "", info))
-        modern.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("copc", 1000, "", page)])
-        modern.write(target)
-        return target
-
-    return make
 
 
 def test_what_a_killed_command_left_is_removed_and_reported_by_the_next_into_the_same_folder(

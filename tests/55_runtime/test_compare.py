@@ -39,8 +39,11 @@ def request(suburb: Path, out: Path, **fields: object) -> CompareRequest:
     return CompareRequest(run=dataclasses.replace(run_request, **fields), variants=BOTH)
 
 
+Compared = tuple[CompareSummary, list[Event]]
+
+
 @pytest.fixture(scope="module")
-def compared(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[CompareSummary, list[Event]]:
+def compared(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> Compared:
     """Both presets of Fuzzy SART on the suburb, and the events meanwhile."""
     events: list[Event] = []
     return compare(request(suburb, tmp_path_factory.mktemp("compared") / "out"), events.append), events
@@ -48,7 +51,7 @@ def compared(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Co
 
 @pytest.mark.parametrize("variant", BOTH, ids=lambda variant: variant.label)
 def test_each_variant_has_the_content_of_a_run_of_its_own(
-    suburb: Path, compared: tuple[CompareSummary, list[Event]], variant: Variant, tmp_path: Path
+    suburb: Path, compared: Compared, variant: Variant, tmp_path: Path
 ) -> None:
     settings = RunSettings.from_mapping({"method": variant.method, "preset": variant.preset})
     alone = run(RunRequest(inputs=(str(suburb),), out=str(tmp_path / "alone"), settings=settings, resources=SERIAL))
@@ -60,24 +63,23 @@ def test_each_variant_has_the_content_of_a_run_of_its_own(
         assert manifests[0][name] == manifests[1][name], name
 
 
-def test_the_presets_differ(compared: tuple[CompareSummary, list[Event]]) -> None:
+def test_the_presets_differ(compared: Compared) -> None:
     assert len({found.digest for found in compared[0].runs.values()}) == 2
 
 
-def test_candidates_are_found_once_and_modelled_once_a_variant(compared: tuple[CompareSummary, list[Event]]) -> None:
+def test_candidates_are_found_once_and_modelled_once_a_variant(compared: Compared) -> None:
     summary, events = compared
     stages = [event.stage for event in events if event.kind == "stage"]
     assert stages == ["ingest", "split", "join", "outline", "reconstruct", "reconstruct", "publish", "publish"]
     candidates = summary.runs["fuzzy-sart"].counts["candidates"]
-    counted = [
-        (event.done, event.total) for event in events if (event.kind, event.stage) == ("progress", "reconstruct")
-    ]
+    modelled = [event for event in events if event.stage == "reconstruct"]
+    counted = [(event.done, event.total) for event in modelled if event.kind == "progress"]
     assert counted == sorted(counted)
     assert counted[-1] == (2 * candidates, 2 * candidates)
-    assert {event.total for event in events if event.stage == "reconstruct"} == {2 * candidates}
+    assert {event.total for event in modelled} == {2 * candidates}
 
 
-def test_every_building_has_its_seconds(compared: tuple[CompareSummary, list[Event]]) -> None:
+def test_every_building_has_its_seconds(compared: Compared) -> None:
     summary, _ = compared
     first, second = summary.seconds.values()
     assert set(first) == set(second)
@@ -85,7 +87,7 @@ def test_every_building_has_its_seconds(compared: tuple[CompareSummary, list[Eve
     assert min(first.values()) > 0.0
 
 
-def test_nothing_but_the_runs_is_left(compared: tuple[CompareSummary, list[Event]]) -> None:
+def test_nothing_but_the_runs_is_left(compared: Compared) -> None:
     out = Path(compared[0].out)
     assert [entry.name for entry in out.iterdir()] == ["runs"]
     assert sorted(entry.name for entry in (out / "runs").iterdir()) == ["fuzzy-sart", "fuzzy-sart-faithful"]
@@ -118,20 +120,14 @@ def test_another_comparison_replaces_all_of_the_earlier_one_when_asked(suburb: P
     assert not stale.exists()
 
 
-def test_a_folder_of_something_else_is_never_replaced(suburb: Path, tmp_path: Path) -> None:
-    (tmp_path / "thesis.docx").write_text("years of work")
-    with pytest.raises(RunError, match="is no comparison"):
-        compare(request(suburb, tmp_path, overwrite=True))
-    assert (tmp_path / "thesis.docx").exists()
-
-
-def test_what_only_looks_like_a_broken_comparison_is_never_replaced(suburb: Path, tmp_path: Path) -> None:
-    (tmp_path / "runs" / "of-mine").mkdir(parents=True)
-    (tmp_path / "runs" / "of-mine" / "run.json").write_text("{}")
-    (tmp_path / "thesis.docx").write_text("years of work")
+@pytest.mark.parametrize("files", [["thesis.docx"], ["thesis.docx", "runs/of-mine/run.json"]], ids=["other", "alike"])
+def test_a_folder_of_something_else_is_never_replaced(suburb: Path, tmp_path: Path, files: list[str]) -> None:
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("{}")
     with pytest.raises(RunError, match=r"holds thesis\.docx and is no comparison"):
         compare(request(suburb, tmp_path, overwrite=True))
-    assert (tmp_path / "runs" / "of-mine" / "run.json").exists()
+    assert all((tmp_path / name).exists() for name in files)
 
 
 def test_no_page_of_an_earlier_comparison_stands_beside_runs_that_were_cancelled(suburb: Path, tmp_path: Path) -> None:

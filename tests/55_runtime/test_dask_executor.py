@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import chores
 import dask
 import psutil
 import pytest
@@ -29,9 +29,11 @@ from pipeline.runtime.monitoring.measurement import Measured, measure_packed, pa
 from pipeline.runtime.monitoring.versions import ENGINE, differences, fingerprint, versions_here, versions_of
 from pipeline.runtime.resources import Resources
 
-sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
 
-import chores
+def worked_off(cluster: Cluster, stage: str, function: Callable[[Any], Any], tasks: Iterable[Any]) -> list[Any]:
+    """Results of a map on a cluster, as they came."""
+    with cluster.executor() as executor:
+        return [measured.result for measured in executor.map(stage, function, list(tasks), Watch())]
 
 
 def collect(running: Iterable[Measured[int]], results: list[int]) -> None:
@@ -78,9 +80,7 @@ def test_workers_are_forked_from_one_server_and_their_children_from_what_they_we
 
 def test_several_runs_share_one_cluster_at_once(cluster: Cluster) -> None:
     def go(first: int) -> list[int]:
-        with cluster.executor() as executor:
-            tasks = range(first, first + 20)
-            return sorted(measured.result for measured in executor.map("double", chores.double, tasks, Watch()))
+        return sorted(worked_off(cluster, "double", chores.double, range(first, first + 20)))
 
     with ThreadPoolExecutor(4) as threads:
         found = list(threads.map(go, (0, 100, 200, 300)))
@@ -94,9 +94,7 @@ def test_a_fault_of_a_task_is_raised_as_it_is(cluster: Cluster) -> None:
 
 def test_a_task_whose_worker_dies_runs_again_elsewhere(cluster: Cluster, tmp_path: Path) -> None:
     tasks = [(str(tmp_path), number, 1) for number in range(3)]
-    with cluster.executor() as executor:
-        results = [measured.result for measured in executor.map("die", chores.die_at_first, tasks, Watch())]
-    assert sorted(results) == [0, 1, 2]
+    assert sorted(worked_off(cluster, "die", chores.die_at_first, tasks)) == [0, 1, 2]
     for number in range(3):
         assert len(list(tmp_path.glob(f"{number}.*"))) >= 2
 
@@ -107,18 +105,14 @@ def test_only_the_task_that_kills_its_workers_again_and_again_is_blamed(cluster:
     with cluster.executor() as executor, pytest.raises(RunError, match=r"stage die: .* when it ran alone: 5\. "):
         collect(executor.map("die", chores.die_if_five, range(12), Watch()), results)
     assert set(results) <= set(range(12)) - {5}
-    with cluster.executor() as executor:
-        left = [measured.result for measured in executor.map("double", chores.double, range(8), Watch())]
-    assert sorted(left) == [2 * n for n in range(8)]
+    assert sorted(worked_off(cluster, "double", chores.double, range(8))) == [2 * n for n in range(8)]
 
 
 @pytest.mark.slow
 def test_tasks_under_suspicion_are_tried_alone_and_none_is_lost(cluster: Cluster, tmp_path: Path) -> None:
     # more deaths than Dask allows a task; what was on the same workers is suspected with it
     tasks = [(str(tmp_path), number, 3 if number == 5 else 0) for number in range(12)]
-    with cluster.executor() as executor:
-        results = [measured.result for measured in executor.map("die", chores.die_at_first, tasks, Watch())]
-    assert sorted(results) == list(range(12))
+    assert sorted(worked_off(cluster, "die", chores.die_at_first, tasks)) == list(range(12))
 
 
 @pytest.mark.slow
@@ -127,11 +121,8 @@ def test_a_keeper_stays_while_it_starts_its_worker_anew_and_one_that_gave_up_is_
     with dask.config.set({"distributed.deploy.lost-worker-timeout": "1 ms"}):
         with Cluster(workers=1) as one, one.executor() as executor:
             keeper = one._embedded.workers[0]
-            found = [
-                measured.result
-                for measured in executor.map("die", chores.die_at_first, [(str(tmp_path), 7, 1)], Watch())
-            ]
-            assert found == [7]
+            (found,) = executor.map("die", chores.die_at_first, [(str(tmp_path), 7, 1)], Watch())
+            assert found.result == 7
             assert one._embedded.workers[0] is keeper
             assert keeper.status == Status.running
             one._embedded.sync(keeper.close)
@@ -197,8 +188,7 @@ def test_a_cancelled_run_stops_its_tasks_and_waits_for_them(cluster: Cluster, tm
                 way.result(LONG_S)
     begun = len(list(tmp_path.glob("started-*")))
     assert begun < len(tasks)
-    with cluster.executor() as executor:
-        assert [m.result for m in executor.map("double", chores.double, [4], Watch())] == [8]
+    assert worked_off(cluster, "double", chores.double, [4]) == [8]
     assert len(list(tmp_path.glob("started-*"))) == begun, "a task of the run that was cancelled began later"
 
 
@@ -258,9 +248,8 @@ class Lookouts:
         self.client = FakeScheduler()
         self.events: list[Event] = []
         self.counts: list[int] = []
-        self.monitor = ClusterMonitor(
-            self.client, "tcp://s:8786", self.counts.append, "Start one", clock=lambda: self.now_s
-        )
+        tell = self.counts.append
+        self.monitor = ClusterMonitor(self.client, "tcp://s:8786", tell, "Start one", clock=lambda: self.now_s)
 
     def pass_time(self, seconds: float) -> None:
         """Look once a second for a while."""

@@ -50,8 +50,11 @@ def no_children_left() -> Iterator[None]:
     assert ours() == []
 
 
+Ask = Callable[..., Any]
+
+
 @pytest.fixture
-def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ask:
     """Evaluates an expression in a fresh child that has loaded a module of the test."""
     (tmp_path / "loaded_by_a_test.py").write_text(PROGRAM)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
@@ -82,20 +85,20 @@ def servers() -> list[psutil.Process]:
     return [process for process in found if process.status() != psutil.STATUS_ZOMBIE]
 
 
-def test_children_have_what_their_server_loaded(ask: Callable[..., Any]) -> None:
+def test_children_have_what_their_server_loaded(ask: Ask) -> None:
     loaded_by, first = ask("__import__('loaded_by_a_test').LOADED_BY, os.getpid()")
     assert [server.pid for server in servers()] == [loaded_by]
     assert ask("__import__('loaded_by_a_test').LOADED_BY") == loaded_by
     assert first != loaded_by
 
 
-def test_a_server_can_start_before_its_first_child(ask: Callable[..., Any]) -> None:
+def test_a_server_can_start_before_its_first_child(ask: Ask) -> None:
     child_pool.preload(["loaded_by_a_test"])
     (server,) = wait_for(servers, "the server")
     assert ask("__import__('loaded_by_a_test').LOADED_BY") == server.pid
 
 
-def test_a_child_reports_what_its_server_cannot_load(ask: Callable[..., Any]) -> None:
+def test_a_child_reports_what_its_server_cannot_load(ask: Ask) -> None:
     child_pool.preload(["loaded_by_a_test:fail"])
     assert ask("1 + 1") == 2
     with pytest.raises(RunError, match=r"(?s)3 times in a row.*OSError: not loaded"):
@@ -103,7 +106,7 @@ def test_a_child_reports_what_its_server_cannot_load(ask: Callable[..., Any]) ->
 
 
 def test_children_have_the_present_environment_and_folder(
-    ask: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ask: Ask, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = ask("os.getppid()")
     monkeypatch.setenv("SOME_WORD", "new")
@@ -113,7 +116,7 @@ def test_children_have_the_present_environment_and_folder(
 
 
 def test_a_change_of_a_variable_that_is_read_once_starts_another_server(
-    ask: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    ask: Ask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = ask("os.getppid()")
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
@@ -123,13 +126,11 @@ def test_a_change_of_a_variable_that_is_read_once_starts_another_server(
     wait_for(lambda: [server.pid for server in servers()] == [after], "the end of the retired server")
 
 
-def test_children_begin_with_one_thread_and_their_own_session(ask: Callable[..., Any]) -> None:
+def test_children_begin_with_one_thread_and_their_own_session(ask: Ask) -> None:
     assert ask("len(os.listdir('/proc/self/task')), os.getsid(0) == os.getpid() == os.getpgid(0)") == (2, True)
 
 
-def test_children_of_a_server_that_is_killed_die_and_the_work_is_done_by_others(
-    ask: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_children_of_a_server_that_is_killed_die_and_the_work_is_done_by_others(ask: Ask, tmp_path: Path) -> None:
     mark, go = tmp_path / "mark", tmp_path / "go"
     order = f"open('{mark}', 'a').write('1') and [time.sleep(0.02) for _ in iter(lambda: os.path.exists('{go}'), True)]"
     found: list[Any] = []
@@ -146,7 +147,7 @@ def test_children_of_a_server_that_is_killed_die_and_the_work_is_done_by_others(
     assert [other.pid for other in servers()] != [server.pid]
 
 
-def test_a_server_ignores_sigterm(ask: Callable[..., Any]) -> None:
+def test_a_server_ignores_sigterm(ask: Ask) -> None:
     server = ask("os.getppid()")
     os.kill(server, signal.SIGTERM)
     child_pool._pool._idle[0].end()
@@ -154,7 +155,7 @@ def test_a_server_ignores_sigterm(ask: Callable[..., Any]) -> None:
 
 
 def test_nothing_is_forked_from_a_process_with_threads(
-    ask: Callable[..., Any], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    ask: Ask, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(child_pool._pool, "_can_fork", True)  # restored after the test
     with caplog.at_level(logging.WARNING):
@@ -164,9 +165,7 @@ def test_nothing_is_forked_from_a_process_with_threads(
     assert "started threads" in caplog.text
 
 
-def test_children_are_spawned_if_nothing_can_be_forked(
-    ask: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_children_are_spawned_if_nothing_can_be_forked(ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(child_pool._pool, "_can_fork", False)
     assert ask("os.getppid()") == os.getpid()
     loss = ask("os.kill(os.getpid(), 11)")
@@ -174,7 +173,7 @@ def test_children_are_spawned_if_nothing_can_be_forked(
     assert servers() == []
 
 
-def test_a_child_cancelled_before_its_server_has_loaded_never_begins(ask: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_child_cancelled_before_its_server_has_loaded_never_begins(ask: Ask, tmp_path: Path) -> None:
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)  # opening it waits for a writer
     with (

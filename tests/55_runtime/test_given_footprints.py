@@ -7,17 +7,19 @@ from pathlib import Path
 from typing import Any
 
 import geopandas
-import pyarrow.dataset as ds
 import pytest
 import shapely
+from run_tables import rows
 from shapely import Point, Polygon
 
 from pipeline.errors import EmptyInputError
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.run import run
 
 
-def rows(run_dir: str) -> dict[str, dict[str, Any]]:
-    found = ds.dataset(f"{run_dir}/buildings", partitioning="hive").to_table().to_pylist()
-    return {row["source_id"]: row for row in found}
+def rows_by_source(run_dir: str) -> dict[str, dict[str, Any]]:
+    return {row["source_id"]: row for row in rows(run_dir)}
 
 
 def features(run_dir: str) -> dict[str, dict[str, Any]]:
@@ -34,15 +36,16 @@ def features(run_dir: str) -> dict[str, dict[str, Any]]:
 @pytest.fixture(scope="module")
 def houses(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Polygon]:
     """Outlines of the suburb's houses, by a run without footprints."""
-    from pipeline.runtime.request import RunRequest
-    from pipeline.runtime.resources import SERIAL
-    from pipeline.runtime.run import run
+    out = str(tmp_path_factory.mktemp("found") / "run")
+    run(RunRequest(inputs=(str(suburb),), out=out, resources=SERIAL))
+    return sorted((shapely.from_wkb(row["geometry"]).envelope for row in rows(out)), key=lambda outline: outline.bounds)
 
-    summary = run(
-        RunRequest(inputs=(str(suburb),), out=str(tmp_path_factory.mktemp("found") / "run"), resources=SERIAL)
-    )
-    found = ds.dataset(f"{summary.run_dir}/buildings").to_table(columns=["geometry"]).column("geometry").to_pylist()
-    return sorted((shapely.from_wkb(data).envelope for data in found), key=lambda polygon: polygon.bounds)
+
+def write_parquet(folder: Path, outlines: list[Any]) -> str:
+    """A GeoParquet file of outlines, numbered from 0."""
+    frame = geopandas.GeoDataFrame({"id": range(len(outlines))}, geometry=outlines, crs="EPSG:25832")
+    frame.to_parquet(folder / "a.parquet")
+    return str(folder / "a.parquet")
 
 
 def twisted(polygon: Polygon) -> Polygon:
@@ -60,7 +63,7 @@ def test_attributes_and_ids_come_out_again(
     path = tmp_path / name
     frame.to_parquet(path) if name.endswith("parquet") else frame.to_file(path)
     summary = reconstruct(suburb, footprints=str(path))
-    found = rows(summary.run_dir)
+    found = rows_by_source(summary.run_dir)
     wanted = {
         "x-1": {"id": "x-1", "status": "built", "year": 1901, "Größe": 1.5},
         "x-2": {"id": "x-2", "status": None, "year": 1955, "Größe": 2.5},
@@ -70,14 +73,8 @@ def test_attributes_and_ids_come_out_again(
     # a column of the file with the name of one of ours stays apart from it
     assert features(summary.run_dir)["x-1"]["status"] == "ok"
     report = json.loads((Path(summary.run_dir) / "footprints.json").read_text())
-    assert report == {
-        "path": str(path),
-        "used": 2,
-        "off_the_data": 0,
-        "repaired": 0,
-        "left_out": 0,
-        "issues": [],
-    }
+    counts = {"used": 2, "off_the_data": 0, "repaired": 0, "left_out": 0}
+    assert report == {"path": str(path), **counts, "issues": []}
 
 
 def test_every_fault_is_reported_by_its_id_and_none_stops_the_run(
@@ -98,16 +95,12 @@ def test_every_fault_is_reported_by_its_id_and_none_stops_the_run(
     path = tmp_path / "a.gpkg"
     geopandas.GeoDataFrame({"id": list(outlines)}, geometry=list(outlines.values()), crs="EPSG:25832").to_file(path)
     summary = reconstruct(suburb, footprints=str(path))
-    assert set(rows(summary.run_dir)) == {"good", "bow tie"}
+    assert set(rows_by_source(summary.run_dir)) == {"good", "bow tie"}
     report = json.loads((Path(summary.run_dir) / "footprints.json").read_text())
     assert (report["used"], report["off_the_data"], report["repaired"], report["left_out"]) == (2, 2, 1, 4)
-    assert {issue["source_id"]: issue["problem"] for issue in report["issues"]} == {
-        "bow tie": "invalid",
-        "empty": "empty",
-        "none": "no_geometry",
-        "point": "not_polygon",
-        "line": "no_area",
-    }
+    problems = {"bow tie": "invalid", "empty": "empty", "none": "no_geometry"}
+    problems |= {"point": "not_polygon", "line": "no_area"}
+    assert {issue["source_id"]: issue["problem"] for issue in report["issues"]} == problems
     for issue in report["issues"]:
         assert any(warning.startswith(f"footprint {issue['source_id']}: ") for warning in summary.warnings)
     assert "repaired to 2 polygons" in next(i["action"] for i in report["issues"] if i["source_id"] == "bow tie")
@@ -116,10 +109,7 @@ def test_every_fault_is_reported_by_its_id_and_none_stops_the_run(
 def test_many_faults_are_warned_of_ten_by_ten_and_listed_whole(
     suburb: Path, houses: list[Polygon], reconstruct: Any, tmp_path: Path
 ) -> None:
-    outlines = [houses[0], *[None] * 30]
-    frame = geopandas.GeoDataFrame({"id": range(31)}, geometry=outlines, crs="EPSG:25832")
-    frame.to_parquet(tmp_path / "a.parquet")
-    summary = reconstruct(suburb, footprints=str(tmp_path / "a.parquet"))
+    summary = reconstruct(suburb, footprints=write_parquet(tmp_path, [houses[0], *[None] * 30]))
     assert sum(warning.startswith("footprint ") for warning in summary.warnings) == 10
     assert "20 more faults of footprints, each in footprints.json of a run" in summary.warnings
     assert len(json.loads((Path(summary.run_dir) / "footprints.json").read_text())["issues"]) == 30
@@ -128,10 +118,8 @@ def test_many_faults_are_warned_of_ten_by_ten_and_listed_whole(
 def test_a_later_run_without_footprints_leaves_no_report_behind(
     suburb: Path, houses: list[Polygon], reconstruct: Any, tmp_path: Path
 ) -> None:
-    frame = geopandas.GeoDataFrame({"id": [1]}, geometry=houses[:1], crs="EPSG:25832")
-    frame.to_parquet(tmp_path / "a.parquet")
     out = str(tmp_path / "run")
-    reconstruct(suburb, footprints=str(tmp_path / "a.parquet"), out=out)
+    reconstruct(suburb, footprints=write_parquet(tmp_path, houses[:1]), out=out)
     assert (tmp_path / "run" / "footprints.json").is_file()
     reconstruct(suburb, out=out, overwrite=True)
     assert not (tmp_path / "run" / "footprints.json").exists()
@@ -139,10 +127,8 @@ def test_a_later_run_without_footprints_leaves_no_report_behind(
 
 
 def test_footprints_of_which_none_can_be_used_are_refused(suburb: Path, reconstruct: Any, tmp_path: Path) -> None:
-    frame = geopandas.GeoDataFrame({"id": [1, 2]}, geometry=[Polygon(), None], crs="EPSG:25832")
-    frame.to_parquet(tmp_path / "a.parquet")
     with pytest.raises(EmptyInputError, match="none of the 2 features is a polygon"):
-        reconstruct(suburb, footprints=str(tmp_path / "a.parquet"))
+        reconstruct(suburb, footprints=write_parquet(tmp_path, [Polygon(), None]))
 
 
 def test_the_footprints_of_delft_model_their_buildings_with_their_attributes(
@@ -157,7 +143,7 @@ def test_the_footprints_of_delft_model_their_buildings_with_their_attributes(
     digests = set()
     for path in (shared_data / "ahn3" / "footprints.gpkg", tmp_path / "a.parquet"):
         summary = reconstruct(*tiles, crs="EPSG:7415", footprints=str(path), bbox=window)
-        found = rows(summary.run_dir)
+        found = rows_by_source(summary.run_dir)
         inside = known[known.intersects(shapely.box(*window))].set_index("bgt_id")
         assert set(found) == set(inside.index)
         for name, row in found.items():

@@ -14,13 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-import pyarrow.dataset as ds
 import pytest
-from processes import LONG_S, wait_for
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from faults.asked import environment
+from processes import LONG_S, wait_for
+from run_tables import rows_by_id
 
 import pipeline.reconstruct
 from pipeline.errors import RunCancelledError, RunError, SettingsError
@@ -64,11 +61,6 @@ def ended(process: psutil.Process) -> bool:
         return True
 
 
-def rows(run_dir: str, table: str = "buildings") -> dict[str, dict[str, Any]]:
-    found: list[dict[str, Any]] = ds.dataset(f"{run_dir}/{table}", partitioning="hive").to_table().to_pylist()
-    return {row["building_id"]: row for row in found}
-
-
 # --- plain functions: promises of the supervisor ---------------------------------------------------------------
 
 
@@ -77,6 +69,8 @@ def outcomes(function: Callable[[Any], Any], items: list[Any], limits: Isolation
     found = dict(supervise(function, items, limits))
     return [found[index] for index in range(len(items))]
 
+
+Order = Callable[[str], str]
 
 PROGRAM = """
 import os, signal, time
@@ -89,18 +83,18 @@ def do(order):
 
 
 @pytest.fixture
-def orders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bare: None) -> Callable[[str], str]:
+def orders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bare: None) -> Order:
     """A function that executes its item as Python in the child and returns it."""
     (tmp_path / "orders_of_a_test.py").write_text(PROGRAM)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.syspath_prepend(str(tmp_path))
     import orders_of_a_test  # type: ignore[import-not-found]
 
-    do: Callable[[str], str] = orders_of_a_test.do
+    do: Order = orders_of_a_test.do
     return do
 
 
-def test_results_come_from_one_child_that_stays(orders: Callable[[str], str]) -> None:
+def test_results_come_from_one_child_that_stays(orders: Order) -> None:
     assert outcomes(orders, ["1", "2", "3"]) == ["1", "2", "3"]
     (first,) = child_processes()
     assert outcomes(orders, ["4"]) == ["4"]
@@ -125,7 +119,7 @@ def test_results_come_from_one_child_that_stays(orders: Callable[[str], str]) ->
     ],
 )
 def test_an_item_that_kills_its_process_harms_only_itself(
-    orders: Callable[[str], str], order: str, reason: Reason, words: str
+    orders: Order, order: str, reason: Reason, words: str
 ) -> None:
     before, loss, after = outcomes(orders, ["1", order, "2"])
     assert (before, after) == ("1", "2")
@@ -134,11 +128,12 @@ def test_an_item_that_kills_its_process_harms_only_itself(
     assert words in loss.detail
 
 
+ENDLESS = ["while True: pass", "import collections, itertools; collections.deque(itertools.repeat(0), maxlen=0)"]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "order", ["while True: pass", "import collections, itertools; collections.deque(itertools.repeat(0), maxlen=0)"]
-)
-def test_an_endless_item_is_ended_even_if_it_holds_the_interpreter(orders: Callable[[str], str], order: str) -> None:
+@pytest.mark.parametrize("order", ENDLESS)
+def test_an_endless_item_is_ended_even_if_it_holds_the_interpreter(orders: Order, order: str) -> None:
     before, loss, after = outcomes(orders, ["1", order, "2"], IsolationLimits(timeout_s=1.5))
     assert (before, after) == ("1", "2")
     assert isinstance(loss, Loss)
@@ -148,27 +143,28 @@ def test_an_endless_item_is_ended_even_if_it_holds_the_interpreter(orders: Calla
     assert "in do" in loss.stderr, "the traceback is there"
 
 
-def test_an_item_that_succeeds_alone_is_not_lost(orders: Callable[[str], str], tmp_path: Path) -> None:
+def test_an_item_that_succeeds_alone_is_not_lost(orders: Order, tmp_path: Path) -> None:
     first_only = f"p = '{tmp_path}/mark'\nif not os.path.exists(p): open(p, 'w').close(); os.abort()"
     assert outcomes(orders, ["1", first_only, "2"]) == ["1", first_only, "2"]
 
 
+PILES = "import sys; sys.modules['os'].__dict__.setdefault('pile', []).append(b'1' * ({mib} * 2**20))"
+
+
 @pytest.mark.slow
-def test_memory_used_by_earlier_items_is_not_blamed_on_the_last(orders: Callable[[str], str]) -> None:
-    piles = (
-        "import sys; sys.modules['os'].__dict__.setdefault('pile', []).append(b'1' * (400 * 2**20)); time.sleep(0.2)"
-    )
+def test_memory_used_by_earlier_items_is_not_blamed_on_the_last(orders: Order) -> None:
+    piles = PILES.format(mib=400) + "; time.sleep(0.2)"
     assert outcomes(orders, [piles] * 4) == [piles] * 4
 
 
-def test_a_child_that_holds_much_memory_is_replaced(orders: Callable[[str], str]) -> None:
-    piles = "import sys; sys.modules['os'].__dict__.setdefault('pile', []).append(b'1' * (700 * 2**20))"
+def test_a_child_that_holds_much_memory_is_replaced(orders: Order) -> None:
+    piles = PILES.format(mib=700)
     assert outcomes(orders, [piles]) == [piles]
     assert child_processes() == []
 
 
 @pytest.mark.slow
-def test_the_same_fault_has_the_same_detail(orders: Callable[[str], str]) -> None:
+def test_the_same_fault_has_the_same_detail(orders: Order) -> None:
     limits = IsolationLimits(timeout_s=1.0, memory_bytes=2**29)
     faults = ["os.abort()", "while True: pass", "held = [b'1' * 2**25 for _ in range(10**6)]"]
     first, again = outcomes(orders, faults, limits), outcomes(orders, faults[::-1], limits)[::-1]
@@ -179,33 +175,33 @@ LOUD = "print('x' * 10**6); os.write(1, b'y' * 10**6); os.system('echo z')"
 
 
 @pytest.mark.parametrize("order", [LOUD, f"'{'a' * 5_000_000}'"], ids=["loud", "large"])
-def test_much_output_and_a_large_result_pass_the_pipe_whole(orders: Callable[[str], str], order: str) -> None:
+def test_much_output_and_a_large_result_pass_the_pipe_whole(orders: Order, order: str) -> None:
     assert outcomes(orders, [order, "1"]) == [order, "1"]
 
 
 @pytest.mark.slow
-def test_only_the_end_of_a_childs_output_is_kept(orders: Callable[[str], str]) -> None:
+def test_only_the_end_of_a_childs_output_is_kept(orders: Order) -> None:
     loud = "for _ in range(64): os.write(2, b'y' * 2**20); time.sleep(0.02)"
     _, loss = outcomes(orders, [loud, loud + "\nprint('last words', flush=True); os.abort()"])
     assert "last words" in loss.stderr
     assert len(loss.stderr) <= 6000
 
 
-def test_an_error_of_the_function_is_raised_here(orders: Callable[[str], str]) -> None:
+def test_an_error_of_the_function_is_raised_here(orders: Order) -> None:
     with pytest.raises(PermissionError, match="not yours"):
         outcomes(orders, ["1", "raise PermissionError('not yours')"])
     with pytest.raises(RunError, match="Own: words"):  # a class that this process cannot know
         outcomes(orders, ["class Own(Exception): pass\nraise Own('words')"])
 
 
-def test_cancelling_kills_the_child_within_an_item(orders: Callable[[str], str]) -> None:
+def test_cancelling_kills_the_child_within_an_item(orders: Order) -> None:
     began = time.monotonic()
     with pytest.raises(RunCancelledError):
         dict(supervise(orders, ["while True: pass"], LIMITS, lambda: time.monotonic() - began > 0.5))
     assert child_processes() == []
 
 
-def test_a_child_killed_from_outside_costs_nothing(orders: Callable[[str], str], tmp_path: Path) -> None:
+def test_a_child_killed_from_outside_costs_nothing(orders: Order, tmp_path: Path) -> None:
     waits = f"open('{tmp_path}/reached', 'a').write('1')\nwhile not os.path.exists('{tmp_path}/go'): time.sleep(0.02)"
     found: list[Any] = []
     thread = threading.Thread(target=lambda: found.extend(outcomes(orders, ["1", waits, "2"])))
@@ -219,7 +215,7 @@ def test_a_child_killed_from_outside_costs_nothing(orders: Callable[[str], str],
     assert found == ["1", waits, "2"]
 
 
-def test_an_idle_child_that_was_killed_is_replaced(orders: Callable[[str], str]) -> None:
+def test_an_idle_child_that_was_killed_is_replaced(orders: Order) -> None:
     outcomes(orders, ["1"])
     (victim,) = child_processes()
     victim.kill()
@@ -227,7 +223,7 @@ def test_an_idle_child_that_was_killed_is_replaced(orders: Callable[[str], str])
     assert outcomes(orders, ["2"]) == ["2"]
 
 
-def test_threads_have_children_of_their_own(orders: Callable[[str], str], tmp_path: Path) -> None:
+def test_threads_have_children_of_their_own(orders: Order, tmp_path: Path) -> None:
     def meeting(me: str, other: str) -> str:
         return f"open('{tmp_path}/{me}', 'w').close()\nwhile not os.path.exists('{tmp_path}/{other}'): time.sleep(0.02)"
 
@@ -257,7 +253,7 @@ def test_children_that_cannot_start_are_an_error_with_their_output(monkeypatch: 
 
 
 def test_children_that_die_before_an_item_begins_are_an_error(
-    orders: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    orders: Order, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "orders_of_a_test.py").write_text("import os; os._exit(9)")
     with pytest.raises(RunError, match="3 times in a row before it began: its process ended with exit code 9"):
@@ -301,14 +297,10 @@ time.sleep(1000)
 """
 
 
-@pytest.mark.parametrize(
-    "order",
-    ["1", "while True: pass", "import collections, itertools; collections.deque(itertools.repeat(0), maxlen=0)"],
-    ids=["idle", "busy", "busy with the lock"],
-)
+@pytest.mark.parametrize("order", ["1", *ENDLESS], ids=["idle", "busy", "busy with the lock"])
 @pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_a_child_is_gone_when_its_worker_is_killed(
-    orders: Callable[[str], str], tmp_path: Path, order: str, sign: signal.Signals
+    orders: Order, tmp_path: Path, order: str, sign: signal.Signals
 ) -> None:
     item = f"open('{tmp_path}/reached', 'w').close()\n{order}"
     with subprocess.Popen([sys.executable, "-c", WORKER, str(tmp_path), item], stderr=subprocess.DEVNULL) as worker:
@@ -321,7 +313,7 @@ def test_a_child_is_gone_when_its_worker_is_killed(
         wait_for(lambda process=process: ended(process), "the end of the child and of its server")
 
 
-def test_a_child_outlives_the_thread_that_started_it(orders: Callable[[str], str]) -> None:
+def test_a_child_outlives_the_thread_that_started_it(orders: Order) -> None:
     thread = threading.Thread(target=lambda: outcomes(orders, ["1"]))
     thread.start()
     thread.join(LONG_S)
@@ -344,7 +336,7 @@ def test_isolation_changes_no_content(suburb: Path, reconstruct: Any) -> None:
 def test_a_building_with_an_internal_error_leaves_a_bundle_with_and_without_a_child(
     suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch, isolate: bool
 ) -> None:
-    victim = min(rows(reconstruct(suburb).run_dir))
+    victim = min(rows_by_id(reconstruct(suburb).run_dir))
     for name, value in environment(**{"raise": [victim]}).items():
         monkeypatch.setenv(name, value)
     real = pipeline.reconstruct._reconstruct
@@ -356,7 +348,7 @@ def test_a_building_with_an_internal_error_leaves_a_bundle_with_and_without_a_ch
 
     monkeypatch.setattr(pipeline.reconstruct, "_reconstruct", faulty)
     summary = reconstruct(suburb, isolate=isolate)
-    row = rows(summary.run_dir)[victim]
+    row = rows_by_id(summary.run_dir)[victim]
     assert (row["status"], row["reason"]) == ("failed", "internal_error")
     assert "on purpose" in row["reason_detail"]
     assert [path.name for path in Path(summary.run_dir, "quarantine").iterdir()] == [f"{victim}.bundle"]
@@ -367,7 +359,7 @@ def test_every_fault_harms_only_its_building_and_leaves_record_and_bundle(
     town: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = reconstruct(town)
-    good = rows(whole.run_dir)
+    good = rows_by_id(whole.run_dir)
     wanted = {
         "crash": "crashed",
         "abort": "crashed",
@@ -385,7 +377,7 @@ def test_every_fault_harms_only_its_building_and_leaves_record_and_bundle(
     for name, value in environment(**{fault: [victim] for fault, victim in victims.items()}).items():
         monkeypatch.setenv(name, value)
     summary = reconstruct(town, isolate=True, building_timeout_s=20.0, building_memory_bytes=2**30)
-    hurt = rows(summary.run_dir)
+    hurt = rows_by_id(summary.run_dir)
     assert {fault: hurt[victim]["reason"] for fault, victim in victims.items()} == wanted
     assert "there is no bundle" in hurt[victims["crash_gather"]]["reason_detail"]
     kept = {path.stem for path in Path(summary.run_dir, "quarantine").iterdir()}

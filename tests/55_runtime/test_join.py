@@ -119,9 +119,8 @@ def patchwork(seed: int, *, side_m: int, block_m: float, ground: float) -> Patch
     blocks = math.ceil(side_m / block_m)
     at = (x / (1000 * block_m)).astype(int), (y / (1000 * block_m)).astype(int)
     level = np.where(random.random((blocks, blocks)) < ground, 0, random.integers(1, 4, (blocks, blocks)))[at]
-    solids = random.choice(
-        [VertexKind.OBJECT, VertexKind.OBJECT, VertexKind.BUILDING, VertexKind.CROWN], (blocks, blocks)
-    )
+    kinds = [VertexKind.OBJECT, VertexKind.OBJECT, VertexKind.BUILDING, VertexKind.CROWN]
+    solids = random.choice(kinds, (blocks, blocks))
     z = 3000 * level + random.integers(0, 200, x.size)
     kind = np.where(level == 0, VertexKind.GROUND, solids[at]).astype(np.int8)
     # rifts: no point for metres, so that no facet bridges them
@@ -181,16 +180,13 @@ def test_patches_of_many_levels_in_all_or_some_tiles_are_joined_as_by_the_slow_j
 def test_the_tiles_do_not_decide_what_is_found(scene: Patchwork, grid: TileGrid) -> None:
     everything = TileGrid(size_mm=200_000, halo_mm=8_000, origin_x_mm=-90_000, origin_y_mm=-90_000)
     (alone,) = [handed_on(whole, everything, CUT, EASY) for whole in scene.cut(everything)]
-    assert alone.surfaces is not None
     assert len(alone.surfaces.kind) == alone.surfaces.steps == len(alone.surfaces.facets.names) == 0
     whole = join_tiles([alone], everything, EASY, CRS)
     cut = join_tiles([handed_on(one, grid, CUT, EASY) for one in scene.cut(grid)], grid, EASY, CRS)
-    assert Counter((c.building_id, c.points) for c in cut.candidates) == Counter(
-        (c.building_id, c.points) for c in whole.candidates
-    )
-    assert [dataclasses.replace(r, owner=Tile(0, 0), ranges=()) for r in cut.rejected] == [
-        dataclasses.replace(r, owner=Tile(0, 0), ranges=()) for r in whole.rejected
-    ]
+    counts = [Counter((c.building_id, c.points) for c in found.candidates) for found in (cut, whole)]
+    assert counts[0] == counts[1]
+    nowhere = [[dataclasses.replace(r, owner=Tile(0, 0), ranges=()) for r in found.rejected] for found in (cut, whole)]
+    assert nowhere[0] == nowhere[1]
     assert cut.small_fragments == whole.small_fragments
 
 
@@ -262,13 +258,8 @@ def any_fragments(seed: int, most: int, facets: int) -> list[WholeSplit]:
         points[np.setdiff1d(np.arange(count), held)] = NOWHERE
         solid, steps = np.flatnonzero((kind != FacetKind.STEP) & (kind != FacetKind.GROUND)), np.flatnonzero(kind == 5)
         links = int(random.integers(0, 2 * most)) if len(solid) and len(steps) else 0
-        along = np.column_stack(
-            (
-                random.choice(solid, links) if links else np.empty(0),
-                random.choice(steps, links) if links else np.empty(0),
-                random.integers(1, 900, links),
-            )
-        )
+        ends = [random.choice(which, links) if links else np.empty(0) for which in (solid, steps)]
+        along = np.column_stack((*ends, random.integers(1, 900, links)))
         holders = [
             (facet, random.choice(same))
             for facet in range(facets)
@@ -381,9 +372,8 @@ def test_towns_in_tiny_tiles_are_joined_as_by_the_slow_join(
         wholes = []
         for tile in sorted({Tile(c, r) for c, r in zip(columns.tolist(), rows.tolist(), strict=True)}):
             window = grid.window(tile)
-            found = split_tile(
-                points.take(np.flatnonzero(window.contains(x, y))), grid.core(tile), window, scene, classes
-            )
+            inside = points.take(np.flatnonzero(window.contains(x, y)))
+            found = split_tile(inside, grid.core(tile), window, scene, classes)
             wholes.append(sorted_points(tile, found.fragments, found.point_fragment))
         slow, new = both_joins(wholes, grid, scene.surfaces, scene.candidates)
         assert new == slow

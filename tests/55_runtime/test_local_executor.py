@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import chores
 import pytest
 from faults.asked import environment
 from processes import wait_for
@@ -21,16 +21,12 @@ from pipeline.runtime.manifest import read_manifest
 from pipeline.runtime.monitoring.events import Watch
 from pipeline.runtime.monitoring.measurement import Measured, peak_of_process
 
-sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
-
-import chores
-
 
 @pytest.fixture(autouse=True)
 def children_that_know_chores(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Children of a server of its own, which finds the tasks of this file."""
     child_pool.kill_children()
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent / "on_workers"), prepend=os.pathsep)
+    monkeypatch.setenv("PYTHONPATH", str(Path(chores.__file__).parent), prepend=os.pathsep)
     yield
     child_pool.kill_children()
 

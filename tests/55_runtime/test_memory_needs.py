@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
+import chores
 import pytest
 from distributed import Client, LocalCluster, Nanny
 from processes import LONG_S, wait_for
@@ -28,10 +28,6 @@ from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.plan import window_bytes
 from pipeline.runtime.stages.model_batch import BatchTask
 from pipeline.tiling import Tile, TileGrid
-
-sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
-
-import chores
 
 GIB = 2**30
 

@@ -56,9 +56,8 @@ def quick(monkeypatch):
 
 
 def request(tile, bucket, scratch=None, **more):
-    return RunRequest(
-        inputs=(tile,), out=f"{bucket}/run", settings=SETTINGS, resources=Resources(workers=0, scratch=scratch), **more
-    )
+    resources = Resources(workers=0, scratch=scratch)
+    return RunRequest(inputs=(tile,), out=f"{bucket}/run", settings=SETTINGS, resources=resources, **more)
 
 
 def files(place):

@@ -11,12 +11,12 @@ import weakref
 from pathlib import Path
 from typing import Any
 
-import pyarrow.dataset as ds
 import pytest
 import shapely
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from run_tables import rows_by_id, write_footprints
 
 import pipeline.reconstruct
 import pipeline.runtime.rerun
@@ -26,8 +26,10 @@ from pipeline.io.storage import sha256_of
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.earlier import Record
 from pipeline.runtime.overrides.overrides_file import overrides_of, own_modelling, read_overrides
+from pipeline.runtime.request import RunRequest
 from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.run import run
 from pipeline.runtime.stages.sites import CandidateSite
 from pipeline.settings import RunSettings
 from pipeline.tiling import Tile
@@ -35,11 +37,6 @@ from pipeline.tiling import Tile
 TILES = {"tile_size_m": 40.0, "candidates": {"min_area_m2": 88.0}}
 """Small tiles, so that houses cross their borders; and small houses are rejected, so that there is what to accept."""
 METRES = SpatialReference()
-
-
-def rows(run_dir: str, table: str) -> dict[str, dict[str, Any]]:
-    found = ds.dataset(f"{run_dir}/{table}", partitioning="hive").to_table().to_pylist()
-    return {row["object_id" if table == "rejected" else "building_id"]: row for row in found}
 
 
 def others(found: dict[str, dict[str, Any]], *names: str) -> dict[str, dict[str, Any]]:
@@ -58,27 +55,11 @@ def outline(row: dict[str, Any]) -> Any:
 @pytest.fixture(scope="module")
 def suburb(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tile with a dozen houses: a little more than the other tests of runs need."""
-    folder = tmp_path_factory.mktemp("suburb")
-    simulate("suburb", folder, 3, size_m=(120.0, 100.0), density_per_m2=2.5)
-    return folder / "suburb.laz"
-
-
-def write_outlines(path: Path, outlines: dict[str, Any], **attributes: str) -> Path:
-    """Footprints by their ids, as GeoJSON in the suburb's CRS."""
-    features = [
-        {"type": "Feature", "properties": {"id": name, **attributes}, "geometry": shapely.geometry.mapping(polygon)}
-        for name, polygon in outlines.items()
-    ]
-    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
-    path.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": features}))
-    return path
+    return simulate("suburb", tmp_path_factory.mktemp("suburb"), 3, size_m=(120.0, 100.0), density_per_m2=2.5).laz
 
 
 @pytest.fixture(scope="module")
 def plain(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    from pipeline.runtime.request import RunRequest
-    from pipeline.runtime.run import run
-
     out = str(tmp_path_factory.mktemp("plain") / "run")
     return run(RunRequest(inputs=(str(suburb),), out=out, settings=RunSettings.from_mapping(TILES), resources=SERIAL))
 
@@ -98,7 +79,7 @@ def overridden(suburb: Path, reconstruct: Any, tmp_path: Path) -> Any:
 @pytest.fixture
 def everything(plain: Any) -> str:
     """Overrides of every kind, of buildings in several tiles."""
-    buildings, rejected = rows(plain.run_dir, "buildings"), rows(plain.run_dir, "rejected")
+    buildings, rejected = rows_by_id(plain.run_dir), rows_by_id(plain.run_dir, "rejected")
     gone, redrawn, other = sorted(buildings, key=lambda name: -buildings[name]["n_points"])[:3]
     found = max(rejected, key=lambda name: rejected[name]["n_points"])
     box = outline(buildings[redrawn]).envelope
@@ -125,12 +106,12 @@ def everything(plain: Any) -> str:
 
 
 def test_a_rejected_building_is_listed_among_the_rejected_with_the_user_s_note(plain: Any, overridden: Any) -> None:
-    before = rows(plain.run_dir, "buildings")
+    before = rows_by_id(plain.run_dir)
     name = max(before)
     summary = overridden(f'[[building]]\nbuilding_id = "{name}"\naction = "reject"\nnote = "a tent"')
-    assert rows(summary.run_dir, "buildings") == others(before, name)
-    after = rows(summary.run_dir, "rejected")
-    assert others(after, name) == rows(plain.run_dir, "rejected")
+    assert rows_by_id(summary.run_dir) == others(before, name)
+    after = rows_by_id(summary.run_dir, "rejected")
+    assert others(after, name) == rows_by_id(plain.run_dir, "rejected")
     assert (after[name]["reason"], after[name]["reason_detail"]) == ("overridden", "a tent")
     assert after[name]["n_points"] == before[name]["n_points"]
     assert outline(after[name]).buffer(0.5).contains(outline(before[name]).centroid)
@@ -139,12 +120,12 @@ def test_a_rejected_building_is_listed_among_the_rejected_with_the_user_s_note(p
 
 
 def test_an_accepted_object_is_modelled_under_its_own_id(plain: Any, overridden: Any) -> None:
-    before = rows(plain.run_dir, "rejected")
+    before = rows_by_id(plain.run_dir, "rejected")
     name = max(before, key=lambda name: before[name]["n_points"])
     summary = overridden(f'[[building]]\nbuilding_id = "{name}"\naction = "accept"')
-    after = rows(summary.run_dir, "buildings")
-    assert rows(summary.run_dir, "rejected") == others(before, name)
-    assert others(after, name) == rows(plain.run_dir, "buildings")
+    after = rows_by_id(summary.run_dir)
+    assert rows_by_id(summary.run_dir, "rejected") == others(before, name)
+    assert others(after, name) == rows_by_id(plain.run_dir)
     assert (after[name]["status"], after[name]["overridden"]) == ("ok", "accept")
     assert after[name]["n_points"] == before[name]["n_points"]
     around = outline(before[name]).buffer(1.0)
@@ -152,12 +133,12 @@ def test_an_accepted_object_is_modelled_under_its_own_id(plain: Any, overridden:
 
 
 def test_another_footprint_is_modelled_with_the_points_inside_it(plain: Any, overridden: Any) -> None:
-    before = rows(plain.run_dir, "buildings")
+    before = rows_by_id(plain.run_dir)
     name = min(before)
     west, south, east, north = outline(before[name]).bounds
     half = shapely.box(west, south, (west + east) / 2, north)
     summary = overridden(f'[[building]]\nbuilding_id = "{name}"\nfootprint = "{half.wkt}"')
-    after = rows(summary.run_dir, "buildings")
+    after = rows_by_id(summary.run_dir)
     assert others(after, name) == others(before, name)
     assert after[name]["overridden"] == "footprint"
     assert outline(after[name]).symmetric_difference(half).area < 0.02 * half.area
@@ -166,22 +147,22 @@ def test_another_footprint_is_modelled_with_the_points_inside_it(plain: Any, ove
 
 @pytest.mark.slow
 def test_overlapping_footprints_of_two_buildings_have_all_their_points_each(plain: Any, overridden: Any) -> None:
-    before = rows(plain.run_dir, "buildings")
+    before = rows_by_id(plain.run_dir)
     one, other = sorted(before)[:2]
     box = outline(before[one]).envelope
     entries = {name: f'[[building]]\nbuilding_id = "{name}"\nfootprint = "{box.wkt}"\n' for name in (one, other)}
     alone, both = overridden(entries[one]), overridden(entries[one] + entries[other])
-    first = rows(alone.run_dir, "buildings")[one]
-    found = rows(both.run_dir, "buildings")
+    first = rows_by_id(alone.run_dir)[one]
+    found = rows_by_id(both.run_dir)
     assert found[one] == first
     assert found[other]["n_points"] == first["n_points"]
 
 
 def test_another_method_and_its_settings_are_those_of_one_building(plain: Any, overridden: Any) -> None:
-    before = rows(plain.run_dir, "buildings")
+    before = rows_by_id(plain.run_dir)
     name = min(before)
     text = f'[[building]]\nbuilding_id = "{name}"\nmethod = "kmeans"\npreset = "faithful"\n'
-    after = rows(overridden(text).run_dir, "buildings")
+    after = rows_by_id(overridden(text).run_dir)
     assert others(after, name) == others(before, name)
     assert (after[name]["method"], after[name]["overridden"]) == ("kmeans", "method")
     assert after[name]["input_hash"] == before[name]["input_hash"]
@@ -193,15 +174,15 @@ def test_another_method_and_its_settings_are_those_of_one_building(plain: Any, o
 def test_a_building_with_another_method_is_as_in_a_run_of_that_method(
     plain: Any, overridden: Any, suburb: Path, reconstruct: Any
 ) -> None:
-    name = min(rows(plain.run_dir, "buildings"))
+    name = min(rows_by_id(plain.run_dir))
     text = f'[[building]]\nbuilding_id = "{name}"\nmethod = "parameter-space-3d"\n'
-    whole = rows(reconstruct(suburb, settings={**TILES, "method": "parameter-space-3d"}).run_dir, "buildings")
-    alone = rows(overridden(text).run_dir, "buildings")
+    whole = rows_by_id(reconstruct(suburb, settings={**TILES, "method": "parameter-space-3d"}).run_dir)
+    alone = rows_by_id(overridden(text).run_dir)
     assert {**alone[name], "overridden": None} == whole[name]
 
 
 def test_a_point_names_the_building_around_it_and_far_ones_name_the_nearest(plain: Any, overridden: Any) -> None:
-    before = rows(plain.run_dir, "buildings")
+    before = rows_by_id(plain.run_dir)
     name = min(before)
     place = outline(before[name]).representative_point()
     west = min(outline(row).bounds[0] for row in before.values())
@@ -217,7 +198,7 @@ def test_a_point_names_the_building_around_it_and_far_ones_name_the_nearest(plai
         action = "accept"
     """
     summary = overridden(text)
-    assert set(before) - set(rows(summary.run_dir, "buildings")) == {name}
+    assert set(before) - set(rows_by_id(summary.run_dir)) == {name}
     found = [warning for warning in summary.warnings if warning.startswith("overrides: ")]
     assert "it is in no building; the nearest is" in found[0]
     assert "there is no rejected object within 50 m" in found[1]
@@ -227,14 +208,14 @@ def test_a_point_names_the_building_around_it_and_far_ones_name_the_nearest(plai
 
 
 def test_ids_that_are_none_are_warned_of_with_the_nearest(plain: Any, overridden: Any) -> None:
-    name = min(rows(plain.run_dir, "buildings"))
+    name = min(rows_by_id(plain.run_dir))
     summary = overridden(f'[[building]]\nbuilding_id = "{name[:-1]}"\naction = "reject"')
     assert summary.digest == plain.digest
     assert any(f"the nearest is {name}" in warning for warning in summary.warnings)
 
 
 def test_what_changes_nothing_is_reported(plain: Any, overridden: Any) -> None:
-    building, thing = min(rows(plain.run_dir, "buildings")), min(rows(plain.run_dir, "rejected"))
+    building, thing = min(rows_by_id(plain.run_dir)), min(rows_by_id(plain.run_dir, "rejected"))
     text = f"""
         [[building]]
         building_id = "{building}"
@@ -259,9 +240,9 @@ def test_overrides_do_the_same_whatever_the_tiles(everything: str, overridden: A
 
 
 def test_given_footprints_are_overridden_by_their_own_id(plain: Any, overridden: Any, tmp_path: Path) -> None:
-    known = [outline(row) for _, row in sorted(rows(plain.run_dir, "buildings").items())][:3]
-    write_outlines(tmp_path / "given.geojson", dict(zip("abc", known, strict=True)), use="flat")
-    write_outlines(tmp_path / "better.geojson", {"better": known[2].envelope})
+    known = [outline(row) for _, row in sorted(rows_by_id(plain.run_dir).items())][:3]
+    write_footprints(tmp_path / "given.geojson", dict(zip("abc", known, strict=True)), use="flat")
+    write_footprints(tmp_path / "better.geojson", {"better": known[2].envelope})
     text = """
         [[building]]
         source_id = "a"
@@ -274,12 +255,12 @@ def test_given_footprints_are_overridden_by_their_own_id(plain: Any, overridden:
         action = "reject"
     """
     summary = overridden(text, footprints=str(tmp_path / "given.geojson"))
-    found = {row["source_id"]: row for row in rows(summary.run_dir, "buildings").values()}
+    found = {row["source_id"]: row for row in rows_by_id(summary.run_dir).values()}
     assert set(found) == {"b", "c"}
     assert (found["b"]["overridden"], found["c"]["overridden"]) == (None, "footprint")
     assert json.loads(found["c"]["source_attributes"]) == {"id": "c", "use": "flat"}
     assert outline(found["c"]).symmetric_difference(known[2].envelope).area < 0.02 * known[2].area
-    assert [row["reason"] for row in rows(summary.run_dir, "rejected").values()] == ["overridden"]
+    assert [row["reason"] for row in rows_by_id(summary.run_dir, "rejected").values()] == ["overridden"]
     assert any("source_id 'd'" in warning and "source_id of this run" in warning for warning in summary.warnings)
 
 
@@ -359,7 +340,6 @@ def test_points_and_outlines_are_in_the_units_of_the_crs() -> None:
     entry = {"point": [100, 200], "footprint": "POLYGON ((0 0, 10 0, 10 10, 0 10, 0 0))"}
     (found,) = overrides_of({"building": [entry]}, feet, RunSettings())
     assert found.point_m == pytest.approx((30.48, 60.96))
-    assert found.footprint is not None
     assert found.footprint.area == pytest.approx(100 * 0.3048**2)
 
 
@@ -439,7 +419,7 @@ def test_a_rerun_models_no_other_building_and_splits_only_the_tiles_around(
 
     first = copied()
     monkeypatch.setattr(pipeline.reconstruct, "reconstruct_building", watched)
-    name = max(rows(first.run_dir, "buildings"))
+    name = max(rows_by_id(first.run_dir))
     (tmp_path / "o.toml").write_text(f'[[building]]\nbuilding_id = "{name}"\nmethod = "kmeans"')
     done = again(first.run_dir, overrides=str(tmp_path / "o.toml"))
     assert modelled == [name]
@@ -454,9 +434,9 @@ def test_a_rerun_models_no_other_building_and_splits_only_the_tiles_around(
 def test_a_named_building_is_modelled_again_and_comes_out_the_same(plain: Any, copied: Any) -> None:
     first = copied()
     before = files(first.run_dir)
-    name = min(rows(first.run_dir, "buildings"))
+    name = min(rows_by_id(first.run_dir))
     done = again(first.run_dir, only=(name,))
-    assert done.buildings == {name: rows(first.run_dir, "buildings")[name]["status"]}
+    assert done.buildings == {name: rows_by_id(first.run_dir)[name]["status"]}
     assert done.digest == first.digest == plain.digest
     assert files(first.run_dir) == before
 
@@ -495,7 +475,7 @@ def test_a_rerun_holds_the_new_files_of_one_tile_at_a_time_and_touches_the_run_w
 
     monkeypatch.setattr("pipeline.runtime.rerun.updated_tile", watched)
     monkeypatch.setattr("pipeline.runtime.rerun._written", written)
-    done = again(first.run_dir, only=tuple(rows(first.run_dir, "buildings")))
+    done = again(first.run_dir, only=tuple(rows_by_id(first.run_dir)))
     assert len(made) == len(done.tiles) > 1
     assert sum(path.endswith(".city.jsonl") for path in prepared) == len(done.tiles)
     assert files(first.run_dir) == before
@@ -505,11 +485,11 @@ def test_a_rerun_holds_the_new_files_of_one_tile_at_a_time_and_touches_the_run_w
 def test_a_rerun_with_given_footprints_is_a_whole_run_too(
     plain: Any, overridden: Any, suburb: Path, reconstruct: Any, tmp_path: Path
 ) -> None:
-    known = [outline(row) for _, row in sorted(rows(plain.run_dir, "buildings").items())]
-    given = write_outlines(tmp_path / "given.geojson", {str(k): polygon for k, polygon in enumerate(known)})
+    known = [outline(row) for _, row in sorted(rows_by_id(plain.run_dir).items())]
+    given = write_footprints(tmp_path / "given.geojson", {str(k): polygon for k, polygon in enumerate(known)})
     text = "[[building]]\nsource_id = '3'\naction = 'reject'\n[[building]]\nsource_id = '5'\nmethod = 'kmeans'"
     (tmp_path / "area").mkdir()  # the same name, distinguished by the whole path
-    area = write_outlines(tmp_path / "area" / given.name, {"area": shapely.union_all(known).envelope.buffer(20.0)})
+    area = write_footprints(tmp_path / "area" / given.name, {"area": shapely.union_all(known).envelope.buffer(20.0)})
     whole = overridden(text, footprints=str(given), aoi=str(area))
     first = reconstruct(suburb, settings=TILES, footprints=str(given), aoi=str(area))
     done = again(first.run_dir, overrides=str(tmp_path / "overrides.toml"))
@@ -526,7 +506,7 @@ def test_a_rerun_with_given_footprints_is_a_whole_run_too(
 def test_a_rerun_that_is_cancelled_leaves_the_run_as_it_was(plain: Any, copied: Any, tmp_path: Path) -> None:
     first = copied()
     before = files(first.run_dir) | {"run.json": (Path(first.run_dir) / "run.json").read_bytes()}
-    name = min(rows(first.run_dir, "buildings"))
+    name = min(rows_by_id(first.run_dir))
     with pytest.raises(RunCancelledError):
         rerun(RerunRequest(run_dir=first.run_dir, only=(name,), resources=SERIAL), cancelled=lambda: True)
     assert files(first.run_dir) | {"run.json": (Path(first.run_dir) / "run.json").read_bytes()} == before
@@ -539,7 +519,7 @@ def test_a_building_that_the_split_tiles_cut_off_is_sought_in_all_of_them(
     monkeypatch.setattr("pipeline.runtime.rerun.AROUND_M", 0.0)
     size_m = 60.0
     first = reconstruct(suburb, settings={"tile_size_m": size_m})
-    outlines = [outline(row) for row in rows(first.run_dir, "buildings").values()]
+    outlines = [outline(row) for row in rows_by_id(first.run_dir).values()]
     across = [o for o in outlines if o.bounds[0] // size_m != o.bounds[2] // size_m]
     house = max(across, key=lambda o: o.bounds[2] % size_m)
     _, south, east, north = house.bounds
@@ -557,7 +537,7 @@ def test_the_bundle_of_a_building_that_meets_a_fault_comes_with_the_other_files_
 ) -> None:
     first = copied()
     before = files(first.run_dir)
-    name = min(rows(first.run_dir, "buildings"))
+    name = min(rows_by_id(first.run_dir))
 
     def faulty(*_: Any) -> Any:
         raise ZeroDivisionError
@@ -580,7 +560,7 @@ def test_the_bundle_of_a_building_that_meets_a_fault_comes_with_the_other_files_
 
 def test_a_rerun_that_fails_among_the_files_says_so(copied: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     first = copied()
-    name = min(rows(first.run_dir, "buildings"))
+    name = min(rows_by_id(first.run_dir))
 
     def full(*_: Any) -> None:
         raise OSError("no space left")
@@ -602,7 +582,7 @@ def test_runs_that_cannot_be_continued_are_refused_with_the_reason(
     tile = tmp_path / "tile.laz"
     tile.write_bytes(suburb.read_bytes())
     first = reconstruct(tile, settings=TILES)
-    name = min(rows(first.run_dir, "buildings"))
+    name = min(rows_by_id(first.run_dir))
     manifest = Path(first.run_dir) / "run.json"
     text = manifest.read_text()
     found = json.loads(text)

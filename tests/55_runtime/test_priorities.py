@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import chores
 import pytest
 from distributed import Client
 from processes import LONG_S, wait_for
@@ -13,10 +13,6 @@ from processes import LONG_S, wait_for
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.priorities import PRIORITIES, Traffic, priority_of
 from pipeline.runtime.monitoring.events import Watch
-
-sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
-
-import chores
 
 
 def test_no_wish_leads_out_of_the_kind_of_a_run() -> None:

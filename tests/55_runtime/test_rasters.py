@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,31 +16,16 @@ from las_files import write_las
 
 from pipeline.errors import SettingsError
 from pipeline.export.raster import NO_VALUE, RasterLattice, write_cog
-from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
-from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.classify import ClassifySummary
 from pipeline.runtime.stages.rasters import RASTERS
-from pipeline.settings import RunSettings
 
 FOOT = 0.3048
 
 
 @pytest.fixture
-def rasters_of(tmp_path: Path) -> Callable[..., ClassifySummary]:
-    """Classify with rasters: `rasters_of(path, settings={...}, **fields)`."""
-    numbers = iter(range(1000))
-
-    def go(path: Path, settings: dict[str, Any] | None = None, **fields: Any) -> ClassifySummary:
-        request = ClassifyRequest(
-            inputs=(str(path),),
-            out=str(tmp_path / f"rasters-{next(numbers)}"),
-            settings=RunSettings.from_mapping({"classes": "ignore", **(settings or {})}),
-            resources=SERIAL,
-            rasters=True,
-            **fields,
-        )
-        return classify(request)
-
-    return go
+def rasters_of(run_classify: Callable[..., ClassifySummary]) -> Callable[..., ClassifySummary]:
+    """Classify with rasters."""
+    return functools.partial(run_classify, rasters=True)
 
 
 def slope(x: Any, y: Any) -> Any:
@@ -138,15 +124,9 @@ def test_windows_beyond_the_lattice_are_cut_and_nothing_else_is_left(tmp_path: P
     assert (lattice.columns, lattice.rows) == (4, 3)
     block = np.arange(16, dtype=np.float32).reshape(4, 4)
     block[2, 2] = np.nan
-    write_cog(
-        tmp_path / "a.tif",
-        tmp_path / "working.tif",
-        lattice,
-        [(9, 19, block), (900, 900, block)],
-        crs_wkt=None,
-        description="test",
-        unit="metre",
-    )
+    tags = {"crs_wkt": None, "description": "test", "unit": "metre"}
+    windows = [(9, 19, block), (900, 900, block)]
+    write_cog(tmp_path / "a.tif", tmp_path / "working.tif", lattice, windows, **tags)
     assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
     with rasterio.open(tmp_path / "a.tif") as raster:
         assert raster.crs is None

@@ -6,7 +6,6 @@ import dataclasses
 import io
 import json
 import pickle
-import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,6 @@ import numpy as np
 import pytest
 import shapely
 from command_line import invoke
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from faults.asked import environment
 
 import pipeline.reconstruct
@@ -99,8 +95,8 @@ def test_a_bundle_comes_back_as_it_was(bundle: Bundle, path: Path) -> None:
     bare = {name: np.empty((0, 3)) for name in ("points", "ground", "split_returns", "beside", "beside_later")}
     for name in bare:
         assert np.array_equal(getattr(found.candidate, name), getattr(bundle.candidate, name))
-    for given, back in ((bundle, found),):
-        assert str(dataclasses.replace(back.candidate, **bare)) == str(dataclasses.replace(given.candidate, **bare))
+    given, back = (str(dataclasses.replace(one.candidate, **bare)) for one in (bundle, found))
+    assert back == given
     assert found.settings == bundle.settings
     assert (found.method, found.incident, found.reference) == (bundle.method, bundle.incident, bundle.reference)
     assert path.name == "abcdefghijklmnopqrstuvwx.bundle"
@@ -109,10 +105,9 @@ def test_a_bundle_comes_back_as_it_was(bundle: Bundle, path: Path) -> None:
 
 def test_what_is_unknown_comes_back_as_unknown(bundle: Bundle, tmp_path: Path) -> None:
     candidate = dataclasses.replace(bundle.candidate, footprint=None, source_id=None, ground_z_m=float("nan"))
-    written = write_bundle(str(tmp_path), dataclasses.replace(bundle, candidate=candidate, incident=Incident(
-        reason="internal_error", detail=""
-    )))  # fmt: skip
-    found = read_bundle(str(written))
+    incident = Incident(reason="internal_error", detail="")
+    other = dataclasses.replace(bundle, candidate=candidate, incident=incident)
+    found = read_bundle(str(write_bundle(str(tmp_path), other)))
     assert found.candidate.footprint is None
     assert found.candidate.source_id is None
     assert np.isnan(found.candidate.ground_z_m)
@@ -196,14 +191,8 @@ def test_what_is_no_bundle_is_exit_code_3_and_named(path: Path, tmp_path: Path) 
     (tmp_path / "damaged.bundle").write_bytes(whole[:middle] + b"\xff" * 40 + whole[middle + 40 :])
     (tmp_path / "folder.bundle").mkdir()
     rewritten(path, points_npy=b"")
-    for name in (
-        "text.bundle",
-        "cut.bundle",
-        "damaged.bundle",
-        "folder.bundle",
-        "absent.bundle",
-        "quarantine/other.bundle",
-    ):
+    names = [f"{name}.bundle" for name in ("text", "cut", "damaged", "folder", "absent", "quarantine/other")]
+    for name in names:
         code, _, said = invoke("replay", str(tmp_path / name))
         assert code == 3, said
         assert name in said

@@ -8,10 +8,10 @@ from typing import Any
 
 import laspy
 import numpy as np
-import pyarrow.dataset as ds
 import pytest
 import shapely
 from las_files import write_las
+from run_tables import rows, write_footprints
 
 import pipeline.export.tile
 import pipeline.reconstruct
@@ -26,14 +26,9 @@ from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.settings import RunSettings
 
 
-def rows(run_dir: str, table: str) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = ds.dataset(f"{run_dir}/{table}", partitioning="hive").to_table().to_pylist()
-    return found
-
-
 def test_every_candidate_has_a_record_and_a_mesh(suburb: Path, reconstruct: Any) -> None:
     summary = reconstruct(suburb)
-    buildings = rows(summary.run_dir, "buildings")
+    buildings = rows(summary.run_dir)
     assert len(buildings) == summary.counts["candidates"] == sum(summary.statuses.values())
     for row in buildings:
         assert (Path(summary.run_dir) / row["mesh_path"]).is_file() == (row["status"] != "failed")
@@ -51,7 +46,7 @@ def test_the_state_of_each_tile_names_files_that_are_there(suburb: Path, reconst
 
 def test_one_broken_building_costs_only_itself(suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = reconstruct(suburb)
-    victim = min(row["building_id"] for row in rows(whole.run_dir, "buildings"))
+    victim = min(row["building_id"] for row in rows(whole.run_dir))
     real = pipeline.reconstruct.method_named
 
     def sabotaged(name: str) -> Any:
@@ -65,7 +60,7 @@ def test_one_broken_building_costs_only_itself(suburb: Path, reconstruct: Any, m
         return type(method)(**{**vars(method), "segment": segment})
 
     monkeypatch.setattr(pipeline.reconstruct, "method_named", sabotaged)
-    hurt = {row["building_id"]: row for row in rows(reconstruct(suburb).run_dir, "buildings")}
+    hurt = {row["building_id"]: row for row in rows(reconstruct(suburb).run_dir)}
     assert hurt[victim]["status"] == "failed"
     assert hurt[victim]["reason"] == "internal_error"
     assert "on purpose" in hurt[victim]["reason_detail"]
@@ -76,18 +71,13 @@ def test_one_broken_building_costs_only_itself(suburb: Path, reconstruct: Any, m
 def test_given_footprints_are_the_candidates_also_where_there_are_no_points(
     suburb: Path, reconstruct: Any, tmp_path: Path
 ) -> None:
-    found = [row for row in rows(reconstruct(suburb).run_dir, "buildings") if row["status"] == "ok"]
+    found = [row for row in rows(reconstruct(suburb).run_dir) if row["status"] == "ok"]
     outlines = [shapely.from_wkb(row["geometry"]) for row in found[:2]]
     bare = shapely.box(*(np.array(outlines[0].bounds[:2]) - 6.0), *(np.array(outlines[0].bounds[:2]) - 3.0))
-    features = [
-        {"type": "Feature", "properties": {"id": name}, "geometry": shapely.geometry.mapping(outline)}
-        for name, outline in zip(("one", "two", "bare"), [*outlines, bare], strict=True)
-    ]
-    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
-    path = tmp_path / "footprints.geojson"
-    path.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": features}))
+    named = {"one": outlines[0], "two": outlines[1], "bare": bare}
+    path = write_footprints(tmp_path / "footprints.geojson", named)
     summary = reconstruct(suburb, footprints=str(path))
-    records = {row["source_id"]: row for row in rows(summary.run_dir, "buildings")}
+    records = {row["source_id"]: row for row in rows(summary.run_dir)}
     assert set(records) == {"one", "two", "bare"}
     assert records["one"]["status"] == records["two"]["status"] == "ok"
     assert (records["bare"]["status"], records["bare"]["reason"]) == ("failed", "too_few_points")
@@ -139,9 +129,8 @@ def test_a_folder_that_is_no_run_is_never_replaced(suburb: Path, reconstruct: An
 def test_progress_is_reported_by_stage_and_never_runs_backwards(suburb: Path, tmp_path: Path) -> None:
     events: list[Event] = []
     settings = RunSettings.from_mapping({"tile_size_m": 40.0})
-    run(
-        RunRequest(inputs=(str(suburb),), out=str(tmp_path / "run"), settings=settings, resources=SERIAL), events.append
-    )
+    out = str(tmp_path / "run")
+    run(RunRequest(inputs=(str(suburb),), out=out, settings=settings, resources=SERIAL), events.append)
     stages = [event.stage for event in events if event.kind == "stage"]
     assert stages == ["ingest", "split", "join", "outline", "reconstruct", "publish"]
     for stage in ("ingest", "split", "reconstruct", "publish"):
@@ -184,9 +173,9 @@ def test_feet_give_the_buildings_of_metres(tmp_path: Path, suburb: Path, reconst
     metres = reconstruct(tmp_path / "metres.xyz", crs="EPSG:25832")
     feet = reconstruct(tmp_path / "feet.xyz", crs="EPSG:2994")
     assert feet.statuses == metres.statuses
-    height = {r["building_id"]: r for r in rows(metres.run_dir, "buildings")}
+    height = {r["building_id"]: r for r in rows(metres.run_dir)}
     areas = sorted(row["footprint_area_m2"] for row in height.values())
-    in_feet = rows(feet.run_dir, "buildings")
+    in_feet = rows(feet.run_dir)
     assert sorted(row["footprint_area_m2"] for row in in_feet) == pytest.approx(areas, rel=0.02)
     ratio = np.array(sorted(r["ridge_z"] for r in in_feet)) / np.array(sorted(r["ridge_z"] for r in height.values()))
     assert ratio == pytest.approx(1 / 0.3048, rel=0.01)
@@ -202,16 +191,11 @@ def test_stray_class_codes_are_not_believed(suburb: Path, tmp_path: Path, recons
 
 
 def test_footprints_outside_the_box_are_left_out_and_reported(suburb: Path, tmp_path: Path, reconstruct: Any) -> None:
-    found = [shapely.from_wkb(row["geometry"]) for row in rows(reconstruct(suburb).run_dir, "buildings")]
+    found = [shapely.from_wkb(row["geometry"]) for row in rows(reconstruct(suburb).run_dir)]
     x0, y0, x1, y1 = found[0].bounds
     far = [outline for outline in found[1:] if not outline.intersects(shapely.box(x0 - 2, y0 - 2, x1 + 2, y1 + 2))]
-    features = [
-        {"type": "Feature", "properties": {"id": str(k)}, "geometry": shapely.geometry.mapping(outline)}
-        for k, outline in enumerate([found[0], *far])
-    ]
-    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
-    path = tmp_path / "footprints.geojson"
-    path.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": features}))
+    named = {str(k): outline for k, outline in enumerate([found[0], *far])}
+    path = write_footprints(tmp_path / "footprints.geojson", named)
     summary = reconstruct(suburb, footprints=str(path), bbox=(x0 - 2, y0 - 2, x1 + 2, y1 + 2))
     assert summary.counts["candidates"] == 1
     assert any(f"{len(far)} of {len(far) + 1} footprints lie off the data" in w for w in summary.warnings)
@@ -225,7 +209,7 @@ def test_a_request_that_cannot_work_leaves_the_earlier_run_alone(
     with pytest.raises(InputError):
         reconstruct(suburb, out=str(out), overwrite=True, footprints=str(tmp_path / "nowhere.gpkg"))
     assert json.loads((out / "run.json").read_text())["status"] == "finished"
-    assert len(rows(str(out), "buildings")) == first.counts["candidates"]
+    assert len(rows(str(out))) == first.counts["candidates"]
 
 
 def test_a_run_that_breaks_says_so_in_its_manifest(suburb: Path, tmp_path: Path, reconstruct: Any) -> None:
@@ -240,7 +224,7 @@ def test_a_tile_that_cannot_be_written_costs_only_itself(
     suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = reconstruct(suburb, settings={"tile_size_m": 40.0})
-    tiles = sorted({row["tile"] for row in rows(whole.run_dir, "buildings")})
+    tiles = sorted({row["tile"] for row in rows(whole.run_dir)})
     real = pipeline.export.tile.write_tile
 
     def sabotaged(run_dir: str, tile_key: str, *rest: Any, **options: Any) -> Any:
@@ -255,7 +239,7 @@ def test_a_tile_that_cannot_be_written_costs_only_itself(
     assert (state["state"], state["files"]) == ("failed", {})
     assert "on purpose" in state["error"]
     assert json.loads((Path(hurt.run_dir) / "run.json").read_text())["status"] == "incomplete"
-    assert sorted({row["tile"] for row in rows(hurt.run_dir, "buildings")}) == tiles[1:]
+    assert sorted({row["tile"] for row in rows(hurt.run_dir)}) == tiles[1:]
 
 
 @pytest.mark.parametrize("out", ["ftp://host/run", "https://host/run"])

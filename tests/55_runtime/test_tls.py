@@ -77,10 +77,8 @@ def test_a_key_may_lie_in_the_file_of_its_certificate(authority: Authority, tmp_
 def test_all_missing_files_are_reported_at_once(authority: Authority) -> None:
     with pytest.raises(SettingsError) as refused:
         TlsFiles(ca="/nowhere/ca.pem", cert="/nowhere/one.pem", key=authority.files().key)
-    assert [fault.split(":")[0] for fault in refused.value.faults] == [
-        "TLS_CA is /nowhere/ca.pem",
-        "TLS_CERT is /nowhere/one.pem",
-    ]
+    faults = [fault.split(":")[0] for fault in refused.value.faults]
+    assert faults == ["TLS_CA is /nowhere/ca.pem", "TLS_CERT is /nowhere/one.pem"]
     assert all("No such file" in fault and "--tls-ca" in fault for fault in refused.value.faults)
 
 

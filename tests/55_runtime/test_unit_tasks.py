@@ -68,13 +68,8 @@ def stored(points: npt.NDArray[np.void], grid: TileGrid, root: Path, fragments: 
         cuts = np.linspace(0, len(own), fragments + 1).astype(int).tolist()
         ranges += [PointRange(tile=tile, start=a, stop=b) for a, b in itertools.pairwise(cuts)]
     lowest = min(zip(points["x"].tolist(), points["y"].tolist(), points["z"].tolist(), strict=True))
-    site = CandidateSite(
-        building_id=object_id(CRS, lowest),
-        owner=grid.tile_of(lowest[0], lowest[1]),
-        ranges=tuple(ranges),
-        points=len(points),
-    )
-    return site, scratch
+    owner, name = grid.tile_of(lowest[0], lowest[1]), object_id(CRS, lowest)
+    return CandidateSite(building_id=name, owner=owner, ranges=tuple(ranges), points=len(points)), scratch
 
 
 def divided(site: CandidateSite, grid: TileGrid, scratch: Scratch, own: UnitSettings) -> list[CandidateSite]:
@@ -88,41 +83,46 @@ def divided(site: CandidateSite, grid: TileGrid, scratch: Scratch, own: UnitSett
 ONE_TILE = TileGrid(size_mm=1_000_000, halo_mm=0)
 
 
+Terrace = tuple[CandidateSite, Scratch, list[CandidateSite]]
+
+
+@pytest.fixture
+def terrace(row: npt.NDArray[np.void], tmp_path: Path) -> Terrace:
+    """The row as one candidate in one tile, the scratch that holds it, and its units."""
+    site, scratch = stored(row, ONE_TILE, tmp_path, 1)
+    return site, scratch, divided(site, ONE_TILE, scratch, UnitSettings())
+
+
 @settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    size_mm=st.integers(3_000, 40_000),
-    shift_x_mm=st.integers(0, 20_000),
-    shift_y_mm=st.integers(0, 20_000),
+    grid=st.builds(
+        TileGrid,
+        size_mm=st.integers(3_000, 40_000),
+        halo_mm=st.just(0),
+        origin_x_mm=st.integers(0, 20_000),
+        origin_y_mm=st.integers(0, 20_000),
+    ),
     fragments=st.integers(1, 3),
     seed=st.integers(0, 99),
 )
 def test_units_do_not_depend_on_tiles_fragments_and_order(
-    size_mm: int,
-    shift_x_mm: int,
-    shift_y_mm: int,
-    fragments: int,
-    seed: int,
-    row: npt.NDArray[np.void],
-    tmp_path_factory: pytest.TempPathFactory,
+    grid: TileGrid, fragments: int, seed: int, row: npt.NDArray[np.void], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     whole, scratch = stored(row, ONE_TILE, tmp_path_factory.mktemp("whole"), 1)
     expected = {u.building_id: u for u in divided(whole, ONE_TILE, scratch, UnitSettings())}
     assert len(expected) == len(EAVES_M)
     points = {name: points_of(scratch, unit) for name, unit in expected.items()}
-    grid = TileGrid(size_mm=size_mm, halo_mm=0, origin_x_mm=shift_x_mm, origin_y_mm=shift_y_mm)
     mixed = row[np.random.default_rng(seed).permutation(len(row))]
     site, scratch = stored(mixed, grid, tmp_path_factory.mktemp("cut"), fragments)
     units = divided(site, grid, scratch, UnitSettings())
     assert {u.building_id for u in units} == set(expected)
     for unit in units:
         assert np.array_equal(points_of(scratch, unit), points[unit.building_id])
-        assert unit.outline is not None
         assert unit.outline.equals_exact(expected[unit.building_id].outline, 0.0)
 
 
-def test_touching_units_share_their_walls(row: npt.NDArray[np.void], tmp_path: Path) -> None:
-    site, scratch = stored(row, ONE_TILE, tmp_path, 1)
-    units = divided(site, ONE_TILE, scratch, UnitSettings())
+def test_touching_units_share_their_walls(terrace: Terrace) -> None:
+    _, scratch, units = terrace
     parts = [unit.outline for unit in units]
     whole = shapely.union_all(parts)
     assert whole.geom_type == "Polygon"
@@ -136,19 +136,17 @@ def test_touching_units_share_their_walls(row: npt.NDArray[np.void], tmp_path: P
         assert shapely.symmetric_difference(drawn, unit.outline).area < 0.1
 
 
-def test_the_outline_is_part_of_what_a_model_is_made_of(row: npt.NDArray[np.void], tmp_path: Path) -> None:
-    site, scratch = stored(row, ONE_TILE, tmp_path, 1)
-    unit = divided(site, ONE_TILE, scratch, UnitSettings())[0]
+def test_the_outline_is_part_of_what_a_model_is_made_of(terrace: Terrace) -> None:
+    _, scratch, (unit, *_) = terrace
     _, facts = gather(scratch, ONE_TILE, unit, GpsTimeKind.NONE)
     _, alone = gather(scratch, ONE_TILE, dataclasses.replace(unit, outline=None), GpsTimeKind.NONE)
     assert facts.input_hash != alone.input_hash
 
 
 def test_a_block_that_cannot_be_drawn_costs_only_its_outlines_and_is_reported(
-    row: npt.NDArray[np.void], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    terrace: Terrace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    site, scratch = stored(row, ONE_TILE, tmp_path, 1)
-    units = divided(site, ONE_TILE, scratch, UnitSettings())
+    _, scratch, units = terrace
     (task,) = outline_tasks(units, RoofSettings(), ONE_TILE, scratch)
 
     def broken(*_: object) -> None:
@@ -165,9 +163,8 @@ def test_a_block_that_cannot_be_drawn_costs_only_its_outlines_and_is_reported(
         draw_outlines(task)
 
 
-def test_raw_outlines_are_not_drawn_together(row: npt.NDArray[np.void], tmp_path: Path) -> None:
-    site, scratch = stored(row, ONE_TILE, tmp_path, 1)
-    units = divided(site, ONE_TILE, scratch, UnitSettings())
+def test_raw_outlines_are_not_drawn_together(terrace: Terrace) -> None:
+    _, scratch, units = terrace
     assert outline_tasks(units, RoofSettings(straight_eaves=False), ONE_TILE, scratch) == []
 
 
@@ -188,8 +185,8 @@ def test_units_keep_every_point_once_in_the_tile_that_holds_it(row: npt.NDArray[
             assert grid.core(part.tile).contains(held["x"], held["y"]).all()
 
 
-def test_a_candidate_of_one_unit_stays_as_it_is(row: npt.NDArray[np.void], tmp_path: Path) -> None:
-    site, scratch = stored(row, ONE_TILE, tmp_path, 1)
+def test_a_candidate_of_one_unit_stays_as_it_is(terrace: Terrace) -> None:
+    site, scratch, _ = terrace
     assert divided(site, ONE_TILE, scratch, UnitSettings(split="nothing")) == [site]
     empty = CandidateSite(building_id="a", owner=site.owner, ranges=(), points=0)
     assert divided(empty, ONE_TILE, scratch, UnitSettings()) == [empty]

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
+import chores
 import httpx
 import pytest
 import typer
@@ -32,10 +33,6 @@ from pipeline.runtime.monitoring.tallies import TALLIES, Tallies
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.tiling import Tile
-
-sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
-
-import chores
 
 
 def shown(registry: CollectorRegistry) -> dict[str, float]:

@@ -75,6 +75,15 @@ class Place:
         shutil.rmtree(self.folder / "fresh", ignore_errors=True)
         return self.run("fresh", None, settings)
 
+    def run_as_fresh(self, settings: dict[str, Any] | None = None) -> RunSummary:
+        """Run in the work folder; the outcome is that of a fresh run."""
+        summary = self.run(settings=settings)
+        tasks = self.tasks
+        assert summary.digest == self.fresh(settings).digest
+        assert files_of(self.folder / "run") == files_of(self.folder / "fresh")
+        self.tasks = tasks
+        return summary
+
     def change(self, name: str, change: Callable[[laspy.LasData], Any]) -> None:
         """Change the points of one input."""
         path = self.inputs / name
@@ -90,12 +99,7 @@ def quarters(tmp_path_factory: pytest.TempPathFactory) -> Path:
     simulate("town", folder.with_name("whole"), 5, size_m=(110.0, 100.0), density_per_m2=3.0)
     las = laspy.read(folder.with_name("whole") / "town.laz")
     east, north = las.x > np.median(las.x), las.y > np.median(las.y)
-    for name, chosen in {
-        "sw": ~east & ~north,
-        "se": east & ~north,
-        "nw": ~east & north,
-        "ne": east & north,
-    }.items():
+    for name, chosen in (("sw", ~east & ~north), ("se", east & ~north), ("nw", ~east & north), ("ne", east & north)):
         part = laspy.LasData(las.header)
         part.points = las.points[chosen]
         part.write(folder / f"{name}.laz")
@@ -164,8 +168,7 @@ def stop_at(stage: str, done: int) -> Callable[[Event], None]:
 
 @pytest.mark.slow
 def test_a_run_in_a_work_folder_is_any_run(place: Place) -> None:
-    assert place.run().digest == place.fresh().digest
-    assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
+    place.run_as_fresh()
 
 
 def test_a_run_after_a_finished_one_does_nothing_again(used: Place, finished: Finished) -> None:
@@ -197,12 +200,9 @@ def test_a_run_that_was_cut_off_goes_on_where_it_stopped(place: Place, finished:
 def test_what_changed_is_done_again_and_nothing_else(used: Place, finished: Finished) -> None:
     first, whole = finished.summary, finished.tasks
     used.change("sw.laz", raised)
-    again = used.run()
-    tasks = used.tasks
-    assert again.digest == used.fresh().digest != first.digest
-    assert files_of(used.folder / "run") == files_of(used.folder / "fresh")
-    assert tasks["ingest"] == 1
-    assert 0 < tasks["split"] <= whole["split"]
+    assert used.run_as_fresh().digest != first.digest
+    assert used.tasks["ingest"] == 1
+    assert 0 < used.tasks["split"] <= whole["split"]
 
 
 def test_a_file_that_was_only_touched_costs_its_reading(used: Place, finished: Finished) -> None:
@@ -225,8 +225,7 @@ def test_models_of_input_that_did_not_change_are_taken_again(used: Place) -> Non
 @pytest.mark.slow
 def test_a_file_that_is_gone_and_one_that_is_new(used: Place, finished: Finished) -> None:
     (used.inputs / "nw.laz").rename(used.folder / "nw.laz")
-    assert used.run().digest == used.fresh().digest
-    assert files_of(used.folder / "run") == files_of(used.folder / "fresh")
+    used.run_as_fresh()
     (used.folder / "nw.laz").rename(used.inputs / "nw.laz")
     assert used.run().digest == finished.summary.digest
     assert files_of(used.folder / "run") == files_of(finished.aside / "run")
@@ -237,14 +236,13 @@ def test_a_file_that_is_gone_and_one_that_is_new(used: Place, finished: Finished
     "settings",
     [
         {"candidates": {"min_area_m2": 30.0}},
-        pytest.param({"method": "kmeans"}, marks=pytest.mark.slow),
-        pytest.param({"tile_size_m": 60.0}, marks=pytest.mark.slow),
-        pytest.param({"lods": "1.2,2.2"}, marks=pytest.mark.slow),
+        {"method": "kmeans"},
+        {"tile_size_m": 60.0},
+        {"lods": "1.2,2.2"},
     ],
 )
 def test_other_settings_are_another_result(used: Place, settings: dict[str, Any]) -> None:
-    assert used.run(settings=settings).digest == used.fresh(settings).digest
-    assert files_of(used.folder / "run") == files_of(used.folder / "fresh")
+    used.run_as_fresh(settings)
 
 
 @pytest.mark.slow

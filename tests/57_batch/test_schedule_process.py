@@ -9,8 +9,9 @@ import os
 import shutil
 import signal
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from schedule_contract import HOUR, NOON, ScheduleContract, StoredSchedule
@@ -96,7 +97,7 @@ def test_a_damaged_file_is_named(file: Path, damage: dict[str, object], reason: 
     written = ScheduleRecord(state=ScheduleState(decided_until=AT)).as_dict()
     (work / NAME).write_text(json.dumps(written | damage))
     with pytest.raises(RunError, match=rf"schedule\.json cannot be read: .*{reason}.*Remove it to begin anew"):
-        Days([]).go(file)
+        gone(file)
 
 
 # --- the process
@@ -125,9 +126,9 @@ class FakeRun:
 class Days(Ending):
     """A clock that goes on while the schedule sleeps, and does at each look what the test says."""
 
-    def __init__(self, steps: list[Callable[[], None]]) -> None:
+    def __init__(self, steps: Sequence[Step] = (), at: dt.datetime = AT - HOUR / 2) -> None:
         super().__init__()
-        self.time, self._steps = AT - HOUR / 2, steps
+        self.time, self._steps = at, list(steps)
         self.runs: list[FakeRun] = []
         self.events: list[Event] = []
 
@@ -142,7 +143,7 @@ class Days(Ending):
     def wait(self, seconds: float) -> None:
         assert 0.0 < seconds <= schedule_process.LONGEST_SLEEP_S
         if self._steps:
-            self._steps.pop(0)()
+            self._steps.pop(0)(self)
         else:
             self.set()
 
@@ -151,6 +152,38 @@ class Days(Ending):
 
     def later(self, hours: float) -> None:
         self.time += hours * HOUR
+
+
+Step = Callable[[Days], Any]
+
+
+def passes(hours: float) -> Step:
+    return lambda days: days.later(hours)
+
+
+def ends(code: int) -> Step:
+    """The latest run ends by itself."""
+    return lambda days: setattr(days.runs[-1], "code", code)
+
+
+def write(file: Path, text: str) -> Step:
+    """Change the batch file at the clock's time."""
+
+    def change(days: Days) -> None:
+        file.write_text(text)
+        os.utime(file, ns=(0, round(days.time.timestamp()) * 10**9))
+
+    return change
+
+
+def gone(file: Path, *steps: Step, at: dt.datetime = AT - HOUR / 2, kind: type[Days] = Days) -> Days:
+    """The days after these steps and the end of the process."""
+    days = kind(steps, at)
+    days.go(file)
+    return days
+
+
+LATER = AT + HOUR / 4
 
 
 @pytest.fixture
@@ -167,46 +200,27 @@ def record_of(file: Path) -> ScheduleRecord:
 
 
 def test_runs_follow_one_another_and_are_recorded_with_their_codes(file: Path) -> None:
-    days = Days([])
-    days._steps = [
-        lambda: days.later(0.5),
-        lambda: setattr(days.runs[0], "code", 0),
-        lambda: days.later(1.0),
-        lambda: setattr(days.runs[1], "code", 1),
-        lambda: days.later(1.0),
-        lambda: setattr(days.runs[2], "code", 4),
-    ]
-    days.go(file)
-    assert [entry.outcome for entry in record_of(file).entries] == [
-        Outcome.RAN,
-        Outcome.INCOMPLETE,
-        Outcome.FAILED,
-    ]
+    days = gone(file, passes(0.5), ends(0), passes(1.0), ends(1), passes(1.0), ends(4))
+    outcomes = [entry.outcome for entry in record_of(file).entries]
+    assert outcomes == [Outcome.RAN, Outcome.INCOMPLETE, Outcome.FAILED]
     assert record_of(file).counts == {"ran": 1, "incomplete": 1, "failed": 1}
     kinds = Counter(event.kind for event in days.events)
     assert kinds == {"run": 4, "warning": 2}
 
 
 def test_an_end_interrupts_the_run_and_the_next_start_goes_on(file: Path) -> None:
-    days = Days([])
-    days._steps = [lambda: days.later(0.5)]
-    days.go(file)
+    days = gone(file, passes(0.5))
     assert days.runs[0].signals == [signal.SIGINT]
     assert [entry.outcome for entry in record_of(file).entries] == [Outcome.INTERRUPTED]
     assert record_of(file).running == AT
-    again = Days([])
-    again.time = AT + HOUR / 4
-    again._steps = [lambda: setattr(again.runs[0], "code", 0)]
-    again.go(file)
+    again = gone(file, ends(0), at=LATER)
     assert len(again.runs) == 1
     assert (record_of(file).running, record_of(file).counts) == (None, {"interrupted": 1, "ran": 1})
 
 
 def test_a_run_by_hand_is_not_overlapped(file: Path) -> None:
-    days = Days([])
-    days._steps = [lambda: days.later(0.5), lambda: days.later(1.0)]
     with locked_work(str(file.with_suffix(".work"))):
-        days.go(file)
+        days = gone(file, passes(0.5), passes(1.0))
     assert (days.runs, record_of(file).counts) == ([], {"skipped": 2})
 
 
@@ -214,71 +228,41 @@ def test_a_second_process_is_refused(file: Path) -> None:
     work = file.with_suffix(".work")
     make_work(work)
     with locked_file(work, LOCK), pytest.raises(RunError, match="is at work already"):
-        Days([]).go(file)
-
-
-def write(days: Days, file: Path, text: str) -> Callable[[], None]:
-    """Change the batch file at the clock's time."""
-
-    def change() -> None:
-        file.write_text(text)
-        os.utime(file, ns=(0, round(days.time.timestamp()) * 10**9))
-
-    return change
+        gone(file)
 
 
 def test_times_before_a_change_are_decided_by_the_old_ones_later_ones_by_the_new(file: Path) -> None:
-    days = Days([])
     os.utime(file, ns=(0, 0))
-    days._steps = [
-        lambda: days.later(0.45),
-        write(days, file, FILE.replace("0 *", "58 *")),  # at 01:57
-        lambda: days.later(0.1),
-        lambda: setattr(days.runs[0], "code", 0),
-        lambda: days.later(1.0),
-        lambda: setattr(days.runs[1], "code", 0),
-        write(days, file, FILE.replace("0 *", "50 *") + "paused = true\n"),
-        lambda: days.later(2.0),
-    ]
-    days.go(file)
+    changed = write(file, FILE.replace("0 *", "58 *"))
+    paused = write(file, FILE.replace("0 *", "50 *") + "paused = true\n")
+    # the first change is at 01:57
+    gone(file, passes(0.45), changed, passes(0.1), ends(0), passes(1.0), ends(0), paused, passes(2.0))
     slots = [entry.slot for entry in record_of(file).entries]
     assert slots == [AT - HOUR / 30, AT + HOUR * 29 / 30]
 
 
 def test_a_time_that_was_overslept_counts_by_what_the_file_said_then(file: Path) -> None:
-    days = Days([])
     os.utime(file, ns=(0, 0))
 
-    def overslept() -> None:
+    def overslept(days: Days) -> None:
         days.later(0.75)  # from 01:30 to 02:15, and the file is written then
-        write(days, file, FILE.replace("0 *", "10 *"))()
+        write(file, FILE.replace("0 *", "10 *"))(days)
 
-    days._steps = [overslept, lambda: setattr(days.runs[0], "code", 0)]
-    days.go(file)
+    gone(file, overslept, ends(0))
     assert [entry.slot for entry in record_of(file).entries] == [AT]
 
 
 def test_other_times_of_a_schedule_that_was_down_count_from_its_start_on(file: Path) -> None:
-    Days([]).go(file)
+    gone(file)
     file.write_text(FILE.replace("0 *", "45 *"))
-    days = Days([])
-    days.time = AT
-    days.go(file)
+    days = gone(file, at=AT)
     assert (days.runs, record_of(file).entries) == ([], ())
 
 
 def test_a_broken_file_runs_nothing_and_fails_every_slot_until_it_is_fixed(file: Path) -> None:
-    days = Days([])
-    days._steps = [
-        write(days, file, FILE.replace("0 *", "77 *")),
-        lambda: days.later(0.5),
-        write(days, file, FILE + '[work]\npath = "elsewhere"\n'),
-        lambda: days.later(1.0),
-        write(days, file, FILE),
-        lambda: days.later(1.0),
-        lambda: setattr(days.runs[0], "code", 0),
-    ]
-    days.go(file)
+    wrong = write(file, FILE.replace("0 *", "77 *"))
+    elsewhere = write(file, FILE + '[work]\npath = "elsewhere"\n')
+    gone(file, wrong, passes(0.5), elsewhere, passes(1.0), write(file, FILE), passes(1.0), ends(0))
     assert [(entry.outcome, entry.slot) for entry in record_of(file).entries] == [
         (Outcome.FAILED, AT),
         (Outcome.FAILED, AT + HOUR),
@@ -289,48 +273,31 @@ def test_a_broken_file_runs_nothing_and_fails_every_slot_until_it_is_fixed(file:
 
 
 def test_a_paused_schedule_goes_on_with_a_run_that_was_cut_off_only_when_it_is_resumed(file: Path) -> None:
-    days = Days([])
-    days._steps = [lambda: days.later(0.5)]
-    days.go(file)
+    gone(file, passes(0.5))
     file.write_text(FILE + "paused = true\n")
-    paused = Days([])
-    paused.go(file)
+    paused = gone(file)
     assert (paused.runs, record_of(file).running) == ([], AT)
     file.write_text(FILE)
-    again = Days([])
-    again.time = AT + HOUR / 4
-    again._steps = [lambda: setattr(again.runs[0], "code", 0)]
-    again.go(file)
+    again = gone(file, ends(0), at=LATER)
     assert (len(again.runs), record_of(file).running) == (1, None)
 
 
 @pytest.mark.parametrize(("code", "goes_on"), [(0, False), (1, True), (4, True), (130, True), (-15, True), (143, True)])
 def test_only_a_run_that_is_whole_is_not_gone_on_with(file: Path, code: int, goes_on: bool) -> None:
-    days = Days([])
-
-    def ends() -> None:
-        days.runs[0].ends_with = code
-
-    days._steps = [lambda: days.later(0.5), ends]
-    days.go(file)
+    gone(file, passes(0.5), lambda days: setattr(days.runs[0], "ends_with", code))
     assert (record_of(file).running is not None) is goes_on
 
 
 def test_a_full_disk_starts_nothing_and_ends_nothing(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    days = Days([])
     real = schedule_file.LocalStorage.put
 
     def full(self: object, key: str, content: bytes) -> None:
         raise OSError(28, "No space left on device")
 
-    days._steps = [
-        lambda: monkeypatch.setattr(schedule_file.LocalStorage, "put", full),
-        lambda: days.later(0.5),
-        lambda: days.later(0.1),
-        lambda: monkeypatch.setattr(schedule_file.LocalStorage, "put", real),
-        lambda: setattr(days.runs[0], "code", 0),
-    ]
-    days.go(file)
+    def puts_by(put: Any) -> Step:
+        return lambda _: monkeypatch.setattr(schedule_file.LocalStorage, "put", put)
+
+    days = gone(file, puts_by(full), passes(0.5), passes(0.1), puts_by(real), ends(0))
     assert [(entry.outcome, entry.slot) for entry in record_of(file).entries] == [(Outcome.RAN, AT)]
     assert any("cannot be written, so no run is started" in event.message for event in days.events)
 
@@ -341,22 +308,15 @@ def test_a_run_that_cannot_be_started_is_recorded(file: Path) -> None:
             assert batch.schedule.cron
             raise OSError(12, "Cannot allocate memory")
 
-    days = Poor([])
-    days._steps = [lambda: days.later(0.5)]
-    days.go(file)
+    gone(file, passes(0.5), kind=Poor)
     (entry,) = record_of(file).entries
     assert (entry.outcome, "Cannot allocate memory" in entry.message) == (Outcome.FAILED, True)
 
 
 def test_a_run_that_outlived_the_process_before_is_waited_for(file: Path) -> None:
-    days = Days([])
-    days._steps = [lambda: days.later(0.5)]
-    days.go(file)
-    work = file.with_suffix(".work")
-    again = Days([])
-    again.time = AT + HOUR / 4
-    with locked_file(work, RUN_LOCK):
-        again.go(file)
+    gone(file, passes(0.5))
+    with locked_file(file.with_suffix(".work"), RUN_LOCK):
+        again = gone(file, at=LATER)
     assert (again.runs, record_of(file).running) == ([], AT)
 
 
@@ -372,28 +332,19 @@ def test_a_run_that_does_not_end_is_killed_by_a_second_request(file: Path) -> No
             self.runs.append(Deaf())
             return self.runs[-1]
 
-    days = Hasty([])
-    days._steps = [lambda: days.later(0.5), days.set, lambda: None]
-    days.go(file)
+    days = gone(file, passes(0.5), Days.set, lambda _: None, kind=Hasty)
     assert days.runs[0].signals == [signal.SIGINT, signal.SIGKILL]
     assert record_of(file).running == AT
 
 
 def test_a_work_folder_that_is_removed_is_made_and_held_again(file: Path) -> None:
-    days = Days([])
     work = file.with_suffix(".work")
 
-    def second() -> None:
+    def second(_: Days) -> None:
         with pytest.raises(RunError, match="is at work already"), locked_file(work, LOCK):
             pass
 
-    days._steps = [
-        lambda: shutil.rmtree(work),
-        lambda: days.later(0.5),
-        second,
-        lambda: setattr(days.runs[0], "code", 0),
-    ]
-    days.go(file)
+    gone(file, lambda _: shutil.rmtree(work), passes(0.5), second, ends(0))
     assert record_of(file).counts == {"ran": 1}
     with locked_work(str(work)):
         pass  # a run of the batch takes it for a work folder
@@ -402,27 +353,19 @@ def test_a_work_folder_that_is_removed_is_made_and_held_again(file: Path) -> Non
 def test_a_time_that_waited_is_missed_if_the_times_changed_meanwhile(file: Path) -> None:
     file.write_text(FILE + 'overlap = "wait"\n')
     with locked_work(str(file.with_suffix(".work"))):
-        days = Days([])
-        days._steps = [lambda: days.later(0.5)]
-        days.go(file)
+        gone(file, passes(0.5))
     assert record_of(file).state.waiting == AT
     file.write_text(FILE.replace("0 *", "45 *"))
-    again = Days([])
-    again.time = AT + HOUR / 4
-    again.go(file)
+    again = gone(file, at=LATER)
     assert (again.runs, record_of(file).state.waiting, record_of(file).counts) == ([], None, {"missed": 1})
 
 
 def test_a_time_that_comes_while_a_broken_file_keeps_a_run_from_going_on_is_not_an_overlap(file: Path) -> None:
-    days = Days([])
-    days._steps = [lambda: days.later(0.5)]
-    days.go(file)
-    again = Days([])
-    again.time = AT + HOUR / 4
+    gone(file, passes(0.5))
     outlived = contextlib.ExitStack()
     outlived.enter_context(locked_file(file.with_suffix(".work"), RUN_LOCK))
-    again._steps = [write(again, file, FILE.replace("0 *", "77 *")), outlived.close, lambda: again.later(1.0)]
-    again.go(file)
+    wrong = write(file, FILE.replace("0 *", "77 *"))
+    again = gone(file, wrong, lambda _: outlived.close(), passes(1.0), at=LATER)
     assert (again.runs, record_of(file).running) == ([], AT)
     assert record_of(file).counts == {"interrupted": 1, "failed": 1}
 
@@ -441,7 +384,7 @@ def test_an_end_is_noticed_during_a_wait() -> None:
 def test_a_batch_without_times_is_refused(file: Path) -> None:
     file.write_text(FILE.split("[schedule]", maxsplit=1)[0])
     with pytest.raises(SettingsError, match=r"\[schedule\] cron is missing"):
-        Days([]).go(file)
+        gone(file)
 
 
 def test_times_are_checked_with_the_file(file: Path) -> None:

@@ -38,6 +38,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def text(folder: Path) -> str:
+    """The batch file, for another folder."""
+    return (folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/")
+
+
+@pytest.fixture
+def file(text: str, tmp_path: Path) -> Path:
+    """The same batch with a folder of its own for work and results."""
+    (tmp_path / "city.toml").write_text(text)
+    return tmp_path / "city.toml"
+
+
 def call(*words: str | Path) -> tuple[int, str, str]:
     ended = CliRunner().invoke(app, ["batch", *map(str, words)])
     return ended.exit_code, ended.stdout, ended.stderr
@@ -74,18 +87,15 @@ def test_a_batch_is_planned_run_and_reported(folder: Path) -> None:
     assert all(stage["kept"] == stage["done"] for name, stage in status["stages"].items() if name != "join")
 
 
-def test_a_batch_that_leaves_its_workers_to_the_estimate_gives_what_one_process_gives(
-    folder: Path, tmp_path: Path
-) -> None:
-    text = (folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/")
+def test_a_batch_that_leaves_its_workers_to_the_estimate_gives_what_one_process_gives(file: Path, text: str) -> None:
     digests = {}
     for workers in ("0", '"auto"'):
-        file = tmp_path / f"city{len(digests)}.toml"
+        file = file.with_name(f"city{len(digests)}.toml")
         file.write_text(text.replace("workers = 0", f"workers = {workers}").replace('"models"', f'"{file.stem}"'))
         code, reported, error = call("run", file, "--json")
         assert code == 0, error
         digests[workers] = json.loads(reported)["digest"]
-        manifest = json.loads((tmp_path / file.stem / "run.json").read_text())
+        manifest = json.loads((file.with_suffix("") / "run.json").read_text())
         assert (len(manifest["peak_memory_bytes"]) > 1) is (workers != "0")
     assert digests['"auto"'] == digests["0"]
 
@@ -104,20 +114,13 @@ def test_a_tile_index_and_a_bucket_are_inputs_and_results_of_a_batch(folder: Pat
     assert json.loads(reported)["digest"] == run_digest(f"{bucket}/models")
     assert b"Failures" not in storage_at(f"{bucket}/models").get("run.html")
     again = json.loads(call("run", file, "--json")[1])
-    assert (again["digest"], again["counts"]["reused"]) == (
-        json.loads(reported)["digest"],
-        again["counts"]["candidates"],
-    )
+    assert again["digest"] == json.loads(reported)["digest"]
+    assert again["counts"]["reused"] == again["counts"]["candidates"]
 
 
-def test_the_report_is_that_of_the_last_run_or_none(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = tmp_path / "city.toml"
-    text = (folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/")
-    file.write_text(text)
+def test_the_report_is_that_of_the_last_run_or_none(file: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert call("run", file)[0] == 0
-    page = tmp_path / "models" / "run.html"
+    page = file.with_name("models") / "run.html"
     assert page.is_file()
     file.write_text(text.replace("[output]\n", "[output]\nreport = false\n"))
     assert call("run", file)[0] == 0
@@ -133,20 +136,15 @@ def test_the_report_is_that_of_the_last_run_or_none(
     assert "the run is complete, its report could not be written" in error
 
 
-def test_a_batch_of_other_points_is_looked_at_again(folder: Path, tmp_path: Path) -> None:
-    file = tmp_path / "city.toml"
-    text = (folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/")
-    file.write_text(text)
+def test_a_batch_of_other_points_is_looked_at_again(file: Path) -> None:
     assert call("run", file)[0] == 0
-    batch, (count, points) = read_batch(file), buildings_before(str(tmp_path / "city.work"))
+    batch, (count, points) = read_batch(file), buildings_before(str(file.with_suffix(".work")))
     found = estimate(batch, 1, (count, points))
     assert (found.buildings, found.buildings_from) == (count, "as many as in the run before")
     assert estimate(batch, 1, (count, points + 1)).buildings_from.startswith("raised objects in 1 of 1")
 
 
-def test_times_are_reported_before_the_first_run(folder: Path, tmp_path: Path) -> None:
-    file = tmp_path / "city.toml"
-    text = (folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/")
+def test_times_are_reported_before_the_first_run(file: Path, text: str) -> None:
     file.write_text(text + '[schedule]\ncron = "30 2 * * *"\ntime_zone = "Europe/Amsterdam"\n')
     code, reported, _ = call("status", file)
     assert (code, rows(reported)["state"]) == (0, "never run")
@@ -170,21 +168,17 @@ def test_a_schedule_ends_by_signals_and_under_nohup_outlives_its_terminal(hangup
     assert len(reported) == times
 
 
-def test_a_batch_that_someone_runs_is_refused(folder: Path, tmp_path: Path) -> None:
-    file = tmp_path / "city.toml"
-    file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
-    with locked_work(str(tmp_path / "city.work")):
+def test_a_batch_that_someone_runs_is_refused(file: Path) -> None:
+    with locked_work(str(file.with_suffix(".work"))):
         code, _, error = call("run", file)
     assert code == 4
     assert "is at work already" in error
 
 
 def test_who_comes_second_says_nothing_in_the_status_of_who_came_first(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = tmp_path / "city.toml"
-    file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
-    work = tmp_path / "city.work"
+    work = file.with_suffix(".work")
     make_work(work)
     (work / "status.json").write_text("of the first")
     # both looked before either held the folder
@@ -226,22 +220,18 @@ def test_places_that_cannot_be_written_are_refused_before_anything_runs(
     [("plan", 10, "work folder"), ("run", 10, "work folder"), ("plan", 10**12, "")],
 )
 def test_what_does_not_fit_is_refused_before_anything_runs(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, free: int, words: str
+    file: Path, monkeypatch: pytest.MonkeyPatch, command: str, free: int, words: str
 ) -> None:
     monkeypatch.setattr("pipeline.batch.estimates._free", lambda _: free)
-    file = tmp_path / "city.toml"
-    file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
     code, _, error = call(command, file)
     assert code == (4 if words else 0)
     assert words in error
-    assert not (tmp_path / "models").exists()
+    assert not file.with_name("models").exists()
 
 
 def test_results_that_are_replaced_need_no_room_beside_themselves(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = tmp_path / "city.toml"
-    file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
     monkeypatch.setattr("pipeline.batch.estimates._free", lambda path: 10 if path.endswith("models") else 10**12)
     assert "the results in" in call("plan", file)[2]
     (tmp_path / "models").mkdir()
@@ -251,13 +241,8 @@ def test_results_that_are_replaced_need_no_room_beside_themselves(
     assert "the results in" not in call("plan", file)[2]
 
 
-def test_a_tile_that_no_worker_can_hold_is_refused(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def small(**_: object) -> tuple[int, int | None]:
-        return 2, 1_000_000
-
-    monkeypatch.setattr("pipeline.batch.estimates.memory_of_workers", small)
+def test_a_tile_that_no_worker_can_hold_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.batch.estimates.memory_of_workers", lambda **_: (2, 1_000_000))
     code, _, error = call("plan", folder / "city.toml")
     assert code == 4
     assert "Set a smaller tile_size_m, or give the workers more memory" in error
@@ -265,25 +250,18 @@ def test_a_tile_that_no_worker_can_hold_is_refused(
 
 def test_a_limit_that_the_largest_tile_may_exceed_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     need = json.loads(call("plan", folder / "city.toml", "--json")[1])["worker_bytes"]
-
-    def tight(**_: object) -> tuple[int, int | None]:
-        return 2, need - 1
-
-    monkeypatch.setattr("pipeline.batch.estimates.memory_of_workers", tight)
+    monkeypatch.setattr("pipeline.batch.estimates.memory_of_workers", lambda **_: (2, need - 1))
     code, _, error = call("plan", folder / "city.toml")
     assert code == 0
     assert "a worker may need up to" in " ".join(error.split())
 
 
-def test_the_disk_that_work_and_results_share_must_hold_both(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = tmp_path / "city.toml"
-    file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
+def test_the_disk_that_work_and_results_share_must_hold_both(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reported = json.loads(call("plan", file, "--json")[1])
-    monkeypatch.setattr("pipeline.batch.estimates._free", lambda _: reported["work_bytes"] + reported["out_bytes"])
+    need = reported["work_bytes"] + reported["out_bytes"]
+    monkeypatch.setattr("pipeline.batch.estimates._free", lambda _: need)
     assert call("plan", file)[0] == 0
-    monkeypatch.setattr("pipeline.batch.estimates._free", lambda _: reported["work_bytes"] + reported["out_bytes"] - 1)
+    monkeypatch.setattr("pipeline.batch.estimates._free", lambda _: need - 1)
     code, _, error = call("plan", file)
     assert code == 4
     assert "of one disk" in " ".join(error.split())

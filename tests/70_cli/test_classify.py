@@ -9,22 +9,12 @@ from typing import Any
 import laspy
 import numpy as np
 import pytest
-import typer
+from command_line import invoke
 from las_files import write_las
-from typer.testing import CliRunner
 
-from pipeline.cli.classifying import classify
 from pipeline.runtime import engine
 from pipeline.runtime.cluster.local_executor import LocalExecutor
 from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
-
-
-def invoke(*words: str) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error of the command."""
-    app = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
-    app.command()(classify)
-    result = CliRunner().invoke(app, list(words))
-    return result.exit_code, result.stdout, result.stderr
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +30,7 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_file_comes_back_with_classes_and_rasters(house: Path, tmp_path: Path) -> None:
     words = (str(house), "--out", str(tmp_path / "out"), "--workers", "0", "--rasters", "--json")
-    code, out, _ = invoke(*words, "--crs", "EPSG:7415", "--raster-cell", "1")
+    code, out, _ = invoke("classify", *words, "--crs", "EPSG:7415", "--raster-cell", "1")
     assert code == 0
     reported = json.loads(out)
     las = laspy.read(reported["files"][0]["path"])
@@ -57,7 +47,7 @@ def test_this_process_or_its_children_as_the_estimate_says_give_the_same_file(
     house: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_small: bool
 ) -> None:
     serial = tmp_path / "serial"
-    assert invoke(str(house), "--out", str(serial), "--workers", "0", "--quiet")[0] == 0
+    assert invoke("classify", str(house), "--out", str(serial), "--workers", "0", "--quiet")[0] == 0
     engines: list[Executor] = []
 
     def executor_for(*asked: Any, **more: Any) -> Executor:
@@ -68,7 +58,7 @@ def test_this_process_or_its_children_as_the_estimate_says_give_the_same_file(
     if not is_small:
         monkeypatch.setattr(engine, "ALONE_S", 0.0)
         monkeypatch.setattr("pipeline.runtime.isolation.preloading._SMALL_BYTES", 0)
-    code, out, _ = invoke(str(house), "--out", str(tmp_path / "auto"), "--json")
+    code, out, _ = invoke("classify", str(house), "--out", str(tmp_path / "auto"), "--json")
     assert code == 0
     assert [type(one) for one in engines] == [SerialExecutor if is_small else LocalExecutor]
     (reported,) = json.loads(out)["files"]
@@ -76,7 +66,7 @@ def test_this_process_or_its_children_as_the_estimate_says_give_the_same_file(
 
 
 def test_people_see_a_table_of_classes(house: Path, tmp_path: Path) -> None:
-    code, out, _ = invoke(str(house), "--out", str(tmp_path / "out"), "--workers", "0", "--quiet")
+    code, out, _ = invoke("classify", str(house), "--out", str(tmp_path / "out"), "--workers", "0", "--quiet")
     assert code == 0
     assert "2 ground" in out
     assert "6 building" in out
@@ -84,12 +74,14 @@ def test_people_see_a_table_of_classes(house: Path, tmp_path: Path) -> None:
 
 def test_a_file_that_is_there_and_a_cell_without_extent_end_with_their_codes(house: Path, tmp_path: Path) -> None:
     (tmp_path / "house.laz").touch()
-    code, _, err = invoke(str(house), "--out", str(tmp_path), "--workers", "0")
+    code, _, err = invoke("classify", str(house), "--out", str(tmp_path), "--workers", "0")
     assert code == 4
     assert "--overwrite" in err
-    code, _, err = invoke(str(house), "--out", str(tmp_path / "b"), "--workers", "0", "--rasters", "--raster-cell", "0")
+    code, _, err = invoke(
+        "classify", str(house), "--out", str(tmp_path / "b"), "--workers", "0", "--rasters", "--raster-cell", "0"
+    )
     assert code == 2
     assert "raster cell is 0" in err
-    code, _, err = invoke(str(tmp_path / "no.laz"), "--out", str(tmp_path / "c"), "--workers", "0")
+    code, _, err = invoke("classify", str(tmp_path / "no.laz"), "--out", str(tmp_path / "c"), "--workers", "0")
     assert code == 3
     assert "no.laz" in err

@@ -1,4 +1,4 @@
-"""The commands as a user meets them: help, usage errors, input errors, machine output."""
+"""The commands as a user meets them: help, usage errors, input errors, machine output, options that they share."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from command_line import invoke
 
 from pipeline import __version__
 from pipeline.cli import app
+from pipeline.cli.options import worker_count
 
 COMMANDS = (
     *("reconstruct", "rerun", "compare", "classify", "inspect", "simulate", "digest"),
@@ -114,3 +115,35 @@ def test_the_console_script_runs_as_a_program() -> None:
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 3
     assert result.stderr.startswith("error: no-such.laz: no such file")
+
+
+# --- options that several commands share
+
+
+@pytest.mark.parametrize(("text", "workers"), [("auto", None), ("0", 0), ("3", 3), ("1024", 1024)])
+def test_workers_are_a_number_or_left_to_the_estimate(text: str, workers: int | None) -> None:
+    assert worker_count(text) == workers
+
+
+@pytest.mark.parametrize("text", ["many", "", "-1", "1.5", "1025", "AUTO", "²"])
+def test_workers_that_are_no_number_are_named_with_what_to_use(text: str) -> None:
+    with pytest.raises(typer.BadParameter) as raised:
+        worker_count(text)
+    assert str(raised.value) == f"{text!r}: use auto, or a whole number from 0 to 1024"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("reconstruct", "a.laz", "--out", "run"),
+        ("rerun", "run"),
+        ("compare", "a.laz", "--methods", "kmeans", "--out", "out"),
+        ("classify", "a.laz", "--out", "out"),
+        ("demo",),
+    ],
+    ids=lambda words: words[0],
+)
+def test_every_command_with_workers_refuses_what_is_no_number(words: tuple[str, ...]) -> None:
+    code, _, error = invoke(*words, "--workers", "many")
+    assert code == 2
+    assert "'many': use auto, or a whole number from 0 to 1024" in " ".join(error.split())

@@ -11,6 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import invoke
 
+Compared = tuple[Path, dict[str, Any]]
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -22,7 +24,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def compared(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+def compared(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Compared:
     """Three variants measured against the truth: the folder, and the JSON document."""
     out = tmp_path_factory.mktemp("compared") / "out"
     methods = ("--methods", "fuzzy-sart,kmeans:faithful", "--methods", "parameter-space-3d")
@@ -32,17 +34,15 @@ def compared(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     return out, json.loads(said)
 
 
-def test_everything_is_in_one_folder(compared: tuple[Path, dict[str, Any]]) -> None:
+def test_everything_is_in_one_folder(compared: Compared) -> None:
     out, _ = compared
-    assert {entry.name for entry in out.iterdir()} == {
-        "runs", "compare.json", "buildings.parquet", "compare.md", "index.html",
-    }  # fmt: skip
-    assert {entry.name for entry in (out / "runs").iterdir()} == {
-        "fuzzy-sart", "kmeans-faithful", "parameter-space-3d",
-    }  # fmt: skip
+    files = {"compare.json", "buildings.parquet", "compare.md", "index.html"}
+    assert {entry.name for entry in out.iterdir()} == files | {"runs"}
+    labels = {"fuzzy-sart", "kmeans-faithful", "parameter-space-3d"}
+    assert {entry.name for entry in (out / "runs").iterdir()} == labels
 
 
-def test_the_document_is_what_compare_json_holds(compared: tuple[Path, dict[str, Any]]) -> None:
+def test_the_document_is_what_compare_json_holds(compared: Compared) -> None:
     out, document = compared
     stored = json.loads((out / "compare.json").read_text())
     assert {name: document[name] for name in stored} == stored
@@ -50,10 +50,8 @@ def test_the_document_is_what_compare_json_holds(compared: tuple[Path, dict[str,
     assert len(candidates) == 1
     for reported in stored["variants"]:
         assert sum(reported["statuses"].values()) == candidates.copy().pop()
-        assert (
-            json.loads((out / reported["run_dir"] / "run.json").read_text())["content_sha256"]
-            == reported["content_sha256"]
-        )
+        manifest = json.loads((out / reported["run_dir"] / "run.json").read_text())
+        assert manifest["content_sha256"] == reported["content_sha256"]
         assert reported["seconds_a_building"]["median"] > 0.0
         table = pq.read_table(out / "buildings.parquet", columns=["label", "seconds"])
         seconds = [row["seconds"] for row in table.to_pylist() if row["label"] == reported["label"]]
@@ -61,7 +59,7 @@ def test_the_document_is_what_compare_json_holds(compared: tuple[Path, dict[str,
         assert reported["seconds_a_building"] == pytest.approx(expected, abs=1e-6)
 
 
-def test_every_building_has_a_row_a_method(compared: tuple[Path, dict[str, Any]]) -> None:
+def test_every_building_has_a_row_a_method(compared: Compared) -> None:
     out, document = compared
     table = pq.read_table(out / "buildings.parquet")
     candidates = document["variants"][0]["counts"]["candidates"]
@@ -70,7 +68,7 @@ def test_every_building_has_a_row_a_method(compared: tuple[Path, dict[str, Any]]
     assert "outcome" in table.column_names
 
 
-def test_the_page_names_every_method_and_every_building(compared: tuple[Path, dict[str, Any]]) -> None:
+def test_the_page_names_every_method_and_every_building(compared: Compared) -> None:
     out, document = compared
     page = (out / "index.html").read_text()
     for reported in document["variants"]:
@@ -79,14 +77,11 @@ def test_the_page_names_every_method_and_every_building(compared: tuple[Path, di
         assert building_id in page
 
 
-def test_children_give_what_this_process_gives(
-    scene: Path, compared: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_children_give_what_this_process_gives(scene: Path, compared: Compared, tmp_path: Path) -> None:
     methods = ("--methods", "fuzzy-sart,kmeans:faithful,parameter-space-3d")
     options = ("--truth", str(scene / "truth"), "--json")
-    code, said, reported = invoke(
-        "compare", str(scene / "suburb.laz"), *methods, "--out", str(tmp_path / "out"), *options
-    )
+    out = ("--out", str(tmp_path / "out"))
+    code, said, reported = invoke("compare", str(scene / "suburb.laz"), *methods, *out, *options)
     assert code == 0, reported
     local, serial = json.loads(said)["variants"], compared[1]["variants"]
     for name in ("label", "statuses", "counts", "content_sha256"):
@@ -97,9 +92,8 @@ def test_children_give_what_this_process_gives(
 
 
 def test_bad_variants_are_refused_before_anything_is_written(scene: Path, tmp_path: Path) -> None:
-    code, _, reported = invoke(
-        "compare", str(scene / "suburb.laz"), "--methods", "magic,fuzzy-sart:bold", "--out", str(tmp_path / "out")
-    )
+    methods = ("--methods", "magic,fuzzy-sart:bold")
+    code, _, reported = invoke("compare", str(scene / "suburb.laz"), *methods, "--out", str(tmp_path / "out"))
     assert code == 2
     assert "magic" in reported
     assert "bold" in reported

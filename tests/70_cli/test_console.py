@@ -76,10 +76,8 @@ def test_an_input_error_is_one_line_without_a_traceback(capsys: pytest.CaptureFi
 def test_all_faults_of_the_settings_are_reported_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(typer.Exit), Console():
         raise SettingsError(["vigilance is 7: use 0 to 1", "tau is -1: use 1 to 100"])
-    assert capsys.readouterr().err.splitlines() == [
-        "error: vigilance is 7: use 0 to 1",
-        "error: tau is -1: use 1 to 100",
-    ]
+    reported = ["error: vigilance is 7: use 0 to 1", "error: tau is -1: use 1 to 100"]
+    assert capsys.readouterr().err.splitlines() == reported
 
 
 def test_a_fault_of_our_own_shows_its_traceback(capsys: pytest.CaptureFixture[str]) -> None:
@@ -121,15 +119,8 @@ def test_json_events_are_a_line_each(capsys: pytest.CaptureFixture[str]) -> None
     console.on_event(Event(kind="stage", stage="split", total=4))
     console.on_event(Event(kind="warning", message="no vertical unit"))
     events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
-    assert events[0] == {
-        "kind": "stage",
-        "stage": "split",
-        "done": 0,
-        "total": 4,
-        "message": "",
-        "kept": 0,
-        "failed": 0,
-    }
+    counts = {"done": 0, "total": 4, "kept": 0, "failed": 0}
+    assert events[0] == {"kind": "stage", "stage": "split", "message": "", **counts}
     assert events[1] == {"kind": "warning", "message": "no vertical unit"}
 
 

@@ -11,9 +11,8 @@ import laspy
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from typer.testing import CliRunner
+from command_line import invoke
 
-from pipeline.cli import app
 from pipeline.console import ExitCode
 from pipeline.ruler.simulation.dataset import Output, ScenePaths, simulate
 
@@ -28,10 +27,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> ScenePaths:
 
 
 def evaluated(*words: str | Path) -> dict[str, Any]:
-    result = CliRunner().invoke(app, ["evaluate", *(str(word) for word in words), "--json"])
-    assert result.exit_code == 0, result.stderr
-    document: dict[str, Any] = json.loads(result.stdout)
-    return document
+    code, said, error = invoke("evaluate", *map(str, words), "--json")
+    assert code == 0, error
+    return dict(json.loads(said))
 
 
 def figures(document: dict[str, Any]) -> dict[str, float]:
@@ -39,9 +37,9 @@ def figures(document: dict[str, Any]) -> dict[str, float]:
 
 
 def refused(*words: str | Path) -> str:
-    result = CliRunner().invoke(app, ["evaluate", *(str(word) for word in words)])
-    assert result.exit_code in {ExitCode.USAGE, ExitCode.INPUT}
-    return " ".join(result.stderr.split())
+    code, _, error = invoke("evaluate", *map(str, words))
+    assert code in {ExitCode.USAGE, ExitCode.INPUT}
+    return " ".join(error.split())
 
 
 def test_a_report_holds_page_text_and_tables(scene: ScenePaths, tmp_path: Path) -> None:

@@ -12,6 +12,8 @@ from command_line import invoke
 
 from pipeline.console import ExitCode
 
+Run = tuple[Path, dict[str, Any], list[dict[str, Any]]]
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -24,7 +26,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], list[dict[str, Any]]]:
+def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run on it in this process: directory, JSON document, events."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     tile = str(scene / "gable.laz")
@@ -33,14 +35,14 @@ def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, di
     return folder, json.loads(said), [json.loads(line) for line in events.splitlines()]
 
 
-def test_the_gable_becomes_one_gable(run: tuple[Path, dict[str, Any], Any]) -> None:
+def test_the_gable_becomes_one_gable(run: Run) -> None:
     _, summary, _ = run
     assert summary["statuses"] == {"ok": 1}
     assert summary["roof_types"] == {"gable": 1}
     assert summary["failed_tiles"] == []
 
 
-def test_the_run_directory_is_laid_out_as_documented(run: tuple[Path, Any, Any]) -> None:
+def test_the_run_directory_is_laid_out_as_documented(run: Run) -> None:
     folder, _, _ = run
     page = Path(__file__).resolve().parents[2] / "docs" / "run_directory.md"
     documented = {line.split("/")[0].split(" ")[0] for line in page.read_text().split("```")[1].splitlines() if line}
@@ -51,9 +53,7 @@ def test_the_run_directory_is_laid_out_as_documented(run: tuple[Path, Any, Any])
     assert len(list(folder.glob("meshes/*/*.obj"))) == 1
 
 
-def test_levels_of_detail_are_written_side_by_side(
-    scene: Path, run: tuple[Path, dict[str, Any], Any], tmp_path: Path
-) -> None:
+def test_levels_of_detail_are_written_side_by_side(scene: Path, run: Run, tmp_path: Path) -> None:
     words = ("reconstruct", str(scene / "gable.laz"), "--out", str(tmp_path / "run"), "--workers", "0", "--json")
     code, said, _ = invoke(*words, "--lods", "2.2, 1.2,1.3")
     assert code == 0
@@ -68,14 +68,12 @@ def test_levels_of_detail_are_written_side_by_side(
     assert "lods is '2.1': use one of 1.2, 1.3, 2.2" in said
 
 
-def test_the_stages_are_reported_in_order(run: tuple[Path, Any, list[dict[str, Any]]]) -> None:
+def test_the_stages_are_reported_in_order(run: Run) -> None:
     stages = [event["stage"] for event in run[2] if event["kind"] == "stage"]
     assert stages == ["ingest", "split", "join", "outline", "reconstruct", "publish"]
 
 
-def test_a_building_is_overridden_and_the_run_brought_in_line(
-    scene: Path, run: tuple[Path, dict[str, Any], Any], tmp_path: Path
-) -> None:
+def test_a_building_is_overridden_and_the_run_brought_in_line(scene: Path, run: Run, tmp_path: Path) -> None:
     folder, summary, _ = run
     name = next(folder.glob("meshes/*/*.obj")).stem
     overrides = tmp_path / "overrides.toml"
@@ -98,14 +96,12 @@ def test_a_building_is_overridden_and_the_run_brought_in_line(
     assert invoke("rerun", out, "--workers", "0")[0] == invoke(*whole, "--overwrite")[0] == 2
 
 
-def test_digest_prints_what_the_run_reported(run: tuple[Path, dict[str, Any], Any]) -> None:
+def test_digest_prints_what_the_run_reported(run: Run) -> None:
     folder, summary, _ = run
     assert invoke("digest", str(folder)) == (0, f"{summary['digest']}\n", "")
 
 
-def test_a_second_run_needs_leave_to_overwrite_and_gives_the_same(
-    scene: Path, run: tuple[Path, dict[str, Any], Any], tmp_path: Path
-) -> None:
+def test_a_second_run_needs_leave_to_overwrite_and_gives_the_same(scene: Path, run: Run, tmp_path: Path) -> None:
     folder, summary, _ = run
     # by children, as nothing says otherwise; the first run was serial
     again = ("reconstruct", str(scene), "--out", str(folder), "--json")
@@ -155,7 +151,7 @@ def test_a_rectangle_without_points_or_sense_is_refused(
     assert invoke("reconstruct", str(scene / "gable.laz"), *words)[0] == code
 
 
-def test_the_query_of_the_docs_finds_the_building(run: tuple[Path, Any, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_query_of_the_docs_finds_the_building(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     import duckdb
 
     page = Path(__file__).resolve().parents[2] / "docs" / "run_directory.md"
@@ -166,9 +162,7 @@ def test_the_query_of_the_docs_finds_the_building(run: tuple[Path, Any, Any], mo
     assert rows[0][4].startswith("x")
 
 
-def test_a_failed_tile_is_exit_code_1(
-    scene: Path, run: tuple[Path, Any, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_failed_tile_is_exit_code_1(scene: Path, run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     import pipeline.runtime.run as module
 
     whole = module.run

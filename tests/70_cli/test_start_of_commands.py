@@ -48,13 +48,8 @@ with TestClient(create_app(ServiceSettings(state=sys.argv[1])), base_url="http:/
 def imported(program: str, tmp_path: Path, *arguments: str, code: int = 0) -> set[str]:
     """The packages that a program has imported when it ends."""
     reported = tmp_path / "modules.json"
-    ended = subprocess.run(
-        [sys.executable, "-c", program, *arguments],
-        env={**os.environ, "MODULES": str(reported)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command, env = [sys.executable, "-c", program, *arguments], {**os.environ, "MODULES": str(reported)}
+    ended = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
     assert ended.returncode == code, ended.stderr
     return set(json.loads(reported.read_text()))
 

@@ -6,9 +6,8 @@ import json
 from collections.abc import Callable, Iterable
 
 import pytest
-from typer.testing import CliRunner
+from command_line import invoke
 
-from pipeline.cli import app
 from pipeline.compiler import warm_up
 from pipeline.compiler.warm_up import Listed
 
@@ -32,12 +31,6 @@ def compiled(monkeypatch: pytest.MonkeyPatch) -> list[list[Listed]]:
     return calls
 
 
-def invoke(*words: str) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error of the command."""
-    result = CliRunner().invoke(app, ["warm-up", *words])
-    return result.exit_code, result.stdout, result.stderr
-
-
 @pytest.mark.parametrize(
     ("words", "groups"),
     [
@@ -52,16 +45,16 @@ def invoke(*words: str) -> tuple[int, str, str]:
 def test_what_is_named_is_compiled_and_nothing_else(
     compiled: list[list[Listed]], words: tuple[str, ...], groups: list[str] | None
 ) -> None:
-    code, said, _ = invoke(*words)
+    code, said, _ = invoke("warm-up", *words)
     assert code == 0
     assert compiled == [warm_up.listed(groups)]
     assert said.startswith(f"{len(compiled[0])} kernels are compiled; it took ")
 
 
 def test_every_group_that_is_listed_can_be_named_and_adds_kernels(compiled: list[list[Listed]]) -> None:
-    help_text = " ".join(invoke("--help")[1].split())
+    help_text = " ".join(invoke("warm-up", "--help")[1].split())
     for name in warm_up.groups():
-        assert invoke(name)[0] == 0
+        assert invoke("warm-up", name)[0] == 0
         assert compiled[-1]
         assert name in help_text
     assert sum(map(len, compiled)) == len(warm_up.listed())
@@ -71,7 +64,7 @@ def test_every_group_that_is_listed_can_be_named_and_adds_kernels(compiled: list
 def test_a_name_that_is_not_known_is_exit_code_2_with_the_choices(
     compiled: list[list[Listed]], words: tuple[str, ...]
 ) -> None:
-    code, _, reported = invoke(*words)
+    code, _, reported = invoke("warm-up", *words)
     reported = " ".join(reported.split())
     assert code == 2
     assert f"'magic' is not known: use {', '.join(warm_up.groups())} or all" in reported
@@ -80,14 +73,14 @@ def test_a_name_that_is_not_known_is_exit_code_2_with_the_choices(
 
 
 def test_all_names_that_are_not_known_are_reported_at_once(compiled: list[list[Listed]]) -> None:
-    reported = invoke("magic", "spells")[2]
+    reported = invoke("warm-up", "magic", "spells")[2]
     assert "'magic'" in reported
     assert "'spells'" in reported
     assert compiled == []
 
 
 def test_machines_get_seconds_and_kernels_and_how_far_it_is(compiled: list[list[Listed]]) -> None:
-    code, said, reported = invoke("diff", "--json")
+    code, said, reported = invoke("warm-up", "diff", "--json")
     assert code == 0
     document = json.loads(said)
     count = len(compiled[0])

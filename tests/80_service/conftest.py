@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from driver_bench import bench  # noqa: F401 - a fixture
+from live_service import POINTS
 from migrated import with_tables
 from starlette.testclient import TestClient
 
@@ -18,11 +21,12 @@ from service.keys import Scope, new_key
 from service.settings import ServiceSettings
 from service.store import JobStore
 
+sys.path.insert(0, str(Path(__file__).parent))
+
+import finished_runs as runs
+
 OWN_URL = "http://127.0.0.1:8000"
 """What the tests call the service; a foreign name is refused."""
-
-POINTS = b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(20) for y in range(20))
-"""A point cloud as text, small and valid."""
 
 
 class LocalService:
@@ -50,6 +54,11 @@ class LocalService:
         job = self.store.claim("a driver", lease_s=3600.0, max_attempts=3)
         assert job is not None
         return job
+
+    def request_of(self, answer: httpx.Response) -> JobRequest:
+        """The request of the job that an answer has made."""
+        assert answer.status_code == 201, answer.text
+        return self.store.get(answer.json()["jobID"]).request
 
     def key(self, scope: Scope) -> dict[str, str]:
         """A new key, as the header that sends it."""
@@ -80,3 +89,16 @@ def starting(tmp_path: Path) -> Iterator[Starting]:
 def local_service(starting: Starting) -> LocalService:
     """A service on loopback, without keys."""
     return starting()
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[runs.Service]:
+    """A service without keys that holds finished runs as jobs."""
+    with runs.service(tmp_path_factory.mktemp("state")) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def client(service: runs.Service) -> TestClient:
+    """A client of it."""
+    return service.client

@@ -11,7 +11,6 @@ import re
 import resource
 import sqlite3
 import struct
-import sys
 import tracemalloc
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +22,7 @@ import pytest
 from examples import examples
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from live_service import las_bytes
 
 from pipeline.errors import EmptyInputError, InputError, UnreadableInputError
 from pipeline.io import SpatialReference, read_footprints
@@ -30,10 +30,6 @@ from service import vectors
 from service.errors import LimitError, TooLargeError
 from service.preflight import CHILD_S, Examiner, examine
 from service.vectors import DEPTH_LIMIT, _levels
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from live_service import las_bytes
 
 MOST = 10_000_000
 """Points that are allowed here."""
@@ -352,30 +348,14 @@ def whole_files(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[str, byt
     return [*samples(), (".gpkg", path.read_bytes())]
 
 
+ODD = [b"\xff" * 8, b"\0" * 8, b"9" * 30, b"nan", b"1e999", b"\n", b"[", b'"', b"\\"]
+ODD += [struct.pack("<d", float("nan")), struct.pack("<d", 1e308), struct.pack("<Q", 2**63)]
+ODD += [b"property list uchar int x\n", b"property float x\n", b"element vertex -5\n"]
 edits = st.lists(
     st.tuples(
         st.sampled_from(["set", "insert", "delete", "cut"]),
         st.floats(0.0, 1.0),
-        st.binary(min_size=1, max_size=12)
-        | st.sampled_from(
-            [
-                b"\xff" * 8,
-                b"\0" * 8,
-                struct.pack("<d", float("nan")),
-                struct.pack("<d", 1e308),
-                struct.pack("<Q", 2**63),
-                b"9" * 30,
-                b"nan",
-                b"1e999",
-                b"\n",
-                b"[",
-                b'"',
-                b"\\",
-                b"property list uchar int x\n",
-                b"property float x\n",
-                b"element vertex -5\n",
-            ]
-        ),
+        st.binary(min_size=1, max_size=12) | st.sampled_from(ODD),
     ),
     min_size=1,
     max_size=5,
@@ -428,8 +408,13 @@ def examiner() -> Iterator[Examiner]:
     made.close()
 
 
-def test_the_child_answers_as_the_function_does(tmp_path: Path, examiner: Examiner) -> None:
-    good = written(tmp_path, "a.laz", las_bytes(100))
+@pytest.fixture
+def good(tmp_path: Path) -> Path:
+    """A file of a hundred points."""
+    return written(tmp_path, "a.laz", las_bytes(100))
+
+
+def test_the_child_answers_as_the_function_does(tmp_path: Path, good: Path, examiner: Examiner) -> None:
     assert examiner.examine(good, max_points=MOST) == examine(good, max_points=MOST)
     with pytest.raises(TooLargeError, match="has 100 points, this service takes 99"):
         examiner.examine(good, max_points=99)
@@ -441,10 +426,8 @@ def test_the_child_answers_as_the_function_does(tmp_path: Path, examiner: Examin
             examiner.examine(path, max_points=MOST)
 
 
-def test_a_file_over_which_the_child_hangs_is_refused_and_the_next_is_served(
-    tmp_path: Path, examiner: Examiner
-) -> None:
-    good, pipe = written(tmp_path, "a.laz", las_bytes(100)), tmp_path / "b.laz"
+def test_a_file_over_which_the_child_hangs_is_refused_and_the_next_is_served(good: Path, examiner: Examiner) -> None:
+    pipe = good.with_name("b.laz")
     os.mkfifo(pipe)  # opening it waits for a writer that never comes
     examiner._timeout_s = 1.0
     with pytest.raises(UnreadableInputError, match="could not be read within 1 s"):
@@ -453,8 +436,8 @@ def test_a_file_over_which_the_child_hangs_is_refused_and_the_next_is_served(
     assert examiner.examine(good, max_points=MOST)["pointCount"] == 100
 
 
-def test_a_file_over_which_the_child_dies_is_refused_and_the_next_is_served(tmp_path: Path, examiner: Examiner) -> None:
-    good, pipe = written(tmp_path, "a.laz", las_bytes(100)), tmp_path / "b.laz"
+def test_a_file_over_which_the_child_dies_is_refused_and_the_next_is_served(good: Path, examiner: Examiner) -> None:
+    pipe = good.with_name("b.laz")
     os.mkfifo(pipe)
 
     def kill_the_readers() -> None:
@@ -462,7 +445,6 @@ def test_a_file_over_which_the_child_dies_is_refused_and_the_next_is_served(tmp_
         for _ in range(2):  # it is tried twice
             with pipe.open("wb"):
                 child = examiner._child
-                assert child is not None
                 child.kill()
                 child.wait()
 
@@ -485,10 +467,7 @@ def test_an_answer_that_cannot_be_read_is_not_taken_for_that_of_the_next_file(
     assert examiner.examine(second, max_points=MOST)["pointCount"] == 55
 
 
-def test_the_child_answers_also_where_a_thousand_files_and_connections_are_open(
-    tmp_path: Path, examiner: Examiner
-) -> None:
-    good = written(tmp_path, "a.laz", las_bytes(100))
+def test_the_child_answers_also_where_a_thousand_files_and_connections_are_open(good: Path, examiner: Examiner) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = 2000
     if hard != resource.RLIM_INFINITY and hard < wanted:
@@ -503,11 +482,9 @@ def test_the_child_answers_also_where_a_thousand_files_and_connections_are_open(
         examiner.close()
 
 
-def test_a_child_that_was_killed_is_started_again_without_a_word(tmp_path: Path, examiner: Examiner) -> None:
-    good = written(tmp_path, "a.laz", las_bytes(100))
+def test_a_child_that_was_killed_is_started_again_without_a_word(good: Path, examiner: Examiner) -> None:
     for _ in range(2):
         assert examiner.examine(good, max_points=MOST)["pointCount"] == 100
-        assert examiner._child is not None
         examiner._child.kill()
         examiner._child.wait()
 
@@ -528,7 +505,6 @@ def test_the_child_knows_none_of_the_services_secrets(
 ) -> None:
     monkeypatch.setenv("GABLEWORK_DATABASE_URL", "postgresql+pg8000://me:secret@host/db")
     examiner.examine(written(tmp_path, "a.laz", las_bytes(10)), max_points=MOST)
-    assert examiner._child is not None
     environment = Path(f"/proc/{examiner._child.pid}/environ")
     if not environment.exists():
         pytest.skip("this system does not show a process's environment")

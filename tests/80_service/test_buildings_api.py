@@ -6,25 +6,21 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cityjson_rules
+import finished_runs as runs
 import geopandas
+import glb_rules
+import httpx
 import pytest
 import shapely
+import small_buildings as small
 from examples import examples
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
-
-sys.path.insert(0, str(Path(__file__).parent))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "60_export"))
-
-import cityjson_rules
-import finished_runs as runs
-import glb_rules
-import small_buildings as small
 
 from pipeline.export.geoparquet import read_table
 from service.errors import RequestError
@@ -50,17 +46,6 @@ def nine_tiles() -> runs.Tiles:
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[runs.Service]:
-    with runs.service(tmp_path_factory.mktemp("state")) as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def client(service: runs.Service) -> TestClient:
-    return service.client
-
-
-@pytest.fixture(scope="module")
 def job_id(service: runs.Service) -> str:
     """A job of six buildings in four tiles."""
     return service.finished()
@@ -80,10 +65,15 @@ def out_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out"
 
 
+def answered(client: TestClient, job_id: str, **asked: Any) -> httpx.Response:
+    """The answer to a request for a page of buildings."""
+    names = {name.replace("_crs", "-crs"): value for name, value in asked.items()}
+    return client.get(f"/jobs/{job_id}/buildings", params=names)
+
+
 def page(client: TestClient, job_id: str, **asked: Any) -> dict[str, Any]:
     """A page of buildings."""
-    names = {name.replace("_crs", "-crs"): value for name, value in asked.items()}
-    answer = client.get(f"/jobs/{job_id}/buildings", params=names)
+    answer = answered(client, job_id, **asked)
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "application/geo+json"
     found: dict[str, Any] = answer.json()
@@ -97,11 +87,7 @@ def ids(found: dict[str, Any]) -> list[str]:
 
 def refused(client: TestClient, job_id: str, **asked: Any) -> str:
     """The detail of a request that is refused."""
-    names = {name.replace("_crs", "-crs"): value for name, value in asked.items()}
-    answer = client.get(f"/jobs/{job_id}/buildings", params=names)
-    assert answer.status_code == 400, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-    return str(answer.json()["detail"])
+    return runs.problem(answered(client, job_id, **asked), 400, "invalid-request")
 
 
 # --- pages -----------------------------------------------------------------------------------------------------------
@@ -276,23 +262,17 @@ def queries(draw: st.DrawFn) -> BuildingQuery:
 
 def twin(features: list[dict[str, Any]], query: BuildingQuery) -> list[str]:
     """The ids that fit, found by looking at every feature."""
+    wanted = {"status": query.statuses, "roof_type": query.roof_types, "reason": query.reasons}
     found = []
     for feature in features:
-        record = feature["properties"]
         if query.bbox is not None:
             if feature["geometry"] is None:
                 continue
-            if not shapely.box(*shapely.geometry.shape(feature["geometry"]).bounds).intersects(
-                shapely.box(*query.bbox)
-            ):
+            own = shapely.box(*shapely.geometry.shape(feature["geometry"]).bounds)
+            if not own.intersects(shapely.box(*query.bbox)):
                 continue
-        if query.statuses and record["status"] not in query.statuses:
-            continue
-        if query.roof_types and record["roof_type"] not in query.roof_types:
-            continue
-        if query.reasons and record["reason"] not in query.reasons:
-            continue
-        found.append(feature["id"])
+        if all(not words or feature["properties"][name] in words for name, words in wanted.items()):
+            found.append(feature["id"])
     return sorted(found)
 
 
@@ -414,9 +394,6 @@ def test_a_job_has_meshes_of_one_kind_and_names_it(client: TestClient, job_id: s
         assert answer.status_code == 404
         assert answer.json()["detail"].endswith(f"request building {GABLE} with f={there}")
         assert client.get(f"/jobs/{job}/buildings/{GABLE}", params={"f": there}).status_code == 200
-    failed = client.get(f"/jobs/{glb_job}/buildings/{FAILED}", params={"f": "glb"})
-    assert failed.status_code == 404
-    assert "has no model (too_few_points)" in failed.json()["detail"]
 
 
 @pytest.mark.parametrize("meshes", ["building", "tile", "glb"])
@@ -454,18 +431,17 @@ def test_a_glb_that_is_gone_or_another_is_reported(client: TestClient, service: 
     job = service.finished(lambda run_dir: runs.write_run(run_dir, meshes="glb"), meshes="glb")
     (path,) = service.folder.run(job, 1).glob("meshes/x851_y4470/*.glb")
     (other,) = service.folder.run(job, 1).glob("meshes/x850_y4470/*.glb")
+    asked = f"/jobs/{job}/buildings/{TWO_PARTS}?f=glb"
     path.write_bytes(other.read_bytes())
-    answer = client.get(f"/jobs/{job}/buildings/{TWO_PARTS}", params={"f": "glb"})
-    assert (answer.status_code, "holds no building" in answer.json()["detail"]) == (404, True)
+    assert "holds no building" in runs.problem(client.get(asked), 404, "no-such-building")
     path.unlink()
-    answer = client.get(f"/jobs/{job}/buildings/{TWO_PARTS}", params={"f": "glb"})
-    assert (answer.status_code, "no longer in the state folder" in answer.json()["detail"]) == (404, True)
+    assert "no longer in the state folder" in runs.problem(client.get(asked), 404, "no-such-building")
 
 
-def test_a_building_without_model_has_no_mesh_and_says_why(client: TestClient, job_id: str) -> None:
-    answer = client.get(f"/jobs/{job_id}/buildings/{FAILED}", params={"f": "obj"})
-    assert answer.status_code == 404
-    assert "has no model (too_few_points)" in answer.json()["detail"]
+def test_a_building_without_model_has_no_mesh_and_says_why(client: TestClient, job_id: str, glb_job: str) -> None:
+    for job, form in ((job_id, "obj"), (glb_job, "glb")):
+        answer = client.get(f"/jobs/{job}/buildings/{FAILED}", params={"f": form})
+        assert "has no model (too_few_points)" in runs.problem(answer, 404, "no-such-building")
     links = client.get(f"/jobs/{job_id}/buildings/{FAILED}").json()["links"]
     assert "model/obj" not in {link["type"] for link in links}
 
@@ -473,8 +449,7 @@ def test_a_building_without_model_has_no_mesh_and_says_why(client: TestClient, j
 def test_a_job_without_meshes_says_so(service: runs.Service) -> None:
     job = service.finished(lambda run_dir: runs.write_run(run_dir, meshes="none"), meshes="none")
     answer = service.client.get(f"/jobs/{job}/buildings/{GABLE}", params={"f": "obj"})
-    assert answer.status_code == 404
-    assert "left out the meshes" in answer.json()["detail"]
+    assert "left out the meshes" in runs.problem(answer, 404, "no-such-building")
     assert service.client.get(f"/jobs/{job}/buildings/{GABLE}", params={"f": "cityjson"}).status_code == 200
 
 
@@ -583,12 +558,8 @@ def test_the_openapi_document_describes_pages_and_buildings(client: TestClient) 
     reported = {word.strip(" `") for row in rows for word in row.split(",")}
     assert {entry["name"] for entry in listed["parameters"]} - {"jobID"} <= reported
     one = described["/jobs/{jobID}/buildings/{buildingID}"]["get"]["responses"]
-    assert set(one["200"]["content"]) == {
-        "application/geo+json",
-        "model/obj",
-        "model/gltf-binary",
-        "application/city+json",
-    }
+    media_types = {"application/geo+json", "model/obj", "model/gltf-binary", "application/city+json"}
+    assert set(one["200"]["content"]) == media_types
     for answers in (listed["responses"], one):
         assert {"200", "400", "401", "403", "404", "406", "422", "429", "500", "503"} <= set(answers)
     assert listed["responses"]["200"]["content"]["application/geo+json"]["example"]["features"]

@@ -5,21 +5,16 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-import sys
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import finished_runs as runs
 import jsonschema
 import pyarrow.parquet as pq
 import pytest
 from driver_bench import Bench
 from starlette.testclient import TestClient
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-import finished_runs as runs
 
 from pipeline.errors import ClusterError, SettingsError
 from pipeline.methods import METHODS
@@ -129,25 +124,24 @@ def test_outputs_are_those_of_the_process(local_service) -> None:
     assert "is not an output: use buildings" in faults_of(execute(local_service, "reconstruct", outputs={"page": {}}))
 
 
+def send_form(service, **fields: object):
+    files = {"tile": ("a.xyz", b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(9) for y in range(9)))}
+    return service.client.post("/jobs", files=files, data={"crs": "EPSG:28992", **fields})
+
+
 @pytest.mark.parametrize("methods", [["fuzzy-sart, fuzzy-sart:faithful"], TWO])
 def test_one_call_with_several_methods_compares_them(local_service, methods: list[str]) -> None:
-    files = {"tile": ("a.xyz", b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(9) for y in range(9)))}
-    form = {"crs": "EPSG:28992", "methods": methods, "outputs": "page,summary"}
-    answer = local_service.client.post("/jobs", files=files, data=form)
-    assert answer.status_code == 201, answer.text
-    asked = local_service.store.get(answer.json()["jobID"]).request
+    form = {"methods": methods, "outputs": "page,summary"}
+    answer = send_form(local_service, **form)
+    asked = local_service.request_of(answer)
     assert (asked.process_id, asked.methods, asked.outputs) == ("compare", tuple(TWO), ("page", "summary"))
-    refused = local_service.client.post("/jobs", files=files, data={**form, "preset": "robust"})
-    assert '"preset" is not an input' in faults_of(refused)
+    assert '"preset" is not an input' in faults_of(send_form(local_service, **form, preset="robust"))
 
 
 @pytest.mark.parametrize("left_empty", ["", " , "])
 def test_one_call_takes_a_preset_and_no_methods_for_none(local_service, left_empty: str) -> None:
-    files = {"tile": ("a.xyz", b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(9) for y in range(9)))}
-    form = {"crs": "EPSG:28992", "method": "kmeans", "preset": "faithful", "methods": left_empty}
-    answer = local_service.client.post("/jobs", files=files, data=form)
-    assert answer.status_code == 201, answer.text
-    asked = local_service.store.get(answer.json()["jobID"]).request
+    answer = send_form(local_service, method="kmeans", preset="faithful", methods=left_empty)
+    asked = local_service.request_of(answer)
     assert (asked.process_id, asked.settings) == ("reconstruct", {"method": "kmeans", "preset": "faithful"})
 
 
@@ -170,7 +164,6 @@ def test_a_driver_compares_and_says_how_it_goes(bench: Bench) -> None:
     assert (done.status, done.progress) == (JobStatus.SUCCESSFUL, 100), done.failure
     by_status = "2 ok, 0 fallback, 0 failed"
     assert done.message == f"2 methods on 2 buildings: {ROBUST} {by_status}; {FAITHFUL} {by_status}"
-    assert done.summary is not None
     assert list(done.summary["runs"]) == [ROBUST, FAITHFUL]
     assert done.summary["runs"][FAITHFUL]["digest"] == "d" * 64
     (request,) = bench.script.compared
@@ -196,8 +189,8 @@ def test_a_running_comparison_that_is_dismissed_stops_and_leaves_no_file(bench: 
     assert not bench.folder.job(job.job_id).exists()
 
 
-def test_a_comparison_whose_cluster_is_lost_is_tried_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.driver.attempts.pause_s", lambda _losses: 0.0)
+def test_a_comparison_whose_cluster_is_lost_is_tried_again(bench: Bench) -> None:
+    bench.patch.setattr("service.driver.attempts.pause_s", lambda _losses: 0.0)
     job = bench.submit(COMPARISON)
     bench.script.raises(ClusterError("the scheduler was lost"))
     bench.driver()
@@ -209,7 +202,6 @@ def test_a_process_that_a_driver_does_not_know_fails_with_those_that_it_does(ben
     job = bench.submit({"process_id": "paint"})
     bench.driver()
     done = bench.over(job)
-    assert done.failure is not None
     assert done.failure.fault is Fault.INPUT
     assert "does not run the process paint, only reconstruct, compare" in done.failure.detail
 
@@ -243,17 +235,6 @@ def test_a_setting_out_of_range_is_found_before_anything_runs(tmp_path: Path) ->
 
 
 # --- what its results answer
-
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[runs.Service]:
-    with runs.service(tmp_path_factory.mktemp("state")) as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def client(service: runs.Service) -> TestClient:
-    return service.client
 
 
 @pytest.fixture(scope="module")

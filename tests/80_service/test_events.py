@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 import threading
 from collections.abc import Iterator
@@ -9,12 +10,8 @@ from collections.abc import Iterator
 from service.jobs import JobEvent, JobStatus
 from service.routes import events as events_routes
 
-STREAM = {"Accept": "text/event-stream"}
-
 
 def event(kind: str, **values: object) -> JobEvent:
-    import datetime as dt
-
     return JobEvent(sequence=0, at=dt.datetime.now(tz=dt.UTC), kind=kind, **values)
 
 
@@ -36,9 +33,13 @@ def finished(service) -> str:
     return job.job_id
 
 
+def streamed(service, job_id: str, **headers: str):
+    """The answer to a request for a job's stream."""
+    return service.client.get(f"/jobs/{job_id}/events", headers={"Accept": "text/event-stream", **headers})
+
+
 def test_the_stream_of_a_finished_job_says_all_and_ends(local_service) -> None:
-    job_id = finished(local_service)
-    answer = local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM)
+    answer = streamed(local_service, finished(local_service))
     assert answer.headers["content-type"].startswith("text/event-stream")
     assert answer.text.startswith("retry: ")
     reported = list(parsed(answer.text))
@@ -50,21 +51,20 @@ def test_the_stream_of_a_finished_job_says_all_and_ends(local_service) -> None:
 
 def test_a_broken_stream_goes_on_where_it_broke(local_service) -> None:
     job_id = finished(local_service)
-    whole = list(parsed(local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM).text))
-    rest = local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM | {"Last-Event-ID": str(whole[1]["id"])})
+    whole = list(parsed(streamed(local_service, job_id).text))
+    rest = streamed(local_service, job_id, **{"Last-Event-ID": str(whole[1]["id"])})
     assert list(parsed(rest.text)) == whole[2:]
 
 
 def test_a_client_with_all_events_of_a_finished_job_gets_204(local_service) -> None:
-    job_id = finished(local_service)
-    answer = local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM | {"Last-Event-ID": "999"})
+    answer = streamed(local_service, finished(local_service), **{"Last-Event-ID": "999"})
     assert answer.status_code == 204
 
 
 def test_an_odd_last_event_id_counts_for_nothing(local_service) -> None:
     job_id = finished(local_service)
     for odd in ("x", "-1", "1e3", ""):
-        answer = local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM | {"Last-Event-ID": odd})
+        answer = streamed(local_service, job_id, **{"Last-Event-ID": odd})
         assert len(list(parsed(answer.text))) == 5
 
 
@@ -79,7 +79,7 @@ def test_a_stream_follows_a_job_that_runs_until_it_is_over(starting) -> None:
 
     driver = threading.Thread(target=drive)
     driver.start()
-    reported = list(parsed(service.client.get(f"/jobs/{job.job_id}/events", headers=STREAM).text))
+    reported = list(parsed(streamed(service, job.job_id).text))
     driver.join(60.0)
     assert [entry["message"] for entry in reported if entry["kind"] == "warning"] == [f"number {n}" for n in range(20)]
     assert reported[-1]["status"] == JobStatus.SUCCESSFUL
@@ -101,7 +101,7 @@ def test_a_stream_without_events_shows_that_it_lives_and_ends_when_the_job_is_go
         return original(job_id, **options)
 
     monkeypatch.setattr(service.store, "get", get)
-    answer = service.client.get(f"/jobs/{job.job_id}/events", headers=STREAM)
+    answer = streamed(service, job.job_id)
     assert [entry.get("status") for entry in parsed(answer.text)] == ["accepted", "running"]
 
 
@@ -119,12 +119,12 @@ def test_more_streams_than_allowed_are_refused_and_counted_down_again(starting) 
     job_id = finished(service)
     streams = service.client.app.state.streams
     streams.open(1)
-    refused = service.client.get(f"/jobs/{job_id}/events", headers=STREAM)
+    refused = streamed(service, job_id)
     assert refused.status_code == 429
     assert int(refused.headers["retry-after"]) >= 1
     streams.close()
     for _ in range(3):
-        assert service.client.get(f"/jobs/{job_id}/events", headers=STREAM).status_code == 200
+        assert streamed(service, job_id).status_code == 200
     assert streams.count == 0
 
 
@@ -132,6 +132,6 @@ def test_a_process_that_ends_ends_its_streams(starting) -> None:
     service = starting(poll_s=0.01)
     job = service.running()
     service.client.app.state.streams.closing = True
-    answer = service.client.get(f"/jobs/{job.job_id}/events", headers=STREAM)
+    answer = streamed(service, job.job_id)
     assert answer.status_code == 200
     assert list(parsed(answer.text)) == []

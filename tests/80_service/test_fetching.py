@@ -7,7 +7,6 @@ import gzip
 import hashlib
 import http.server
 import os
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any, ClassVar
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from live_service import las_bytes
 
 from pipeline.errors import InputError, RunCancelledError, UnreadableInputError
 from pipeline.runtime.monitoring.progress import Progress
@@ -35,10 +35,6 @@ from service.files import StateFolder
 from service.input_policy import checked_path
 from service.jobs import InputReference, JobRequest, Upload
 from service.settings import ServiceSettings
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from live_service import las_bytes
 
 NOW = dt.datetime(2026, 3, 1, tzinfo=dt.UTC)
 MINE, OTHERS = "1" * 32, "2" * 32
@@ -60,6 +56,11 @@ class FakeTable:
 class World:
     """A state folder with uploads, a root with files, and settings."""
 
+    server = ""
+    """The URL of a server, if there is one."""
+    answers: type[Answers]
+    """What it answers, and what it saw."""
+
     def __init__(self, folder: Path, **values: Any) -> None:
         self.root = folder / "tiles"
         self.root.mkdir()
@@ -70,6 +71,10 @@ class World:
         self.target = folder / "inputs"
         chosen: dict[str, Any] = {"state": self.folder.root, "input_roots": (self.root,)} | values
         self.settings = ServiceSettings(**chosen)
+
+    @property
+    def known(self) -> dict[str, Any]:
+        return {"store": self.store, "folder": self.folder, "settings": self.settings}
 
     def add_upload(self, filename: str = "a.laz", content: bytes = b"", *, owner: str = MINE, **reported: Any) -> str:
         upload_id = f"{len(self.store.held) + 10:032x}"
@@ -97,17 +102,14 @@ class World:
 
     def resolve(self, *tiles: InputReference, owner: str | None = MINE, **values: Any) -> None:
         request = JobRequest(tiles=tiles, **values)
-        resolve_inputs(request, store=self.store, folder=self.folder, settings=self.settings, owner=owner)
+        resolve_inputs(request, owner=owner, **self.known)
 
     def materialise(self, reference: InputReference, cancelled: Callable[[], bool] = lambda: False) -> Fetched:
-        return materialise(
-            reference,
-            store=self.store,
-            folder=self.folder,
-            settings=self.settings,
-            target=self.target,
-            cancelled=cancelled,
-        )
+        return materialise(reference, target=self.target, cancelled=cancelled, **self.known)
+
+    def fetched(self, path: str, cancelled: Callable[[], bool] = lambda: False) -> Fetched:
+        """From the server."""
+        return self.materialise(url(f"{self.server}/{path}"), cancelled)
 
     def refuses(self, reference: InputReference, kind: type[ServiceError], match: str) -> None:
         """At submission and when it runs."""
@@ -190,14 +192,7 @@ def test_points_of_all_inputs_together_are_limited(tmp_path: Path) -> None:
         world.resolve(*uploads[:2], path(world.add_file("b.laz")))
     request = JobRequest(tiles=tuple(uploads))
     with pytest.raises(TooLargeError):
-        gather(
-            request,
-            store=world.store,
-            folder=world.folder,
-            settings=world.settings,
-            target=world.target,
-            cancelled=lambda: False,
-        )
+        gather(request, target=world.target, cancelled=lambda: False, **world.known)
 
 
 def test_inputs_are_counted(tmp_path: Path) -> None:
@@ -428,106 +423,102 @@ def server() -> Iterator[tuple[str, type[Answers]]]:
 def web(tmp_path: Path, server: tuple[str, type[Answers]], monkeypatch: pytest.MonkeyPatch) -> World:
     """A world that may fetch from the server, and does not wait long between tries."""
     monkeypatch.setattr(downloads, "FIRST_PAUSE_S", 0.01)
-    return World(tmp_path, input_hosts=(server[0],), max_upload_bytes=1_000_000)
+    world = World(tmp_path, input_hosts=(server[0],), max_upload_bytes=1_000_000)
+    world.server, world.answers = server
+    return world
 
 
 def left_of(world: World) -> list[Path]:
     return [file for file in world.target.rglob("*") if file.is_file()]
 
 
-def test_a_url_is_fetched_as_it_is_with_its_hash(web: World, server: tuple[str, type[Answers]]) -> None:
-    place = f"{server[0]}/good/tile%201.laz?token=secret"
+def test_a_url_is_fetched_as_it_is_with_its_hash(web: World) -> None:
+    place = f"{web.server}/good/tile%201.laz?token=secret"
     web.resolve(url(place))
     found = web.materialise(url(place))
     assert found.path.read_bytes() == Answers.content
     assert found.path.name == "tile 1.laz"
     assert found.path.is_relative_to(web.target)
     assert (found.points, found.sha256) == (100, hashlib.sha256(Answers.content).hexdigest())
-    ((_, headers),) = server[1].seen
+    ((_, headers),) = web.answers.seen
     assert headers["Accept-Encoding"] == "identity"
     assert not {"Cookie", "Authorization"} & set(headers)
 
 
-def test_nothing_is_fetched_when_a_job_is_submitted(web: World, server: tuple[str, type[Answers]]) -> None:
-    web.resolve(url(f"{server[0]}/good/a.laz"))
-    assert server[1].seen == []
+def test_nothing_is_fetched_when_a_job_is_submitted(web: World) -> None:
+    web.resolve(url(f"{web.server}/good/a.laz"))
+    assert web.answers.seen == []
 
 
-def test_two_urls_with_one_name_do_not_meet(web: World, server: tuple[str, type[Answers]]) -> None:
-    paths = {web.materialise(url(f"{server[0]}/good/{folder}/a.laz")).path for folder in "xy"}
+def test_two_urls_with_one_name_do_not_meet(web: World) -> None:
+    paths = {web.fetched(f"good/{folder}/a.laz").path for folder in "xy"}
     assert len(paths) == 2
 
 
 @pytest.mark.parametrize("name", ["a.zip", "", "a", "..", "%2e%2e", "a.laz%00.exe", "a.laz/"])
-def test_a_url_whose_name_ends_in_no_format_is_refused(
-    web: World, server: tuple[str, type[Answers]], name: str
-) -> None:
+def test_a_url_whose_name_ends_in_no_format_is_refused(web: World, name: str) -> None:
     with pytest.raises(RequestError):
-        web.resolve(url(f"{server[0]}/good/{name}"))
+        web.resolve(url(f"{web.server}/good/{name}"))
 
 
 @pytest.mark.parametrize("name", ["..%2f..%2f..%2fa.laz", "%2fetc%2fa.laz", "..%5c..%5ca.laz", "a%00.laz", "%0aa.laz"])
-def test_a_url_cannot_name_a_place_on_our_disk(web: World, server: tuple[str, type[Answers]], name: str) -> None:
-    found = web.materialise(url(f"{server[0]}/good/{name}"))
+def test_a_url_cannot_name_a_place_on_our_disk(web: World, name: str) -> None:
+    found = web.fetched(f"good/{name}")
     assert found.path.name == "a.laz"
     assert found.path.parent.parent == web.target
 
 
-def test_redirects_are_followed_within_the_list_and_not_for_ever(web: World, server: tuple[str, type[Answers]]) -> None:
-    assert web.materialise(url(f"{server[0]}/hop/2/a.laz")).points == 100
+def test_redirects_are_followed_within_the_list_and_not_for_ever(web: World) -> None:
+    assert web.fetched("hop/2/a.laz").points == 100
     with pytest.raises(UnreadableInputError, match="redirects more than 3 times"):
-        web.materialise(url(f"{server[0]}/hop/9/a.laz"))
+        web.fetched("hop/9/a.laz")
 
 
 @pytest.mark.parametrize("word", ["away", "file", "nowhere"])
-def test_a_redirect_to_another_place_is_refused_before_it_is_asked(
-    web: World, server: tuple[str, type[Answers]], word: str
-) -> None:
+def test_a_redirect_to_another_place_is_refused_before_it_is_asked(web: World, word: str) -> None:
     class Other(Answers):
         seen: ClassVar[list[tuple[str, dict[str, str]]]] = []
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Other) as listener:
         thread = threading.Thread(target=listener.serve_forever)
         thread.start()
-        server[1].elsewhere = f"http://127.0.0.1:{listener.server_port}"
+        web.answers.elsewhere = f"http://127.0.0.1:{listener.server_port}"
         with pytest.raises((InputRefusedError, UnreadableInputError)):
-            web.materialise(url(f"{server[0]}/{word}/a.laz"))
+            web.fetched(f"{word}/a.laz")
         listener.shutdown()
         thread.join()
     assert Other.seen == []
     assert left_of(web) == []
 
 
-def test_a_compressed_answer_is_refused_and_never_unpacked(web: World, server: tuple[str, type[Answers]]) -> None:
+def test_a_compressed_answer_is_refused_and_never_unpacked(web: World) -> None:
     with pytest.raises(UnreadableInputError, match="with the encoding 'gzip'"):
-        web.materialise(url(f"{server[0]}/gzip/a.laz"))
+        web.fetched("gzip/a.laz")
     with pytest.raises(UnreadableInputError, match="gzip file: unpack it first"):
-        web.materialise(url(f"{server[0]}/secretly/a.laz"))
+        web.fetched("secretly/a.laz")
     assert all(file.stat().st_size < 1_000_000 for file in left_of(web))
 
 
 @pytest.mark.parametrize("word", ["endless", "boastful"])
-def test_an_answer_that_is_too_long_is_cut_off(web: World, server: tuple[str, type[Answers]], word: str) -> None:
+def test_an_answer_that_is_too_long_is_cut_off(web: World, word: str) -> None:
     with pytest.raises(TooLargeError, match=r"bytes or more, this service takes 1000000"):
-        web.materialise(url(f"{server[0]}/{word}/a.laz"))
+        web.fetched(f"{word}/a.laz")
     assert left_of(web) == []
 
 
-def test_a_busy_server_is_asked_again_and_a_refusing_one_is_not(web: World, server: tuple[str, type[Answers]]) -> None:
-    assert web.materialise(url(f"{server[0]}/busy/a.laz")).points == 100
-    assert len(server[1].seen) == 3
-    server[1].seen.clear()
+def test_a_busy_server_is_asked_again_and_a_refusing_one_is_not(web: World) -> None:
+    assert web.fetched("busy/a.laz").points == 100
+    assert len(web.answers.seen) == 3
+    web.answers.seen.clear()
     with pytest.raises(UnreadableInputError, match="the server answers 404"):
-        web.materialise(url(f"{server[0]}/status/404/a.laz"))
-    assert len(server[1].seen) == 1
+        web.fetched("status/404/a.laz")
+    assert len(web.answers.seen) == 1
 
 
-def test_an_answer_that_breaks_off_is_requested_again_and_then_reported(
-    web: World, server: tuple[str, type[Answers]]
-) -> None:
+def test_an_answer_that_breaks_off_is_requested_again_and_then_reported(web: World) -> None:
     with pytest.raises(UnreadableInputError, match=r"does not answer .* \(tried 4 times\)"):
-        web.materialise(url(f"{server[0]}/cut/a.laz"))
-    assert len(server[1].seen) == ATTEMPTS
+        web.fetched("cut/a.laz")
+    assert len(web.answers.seen) == ATTEMPTS
     assert left_of(web) == []
 
 
@@ -539,8 +530,8 @@ def test_an_absent_server_is_reported_without_the_secrets_in_the_url(tmp_path: P
     assert "secret" not in str(caught.value)
 
 
-def test_a_job_that_is_called_off_stops_fetching(web: World, server: tuple[str, type[Answers]]) -> None:
-    web.settings = ServiceSettings(state=web.folder.root, input_hosts=(server[0],))
+def test_a_job_that_is_called_off_stops_fetching(web: World) -> None:
+    web.settings = ServiceSettings(state=web.folder.root, input_hosts=(web.server,))
     asked = 0
 
     def cancelled() -> bool:
@@ -549,20 +540,18 @@ def test_a_job_that_is_called_off_stops_fetching(web: World, server: tuple[str, 
         return asked > 20
 
     with pytest.raises(RunCancelledError):
-        web.materialise(url(f"{server[0]}/endless/a.laz"), cancelled)
+        web.fetched("endless/a.laz", cancelled)
     assert left_of(web) == []
 
 
-def test_a_job_that_is_called_off_does_not_wait_for_the_next_try(
-    web: World, server: tuple[str, type[Answers]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_job_that_is_called_off_does_not_wait_for_the_next_try(web: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(downloads, "FIRST_PAUSE_S", 3600.0)
     with pytest.raises(RunCancelledError):
-        web.materialise(url(f"{server[0]}/status/503/a.laz"), lambda: bool(server[1].seen))
+        web.fetched("status/503/a.laz", lambda: bool(web.answers.seen))
 
 
 def test_proxies_and_passwords_of_the_environment_are_not_used(
-    web: World, server: tuple[str, type[Answers]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    web: World, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     netrc = tmp_path / "netrc"
     netrc.write_text("machine 127.0.0.1 login me password secret\n")
@@ -570,15 +559,15 @@ def test_proxies_and_passwords_of_the_environment_are_not_used(
     monkeypatch.setenv("NETRC", str(netrc))
     monkeypatch.setenv("HTTP_PROXY", "http://127.0.0.1:9")
     monkeypatch.setenv("ALL_PROXY", "http://127.0.0.1:9")
-    assert web.materialise(url(f"{server[0]}/good/a.laz")).points == 100
-    assert "Authorization" not in server[1].seen[0][1]
+    assert web.fetched("good/a.laz").points == 100
+    assert "Authorization" not in web.answers.seen[0][1]
 
 
-def test_too_many_points_are_refused_after_fetching(web: World, server: tuple[str, type[Answers]]) -> None:
-    web.settings = ServiceSettings(state=web.folder.root, input_hosts=(server[0],), max_points=99)
-    web.resolve(url(f"{server[0]}/good/a.laz"))
+def test_too_many_points_are_refused_after_fetching(web: World) -> None:
+    web.settings = ServiceSettings(state=web.folder.root, input_hosts=(web.server,), max_points=99)
+    web.resolve(url(f"{web.server}/good/a.laz"))
     with pytest.raises(TooLargeError, match="has 100 points, this service takes 99"):
-        web.materialise(url(f"{server[0]}/good/a.laz"))
+        web.fetched("good/a.laz")
 
 
 @given(st.integers(1, 20), st.none() | st.integers(100, 599), st.none() | st.text(max_size=12))
@@ -596,10 +585,10 @@ def test_a_server_that_asks_for_patience_gets_it_within_reason() -> None:
     assert pause_s(1, status=429, retry_after="Wed, 21 Oct 2026 07:28:00 GMT") == 1.0
 
 
-def test_what_is_fetched_is_examined_like_an_upload(web: World, server: tuple[str, type[Answers]]) -> None:
-    server[1].content = b"LASF" + b"\0" * 500
+def test_what_is_fetched_is_examined_like_an_upload(web: World) -> None:
+    web.answers.content = b"LASF" + b"\0" * 500
     with pytest.raises(InputError, match=r"^a\.laz: "):
-        web.materialise(url(f"{server[0]}/good/a.laz"))
+        web.fetched("good/a.laz")
 
 
 def test_a_tile_that_reads_as_a_tile_index_leads_nowhere(tmp_path: Path) -> None:

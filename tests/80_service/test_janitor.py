@@ -7,9 +7,10 @@ import os
 import time
 
 from driver_bench import Bench
+from store_contract import upload
 
 from service.driver.janitor import tidy, tidy_jobs
-from service.jobs import Fault, Job, JobFailure, Upload
+from service.jobs import Fault, Job, JobFailure
 
 
 def test_the_janitor_removes_what_no_job_needs_and_nothing_else(bench: Bench) -> None:
@@ -58,20 +59,8 @@ def test_the_janitor_keeps_all_results_beside_an_empty_database(bench: Bench) ->
 
 
 def test_the_janitor_removes_uploads_whose_time_is_over(bench: Bench) -> None:
-    import datetime as dt
-
-    now = bench.store.now()
     for name, days in (("a", -1), ("b", 1)):
-        upload = Upload(
-            upload_id=name * 32,
-            owner=None,
-            filename="x.laz",
-            size_bytes=1,
-            sha256="0" * 64,
-            created_at=now,
-            expires_at=now + dt.timedelta(days=days),
-        )
-        bench.store.add_upload(upload)
+        upload(bench.store, days=days, upload_id=name * 32)
         bench.folder.upload(name * 32).mkdir(parents=True)
     for name, age_s in (("c", 2 * 24 * 3600.0), ("d", 60.0)):
         folder = bench.folder.upload(name * 32)

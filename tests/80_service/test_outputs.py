@@ -11,7 +11,9 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import cityjson_rules
 import duckdb
+import finished_runs as runs
 import geopandas
 import geoparquet_validator
 import numpy as np
@@ -20,12 +22,6 @@ import pyarrow.parquet as pq
 import pyproj
 import pytest
 import shapely
-
-sys.path.insert(0, str(Path(__file__).parent))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "60_export"))
-
-import cityjson_rules
-import finished_runs as runs
 import small_buildings as small
 
 from pipeline.errors import RunError
@@ -136,9 +132,8 @@ def test_a_damaged_tile_is_named_by_its_file(tmp_path: Path) -> None:
 
 def test_what_an_unfinished_tile_left_is_in_no_output(tmp_path: Path) -> None:
     run_dir = runs.write_run(tmp_path / "run")
-    (run_dir / "state/x851_y4470.json").write_text(
-        json.dumps({"tile": "x851_y4470", "state": "failed", "error": "OSError: disk full", "files": {}})
-    )
+    state = {"tile": "x851_y4470", "state": "failed", "error": "OSError: disk full", "files": {}}
+    (run_dir / "state/x851_y4470.json").write_text(json.dumps(state))
     write_outputs(run_dir, tmp_path / "out")
     lost = runs.ident("two_parts")
     assert lost in {entry.stem for entry in (run_dir / "meshes").rglob("*.obj")}
@@ -309,11 +304,8 @@ def test_the_footprints_are_rfc_7946_with_all_columns_and_all_buildings(out_dir:
         assert 52.0 < shape.centroid.y < 52.02
         assert shape.exterior.is_ccw
         assert all(not hole.is_ccw for hole in shape.interiors)
-    assert Counter(feature["properties"]["status"] for feature in found["features"]) == {
-        "ok": 4,
-        "fallback": 1,
-        "failed": 1,
-    }
+    statuses = Counter(feature["properties"]["status"] for feature in found["features"])
+    assert statuses == {"ok": 4, "fallback": 1, "failed": 1}
 
 
 def test_footprints_come_back_to_the_millimetre(out_dir: Path) -> None:
@@ -357,10 +349,8 @@ def test_a_footprint_without_a_place_on_earth_is_a_feature_without_geometry(tmp_
     found = runs.placed(small.gable(), "found", 500_000.0, 5_000_000.0)
     write_outputs(runs.write_run(tmp_path / "run", {"x1_y1": [lost, found]}, epsg=25832), tmp_path / "out")
     features = json.loads(output_file(tmp_path / "out", "geojson").read_text())["features"]
-    assert {feature["id"]: feature["geometry"] is None for feature in features} == {
-        runs.ident("lost"): True,
-        runs.ident("found"): False,
-    }
+    nowhere = {feature["id"]: feature["geometry"] is None for feature in features}
+    assert nowhere == {runs.ident("lost"): True, runs.ident("found"): False}
     assert json.loads(output_file(tmp_path / "out", "report").read_text())["buildings"]["without_footprint"] == 1
 
 
@@ -425,10 +415,8 @@ def test_the_report_names_inputs_and_warnings_without_the_servers_folders(run_di
     assert [entry["name"] for entry in report["inputs"]] == ["tile.laz", "outlines.gpkg"]
     assert report["inputs"][0]["sha256"] == "ab" * 32
     assert report["warnings"] == ["tile.laz: no GPS time", "something else"]
-    assert report["tiles"] == {
-        "planned": 5,
-        "failed": [{"tile": "x852_y4470", "reason": "OSError: scratch/a is gone"}],
-    }
+    failed = {"tile": "x852_y4470", "reason": "OSError: scratch/a is gone"}
+    assert report["tiles"] == {"planned": 5, "failed": [failed]}
     assert runs.SERVER_FOLDER not in text
     assert str(run_dir) not in text
     assert "node-7" not in text

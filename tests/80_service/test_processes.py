@@ -7,6 +7,7 @@ import json
 
 import jsonschema
 import pytest
+from live_service import POINTS
 
 from pipeline.methods import METHODS, PRESETS
 from pipeline.settings import RunSettings
@@ -18,11 +19,14 @@ from service.run_settings import settings_faults, settings_schema
 from service.wire.inputs import CompareInputs, ReconstructInputs
 from service.wire.jobs import JobForm
 
-POINTS = b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(20) for y in range(20))
-
 
 def execute(service, inputs: object, **body: object):
     return service.client.post("/processes/reconstruct/execution", json={"inputs": inputs, **body})
+
+
+def of_an_upload(service, **more: object) -> dict[str, object]:
+    """The inputs of a job of one upload."""
+    return {"tiles": {"href": f"/uploads/{service.upload()}"}, "crs": "EPSG:28992", **more}
 
 
 def faults_of(answer) -> str:
@@ -137,9 +141,7 @@ def test_a_job_of_an_upload_waits_as_soon_as_the_answer_is_there(local_service) 
 
 
 def test_the_request_that_a_job_says_can_be_sent_again(local_service) -> None:
-    first = execute(
-        local_service, {"tiles": {"href": f"/uploads/{local_service.upload()}"}, "crs": "EPSG:28992", "priority": -3}
-    ).json()
+    first = execute(local_service, of_an_upload(local_service, priority=-3)).json()
     second = local_service.client.post("/processes/reconstruct/execution", json=first["request"]).json()
     one, other = (local_service.store.get(reported["jobID"]) for reported in (first, second))
     assert (one.request, one.priority) == (other.request, other.priority)
@@ -147,7 +149,7 @@ def test_the_request_that_a_job_says_can_be_sent_again(local_service) -> None:
 
 
 def test_without_a_preference_none_is_applied(local_service) -> None:
-    answer = execute(local_service, {"tiles": {"href": f"/uploads/{local_service.upload()}"}, "crs": "EPSG:28992"})
+    answer = execute(local_service, of_an_upload(local_service))
     assert answer.status_code == 201
     assert "preference-applied" not in answer.headers
 
@@ -155,8 +157,7 @@ def test_without_a_preference_none_is_applied(local_service) -> None:
 def test_a_tile_by_value_becomes_an_upload(local_service) -> None:
     value = {"value": base64.b64encode(POINTS).decode(), "encoding": "base64", "mediaType": "text/plain"}
     answer = execute(local_service, {"tiles": [value], "crs": "EPSG:28992"})
-    assert answer.status_code == 201, answer.text
-    reference = local_service.store.get(answer.json()["jobID"]).request.tiles[0]
+    reference = local_service.request_of(answer).tiles[0]
     kept = local_service.store.upload(reference.value)
     assert (kept.filename, kept.size_bytes) == ("tiles.xyz", len(POINTS))
 
@@ -164,11 +165,9 @@ def test_a_tile_by_value_becomes_an_upload(local_service) -> None:
 def test_footprints_by_value_are_geojson(local_service) -> None:
     square = {"type": "Polygon", "coordinates": [[[1, 1], [9, 1], [9, 9], [1, 9], [1, 1]]]}
     outlines = {"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry": square}]}
-    tile = {"href": f"/uploads/{local_service.upload()}"}
     for footprints in (outlines, {"value": outlines, "mediaType": "application/geo+json"}):
-        answer = execute(local_service, {"tiles": tile, "crs": "EPSG:28992", "footprints": footprints})
-        assert answer.status_code == 201, answer.text
-        reference = local_service.store.get(answer.json()["jobID"]).request.footprints
+        answer = execute(local_service, of_an_upload(local_service, footprints=footprints))
+        reference = local_service.request_of(answer).footprints
         path = local_service.settings.state / "uploads" / reference.value / "footprints.geojson"
         assert json.loads(path.read_text()) == outlines
 
@@ -191,20 +190,9 @@ def test_all_faults_of_a_request_are_reported_at_once(local_service) -> None:
         outputs={"pictures": {}},
     )
     reported = faults_of(answer)
-    for words in (
-        "tiles[0].href",
-        "tiles[1]",
-        "geographic",
-        "verticalUnit",
-        "bbox",
-        "method",
-        "[roof] no_such",
-        "meshes",
-        "title",
-        "priority",
-        "colour",
-        "pictures",
-    ):
+    for words in ("tiles[0].href", "tiles[1]", "geographic", "verticalUnit", "bbox", "method", "[roof] no_such"):
+        assert words in reported
+    for words in ("meshes", "title", "priority", "colour", "pictures"):
         assert words in reported
     assert local_service.client.get("/jobs").json()["jobs"] == []
 
@@ -229,42 +217,38 @@ def test_a_request_that_is_none_is_refused(local_service, body: dict, words: str
     assert words in faults_of(local_service.client.post("/processes/reconstruct/execution", json=body))
 
 
-def test_a_body_nested_as_deeply_as_can_just_be_read_is_refused(local_service) -> None:
+def execute_text(service, content: bytes):
     json_type = {"Content-Type": "application/json"}
+    return service.client.post("/processes/reconstruct/execution", content=content, headers=json_type)
+
+
+def test_a_body_nested_as_deeply_as_can_just_be_read_is_refused(local_service) -> None:
     for depth in range(700, 1020, 8):
         for opened, closed in (("[", "]"), ('{"a":', "}")):
             nested = opened * depth + "1" + closed * depth
             for body in (f'{{"inputs": {{"tiles": {nested}}}}}', f'{{"inputs": {{}}, "mode": {nested}}}'):
-                answer = local_service.client.post(
-                    "/processes/reconstruct/execution", content=body.encode(), headers=json_type
-                )
-                assert answer.status_code == 400, depth
+                assert execute_text(local_service, body.encode()).status_code == 400, depth
 
 
 def test_a_body_that_is_no_json_is_refused_with_the_reason(local_service) -> None:
-    json_type = {"Content-Type": "application/json"}
     for content in (b"{", b"[1]", b"\xff", b"9" * 10_000):
-        answer = local_service.client.post("/processes/reconstruct/execution", content=content, headers=json_type)
+        answer = execute_text(local_service, content)
         assert answer.status_code == 400, content[:20]
         assert answer.headers["content-type"] == "application/problem+json"
 
 
 def test_levels_of_detail_are_an_input_of_their_own(local_service) -> None:
-    tile = {"href": f"/uploads/{local_service.upload()}"}
-    answer = execute(local_service, {"tiles": tile, "crs": "EPSG:28992", "lods": "1.2,2.2"})
-    assert answer.status_code == 201, answer.text
-    stored = local_service.store.get(answer.json()["jobID"]).request.settings
+    answer = execute(local_service, of_an_upload(local_service, lods="1.2,2.2"))
+    stored = local_service.request_of(answer).settings
     assert stored == {"lods": "1.2,2.2"}
     assert RunSettings.from_mapping(stored).building.lods == ("1.2", "2.2")
-    assert "lods is" in faults_of(execute(local_service, {"tiles": tile, "lods": "2.1"}))
+    assert "lods is" in faults_of(execute(local_service, of_an_upload(local_service, lods="2.1")))
 
 
 def test_a_preset_stands_beside_the_method(local_service) -> None:
-    tile = {"href": f"/uploads/{local_service.upload()}"}
-    inputs = {"tiles": tile, "crs": "EPSG:28992", "method": "fuzzy-sart", "preset": "faithful"}
+    inputs = of_an_upload(local_service, method="fuzzy-sart", preset="faithful")
     answer = execute(local_service, inputs)
-    assert answer.status_code == 201, answer.text
-    stored = local_service.store.get(answer.json()["jobID"]).request.settings
+    stored = local_service.request_of(answer).settings
     assert stored == {"method": "fuzzy-sart", "preset": "faithful"}
     assert RunSettings.from_mapping(stored).building.method == METHODS["fuzzy-sart"].preset("faithful")
     assert "preset is" in faults_of(execute(local_service, {**inputs, "preset": "loose"}))
@@ -275,16 +259,14 @@ def test_a_preset_stands_beside_the_method(local_service) -> None:
 
 
 def test_method_and_settings_may_not_contradict_each_other(local_service) -> None:
-    tile = {"href": f"/uploads/{local_service.upload()}"}
-    answer = execute(local_service, {"tiles": tile, "classes": "trust", "settings": {"classes": "audit"}})
-    assert "classes is trust" in faults_of(answer)
+    inputs = of_an_upload(local_service, classes="trust", settings={"classes": "audit"})
+    assert "classes is trust" in faults_of(execute(local_service, inputs))
 
 
 def test_a_rectangle_in_another_crs_is_refused(local_service) -> None:
-    tile = {"href": f"/uploads/{local_service.upload()}"}
     box = {"bbox": [4.0, 52.0, 4.1, 52.1]}
     for more in ({}, {"crs": "http://www.opengis.net/def/crs/OGC/1.3/CRS84"}):
-        assert "bbox" in faults_of(execute(local_service, {"tiles": tile, "crs": "EPSG:28992", "bbox": box | more}))
+        assert "bbox" in faults_of(execute(local_service, of_an_upload(local_service, bbox=box | more)))
 
 
 def test_a_missing_upload_is_named(local_service) -> None:
@@ -316,8 +298,7 @@ def test_a_high_priority_needs_the_scope_admin(local_service) -> None:
 
 def test_the_answer_of_a_full_queue_says_when_to_try_again(starting) -> None:
     service = starting(max_queued=2)
-    tile = {"href": f"/uploads/{service.upload()}"}
-    answers = [execute(service, {"tiles": tile, "crs": "EPSG:28992"}) for _ in range(3)]
+    answers = [execute(service, of_an_upload(service)) for _ in range(3)]
     assert [answer.status_code for answer in answers] == [201, 201, 429]
     assert int(answers[2].headers["retry-after"]) > 0
 

@@ -6,36 +6,19 @@ import hashlib
 import io
 import json
 import shutil
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
+import finished_runs as runs
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from starlette.testclient import TestClient
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-import finished_runs as runs
 
 from service.jobs import Fault, JobFailure
 from service.keys import Scope, new_key
 from service.outputs import COMPARISON_OUTPUTS, KINDS, OUTPUTS
 
 OGC = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
-
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[runs.Service]:
-    """A service without keys."""
-    with runs.service(tmp_path_factory.mktemp("state")) as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def client(service: runs.Service) -> TestClient:
-    return service.client
 
 
 @pytest.fixture(scope="module")
@@ -93,9 +76,8 @@ def test_a_file_has_a_name_to_save_and_its_sha256_as_etag(client: TestClient, jo
     answer = client.get(f"/jobs/{job_id}/results/cityjson")
     sha256 = hashlib.sha256(answer.content).hexdigest()
     assert answer.headers["etag"] == f'"{sha256}"'
-    assert (
-        answer.headers["content-disposition"] == f'attachment; filename="gablework-{job_id[:8]}-buildings.city.jsonl"'
-    )
+    name = f"gablework-{job_id[:8]}-buildings.city.jsonl"
+    assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
 
 
 def test_head_says_the_size_and_sends_nothing(client: TestClient, job_id: str) -> None:
@@ -249,27 +231,23 @@ def test_results_whose_files_are_gone_are_not_found(service: runs.Service) -> No
 
 def test_a_building_whose_job_is_being_removed_is_not_found(service: runs.Service) -> None:
     job_id = service.finished()
-    (service.folder.outputs(job_id, 1) / "buildings.geojson").unlink()
-    answer = service.client.get(f"/jobs/{job_id}/buildings/{runs.ident('gable')}")
-    assert "no longer in the state folder" in runs.problem(answer, 404, "no-such-output")
-    (service.folder.outputs(job_id, 1) / "index.sqlite").unlink()
-    answer = service.client.get(f"/jobs/{job_id}/buildings")
-    assert "no longer in the state folder" in runs.problem(answer, 404, "no-such-output")
+    for name, path in (("buildings.geojson", f"buildings/{runs.ident('gable')}"), ("index.sqlite", "buildings")):
+        (service.folder.outputs(job_id, 1) / name).unlink()
+        answer = service.client.get(f"/jobs/{job_id}/{path}")
+        assert "no longer in the state folder" in runs.problem(answer, 404, "no-such-output")
 
 
 def test_results_of_another_key_are_no_results(tmp_path: Path) -> None:
     with runs.service(tmp_path) as service:
-        tokens = {}
-        keys = {}
+        keys, headers = {}, {}
         for name in ("owner", "other"):
-            keys[name], tokens[name] = new_key(name, Scope.READ, now=service.store.now())
+            keys[name], secret = new_key(name, Scope.READ, now=service.store.now())
+            headers[name] = {"Authorization": f"Bearer {secret}"}
             service.store.add_key(keys[name])
         job_id = service.finished(owner=keys["owner"].key_id)
         for path in paths(job_id):
-            mine = service.client.get(path, headers={"Authorization": f"Bearer {tokens['owner']}"})
-            assert mine.status_code == 200
-            foreign = service.client.get(path, headers={"Authorization": f"Bearer {tokens['other']}"})
-            runs.problem(foreign, 404, f"{OGC}no-such-job")
+            assert service.client.get(path, headers=headers["owner"]).status_code == 200
+            runs.problem(service.client.get(path, headers=headers["other"]), 404, f"{OGC}no-such-job")
             runs.problem(service.client.get(path), 401, "unauthorized")
 
 

@@ -9,7 +9,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Self
@@ -18,6 +17,8 @@ import httpx
 import psutil
 import pytest
 from click.testing import Result
+from live_service import POINTS
+from processes import LONG_S, wait_for
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
@@ -26,23 +27,10 @@ from service.cli import app
 from service.settings import ServiceSettings
 from service.supervisor import Supervisor, environment_of, listen, pause_s
 
-DEADLINE_S = 180.0
-"""For what takes seconds on a quiet machine; not a promise of speed."""
-
-
-def until(condition: Callable[[], Any], what: str) -> Any:
-    """What the condition gives, once it is true."""
-    give_up_s = time.monotonic() + DEADLINE_S
-    while time.monotonic() < give_up_s:
-        if found := condition():
-            return found
-        time.sleep(0.05)
-    raise AssertionError(f"not within {DEADLINE_S:.0f} s: {what}")
-
 
 def gablework(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "service.cli", *words]
-    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=DEADLINE_S, **options)
+    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=LONG_S, **options)
 
 
 def invoke(*words: str) -> Result:
@@ -54,12 +42,8 @@ class Served:
     """A service that runs as a process."""
 
     def __init__(self, state: Path, *options: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "service.cli", "serve", "--json", "--port", "0", "--state", str(state), *options],
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert self.process.stdout is not None
+        command = [sys.executable, "-m", "service.cli", "serve", "--json", "--port", "0", "--state", str(state)]
+        self.process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True)
         reported = ""
         while not reported.rstrip().endswith("}"):
             line = self.process.stdout.readline()
@@ -76,7 +60,7 @@ class Served:
                 return next((child for child in children if "driver" in child.cmdline()), None)
             return None
 
-        found = until(find, "a driver beside the service")
+        found = wait_for(find, "a driver beside the service")
         assert isinstance(found, psutil.Process)
         return found
 
@@ -88,7 +72,6 @@ class Served:
                 with contextlib.suppress(psutil.NoSuchProcess):
                     member.kill()
         self.process.wait()
-        assert self.process.stdout is not None
         self.process.stdout.close()
 
 
@@ -107,16 +90,16 @@ def served(tmp_path: Path) -> Iterator[Callable[..., Served]]:
 # --- without a process
 
 
-def test_help_imports_nothing_of_the_service() -> None:
-    heavy = "('fastapi', 'sqlalchemy', 'numba', 'numpy')"
-    code = f"import sys; import service.cli; print([m for m in {heavy} if m in sys.modules])"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"
+SCIENCE = ["numba", "scipy", "pandas", "matplotlib", "dask", "distributed", "pyarrow", "laspy", "pyogrio"]
 
 
-def test_the_api_process_loads_nothing_of_the_science() -> None:
-    heavy = "('numba', 'scipy', 'pandas', 'matplotlib', 'dask', 'distributed', 'pyarrow', 'laspy', 'pyogrio')"
-    code = f"import sys; import service.supervisor; print([m for m in {heavy} if m in sys.modules])"
+@pytest.mark.parametrize(
+    ("module", "heavy"),
+    [("service.cli", ["fastapi", "sqlalchemy", "numba", "numpy"]), ("service.supervisor", SCIENCE)],
+    ids=["help imports nothing of the service", "the API imports nothing of the science"],
+)
+def test_a_process_imports_nothing_that_it_does_not_need(module: str, heavy: list[str]) -> None:
+    code = f"import sys; import {module}; print([m for m in {heavy} if m in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
 
@@ -135,9 +118,8 @@ def test_another_process_reads_the_same_settings_from_its_environment(tmp_path: 
         max_points=5,
         rate_limit="9/second",
     )
-    environment = environment_of(
-        settings, {"gablework_workers": "77", "GABLEWORK_SCHEDULER": "tcp://old:1", "HOME": "/"}
-    )
+    old = {"gablework_workers": "77", "GABLEWORK_SCHEDULER": "tcp://old:1", "HOME": "/"}
+    environment = environment_of(settings, old)
     assert environment["HOME"] == "/"
     for name in list(os.environ):
         if name.upper().startswith("GABLEWORK_"):
@@ -229,10 +211,10 @@ def test_a_supervised_process_is_started_again_and_ends_with_its_supervisor() ->
     first = supervisor.pid
     assert first is not None
     os.kill(first, signal.SIGKILL)
-    until(lambda: supervisor.pid != first and supervisor.status() == "running", "another process")
+    wait_for(lambda: supervisor.pid != first and supervisor.status() == "running", "another process")
     assert supervisor.deaths == 1
     last = supervisor.pid
-    supervisor.end(DEADLINE_S)
+    supervisor.end(LONG_S)
     assert supervisor.status() == "ending"
     assert last is not None
     assert not psutil.pid_exists(last)
@@ -246,7 +228,7 @@ def test_a_supervised_process_that_does_not_end_is_killed(tmp_path: Path) -> Non
     )
     supervisor = Supervisor([sys.executable, "-c", stubborn], os.environ)
     supervisor.start()
-    until(up.exists, "the process ignores SIGTERM")
+    wait_for(up.exists, "the process ignores SIGTERM")
     supervisor.end(0.2)
     assert supervisor.pid is not None
     assert not psutil.pid_exists(supervisor.pid)
@@ -265,10 +247,10 @@ def test_a_supervised_process_is_asked_to_end_once_however_often_that_is_wanted(
     )
     supervisor = Supervisor([sys.executable, "-c", counting], os.environ)
     supervisor.start()
-    until(up.exists, "the process waits for SIGTERM")
+    wait_for(up.exists, "the process waits for SIGTERM")
     supervisor.ask_to_end()
-    until(asked.exists, "the process is asked to end")
-    supervisor.end(DEADLINE_S)
+    wait_for(asked.exists, "the process is asked to end")
+    supervisor.end(LONG_S)
     assert asked.read_text() == "once"
 
 
@@ -325,20 +307,15 @@ def test_a_signal_before_the_server_listens_to_any_is_not_lost(tmp_path: Path) -
         "supervisor.serve(ServiceSettings(state=pathlib.Path(sys.argv[1]), port=0), print, with_driver=False)\n"
     )
     command = [sys.executable, "-c", early, str(tmp_path / "state")]
-    ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=DEADLINE_S)
+    ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=LONG_S)
     assert (ended.returncode, ended.stdout) == (0, ""), ended.stderr
 
 
 def test_limits_that_no_run_takes_are_refused_at_the_start_and_not_by_every_job() -> None:
     assert ServiceSettings(building_memory_bytes=MIN_MEMORY_BYTES).building_memory_bytes == MIN_MEMORY_BYTES
+    endless = dict.fromkeys(("building_timeout_s", "lease_s", "poll_s", "upload_days"), math.inf)
     with pytest.raises(ValidationError) as caught:
-        ServiceSettings(
-            building_memory_bytes=MIN_MEMORY_BYTES - 1,
-            building_timeout_s=math.inf,
-            lease_s=math.inf,
-            poll_s=math.inf,
-            upload_days=math.inf,
-        )
+        ServiceSettings(building_memory_bytes=MIN_MEMORY_BYTES - 1, **endless)
     assert caught.value.error_count() == 5
 
 
@@ -349,17 +326,14 @@ def test_limits_that_no_run_takes_are_refused_at_the_start_and_not_by_every_job(
 def test_all_lines_of_a_service_and_its_driver_are_json_where_the_environment_asks(tmp_path: Path) -> None:
     said = tmp_path / "said"
     with said.open("w") as sink:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "service.cli", "serve", "--port", "0", "--state", str(tmp_path / "state")],
-            env={**os.environ, "GABLEWORK_LOG_JSON": "1", "GABLEWORK_WORKERS": "1"},
-            stdout=sink,
-            stderr=sink,
-        )
+        command = [sys.executable, "-m", "service.cli", "serve", "--port", "0", "--state", str(tmp_path / "state")]
+        env = {**os.environ, "GABLEWORK_LOG_JSON": "1", "GABLEWORK_WORKERS": "1"}
+        process = subprocess.Popen(command, env=env, stdout=sink, stderr=sink)
         try:
-            until(lambda: "distributed.worker" in said.read_text(), "a worker of the driver")
+            wait_for(lambda: "distributed.worker" in said.read_text(), "a worker of the driver")
         finally:
             process.send_signal(signal.SIGTERM)
-            process.wait(DEADLINE_S)
+            process.wait(LONG_S)
     lines = [json.loads(line) for line in said.read_text().splitlines()]
     assert {"uvicorn.error", "gablework.driver", "distributed.worker"} <= {line["logger"] for line in lines}
     assert any(line["message"].startswith("gablework listens on http://") for line in lines)
@@ -371,7 +345,7 @@ def test_serve_answers_and_ends_with_its_driver_on_sigterm(served) -> None:
     driver = running.driver()
     assert httpx.get(f"{running.url}/readyz").json()["checks"]["driver"] == "running"
     running.process.send_signal(signal.SIGTERM)
-    assert running.process.wait(DEADLINE_S) == 0
+    assert running.process.wait(LONG_S) == 0
     assert not driver.is_running()
 
 
@@ -380,7 +354,7 @@ def test_a_driver_that_dies_is_started_again(served) -> None:
     running = served()
     first = running.driver()
     first.kill()
-    second = until(lambda: (found := running.driver()).pid != first.pid and found, "another driver")
+    second = wait_for(lambda: (found := running.driver()).pid != first.pid and found, "another driver")
     assert second.is_running()
     assert httpx.get(f"{running.url}/healthz").status_code == 200
 
@@ -390,20 +364,19 @@ def test_a_driver_ends_when_the_service_is_killed(served) -> None:
     running = served()
     driver = running.driver()
     running.process.kill()
-    until(lambda: not driver.is_running() or driver.status() == psutil.STATUS_ZOMBIE, "the driver's end")
+    wait_for(lambda: not driver.is_running() or driver.status() == psutil.STATUS_ZOMBIE, "the driver's end")
 
 
 @pytest.mark.slow
 def test_an_event_stream_does_not_hold_up_the_end(served, tmp_path: Path) -> None:
     running = served("--no-driver")
-    points = b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(20) for y in range(20))
-    made = httpx.post(f"{running.url}/jobs", files={"tile": ("a.xyz", points)}, data={"crs": "EPSG:28992"}).json()
-    with httpx.stream("GET", f"{running.url}/jobs/{made['jobID']}/events?f=sse", timeout=DEADLINE_S) as stream:
+    made = httpx.post(f"{running.url}/jobs", files={"tile": ("a.xyz", POINTS)}, data={"crs": "EPSG:28992"}).json()
+    with httpx.stream("GET", f"{running.url}/jobs/{made['jobID']}/events?f=sse", timeout=LONG_S) as stream:
         lines = stream.iter_lines()
         assert any(line.startswith("data:") for line in lines)
         running.process.send_signal(signal.SIGTERM)
         assert list(lines) is not None  # the stream ends of itself
-    assert running.process.wait(DEADLINE_S) == 0
+    assert running.process.wait(LONG_S) == 0
 
 
 @pytest.mark.slow
@@ -419,8 +392,8 @@ def test_nothing_is_kept_of_an_upload_whose_client_goes(served, tmp_path: Path) 
             b"POST /jobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 99999999\r\n"
             b"Content-Type: multipart/form-data; boundary=x\r\n\r\n" + head + b"1 2 3\n" * 400_000
         )
-        until(lambda: any(uploads.iterdir()), "the beginning of an upload")
-    until(lambda: not any(uploads.iterdir()), "the end of the unfinished upload")
+        wait_for(lambda: any(uploads.iterdir()), "the beginning of an upload")
+    wait_for(lambda: not any(uploads.iterdir()), "the end of the unfinished upload")
     assert httpx.get(f"{running.url}/jobs").json()["jobs"] == []
 
 

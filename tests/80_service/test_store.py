@@ -7,19 +7,28 @@ from pathlib import Path
 
 import pytest
 from migrated import with_tables
+from schedule_store_contract import ScheduleStoreContract
 from store_contract import StoreContract, claim, submit
 
 from service.errors import StartUpError, StoreError
 from service.store import JobStore, database
 
 
-class TestOnSqlite(StoreContract):
-    """All of the contract, on a file."""
+class OnSqlite:
+    """A database in a file."""
 
     @pytest.fixture
     def url(self, tmp_path: Path, request: pytest.FixtureRequest) -> str:
         url = f"sqlite:///{tmp_path / 'some % folder' / 'service.db'}"
         return with_tables(url) if "store" in request.fixturenames else url
+
+
+class TestJobsOnSqlite(OnSqlite, StoreContract):
+    """All of the contract of jobs, on a file."""
+
+
+class TestSchedulesOnSqlite(OnSqlite, ScheduleStoreContract):
+    """All of the contract of schedules, on a file."""
 
 
 class OnceRefused:

@@ -10,7 +10,6 @@ import errno
 import hashlib
 import json
 import os
-import sys
 import threading
 import time
 import tracemalloc
@@ -22,6 +21,8 @@ import httpx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from live_service import DEADLINE_S, add_key, answer_to, las_bytes, raw_request, serving, settings_in
+from processes import wait_for
 
 from pipeline.errors import InputError
 from service import uploads
@@ -33,10 +34,6 @@ from service.keys import Scope
 from service.settings import ServiceSettings
 from service.store import JobStore
 from service.uploads import TEMPORARY, receive, remove_leftovers
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from live_service import DEADLINE_S, add_key, answer_to, las_bytes, raw_request, serving, settings_in
 
 NOW = dt.datetime(2026, 3, 1, tzinfo=dt.UTC)
 
@@ -64,23 +61,15 @@ async def pieces(content: bytes, size: int = 65_536, fault: BaseException | None
         raise fault
 
 
-def take(
-    folder: Path, content: bytes, name: str = "tile.laz", *, store: FakeTable | None = None, **values: Any
-) -> Upload:
-    fault = values.pop("fault", None)
-    sha256 = values.pop("sha256", None)
-    settings = ServiceSettings(state=folder, **values)
-    return asyncio.run(
-        receive(
-            pieces(content, fault=fault),
-            name,
-            store=store or FakeTable(),
-            folder=StateFolder(folder),
-            settings=settings,
-            owner="1" * 32,
-            sha256=sha256,
-        )
-    )
+def take(folder: Path, content: bytes, name: str = "tile.laz", **values: Any) -> Upload:
+    return take_stream(folder, pieces(content, fault=values.pop("fault", None)), name, **values)
+
+
+def take_stream(folder: Path, stream: AsyncIterator[bytes], name: str, **values: Any) -> Upload:
+    """Keep what comes; `values` are a store, a promised hash, and settings."""
+    store, sha256 = values.pop("store", FakeTable()), values.pop("sha256", None)
+    kept = {"store": store, "folder": StateFolder(folder), "settings": ServiceSettings(state=folder, **values)}
+    return asyncio.run(receive(stream, name, owner="1" * 32, sha256=sha256, **kept))
 
 
 def files_in(folder: Path) -> list[Path]:
@@ -89,10 +78,7 @@ def files_in(folder: Path) -> list[Path]:
 
 def eventually_empty(folder: Path) -> None:
     """Nothing is left behind, once the server has seen that the client has gone."""
-    until_s = time.monotonic() + DEADLINE_S
-    while left := list(folder.iterdir()):
-        assert time.monotonic() < until_s, f"left behind: {left}"
-        time.sleep(0.02)
+    wait_for(lambda: not list(folder.iterdir()), "an empty folder")
 
 
 # --- names -----------------------------------------------------------------------------------------------------------
@@ -191,11 +177,8 @@ def test_an_endless_upload_is_cut_off_at_the_limit(tmp_path: Path) -> None:
             sent += 65_536
             yield b"\0" * 65_536
 
-    settings = ServiceSettings(state=tmp_path, max_upload_bytes=5_000_000)
     with pytest.raises(TooLargeError):
-        asyncio.run(
-            receive(endless(), "a.laz", store=FakeTable(), folder=StateFolder(tmp_path), settings=settings, owner=None)
-        )
+        take_stream(tmp_path, endless(), "a.laz", max_upload_bytes=5_000_000)
     assert sent < 5_000_000 + 2 * uploads.BLOCK_BYTES
     assert files_in(tmp_path) == []
 
@@ -260,16 +243,7 @@ def test_a_large_upload_is_never_held_in_memory(tmp_path: Path) -> None:
 
     tracemalloc.start()
     try:
-        upload = asyncio.run(
-            receive(
-                rows(),
-                "rows.xyz",
-                store=FakeTable(),
-                folder=StateFolder(tmp_path),
-                settings=ServiceSettings(state=tmp_path),
-                owner=None,
-            )
-        )
+        upload = take_stream(tmp_path, rows(), "rows.xyz")
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -363,11 +337,9 @@ def test_a_form_that_is_more_or_less_than_one_file_is_refused_and_leaves_nothing
     two = [("file", ("a.laz", las_bytes(20))), ("file", ("b.laz", las_bytes(20)))]
     assert "send one file" in problem(client.post("/uploads", files=two))
     assert "send one file" in problem(client.post("/uploads", files={"tile": ("a.laz", las_bytes(20))}))
-    assert "the form has no file" in problem(
-        client.post("/uploads", headers={"Content-Type": "multipart/form-data; boundary=x"}, content=b"--x--\r\n")
-    )
-    cut = b'--x\r\nContent-Disposition: form-data; name="file"; filename="a.laz"\r\n\r\n' + las_bytes(20)
     headers = {"Content-Type": "multipart/form-data; boundary=x"}
+    assert "the form has no file" in problem(client.post("/uploads", headers=headers, content=b"--x--\r\n"))
+    cut = b'--x\r\nContent-Disposition: form-data; name="file"; filename="a.laz"\r\n\r\n' + las_bytes(20)
     assert client.post("/uploads", headers=headers, content=cut).status_code == 400
     after_part = cut + b"\r\n--x\r\nContent-Disposition: form-data; na"
     assert client.post("/uploads", headers=headers, content=after_part).status_code == 400
@@ -450,10 +422,7 @@ def test_a_client_that_goes_away_leaves_nothing_behind(tmp_path: Path) -> None:
         folder = StateFolder(settings.state).uploads
         body = b"\0" * 3_000_000
         with raw_request(url, "POST /uploads?filename=a.laz", body, Content_Length="9000000"):
-            until_s = time.monotonic() + DEADLINE_S
-            while not list(folder.glob(f"{TEMPORARY}*/a.laz")):
-                assert time.monotonic() < until_s
-                time.sleep(0.02)
+            wait_for(lambda: list(folder.glob(f"{TEMPORARY}*/a.laz")), "the beginning of an upload")
         eventually_empty(folder)
 
 

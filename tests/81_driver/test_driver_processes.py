@@ -26,15 +26,6 @@ pytestmark = pytest.mark.slow
 DEADLINE_S = 300.0
 
 
-@pytest.fixture(scope="module")
-def tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A gabled house."""
-    folder = tmp_path_factory.mktemp("gable")
-    command = [str(program("gablework")), "simulate", "gable", "--out", str(folder), "--quiet"]
-    subprocess.run(command, check=True)
-    return next(folder.glob("*.laz"))
-
-
 class Site:
     """A state folder with its database, and drivers."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime as dt
 import json
 import re
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -22,15 +21,6 @@ from service.store.tables import SCHEDULES
 
 pytestmark = pytest.mark.slow
 
-COMMAND = [sys.executable, "-m", "service.cli"]
-
-
-@pytest.fixture
-def tile(tmp_path: Path) -> Path:
-    """A gabled house."""
-    subprocess.run([*COMMAND, "simulate", "gable", "--out", str(tmp_path / "gable"), "--quiet"], check=True)
-    return next((tmp_path / "gable").glob("*.laz"))
-
 
 def started(programs: Programs, state: Path) -> tuple[Program, httpx.Client]:
     """A service with its driver, and a client of it."""
@@ -41,7 +31,7 @@ def started(programs: Programs, state: Path) -> tuple[Program, httpx.Client]:
         "GABLEWORK_POLL_S": "0.1",
         "OPENBLAS_NUM_THREADS": "1",
     }
-    command = [*COMMAND, "serve", "--json", "--port", "0", "--state", str(state)]
+    command = [sys.executable, "-m", "service.cli", "serve", "--json", "--port", "0", "--state", str(state)]
     served = programs.start("serve", command, env=environment)
     found = served.wait_for(lambda: re.search(r'"url": *("[^"]+")', served.text), "its URL")
     return served, httpx.Client(base_url=json.loads(found[1]), timeout=60.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from processes import PostgresServer
-from store_contract import StoreContract, claim, submit
+from store_contract import StoreContract, claim, running, submit
 
 from service.errors import StoreError
 from service.store import JobStore
@@ -25,7 +25,7 @@ def test_a_server_that_is_away_is_reported_without_the_password_and_is_found_aga
 ) -> None:
     with JobStore(postgres_url) as store:
         store.migrate()
-        held = (submit(store), claim(store))[1]
+        held = running(store)
         postgres_server.stop()
         try:
             with pytest.raises(StoreError, match="does not answer") as raised:

@@ -50,20 +50,9 @@ def buildings_of(run_dir: str) -> dict[str, tuple[str, str | None]]:
 class BatchRun:
     """A batch file in a folder of its own, run by real processes.
 
-    Parameters
-    ----------
-    programs : Programs
-        Starts and ends them.
-    folder : Path
-        Gets batch file, work folder and results.
-    tiles : Path
-        The inputs.
-    external : bool
-        Whether scheduler and workers are processes of their own.
-    faults : mapping, optional
-        Further faults, as `tests/faults` understands them.
-    store, bucket : optional
-        An object store that holds input and results in place of the folder.
+    The folder gets batch file, work folder and results. `external` says whether scheduler and workers are processes of
+    their own; `faults` are further ones, as `tests/faults` understands them; `store` and `bucket` are an object store
+    that holds input and results in place of the folder.
     """
 
     def __init__(
@@ -106,15 +95,12 @@ class BatchRun:
         )
         if external:
             self.start_scheduler()
-            self.workers = [
-                self._start("worker", "worker", "--scheduler", f"tcp://127.0.0.1:{self.port}") for _ in "ab"
-            ]
+            address = f"tcp://127.0.0.1:{self.port}"
+            self.workers = [self._start("worker", "worker", "--scheduler", address) for _ in "ab"]
 
     def start_scheduler(self) -> None:
         """Start the scheduler, also again."""
-        command = [str(program("dask")), "scheduler", "--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard"]
-        self.scheduler = self._programs.start("scheduler", command, env=self.environment)
-        self.scheduler.wait_for_port(self.port)
+        self.scheduler = self._programs.start_scheduler(self.port, env=self.environment)
 
     def _start(self, name: str, *arguments: str) -> Program:
         return self._programs.start(name, [str(program("gablework")), *arguments], env=self.environment)
@@ -207,7 +193,6 @@ def fill_disk(run: BatchRun, driver: Program, pid: int) -> None:
 
 def kill_scheduler(run: BatchRun, driver: Program, pid: int) -> None:
     """The scheduler's machine is gone."""
-    assert run.scheduler is not None
     run.scheduler.kill()
 
 
@@ -222,7 +207,6 @@ def every(what: str, *, of: int) -> Callable[[BatchRun, Program, int], None]:
     """From now on something becomes of one in so many of the store's requests."""
 
     def strike_store(run: BatchRun, driver: Program, pid: int) -> None:
-        assert run.store is not None
         run.store.reset()
         run.store.script = lambda request: what if request.number % of == 0 else "pass"
 
@@ -231,7 +215,6 @@ def every(what: str, *, of: int) -> Callable[[BatchRun, Program, int], None]:
 
 def silent_at_first(run: BatchRun, driver: Program, pid: int) -> None:
     """The first two requests are never answered."""
-    assert run.store is not None
     run.store.reset()
     run.store.script = lambda request: "silent" if request.number <= 2 else "pass"
 
@@ -315,10 +298,7 @@ def _in_one_run_each(run: BatchRun, fault: Fault) -> tuple[str, str, str]:
 def modelled_twice(runs: Sequence[tuple[int, int]]) -> bool:
     """Whether a run kept fewer buildings than the run before it had done.
 
-    Parameters
-    ----------
-    runs : sequence of (kept, done)
-        Buildings that a run took as they were kept, and those that were done when it ended, kept ones included.
+    Each run is (kept, done): buildings taken as they were kept, and those done when it ended, kept ones included.
     """
     return any(kept < done for (_, done), (kept, _) in itertools.pairwise(runs))
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).parent))
 
 from batch_faults import SETTINGS, Undisturbed, buildings_of
@@ -37,3 +36,17 @@ def undisturbed_batch(town_tile: Path, tmp_path_factory: pytest.TempPathFactory)
     found = Undisturbed(digest=run_digest(out), buildings=buildings_of(out))
     assert len(found.buildings) >= 24
     return found
+
+
+@pytest.fixture(scope="session")
+def tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated suburb of about 100 x 100 m."""
+    return simulate("suburb", tmp_path_factory.mktemp("suburb"), 3, size_m=(100.0, 100.0), density_per_m2=4.0).laz
+
+
+@pytest.fixture(scope="session")
+def digest(tile: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The digest of an undisturbed run on it in one process, in tiles of 40 m."""
+    out = str(tmp_path_factory.mktemp("run") / "run")
+    settings = RunSettings.from_mapping({"tile_size_m": 40.0})
+    return run(RunRequest(inputs=(str(tile),), out=out, settings=settings, resources=SERIAL)).digest

@@ -48,18 +48,11 @@ class Ended:
     @property
     def seconds(self) -> float:
         """Time from submission to the end."""
-        assert self.job.finished_at is not None
         return (self.job.finished_at - self.job.created_at).total_seconds()
 
 
 class Gates:
-    """Stages in which tasks wait until the gate opens: one folder each, as `tests/faults` reads it.
-
-    Parameters
-    ----------
-    folder : Path
-        Gets a folder per stage.
-    """
+    """Stages in which tasks wait until the gate opens: one folder each, as `tests/faults` reads it."""
 
     def __init__(self, folder: Path) -> None:
         self._folders = {stage: folder / stage for stage in STAGES}
@@ -95,18 +88,9 @@ class Gates:
 
 
 class Deployment:
-    """A scheduler, workers, a driver and an API over one state folder.
+    """A scheduler, workers, a driver and an API over one state folder, which lies in a folder of the test.
 
-    Parameters
-    ----------
-    programs : Programs
-        Starts and ends them.
-    folder : Path
-        Gets the state.
-    faults : mapping, optional
-        Further faults, as `tests/faults` understands them.
-    variables : mapping, optional
-        Further settings of the service.
+    `faults` are further ones, as `tests/faults` understands them; `variables` are further settings of the service.
     """
 
     def __init__(

@@ -103,18 +103,13 @@ def test_buildings_that_kill_their_process_harm_only_themselves(
         assert service.running[name].alive, "a building killed a worker"
     for name, reason in expected.items():
         bundle = ended.run / "quarantine" / f"{name}.bundle"
-        replayed = subprocess.run(
-            [program("gablework"), "replay", bundle, "--json"], capture_output=True, text=True, check=False
-        )
+        command = [program("gablework"), "replay", bundle, "--json"]
+        replayed = subprocess.run(command, capture_output=True, text=True, check=False)
         assert replayed.returncode == 0, replayed.stderr
         assert json.loads(replayed.stdout)["record"]["status"] == "ok"
         outcome = row(POISONS[reason], ("reconstruct",), ended, undisturbed)
-        assert (outcome.status, outcome.begun, outcome.ended, outcome.content) == (
-            "successful",
-            1,
-            1,
-            "same but for them",
-        )
+        survived = ("successful", 1, 1, "same but for them")
+        assert (outcome.status, outcome.begun, outcome.ended, outcome.content) == survived
         marked = f"it alone: `{reason}`; replayed: ok"
         table.append(dataclasses.replace(outcome, content="same but for it", marked=marked))
 

@@ -10,29 +10,28 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+import chores
 import pytest
 from distributed import Client
-from processes import Programs, free_port, missing, program
+from processes import Programs, free_port, missing
 
 from pipeline.errors import ClusterError
-from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.tls import VARIABLES, TlsFiles
 from pipeline.runtime.manifest import read_manifest
 from pipeline.runtime.monitoring.events import Watch
-from pipeline.runtime.request import RunRequest
-from pipeline.runtime.resources import SERIAL
-from pipeline.runtime.run import run
-from pipeline.settings import RunSettings
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "55_runtime" / "on_workers"))
-
-import chores
 
 pytestmark = pytest.mark.slow
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "how_to" / "clusters.md"
 SETTINGS = {"tile_size_m": 40.0}
+
+
+def run_documented(folder: Path) -> None:
+    """Run the commands of the page that make certificates."""
+    lines = re.findall(r"^\$ ((?:openssl|printf) .*)$", PAGE.read_text(), re.MULTILINE)
+    assert len(lines) == 4
+    subprocess.run(["sh", "-e", "-c", "\n".join(lines)], cwd=folder, check=True, capture_output=True)
 
 
 @pytest.fixture(scope="module")
@@ -41,29 +40,12 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> TlsFiles:
     if shutil.which("openssl") is None:
         missing("the program openssl is not installed")
     folder = tmp_path_factory.mktemp("certificates")
-    lines = re.findall(r"^\$ ((?:openssl|printf) .*)$", PAGE.read_text(), re.MULTILINE)
-    assert len(lines) == 4
-    subprocess.run(["sh", "-e", "-c", "\n".join(lines)], cwd=folder, check=True, capture_output=True)
-    checked = subprocess.run(
-        ["openssl", "verify", "-x509_strict", "-CAfile", "ca.pem", "cluster.pem"], cwd=folder, check=False
-    )
+    run_documented(folder)
+    verify = ["openssl", "verify", "-x509_strict", "-CAfile", "ca.pem", "cluster.pem"]
+    checked = subprocess.run(verify, cwd=folder, check=False)
     assert checked.returncode == 0, "newer Pythons check certificates strictly"
     names = {name: str(folder / f"{file}") for name, file in (("ca", "ca.pem"), ("cert", "cluster.pem"))}
     return TlsFiles(**names, key=str(folder / "cluster.key"))
-
-
-@pytest.fixture(scope="module")
-def tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated suburb of about 100 x 100 m."""
-    return simulate("suburb", tmp_path_factory.mktemp("suburb"), 3, size_m=(100.0, 100.0), density_per_m2=4.0).laz
-
-
-@pytest.fixture(scope="module")
-def digest(tile: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Of a run in one process."""
-    out = str(tmp_path_factory.mktemp("run") / "run")
-    settings = RunSettings.from_mapping(SETTINGS)
-    return run(RunRequest(inputs=(str(tile),), out=out, settings=settings, resources=SERIAL)).digest
 
 
 def options(files: TlsFiles) -> list[str]:
@@ -73,10 +55,8 @@ def options(files: TlsFiles) -> list[str]:
 
 def start_scheduler(programs: Programs, files: TlsFiles | None, port: int) -> str:
     """`dask scheduler`, with certificates or without; its address."""
-    command = [str(program("dask")), "scheduler", "--host", "127.0.0.1", "--port", str(port)]
-    if files is not None:
-        command += ["--tls-ca-file", files.ca, "--tls-cert", files.cert, "--tls-key", files.key]
-    programs.start("scheduler", [*command, "--dashboard-address", "127.0.0.1:0"]).wait_for_port(port)
+    tls = [] if files is None else ["--tls-ca-file", files.ca, "--tls-cert", files.cert, "--tls-key", files.key]
+    programs.start_scheduler(port, *tls)
     return f"{'tcp' if files is None else 'tls'}://127.0.0.1:{port}"
 
 
@@ -90,13 +70,9 @@ def reconstruct(tile: Path, out: Path, *more: str, env: Mapping[str, str] | None
     settings = out.parent / "settings.toml"
     settings.write_text("[settings]\n" + "".join(f"{name} = {value}\n" for name, value in SETTINGS.items()))
     command = [sys.executable, "-m", "service.cli", "reconstruct", str(tile), "--out", str(out), *more]
-    done = subprocess.run(
-        [*command, "--settings", str(settings), "--json"],
-        env={**os.environ, **(env or {})},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command += ["--settings", str(settings), "--json"]
+    environment = {**os.environ, **(env or {})}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout + done.stderr
 
 
@@ -116,11 +92,8 @@ def test_a_run_over_tls_gives_the_same_content_and_only_those_with_a_certificate
     assert manifest.content_sha256 == digest
 
     # Dask's own way to say it
-    own = {"DASK_DISTRIBUTED__COMM__TLS__CA_FILE": files.ca}
-    own |= {
-        "DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT": files.cert,
-        "DASK_DISTRIBUTED__COMM__TLS__CLIENT__KEY": files.key,
-    }
+    own = {"CA_FILE": files.ca, "CLIENT__CERT": files.cert, "CLIENT__KEY": files.key}
+    own = {f"DASK_DISTRIBUTED__COMM__TLS__{name}": path for name, path in own.items()}
     code, output = reconstruct(tile, tmp_path / "dask", "--scheduler", address, env=own)
     assert code == 0, output
     assert read_manifest(tmp_path / "dask").content_sha256 == digest
@@ -143,8 +116,7 @@ def test_a_run_over_tls_gives_the_same_content_and_only_those_with_a_certificate
     other.mkdir()
     for name in ("ca.pem", "ca.key"):
         shutil.copy(Path(files.ca).with_name(name), other)
-    lines = re.findall(r"^\$ ((?:openssl|printf) .*)$", PAGE.read_text(), re.MULTILINE)
-    subprocess.run(["sh", "-e", "-c", "\n".join(lines)], cwd=other, check=True, capture_output=True)
+    run_documented(other)
     stranger = TlsFiles(ca=files.ca, cert=str(other / "cluster.pem"), key=str(other / "cluster.key"))
     with (
         pytest.raises(ClusterError, match="does not accept our certificate"),

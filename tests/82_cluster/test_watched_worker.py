@@ -11,43 +11,32 @@ import httpx
 import pyarrow.dataset as ds
 import pytest
 from faults import asked
-from processes import Programs, free_port, program, wait_for
+from processes import Programs, free_port, wait_for
 
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.manifest import read_manifest
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL, Resources
 from pipeline.runtime.run import run
-from pipeline.settings import RunSettings
 
 pytestmark = pytest.mark.slow
 
 
 def test_a_building_that_is_lost_is_named_with_its_run_and_counted(programs: Programs, tmp_path: Path) -> None:
     tile = simulate("suburb", tmp_path / "scene", 3, size_m=(60.0, 60.0), density_per_m2=4.0).laz
-    request = RunRequest(
-        inputs=(str(tile),), out=str(tmp_path / "serial"), settings=RunSettings(), resources=SERIAL, meshes="none"
-    )
-    run(request)
+    run(RunRequest(inputs=(str(tile),), out=str(tmp_path / "serial"), resources=SERIAL, meshes="none"))
     found = ds.dataset(tmp_path / "serial" / "buildings", partitioning="hive").to_table(["building_id", "status"])
     lost = min(b for b, status in zip(*found.to_pydict().values(), strict=True) if status == "ok")
 
     port, figures = free_port(), free_port()
-    command = [str(program("dask")), "scheduler", "--host", "127.0.0.1", "--port", str(port)]
-    programs.start("scheduler", [*command, "--dashboard-address", "127.0.0.1:0"]).wait_for_port(port)
+    programs.start_scheduler(port)
     address = f"tcp://127.0.0.1:{port}"
     command = [sys.executable, "-m", "service.cli", "worker", "--scheduler", address, "--log-json"]
     env = asked.environment(crash=[lost])
     worker = programs.start("worker", [*command, "--metrics-port", str(figures)], env=env)
     worker.wait_for_text("is at the scheduler")
-    summary = run(
-        RunRequest(
-            inputs=(str(tile),),
-            out=str(tmp_path / "run"),
-            settings=RunSettings(),
-            resources=Resources(scheduler=address),
-        )
-    )
+    resources = Resources(scheduler=address)
+    summary = run(RunRequest(inputs=(str(tile),), out=str(tmp_path / "run"), resources=resources))
     assert summary.reasons["crashed"] == 1
 
     def page() -> str:

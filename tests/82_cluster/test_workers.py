@@ -2,33 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+import chores
 import psutil
 import pytest
 from faults import asked
 from processes import Program, Programs, free_port, lives, program, wait_for
 
 from pipeline.errors import ClusterError, RunCancelledError, VersionMismatchError
-from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.manifest import RunStatus, read_manifest
 from pipeline.runtime.monitoring.events import Event, Watch
+from pipeline.runtime.monitoring.measurement import Measured
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.resources import SERIAL, Resources
+from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
 from pipeline.settings import RunSettings
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "55_runtime" / "on_workers"))
-
-import chores
 
 pytestmark = pytest.mark.slow
 
@@ -55,17 +52,7 @@ ours.fingerprint.cache_clear()
 
 
 class Bench:
-    """A scheduler, its workers, and runs on them.
-
-    Parameters
-    ----------
-    programs : Programs
-        Starts and ends the processes.
-    folder : Path
-        Of this test.
-    tile : Path
-        The input of all runs.
-    """
+    """A scheduler, its workers, and runs of one tile on them."""
 
     def __init__(self, programs: Programs, folder: Path, tile: Path) -> None:
         self.programs = programs
@@ -84,10 +71,7 @@ class Bench:
 
     def start_scheduler(self) -> Program:
         """`dask scheduler` on the loopback."""
-        command = [str(program("dask")), "scheduler", "--host", "127.0.0.1", "--port", str(self.port)]
-        started = self.programs.start("scheduler", [*command, "--dashboard-address", "127.0.0.1:0"])
-        started.wait_for_port(self.port)
-        return started
+        return self.programs.start_scheduler(self.port)
 
     def start_worker(self, name: str, *options: str, env: dict[str, str] | None = None) -> Program:
         """`dask worker` with one thread under a nanny."""
@@ -102,13 +86,9 @@ class Bench:
 
     def run(self, out: str, cancelled: Callable[[], bool] | None = None) -> RunSummary:
         """Reconstruct the tile on the workers; cancelled where the test is over before."""
+        inputs, resources = (str(self.tile),), Resources(scheduler=self.address)
         settings = RunSettings.from_mapping({"tile_size_m": 40.0})
-        request = RunRequest(
-            inputs=(str(self.tile),),
-            out=str(self.folder / out),
-            settings=settings,
-            resources=Resources(scheduler=self.address),
-        )
+        request = RunRequest(inputs=inputs, out=str(self.folder / out), settings=settings, resources=resources)
         return run(request, self.listen, cancelled=cancelled or self.over.is_set)
 
     def listen(self, event: Event) -> None:
@@ -119,27 +99,19 @@ class Bench:
         """Reconstruct in another thread."""
         return self.threads.submit(self.run, out)
 
+    def paused(self, stage: str = "split") -> tuple[Path, Program, Future[RunSummary]]:
+        """A run whose one worker came to a stage and waits there: its folder, the worker, the run."""
+        folder, env = self.pausing(stage)
+        worker = self.start_worker("one", env=env)
+        running = self.begin("run")
+        wait_for(reached(folder), f"a task of {stage}")
+        return folder, worker, running
+
     def pausing(self, stage: str) -> tuple[Path, dict[str, str]]:
         """A folder, and the environment of workers that stop before the tasks of a stage until it holds `go`."""
         folder = self.folder / f"pause-{stage}"
         folder.mkdir()
         return folder, asked.environment(pause={stage: str(folder)})
-
-
-@pytest.fixture(scope="module")
-def tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated suburb of about 100 x 100 m."""
-    folder = tmp_path_factory.mktemp("suburb")
-    simulate("suburb", folder, 3, size_m=(100.0, 100.0), density_per_m2=4.0)
-    return folder / "suburb.laz"
-
-
-@pytest.fixture(scope="module")
-def digest(tile: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Of an undisturbed run in one process."""
-    settings = RunSettings.from_mapping({"tile_size_m": 40.0})
-    out = str(tmp_path_factory.mktemp("run") / "run")
-    return run(RunRequest(inputs=(str(tile),), out=out, settings=settings, resources=SERIAL)).digest
 
 
 @pytest.fixture
@@ -186,20 +158,15 @@ def test_a_worker_killed_in_any_stage_changes_nothing(stage: str, bench: Bench, 
 
 
 def test_a_worker_process_that_is_killed_below_its_nanny_changes_nothing(bench: Bench, digest: str) -> None:
-    folder, env = bench.pausing("split")
-    bench.start_worker("one", env=env)
-    running = bench.begin("run")
-    pid = wait_for(reached(folder), "a task of split")
+    folder, _, running = bench.paused()
+    pid = wait_for(reached(folder), "its process")
     (folder / "go").touch()
     psutil.Process(pid).kill()
     assert running.result(END_S).digest == digest
 
 
 def test_a_run_without_workers_reports_that_it_waits_and_continues_when_one_comes(bench: Bench, digest: str) -> None:
-    folder, env = bench.pausing("split")
-    only = bench.start_worker("one", env=env)
-    running = bench.begin("run")
-    wait_for(reached(folder), "a task of split")
+    _, only, running = bench.paused()
     only.kill()
 
     def waiting_events() -> list[Event]:
@@ -213,10 +180,7 @@ def test_a_run_without_workers_reports_that_it_waits_and_continues_when_one_come
 
 
 def test_a_scheduler_killed_under_a_run_ends_it_with_a_clear_error(bench: Bench) -> None:
-    folder, env = bench.pausing("split")
-    bench.start_worker("one", env=env)
-    running = bench.begin("run")
-    wait_for(reached(folder), "a task of split")
+    _, _, running = bench.paused()
     bench.scheduler.kill()
     with pytest.raises(ClusterError, match=rf"the scheduler {bench.address} was lost"):
         running.result(END_S)
@@ -274,10 +238,7 @@ def test_a_worker_of_another_version_is_named_before_the_first_task(bench: Bench
 def test_a_worker_of_another_version_that_comes_late_is_refused_by_its_first_task(bench: Bench, tmp_path: Path) -> None:
     preload = tmp_path / "other_version.py"
     preload.write_text(OTHER_VERSION)
-    folder, env = bench.pausing("split")
-    only = bench.start_worker("one", env=env)
-    running = bench.begin("run")
-    wait_for(reached(folder), "a task of split")
+    _, only, running = bench.paused()
     bench.start_worker("other", "--preload", str(preload))
     only.kill()
     with pytest.raises(VersionMismatchError, match=r"worker \S+:\d+: shapely 9\.9 where the client has 2\."):
@@ -313,18 +274,25 @@ def test_a_worker_that_drains_finishes_its_task_and_nothing_runs_twice(bench: Be
     assert workers[1].alive
 
 
-def test_the_last_worker_hands_its_result_over_before_it_leaves(bench: Bench) -> None:
+@contextlib.contextmanager
+def draining(bench: Bench, marks: Path) -> Iterator[tuple[Program, Future[list[Measured[str]]]]]:
+    """A worker that was asked to end while it has a task, and the map of the task, which waits for a mark."""
     worker = bench.start_gablework_worker("one")
     worker.wait_for_text("is at the scheduler")
-    marks = bench.folder / "marks"
     marks.mkdir()
     with Cluster(scheduler=bench.address) as cluster, cluster.executor() as executor:
-        tasks = [(str(marks), "only")]
         watch = Watch(cancelled=bench.over.is_set)
+        tasks = [(str(marks), "only")]
         running = bench.threads.submit(lambda: list(executor.map("wait", chores.wait_for_mark, tasks, watch)))
         wait_for(lambda: list(marks.glob("started-*")), "the task")
         worker.process.send_signal(signal.SIGTERM)
         worker.wait_for_text("no new tasks")
+        yield worker, running
+
+
+def test_the_last_worker_hands_its_result_over_before_it_leaves(bench: Bench) -> None:
+    marks = bench.folder / "marks"
+    with draining(bench, marks) as (worker, running):
         (marks / "go").touch()
         assert [measured.result for measured in running.result(END_S)] == ["only"]
     assert worker.ended() == 0
@@ -332,17 +300,7 @@ def test_the_last_worker_hands_its_result_over_before_it_leaves(bench: Bench) ->
 
 
 def test_a_second_signal_ends_a_worker_at_once(bench: Bench) -> None:
-    worker = bench.start_gablework_worker("one")
-    worker.wait_for_text("is at the scheduler")
-    marks = bench.folder / "marks"
-    marks.mkdir()
-    with Cluster(scheduler=bench.address) as cluster, cluster.executor() as executor:
-        watch = Watch(cancelled=bench.over.is_set)
-        tasks = [(str(marks), "endless")]
-        running = bench.threads.submit(lambda: list(executor.map("wait", chores.wait_for_mark, tasks, watch)))
-        wait_for(lambda: list(marks.glob("started-*")), "the task")
-        worker.process.send_signal(signal.SIGTERM)
-        worker.wait_for_text("no new tasks")
+    with draining(bench, bench.folder / "marks") as (worker, running):
         worker.process.send_signal(signal.SIGTERM)
         assert worker.ended() == 0
         assert "ended at once" in worker.text

@@ -18,6 +18,7 @@ import hypothesis
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, given
+from live_service import POINTS
 from schemathesis.generation import GenerationMode
 from schemathesis.specs.openapi.checks import positive_data_acceptance
 
@@ -31,10 +32,8 @@ import finished_runs
 CASES = int(os.environ.get("GABLEWORK_OPENAPI_CASES", "500"))
 """Requests to be generated, at least."""
 
-EXCLUDED = [
-    # whether an upload is there or a host is allowed, a schema cannot say: such a request is valid and yet refused
-    positive_data_acceptance,
-]
+EXCLUDED = [positive_data_acceptance]
+"""Whether an upload is there or a host is allowed, a schema cannot say: such a request is valid and yet refused."""
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +55,7 @@ class Ids:
         self._processes = itertools.cycle(["reconstruct", "compare"])
         self._methods = itertools.cycle(finished_runs.LABELS)
         self._turn = itertools.count()
-        points = b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(20) for y in range(20))
-        sent = service.client.post("/uploads?filename=points.xyz", content=points)
+        sent = service.client.post("/uploads?filename=points.xyz", content=POINTS)
         assert sent.status_code == 201, sent.text
         self._upload = sent.json()["uploadID"]
         self._schedules = itertools.cycle([self._schedule() for _ in range(3)])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Locator, Page
+from playwright.sync_api import Locator, Page, expect
 
 HUES = {"pent": 0.454, "gable": 0.113, "hip": 0.909, "combination": 0.557}
 """Hues of roof types (0 to 1), those of the palette of Okabe and Ito; light does not change them."""
@@ -20,15 +20,7 @@ FRAMES_AT_REST = 5
 
 
 class Visit:
-    """A page with its complaints.
-
-    Parameters
-    ----------
-    page : Page
-        Playwright's page; not opened yet.
-    url : str
-        Of the service, with a slash at its end.
-    """
+    """A page of Playwright, not opened yet, with its complaints; the service's `url` has a slash at its end."""
 
     def __init__(self, page: Page, url: str) -> None:
         self.page = page
@@ -53,6 +45,16 @@ class Visit:
         self.urls.append(url)
         if not url.startswith((self.url, "blob:", "data:")):
             self.elsewhere.append(url)
+
+    def drop(self, tile: Path) -> None:
+        """Give the page a tile, and wait until it says what it holds."""
+        self.page.set_input_files("#tiles", tile)
+        expect(self.page.locator(".facts")).to_contain_text("points")
+
+    def open_job(self, job: str) -> None:
+        """Choose a job of the list, and wait for its models."""
+        self.page.locator(f'a[href="#/jobs/{job}"]').click()
+        self.wait_for_models()
 
     def wait_for_models(self) -> Locator:
         """The canvas, once all models are drawn."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import subprocess
@@ -13,7 +14,6 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).parent))
 
 from chromium import Visit
@@ -55,36 +55,34 @@ def _files(path: Path) -> list[Path]:
     return [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
 
 
+def _simulated(suite: str, folder: Path) -> Path:
+    subprocess.run([_gablework(), "simulate", suite, "--out", folder], check=True, capture_output=True)
+    (found,) = folder.glob("*.laz")
+    return found
+
+
 @pytest.fixture(scope="session")
 def tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated tile with houses of all roof types."""
-    folder = tmp_path_factory.mktemp("scene")
-    subprocess.run([_gablework(), "simulate", "suburb", "--out", folder], check=True, capture_output=True)
-    (found,) = folder.glob("*.laz")
-    return found
+    return _simulated("suburb", tmp_path_factory.mktemp("scene"))
 
 
 @pytest.fixture(scope="session")
 def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated tile with one gabled house."""
-    folder = tmp_path_factory.mktemp("house")
-    subprocess.run([_gablework(), "simulate", "gable", "--out", folder], check=True, capture_output=True)
-    (found,) = folder.glob("*.laz")
-    return found
+    return _simulated("gable", tmp_path_factory.mktemp("house"))
 
 
 def _gablework() -> Path:
     return program("gablework")
 
 
-Served = tuple[Program, str]
-
-
-def _serve(folder: Path, *options: str, **environment: str) -> Served:
-    """A service on a free port, once it is ready."""
+@contextlib.contextmanager
+def _served(folder: Path, *options: str) -> Iterator[str]:
+    """The URL of a service on a free port, once it is ready."""
     port = free_port()
     command = [str(_gablework()), "serve", "--port", str(port), "--state", str(folder / "state"), *options]
-    served = Program("serve", command, folder / "serve.log", env={**os.environ, **environment})
+    served = Program("serve", command, folder / "serve.log", env=os.environ)
     url = f"http://127.0.0.1:{port}/"
 
     def answers() -> bool:
@@ -93,37 +91,29 @@ def _serve(folder: Path, *options: str, **environment: str) -> Served:
         except httpx.TransportError:
             return False
 
-    served.wait_for(answers, "an answer")
-    return served, url
-
-
-@pytest.fixture(scope="module")
-def service(built_page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """URL of a service without keys, with a driver."""
-    served, url = _serve(tmp_path_factory.mktemp("service"), "--workers", "1")
     try:
+        served.wait_for(answers, "an answer")
         yield url
     finally:
         served.end()
         print(served.tail())
 
 
+@pytest.fixture(scope="module")
+def service(built_page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """URL of a service without keys, with a driver."""
+    with _served(tmp_path_factory.mktemp("service"), "--workers", "1") as url:
+        yield url
+
+
 @pytest.fixture
 def locked(built_page: Path, tmp_path: Path) -> Iterator[tuple[str, str]]:
     """URL of a service that wants a key, without a driver, and a key for it."""
-    created = subprocess.run(
-        [_gablework(), "keys", "create", "--name", "page", "--scope", "submit", "--state", tmp_path / "state"],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
+    command = [_gablework(), "keys", "create", "--name", "page", "--scope", "submit", "--state", tmp_path / "state"]
+    created = subprocess.run(command, check=True, capture_output=True, text=True)
     (key,) = [word for word in created.stdout.split() if word.startswith("gw_")]
-    served, url = _serve(tmp_path, "--no-driver")
-    try:
+    with _served(tmp_path, "--no-driver") as url:
         yield url, key
-    finally:
-        served.end()
-        print(served.tail())
 
 
 @pytest.fixture(scope="module")

@@ -72,8 +72,7 @@ def test_a_dropped_tile_becomes_models_and_a_click_on_one_shows_its_record(
 ) -> None:
     opened = visit(service)
     page = opened.page
-    page.set_input_files("#tiles", tile)
-    expect(page.locator(".facts")).to_contain_text("points")
+    opened.drop(tile)
     page.evaluate(SEE_STAGES)
     page.get_by_role("button", name="Reconstruct").click()
     progress = page.get_by_role("progressbar", name="Progress of the job")
@@ -87,7 +86,6 @@ def test_a_dropped_tile_becomes_models_and_a_click_on_one_shows_its_record(
     assert seen
     assert seen == sorted(seen)
     job = re.search(r"#/jobs/(\w{32})$", page.url)
-    assert job is not None
     listed = httpx.get(f"{service}jobs/{job[1]}/buildings", params={"limit": 1}).json()["numberMatched"]
     assert page.locator("canvas").get_attribute("data-models") == str(listed)
     seen = opened.pixels(tmp_path / "models.png")
@@ -125,8 +123,7 @@ def test_a_reload_brings_back_job_and_building(visit: Open, service: str, finish
 def test_every_download_is_the_file_that_the_results_name(visit: Open, service: str, finished: str) -> None:
     results = httpx.get(f"{service}jobs/{finished}/results").json()
     opened = visit(service)
-    opened.page.locator(f'a[href="#/jobs/{finished}"]').click()
-    opened.wait_for_models()
+    opened.open_job(finished)
     opened.page.locator(".menu summary", has_text="Download").click()
     links = opened.page.locator(".menu-list a[download]")
     assert links.count() == len(results)
@@ -152,8 +149,7 @@ def test_every_download_is_the_file_that_the_results_name(visit: Open, service: 
 
 def test_the_legend_hides_and_shows_a_roof_type(visit: Open, service: str, finished: str) -> None:
     opened = visit(service)
-    opened.page.locator(f'a[href="#/jobs/{finished}"]').click()
-    opened.wait_for_models()
+    opened.open_job(finished)
     before = of_hue(opened.pixels(), "hip").sum()
     rows = opened.page.locator(".building")
     listed = rows.count()
@@ -190,8 +186,7 @@ def test_a_comparison_shows_each_method_and_the_page_of_all(
 ) -> None:
     opened = visit(service)
     page = opened.page
-    page.set_input_files("#tiles", house)
-    expect(page.locator(".facts")).to_contain_text("points")
+    opened.drop(house)
     page.locator("summary", has_text="Options").click()
     expect(page.get_by_label("Method", exact=True)).to_have_value("arrangement")
     expect(page.get_by_role("checkbox", name="arrangement", exact=True)).to_be_disabled()
@@ -205,7 +200,6 @@ def test_a_comparison_shows_each_method_and_the_page_of_all(
     page.get_by_role("button", name="Compare 3 methods").click()
     opened.wait_for_models()
     found = re.search(r"#/jobs/(\w{32})$", page.url)
-    assert found is not None
     reported = httpx.get(f"{service}jobs/{found[1]}").json()
     labels = ["fuzzy-sart", "fuzzy-sart-faithful", "kmeans"]
     assert (reported["processID"], list(reported["summary"]["runs"])) == ("compare", labels)
@@ -248,8 +242,7 @@ def test_levels_of_detail_are_chosen_for_the_job_and_in_the_view(
 ) -> None:
     opened = visit(service)
     page = opened.page
-    page.set_input_files("#tiles", house)
-    expect(page.locator(".facts")).to_contain_text("points")
+    opened.drop(house)
     page.locator("summary", has_text="Options").click()
     boxes = page.get_by_role("group", name="Levels of detail").get_by_role("checkbox")
     names = ["LoD1.2: one block", "LoD1.3: level parts", "LoD2.2: roof faces"]
@@ -288,8 +281,7 @@ def test_levels_of_detail_are_chosen_for_the_job_and_in_the_view(
     expect(choice.last).to_have_attribute("aria-pressed", "true")
     assert (opened.pixels_at_rest() != roof).any(axis=2).mean() < 0.001, "the view has moved"
 
-    page.locator(f'a[href="#/jobs/{finished}"]').click()  # of one level
-    opened.wait_for_models()
+    opened.open_job(finished)  # of one level
     expect(page.get_by_role("button", name="Fit")).to_be_visible()
     expect(page.get_by_role("button", name="LoD2.2")).to_have_count(0)
 
@@ -371,11 +363,9 @@ def test_nothing_is_cut_off_on_narrow_screens(
     visit: Open, service: str, finished: str, width: int, scheme: str, tmp_path: Path
 ) -> None:
     opened = visit(service, viewport={"width": width, "height": 844}, color_scheme=scheme)
-    opened.page.locator(f'a[href="#/jobs/{finished}"]').click()
-    opened.wait_for_models()
+    opened.open_job(finished)
     assert opened.page.evaluate("document.documentElement.scrollWidth") == width
     box = opened.page.locator("canvas").bounding_box()
-    assert box is not None
     assert box["width"] > 0.4 * width
     assert of_hue(opened.pixels(), "gable").any()
     opened.page.screenshot(path=tmp_path / f"{width}-{scheme}.png", full_page=True)

@@ -15,6 +15,13 @@ import yaml
 
 Compose = Mapping[str, Any]
 
+NO_RIGHTS = {
+    "allowPrivilegeEscalation": False,
+    "readOnlyRootFilesystem": True,
+    "capabilities": {"drop": ["ALL"]},
+}
+"""The security context of each container in Kubernetes."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Instruction:

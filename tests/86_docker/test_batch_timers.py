@@ -13,6 +13,7 @@ from typing import Any
 import kubernetes_validate
 import pytest
 import yaml
+from container_files import NO_RIGHTS
 
 from pipeline import __version__
 from pipeline.schedule import Cron, Missed, Overlap
@@ -43,12 +44,9 @@ def unit(root: Path, name: str) -> configparser.ConfigParser:
 
 def test_the_cron_job_is_what_kubernetes_understands(cron_job: dict[str, Any]) -> None:
     kubernetes_validate.validate(cron_job, kubernetes_validate.latest_version(), strict=True)
+    wrong = cron_job | {"spec": {**cron_job["spec"], "schedules": "x"}}
     with pytest.raises(kubernetes_validate.ValidationError):
-        kubernetes_validate.validate(
-            cron_job | {"spec": {**cron_job["spec"], "schedules": "x"}},
-            strict=True,
-            desired_version=kubernetes_validate.latest_version(),
-        )
+        kubernetes_validate.validate(wrong, kubernetes_validate.latest_version(), strict=True)
 
 
 def test_the_cron_job_comes_every_day_and_never_twice_at_a_time(cron_job: dict[str, Any]) -> None:
@@ -68,11 +66,7 @@ def test_the_cron_jobs_pod_has_no_rights_and_keeps_the_run(cron_job: dict[str, A
     assert container["image"] == f"gablework:{__version__}"
     assert container["args"][:2] == ["batch", "run"]
     assert pod["securityContext"]["runAsNonRoot"]
-    assert container["securityContext"] == {
-        "allowPrivilegeEscalation": False,
-        "readOnlyRootFilesystem": True,
-        "capabilities": {"drop": ["ALL"]},
-    }
+    assert container["securityContext"] == NO_RIGHTS
     assert {"requests", "limits"} == set(container["resources"])
     mounts = {mount["name"]: mount["mountPath"] for mount in container["volumeMounts"]}
     assert set(mounts) == {volume["name"] for volume in pod["volumes"]}
@@ -89,7 +83,6 @@ def test_the_timer_starts_its_unit_also_after_the_machine_was_off(root: Path, pa
     assert timer["Timer"]["Persistent"] == "true"
     assert timer["Install"]["WantedBy"] == "timers.target"
     found = re.fullmatch(r"\*-\*-\* (\d\d):(\d\d):00 (\S+)", timer["Timer"]["OnCalendar"])
-    assert found is not None
     Cron(f"{int(found[2])} {int(found[1])} * * *", found[3])
     assert service["Service"]["Type"] == "oneshot"
     # a batch takes as long as it takes
@@ -99,7 +92,6 @@ def test_the_timer_starts_its_unit_also_after_the_machine_was_off(root: Path, pa
     assert (Path(words[0]).name, words[1:3]) == ("gablework", ["batch", "run"])
     assert words[3].startswith(service["Service"]["ReadWritePaths"])
     block = re.search(r"```ini\n(.*?)```", page, re.DOTALL)
-    assert block is not None
     shown = configparser.ConfigParser(interpolation=None)
     shown.optionxform = str  # type: ignore[assignment,method-assign]
     shown.read_string(block[1])
@@ -152,10 +144,6 @@ def test_the_models_of_schedules_agree_with_the_records() -> None:
     assert fields["missed"]["enum"] == list(Missed)
     assert fields["overlap"]["enum"] == list(Overlap)
     defaults = {name: fields[name]["default"] for name in ("missed", "graceSeconds", "overlap", "paused")}
-    assert list(defaults.values()) == [
-        Definition.missed,
-        Definition.grace_s,
-        Definition.overlap,
-        Definition.is_paused,
-    ]
+    wanted = [Definition.missed, Definition.grace_s, Definition.overlap, Definition.is_paused]
+    assert list(defaults.values()) == wanted
     assert ScheduleRun.model_json_schema()["properties"]["outcome"]["enum"] == list(OUTCOMES)

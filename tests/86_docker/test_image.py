@@ -29,8 +29,6 @@ OURS = ("api", "driver", "scheduler", "worker")
 def entrypoint(root: Path) -> ModuleType:
     """docker/entrypoint.py as a module."""
     spec = importlib.util.spec_from_file_location("image_entrypoint", root / "docker" / "entrypoint.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
@@ -38,36 +36,22 @@ def entrypoint(root: Path) -> ModuleType:
 
 
 def test_hadolint_finds_nothing(root: Path) -> None:
-    found = subprocess.run(
-        [program("hadolint"), "--failure-threshold", "style", root / "docker" / "Dockerfile"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [program("hadolint"), "--failure-threshold", "style", root / "docker" / "Dockerfile"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (found.returncode, found.stdout) == (0, "")
 
 
 @pytest.mark.parametrize("name", ["compose.yaml", "compose.tls.yaml", "compose.s3.yaml"])
 def test_the_compose_file_keeps_the_schema(root: Path, name: str) -> None:
-    schema = ["--builtin-schema", "vendor.compose-spec"]
-    found = subprocess.run(
-        [program("check-jsonschema"), *schema, root / "docker" / name],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [program("check-jsonschema"), "--builtin-schema", "vendor.compose-spec", root / "docker" / name]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stdout + found.stderr
 
 
 def test_everything_that_is_copied_exists_and_is_sent_to_the_builder(image: Image, root: Path) -> None:
     rules = (root / ".dockerignore").read_text()
-    sources = [
-        source
-        for stage in image.stages
-        for one in stage.all("COPY")
-        if "from" not in one.options
-        for source in one.words[:-1]
-    ]
+    copies = [one for stage in image.stages for one in stage.all("COPY") if "from" not in one.options]
+    sources = [source for one in copies for source in one.words[:-1]]
     assert len(sources) >= 9
     assert [source for source in sources if not (root / source).exists()] == []
     assert [source for source in sources if not sent_to_the_builder(source, rules)] == []
@@ -224,9 +208,8 @@ def test_a_password_goes_from_its_file_into_the_url(entrypoint: ModuleType, tmp_
         "GABLEWORK_DATABASE_URL": "postgresql+pg8000://me@db:5432/jobs",
         "GABLEWORK_DATABASE_PASSWORD_FILE": str(tmp_path / "password"),
     }
-    assert entrypoint.environment_of(given) == {
-        "GABLEWORK_DATABASE_URL": "postgresql+pg8000://me:a%3Ab%40c%2Fd@db:5432/jobs"
-    }
+    url = "postgresql+pg8000://me:a%3Ab%40c%2Fd@db:5432/jobs"
+    assert entrypoint.environment_of(given) == {"GABLEWORK_DATABASE_URL": url}
     with pytest.raises(SystemExit, match="user and no password"):
         entrypoint.environment_of({**given, "GABLEWORK_DATABASE_URL": "sqlite:///jobs.db"})
     with pytest.raises(SystemExit, match="No such file"):
@@ -298,11 +281,7 @@ def test_the_wheel_of_the_image_holds_all_modules_and_the_page(image: Image, roo
     subprocess.run(command, cwd=source, check=True, capture_output=True)
     (wheel,) = (tmp_path / "wheel").glob("*.whl")
     held = set(zipfile.ZipFile(wheel).namelist())
-    wanted = {
-        path.relative_to(source).as_posix()
-        for folder in ("pipeline", "service")
-        for path in (source / folder).rglob("*")
-        if path.is_file()
-    }
+    paths = [path for folder in ("pipeline", "service") for path in (source / folder).rglob("*")]
+    wanted = {path.relative_to(source).as_posix() for path in paths if path.is_file()}
     assert len(wanted) > 100
     assert wanted - held == set()

@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 import typer
 import yaml
-from container_files import Image
+from container_files import NO_RIGHTS, Image
 
 from pipeline import __version__
 from pipeline.runtime.cluster.tls import VARIABLES
@@ -30,47 +30,26 @@ SINGLE = {"batch.yaml", "cronjob.yaml", "first_key.yaml"}
 """Applied by hand, one run each."""
 ROLES = {"api": ("serve", "--no-driver"), "driver": ("driver",), "worker": ("worker",)}
 SECRETS = {"gablework-tls", "gablework-postgres", "gablework-s3"}
-CLUSTER = {
-    "type": "object",
-    "additionalProperties": False,
-    "required": ["worker", "scheduler"],
-    "properties": {
-        "worker": {
-            "type": "object",
-            "additionalProperties": False,
-            "required": ["replicas", "spec"],
-            "properties": {"replicas": {"type": "integer", "minimum": 0}, "spec": {"type": "object"}},
-        },
-        "scheduler": {
-            "type": "object",
-            "additionalProperties": False,
-            "required": ["spec", "service"],
-            "properties": {"spec": {"type": "object"}, "service": {"type": "object"}},
-        },
-    },
-}
+
+
+def closed(**properties: object) -> dict[str, object]:
+    """The schema of an object that has these members and no other."""
+    return {"type": "object", "additionalProperties": False, "required": list(properties), "properties": properties}
+
+
+OBJECT = {"type": "object"}
+COUNT = {"type": "integer", "minimum": 0}
+CLUSTER = closed(worker=closed(replicas=COUNT, spec=OBJECT), scheduler=closed(spec=OBJECT, service=OBJECT))
 """The fields of a DaskCluster's spec, as the operator reads them; its pods and its service are Kubernetes' own."""
-AUTOSCALER = {
-    "type": "object",
-    "additionalProperties": False,
-    "required": ["cluster", "minimum", "maximum"],
-    "properties": {
-        "cluster": {"type": "string"},
-        "minimum": {"type": "integer", "minimum": 0},
-        "maximum": {"type": "integer", "minimum": 1},
-    },
-}
+AUTOSCALER = closed(cluster={"type": "string"}, minimum=COUNT, maximum={"type": "integer", "minimum": 1})
 
 Document = Mapping[str, Any]
 
 
 def documents() -> list[tuple[str, Document]]:
     """All manifests, with their files."""
-    return [
-        (path.name, document)
-        for path in sorted(FOLDER.glob("*.yaml"))
-        for document in yaml.safe_load_all(path.read_text())
-    ]
+    files = {path.name: yaml.safe_load_all(path.read_text()) for path in sorted(FOLDER.glob("*.yaml"))}
+    return [(name, document) for name, held in files.items() for document in held]
 
 
 DOCUMENTS = documents()
@@ -188,11 +167,7 @@ def test_a_pod_has_no_rights_and_no_more_than_it_needs(name: str, spec: Document
     assert spec["enableServiceLinks"] is False
     assert spec["terminationGracePeriodSeconds"] >= 30
     for container in spec["containers"]:
-        assert container["securityContext"] == {
-            "allowPrivilegeEscalation": False,
-            "readOnlyRootFilesystem": True,
-            "capabilities": {"drop": ["ALL"]},
-        }
+        assert container["securityContext"] == NO_RIGHTS
         assert {"cpu", "memory"} <= set(container["resources"]["requests"])
         assert "memory" in container["resources"]["limits"]
         mounted = {mount["name"] for mount in container["volumeMounts"]}
@@ -262,9 +237,8 @@ def test_all_name_the_scheduler_of_the_operator_over_tls() -> None:
     # the operator looks for them by these names
     assert ports == {"tcp-comm": 8786, "http-dashboard": 8787}
     (scheduler,) = (container for name, container in CONTAINERS if name == "scheduler")
-    assert "distributed.http.scheduler.api" in yaml.safe_load(
-        variables(scheduler)["DASK_DISTRIBUTED__SCHEDULER__HTTP__ROUTES"]
-    )
+    routes = yaml.safe_load(variables(scheduler)["DASK_DISTRIBUTED__SCHEDULER__HTTP__ROUTES"])
+    assert "distributed.http.scheduler.api" in routes
 
 
 def test_the_scheduler_is_reached_from_inside_only() -> None:
@@ -281,11 +255,8 @@ def test_the_scheduler_is_reached_from_inside_only() -> None:
 
 
 def test_every_service_finds_its_pods() -> None:
-    labels = [
-        document["spec"]["template"]["metadata"]["labels"]
-        for _, document in DOCUMENTS
-        if "template" in document.get("spec", {})
-    ]
+    specs = [document.get("spec", {}) for _, document in DOCUMENTS]
+    labels = [spec["template"]["metadata"]["labels"] for spec in specs if "template" in spec]
     for service in of_kind("Service"):
         assert service["spec"]["selector"] in labels
     for one in (*of_kind("Deployment"), *of_kind("StatefulSet")):

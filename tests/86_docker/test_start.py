@@ -22,7 +22,7 @@ import httpx
 import pytest
 import trustme
 from container_files import Compose, Image, laid_over, read_compose
-from processes import LONG_S, PostgresServer, Program, Programs, free_port, missing, program, wait_for
+from processes import LONG_S, PostgresServer, Program, Programs, as_user, free_port, missing, program, wait_for
 
 from pipeline.compiler.store import folder_of_kernels
 from pipeline.ruler.simulation.dataset import simulate
@@ -68,18 +68,8 @@ class Host:
 
     def run(self, command: Sequence[str], env: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
         """Run a command to its end."""
-        return subprocess.run(
-            [*self.before, *command],
-            env=env,
-            cwd=self.folder,
-            user=self.user,
-            group=self.user,
-            extra_groups=None if self.user is None else [],
-            capture_output=True,
-            text=True,
-            timeout=1800,
-            check=False,
-        )
+        place = {"env": env, "cwd": self.folder, "timeout": 1800, **as_user(self.user)}
+        return subprocess.run([*self.before, *command], capture_output=True, text=True, check=False, **place)
 
 
 def able(host: Host) -> bool:
@@ -208,6 +198,14 @@ def documented(root: Path, pattern: str) -> list[str]:
     return shlex.split(line)
 
 
+def new_key(composed: Composed, root: Path) -> str:
+    """A key, made as the page says."""
+    made = composed.run("api", documented(root, "keys create"))
+    assert made.returncode == 0, made.stderr
+    (key,) = re.findall(r"gw_[A-Za-z0-9_-]{43}", made.stdout)
+    return str(key)
+
+
 def send(address: str, key: str, tile: Path, driver: Program) -> list[str]:
     """Reconstruct a tile by the service; the statuses of its buildings."""
     with httpx.Client(base_url=address, headers={"Authorization": f"Bearer {key}"}, timeout=60.0) as client:
@@ -232,10 +230,7 @@ def test_the_documented_way_leads_from_nothing_to_models(composed: Composed, roo
     assert refused.ended() != 0
     assert "gablework keys create" in refused.text
 
-    made = composed.run("api", documented(root, "keys create"))
-    assert made.returncode == 0, made.stderr
-    (key,) = re.findall(r"gw_[A-Za-z0-9_-]{43}", made.stdout)
-
+    key = new_key(composed, root)
     running = {name: composed.start(name, name) for name in ("scheduler", "driver", "api")}
     running |= {name: composed.start("worker", name) for name in ("worker-1", "worker-2")}
     address = f"http://{composed.host.here('0.0.0.0:8000')}"
@@ -266,9 +261,7 @@ def test_the_documented_way_leads_from_nothing_to_models(composed: Composed, roo
 
 
 def test_the_same_services_work_over_tls(composed_tls: Composed, root: Path, tmp_path: Path) -> None:
-    made = composed_tls.run("api", documented(root, "keys create"))
-    assert made.returncode == 0, made.stderr
-    (key,) = re.findall(r"gw_[A-Za-z0-9_-]{43}", made.stdout)
+    key = new_key(composed_tls, root)
     names = ("scheduler", "driver", "api", "worker")
     running = {name: composed_tls.start(name, f"{name}-tls") for name in names}
     port = int(composed_tls.host.here("8786"))

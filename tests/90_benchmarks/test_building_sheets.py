@@ -71,7 +71,6 @@ def test_what_meets_given_outlines_is_left_out_and_sheets_are_as_asked(tmp_path:
     reported = [str(run), "--points", str(tile), "--crs", "EPSG:28992", "--outside", str(given), "--edges"]
     assert main([*reported, "--across", "1", "--down", "1", "--out", str(tmp_path / "sheets")]) == 0
     lines = (tmp_path / "sheets" / "sheets.md").read_text(encoding="utf-8").splitlines()[2:]
-    assert {line.split("|")[2].strip() for line in lines} == {
-        model.source_id or model.building_id for model in models[1:]
-    }
+    outside = {model.source_id or model.building_id for model in models[1:]}
+    assert {line.split("|")[2].strip() for line in lines} == outside
     assert len(list((tmp_path / "sheets").glob("*.png"))) == len(lines) > 1

@@ -93,9 +93,8 @@ def test_counts_are_means_of_the_draws() -> None:
 def test_the_tables_have_the_printed_rows_first_and_blanks_where_nothing_is() -> None:
     found = {"parameter-space-3d": outcomes_of(PAPER_3D)}
     rows = [line.strip("|").split("|") for line in counts_table(found, ["4-2"], good_only=True).splitlines()]
-    assert [cell.strip() for cell in rows[2]] == [
-        "paper, table 4-2", "", "8 / 0 / 5", "109 / 40 / 8", "0 / 4 / 0", "8 / 14 / 1", "125 / 58 / 14",
-    ]  # fmt: skip
+    printed = ["", "8 / 0 / 5", "109 / 40 / 8", "0 / 4 / 0", "8 / 14 / 1", "125 / 58 / 14"]
+    assert [cell.strip() for cell in rows[2]] == ["paper, table 4-2", *printed]
     mine = ["", "6 / 2 / 5", "109 / 40 / 8", "0 / 4 / 0", "8 / 14 / 1", "123 / 60 / 14"]
     assert [cell.strip() for cell in rows[3]] == ["parameter-space-3d", *mine]
     shares = percent_table(found, ["3-1", "4-1"], good_only=False).splitlines()
@@ -113,9 +112,8 @@ def test_the_document_holds_both_subsets_and_all_misprints() -> None:
 
 def test_buildings_are_reported_by_the_slope_of_their_terrain() -> None:
     outcomes = outcomes_of({**PAPER_3D, "pent": (8, 0, 9)})
-    outcomes = dataclasses.replace(
-        outcomes, terrain_deg=np.where(outcomes.is_outcome("correct"), 3.0, np.where(outcomes.good, 7.0, 6.9))
-    )
+    slopes = np.where(outcomes.is_outcome("correct"), 3.0, np.where(outcomes.good, 7.0, 6.9))
+    outcomes = dataclasses.replace(outcomes, terrain_deg=slopes)
     head, _, row = terrain_table({"one": outcomes}).splitlines()
     assert "pent, below 7 deg (n = 12) | pent, 7 deg and more (n = 5)" in head
     assert row.split(" | ")[1].startswith("67 (")

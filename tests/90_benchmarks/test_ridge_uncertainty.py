@@ -29,9 +29,8 @@ def test_what_has_no_figure_is_counted_but_in_no_share() -> None:
     assert share_within(some, 1.0) == 0.5
     assert math.isnan(share_within(some[2:], 1.0))
     row = table([("some", some), ("nothing", some[2:])]).splitlines()[2:]
-    assert [[cell.strip() for cell in line.strip("|").split("|")][:5] for line in row] == [
-        ["some", "3", "1", "50.0 %", "100.0 %"]
-    ]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")][:5] for line in row]
+    assert cells == [["some", "3", "1", "50.0 %", "100.0 %"]]
 
 
 def test_the_ridge_of_a_true_building_is_its_highest_corner() -> None:

@@ -166,9 +166,8 @@ def test_buildings_differ_by_any_content_and_where_one_is_missing(tmp_path) -> N
 
 
 def test_a_loss_is_counted_building_by_building_without_those_that_have_no_points() -> None:
-    loss = score_loss(
-        score(a=0.90, b=0.80, c=0.70, d=0.5, e=math.nan), score(a=0.88, b=0.75, c=0.60, d=0.6, e=math.nan)
-    )
+    before, after = score(a=0.90, b=0.80, c=0.70, d=0.5, e=math.nan), score(a=0.88, b=0.75, c=0.60, d=0.6, e=math.nan)
+    loss = score_loss(before, after)
     assert (loss.buildings, loss.within_5_points, loss.within_2_points) == (4, 3, 2)
     assert loss.mean == pytest.approx((0.02 + 0.05 + 0.10 - 0.10) / 4)
     assert loss.median == pytest.approx(0.035)
@@ -271,9 +270,8 @@ def test_candidates_with_footprints_are_those_of_a_run(shared_data: Path, tmp_pa
     spent = run_survey(entry, FUZZY, tmp_path / "run")
     assert spent.processor > 0.0
     rows = read_table(str(tmp_path / "run"), "buildings").to_pylist()
-    assert {(row["building_id"], row["n_points"]) for row in rows} == {
-        (candidate.building_id, len(candidate.points)) for candidate in found
-    }
+    known = {(candidate.building_id, len(candidate.points)) for candidate in found}
+    assert {(row["building_id"], row["n_points"]) for row in rows} == known
     given_area = sum(shapely.area(candidate.footprint) for candidate in found)
     assert sum(row["footprint_area_m2"] for row in rows) == pytest.approx(given_area, rel=0.05)
 

@@ -24,6 +24,8 @@ from benchmarks.scaling_simulation import (
     simulate,
 )
 
+NAMES = ("ingest", "split", "join", "outline", "reconstruct", "publish")
+
 
 def stage(count: int, seconds: float = 1.0, **other: float) -> Stage:
     return Stage(name="split", before_s=0.0, durations_s=np.full(count, seconds), **other)
@@ -37,10 +39,9 @@ def test_tasks_that_cost_nothing_else_fill_all_workers() -> None:
 
 def test_the_longest_first_is_kept() -> None:
     times = np.array([5.0, 1.0, 1.0, 1.0, 1.0, 1.0])
-    ended_s, _, _ = run_stage(Stage(name="split", before_s=0.0, durations_s=times), Machine(workers=2), 0.0)
-    assert ended_s == pytest.approx(5.0)
-    ended_s, _, _ = run_stage(Stage(name="split", before_s=0.0, durations_s=times[::-1]), Machine(workers=2), 0.0)
-    assert ended_s == pytest.approx(7.0)
+    for durations_s, expected in ((times, 5.0), (times[::-1], 7.0)):
+        split = Stage(name="split", before_s=0.0, durations_s=durations_s)
+        assert run_stage(split, Machine(workers=2), 0.0)[0] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -75,9 +76,8 @@ def test_a_window_smaller_than_the_workers_leaves_some_idle() -> None:
 
 def engine() -> Engine:
     rng = np.random.default_rng(4)
-    names = ("ingest", "split", "join", "outline", "reconstruct", "publish")
     return Engine(
-        times={name: rng.uniform(0.5, 1.5, 60) for name in names},
+        times={name: rng.uniform(0.5, 1.5, 60) for name in NAMES},
         buildings=2000,
         files=60,
         points=8_000_000,
@@ -85,23 +85,22 @@ def engine() -> Engine:
         plan_s=0.01,
         join_s=1e-3,
         digest_s=1e-4,
-        driver_s=dict.fromkeys(names, 1e-3),
+        driver_s=dict.fromkeys(NAMES, 1e-3),
         scheduler_s=1e-3,
         byte_s=1e-9,
-        result_bytes=dict.fromkeys(names, 1000.0),
+        result_bytes=dict.fromkeys(NAMES, 1000.0),
         start_s=1.0,
         tile_m=500.0,
     )
 
 
 def test_a_task_costs_the_driver_what_its_stage_did() -> None:
-    names = ("ingest", "split", "join", "outline", "reconstruct", "publish")
     diary = [{"kind": "run", "stage": "plan", "at_s": 0.0, "cpu_s": 0.0}]
-    diary += [{"kind": "stage", "stage": name, "at_s": 10.0 * k, "cpu_s": 1.0 * k} for k, name in enumerate(names)]
+    diary += [{"kind": "stage", "stage": name, "at_s": 10.0 * k, "cpu_s": 1.0 * k} for k, name in enumerate(NAMES)]
     diary.append({"kind": "finished", "stage": "", "at_s": 60.0, "cpu_s": 6.0})
     tasks = [
         {"stage": name, "began_s": 10.0 * k + (0.5 if name == "join" else 0.0), "cpu_s": 1.0}
-        for k, name in enumerate(names)
+        for k, name in enumerate(NAMES)
         for _ in range(50)
     ]
     trace = {"diary": diary, "tasks": tasks, "summary": {"counts": {"candidates": 100}}}
@@ -110,7 +109,7 @@ def test_a_task_costs_the_driver_what_its_stage_did() -> None:
     # of 1 s in each stage .2 s are idle, and .5 s of the join are the driver's own step; 50 tasks, 4 ms the scheduler's
     assert found["split"] == pytest.approx(0.8 / 50 - 0.004)
     assert found["join"] == pytest.approx(0.3 / 50 - 0.004)
-    assert _driver_costs(trace, costs, 0.02, 0.004) == dict.fromkeys(names, 0.02)
+    assert _driver_costs(trace, costs, 0.02, 0.004) == dict.fromkeys(NAMES, 0.02)
 
 
 def test_a_city_ten_times_as_large_has_ten_times_the_tasks_and_the_work() -> None:
@@ -152,10 +151,9 @@ def test_a_trace_is_given_again() -> None:
         back = {"back_s": began_s + seconds}
         return {"stage": stage, "process": process, "began_s": began_s, "seconds": seconds, "cpu_s": seconds, **back}
 
-    names = ("ingest", "split", "join", "outline", "reconstruct", "publish")
     diary = [{"kind": "run", "stage": "plan", "at_s": 0.0, "cpu_s": 0.0}]
     tasks = []
-    for k, name in enumerate(names):
+    for k, name in enumerate(NAMES):
         start = 5.0 + 10.0 * k
         diary.append({"kind": "stage", "stage": name, "at_s": start, "cpu_s": 0.0})
         tasks += [

@@ -80,9 +80,8 @@ def test_cells_add_up_over_blocks_and_objects_count_by_their_size_and_the_edge()
 
 
 def test_footprints_that_nearly_touch_are_one_block_and_those_across_a_lane_are_two() -> None:
-    united = touching_united(
-        reference_of(shapely.box(0, 0, 10, 10), shapely.box(10.2, 0, 20, 10), shapely.box(21, 0, 30, 10))
-    )
+    houses = (shapely.box(0, 0, 10, 10), shapely.box(10.2, 0, 20, 10), shapely.box(21, 0, 30, 10))
+    united = touching_united(reference_of(*houses))
     areas = sorted(building.footprint.area for building in united.buildings)
     assert areas == pytest.approx([90.0, 200.0], abs=1e-6)
 
@@ -117,7 +116,6 @@ def test_nothing_is_asked_for_where_the_survey_saw_nothing() -> None:
     reference = reference_of(shapely.box(10, 10, 20, 20), shapely.box(10, 50, 20, 70), points=points)
     cut = where_surveyed(dataclasses.replace(reference, extent=shapely.box(0, 0, 100, 100)))
     assert [building.touches_data_edge for building in cut.buildings] == [False, True]
-    assert cut.extent is not None
     assert cut.extent.bounds == pytest.approx((4, 4, 96, 56), abs=1e-6)
     assert cut.extent.area == pytest.approx(92 * 52)  # no hole where the roof was wet
 
@@ -165,7 +163,6 @@ def test_absent_data_are_reported_and_nothing_is_measured(tmp_path: Path, capsys
 def test_the_four_houses_of_a_real_tile_are_found_without_its_classes(shared_data: Path) -> None:
     (scene,) = scenes_named(["hdf"])
     result = measure_real(scene, shared_data, RunSettings.from_mapping({"classes": "ignore"}))
-    assert result.score is not None
     assert (result.score.objects, result.score.object_completeness) == (3, 1.0)
     assert result.score.completeness_without_ring > 0.9
     assert result.unclassified_covered > 0.25  # the box around the house is larger than the house

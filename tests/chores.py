@@ -1,4 +1,4 @@
-"""Tasks for workers under test; on their path, because tests themselves are not importable there."""
+"""Tasks for workers under test; in a module of its own, because tests themselves are not importable there."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, supervise
@@ -35,29 +36,29 @@ def die_if_five(number: int) -> int:
     return number
 
 
-def wait_for_mark(task: tuple[str, str]) -> str:
-    """Say who runs, by a file that counts up, then wait for the file `go`."""
-    folder, name = task
-    order = len(list(Path(folder).glob("started-*")))
-    Path(folder, f"started-{order:03d}-{name}").touch()
+def _named_when(name: str, is_time: Callable[[], bool]) -> str:
+    """The name, when it is time."""
     end = time.monotonic() + DEADLINE_S
-    while not Path(folder, "go").exists():
+    while not is_time():
         if time.monotonic() > end:
             raise TimeoutError(f"{name} was not released")
         time.sleep(0.02)
     return name
 
 
+def wait_for_mark(task: tuple[str, str]) -> str:
+    """Say who runs, by a file that counts up, then wait for the file `go`."""
+    folder, name = task
+    order = len(list(Path(folder).glob("started-*")))
+    Path(folder, f"started-{order:03d}-{name}").touch()
+    return _named_when(name, Path(folder, "go").exists)
+
+
 def meet(task: tuple[str, str, int]) -> str:
     """Say that it runs, then wait until so many tasks have said so."""
     folder, name, others = task
     Path(folder, f"met-{name}").touch()
-    end = time.monotonic() + DEADLINE_S
-    while len(list(Path(folder).glob("met-*"))) < others:
-        if time.monotonic() > end:
-            raise TimeoutError(f"{name} met too few")
-        time.sleep(0.02)
-    return name
+    return _named_when(name, lambda: len(list(Path(folder).glob("met-*"))) >= others)
 
 
 def tasks_held(dask_worker: object) -> int:
