@@ -1,6 +1,6 @@
-"""Writes the pages of docs/reference/ that the code itself can tell.
+"""Writes the pages of docs/reference/ that can be generated from the code.
 
-`make docs` runs it; tests/00_house/test_docs.py fails where a page says other than the code.
+`make docs` runs it; tests/00_house/test_docs.py fails if a page differs from the code.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def exit_codes() -> str:
 
 
 def option_names(parameter: Any) -> str:
-    """How an option or argument is written."""
+    """An option or argument as written on the command line."""
     if parameter.param_type_name == "argument":
         return f"`{parameter.metavar or parameter.name.upper()}`"
     names = ", ".join(f"`{name}`" for name in [*parameter.opts, *parameter.secondary_opts])
@@ -91,7 +91,7 @@ def command_line() -> str:
 
 
 def allowed(field: dataclasses.Field[Any]) -> str:
-    """What values a setting takes."""
+    """The values that a setting accepts."""
     choices, low, high = (field.metadata[key] for key in ("choices", "minimum", "maximum"))
     if choices is not None:
         return ", ".join(f"`{choice}`" for choice in choices)
@@ -140,7 +140,7 @@ def settings() -> str:
         NOTE,
         "# Settings",
         "",
-        "A settings file is TOML with a table `[settings]` and one table a stage below it; it holds only what differs.",
+        "A settings file is TOML with a table `[settings]` and one table per stage below it; it holds only changes.",
         "An unknown name or a value out of range is refused before anything runs, all faults at once:",
         "",
         "```toml",
@@ -173,8 +173,8 @@ def validity() -> str:
         "",
         "Every solid is judged after its coordinates were rounded to 1 mm, by the rules of ISO 19107 as Ledoux (2013)",
         "and val3dity number them. A solid that breaks one is not delivered: simpler and finer forms of it are tried,",
-        "then a labelled LoD1.2 block takes its place, or the candidate is `failed`. What was wrong stays in the",
-        "record (`validity_codes`).",
+        "then a labelled LoD1.2 block replaces it, or the candidate is `failed`. The record keeps the faults",
+        "(`validity_codes`).",
         "",
         *table(["code", "fault"], [[code, fault] for code, fault in codes]),
         "",
@@ -244,8 +244,8 @@ def service() -> str:
         "## Problems",
         "",
         "Every error is a problem document (`application/problem+json`, RFC 9457) with `type`, `title`, `status`,",
-        "`detail` and `instance`, and with `errors`, one sentence a fault, where there can be several. What HTTP says",
-        "(405, 406, 415, 416, an unknown path) has the type `about:blank`. `Retry-After` comes with 429 and 503.",
+        "`detail` and `instance`. If there can be several faults, `errors` has one sentence per fault. Statuses",
+        "of HTTP itself (405, 406, 415, 416, an unknown path) have the type `about:blank`. 429 and 503 have `Retry-After`.",
         "",
         *table(["status", "type", "title"], problems),
         "",
@@ -264,7 +264,7 @@ def service() -> str:
         "",
         "## Settings",
         "",
-        "Environment variables; options of `gablework serve` and `gablework driver` stand above them. Lists are JSON.",
+        "Environment variables; options of `gablework serve` and `gablework driver` override them. Lists are JSON.",
         "",
         *table(["variable", "default", "meaning"], service_settings()),
     ]
@@ -277,13 +277,13 @@ def measures() -> str:
         NOTE,
         "# Measures",
         "",
-        "What `gablework evaluate` reports, chapter by chapter: [how to use it](../how_to/evaluate.md). Shares are of",
+        "The measures of `gablework evaluate`, by chapter: [how to use it](../how_to/evaluate.md). Shares are of",
         "all reference buildings, faces or points unless the formula says otherwise. Intervals hold 95 % of 1000",
         "resamples of buildings, or of blocks of 50 m where cells or ground points are counted (percentile bootstrap,",
         "Efron 1979); a share of 0 or 1 on which all units agree has the exact binomial limit instead (Clopper and",
-        "Pearson 1934). Where conditions are known every figure is given for all buildings, for those without defects",
-        "(*good*) and for those with (*hard*). Buildings that the end of the data cuts are left out, but for the",
-        "points in outlines of the raster: in a dense town they hang together, and the cut ones hold most points.",
+        "Pearson 1934). If conditions are known, every figure is given for all buildings, for those without defects",
+        "(*good*) and for those with defects (*hard*). Buildings cut by the edge of the data are left out, except for",
+        "points in outlines of the raster: in a dense town outlines touch, and the cut ones hold most points.",
         "",
         "The measures follow F. Rottensteiner et al.: The ISPRS benchmark on urban object classification and 3D",
         "building reconstruction (2012), M. Rutzinger, F. Rottensteiner, N. Pfeifer: A comparison of evaluation",
@@ -354,26 +354,26 @@ def changes() -> str:
         NOTE,
         "# Changes between two epochs",
         "",
-        "What `gablework batch diff` writes: [how to use it](../how_to/compare_epochs.md). A row of `changes.parquet`",
-        "is a building, or several that belong together because the epochs divide what stands there in another way.",
-        "`changes.geojson` has the same columns as properties, `changes.json` the sums and what is to be known.",
+        "The results of `gablework batch diff`: [how to use it](../how_to/compare_epochs.md). A row of",
+        "`changes.parquet` is a building, or several that belong together because the epochs divide them differently.",
+        "`changes.geojson` has the same columns as properties, `changes.json` the sums, warnings and thresholds.",
         "",
         "## Classes",
         "",
         *table(["`change`", "meaning"], words(changes_of.CHANGES)),
         "",
-        "A building may be raised or lowered *and* reshaped: `is_raised`, `is_lowered` and `is_reshaped` tell all that",
-        "holds, `change` what moved more volume.",
+        "A building may be raised or lowered *and* reshaped: `is_raised`, `is_lowered` and `is_reshaped` are all set",
+        "that apply, and `change` is the one that moved more volume.",
         "",
         "## Reasons",
         "",
-        "Why a building is `not_comparable`. The list is closed; of several reasons the first is given.",
+        "Why a building is `not_comparable`. The list is closed; if there are several reasons, the first is given.",
         "",
         *table(["`reason`", "meaning"], words(changes_of.INCOMPARABLE)),
         "",
         "## Doubts",
         "",
-        "What makes a verdict less certain than others; the list is closed, a row may have several.",
+        "Reasons why a verdict is less certain than others. The list is closed; a row may have several.",
         "",
         *table(["`doubts`", "meaning"], words(changes_of.DOUBTS)),
         "",
@@ -384,14 +384,14 @@ def changes() -> str:
         "## Columns",
         "",
         "Columns that end in `_m`, `_m2`, `_m3` are metres whatever the CRS; geometry is in the CRS's own units.",
-        "Figures of an epoch that has nothing there, and of models that do not exist, are null. A column `bbox` covers",
-        "the geometry.",
+        "Figures of an epoch without a building there, and of models that do not exist, are null. A column `bbox`",
+        "covers the geometry.",
         "",
         *table(["column", "type", "meaning"], columns),
         "",
         "## Thresholds",
         "",
-        "The table `[diff]` of a `--settings` file; it holds only what differs.",
+        "The table `[diff]` of a `--settings` file; it holds only values that differ.",
         "",
         *table(
             ["setting", "default", "unit", "allowed", "meaning"],

@@ -16,7 +16,7 @@ COUNTED = tuple(outcome for outcome in OUTCOMES if outcome is not Outcome.WAITIN
 
 
 class Trigger(StrEnum):
-    """What caused a run."""
+    """The cause of a run."""
 
     CLOCK = "clock"
     """Its time had come."""
@@ -49,7 +49,7 @@ class ScheduleRun(Entry):
     number: int
     """Counts up within the schedule, from 1."""
     trigger: Trigger
-    """What caused it."""
+    """Its cause."""
     job_id: str | None = None
     """The job that was made, or the one that was under way; it may be removed by now."""
 

@@ -283,7 +283,7 @@ def schedule_document(found: Schedule, base: str, *, with_request: bool = True) 
 
 
 def run_document(run: ScheduleRun, base: str) -> wire.ScheduleRun:
-    """What happened to a slot, as clients see it."""
+    """The outcome of a slot, as clients see it."""
     return wire.ScheduleRun(
         number=run.number,
         trigger=run.trigger.value,

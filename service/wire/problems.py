@@ -10,7 +10,7 @@ from service.wire.base import Answer
 
 
 class Problem(Answer):
-    """What went wrong."""
+    """A problem document."""
 
     type: Annotated[str, Field(description="URI of the kind of problem.")]
     title: Annotated[str, Field(description="The same for every problem of this kind.")]

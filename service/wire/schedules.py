@@ -144,7 +144,7 @@ class ScheduleRequest(SchedulePatch):
 
 
 class ScheduleRun(Answer):
-    """What happened to a slot, or a run by hand."""
+    """The outcome of a slot or of a run by hand."""
 
     number: int = Field(ge=1, description="Counts up within the schedule.")
     trigger: Literal["clock", "hand"]
