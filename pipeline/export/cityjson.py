@@ -27,18 +27,11 @@ _NOT_ATTRIBUTES = ("building_id", "geometry", *SOLID_COLUMNS)
 def cityjson_lines(
     rows: Sequence[tuple[BuildingResult, Mapping[str, Any]]], reference: SpatialReference, title: str
 ) -> Iterable[str]:
-    """The lines of a CityJSONSeq file.
+    """The lines of a CityJSONSeq file, in the units of the reference and, with an EPSG code, its referenceSystem.
 
     Vertices are integers: the transform's scale is 0.001 in metres (finer in other units, to keep 1 mm), its
-    translation whole units at the lower corner of all solids.
-
-    Parameters
-    ----------
-    rows : sequence of (BuildingResult, mapping)
-        Each building with its record (`building_row`), which becomes its attributes; buildings without a solid are
-        features without geometry.
-    reference : SpatialReference
-        Gives the units and, if it has an EPSG code, the referenceSystem.
+    translation whole units at the lower corner of all solids. The record of each building (`building_row`) becomes its
+    attributes; buildings without a solid are features without geometry.
     """
     digits = (
         decimals(reference.horizontal_unit_m),

@@ -37,8 +37,6 @@ class SpatialReference(Protocol):
 def decimals(unit_m: float) -> int:
     """Decimals that keep 1 mm: 3 in metres; in other units one more than needed, so that 1 mm survives the way back.
 
-    Examples
-    --------
     >>> decimals(1.0), decimals(0.3048)
     (3, 4)
     """
@@ -46,19 +44,9 @@ def decimals(unit_m: float) -> int:
 
 
 def crs_coordinates(local: FloatArray, origin: tuple[float, float, float], reference: SpatialReference) -> FloatArray:
-    """Coordinates in the CRS's own units, rounded to 1 mm or finer.
+    """Local metres, (n, 2) or (n, 3), as coordinates in the CRS's own units, rounded to 1 mm or finer.
 
-    Parameters
-    ----------
-    local : array, shape (n, 2) or (n, 3)
-        Local metres.
-    origin : tuple of float
-        Absolute easting, northing, elevation of the local origin in metres.
-
-    Returns
-    -------
-    array, shape as `local`
-        Easting, northing (and elevation) in CRS units.
+    `origin` is the absolute easting, northing, elevation of the local origin in metres.
     """
     units = (reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m)[: local.shape[1]]
     absolute = local + np.array(origin[: local.shape[1]])

@@ -95,8 +95,6 @@ def _volume(measured: _Measured) -> float:
 def weighted_median(values: Sequence[float], weights: Sequence[float]) -> float:
     """The smallest value at which the running weight reaches half of the whole; nan of nothing.
 
-    Examples
-    --------
     >>> weighted_median([3.0, 1.0, 2.0], [1.0, 1.0, 5.0])
     2.0
     """
@@ -140,16 +138,11 @@ def _is_eave(step_x: float, step_y: float, normal: tuple[float, float, float]) -
     return along >= _FACING * math.hypot(step_x, step_y) * tilt
 
 
-def eave_elevation(solids: Sequence[Solid]) -> float:
+def _eave_elevation(measured: Sequence[_Measured]) -> float:
     """Median elevation of the eave edges: the low outer edges of the roof faces; nan where there are none.
 
     An edge counts at its middle; a face's weight is its plan area, shared among its eaves by length.
     """
-    return _eave_elevation([_measured(solid) for solid in solids])
-
-
-def _eave_elevation(measured: Sequence[_Measured]) -> float:
-    """The same of measured solids."""
     values: list[float] = []
     weights: list[float] = []
     for each in measured:

@@ -46,19 +46,11 @@ def solid_names(table_name: str) -> tuple[str, ...]:
 def geo_metadata(
     geometries: Any, projjson: Mapping[str, Any] | None, solids: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """The `geo` entry of the file metadata.
+    """The `geo` entry of the file metadata. Null geometries are left out of types and bounds; an unknown CRS is None.
 
-    Parameters
-    ----------
-    geometries : array of shapely geometries
-        Null ones are left out of types and bounds.
-    projjson : mapping or None
-        The coordinate reference system; None where it is unknown.
-    solids : mapping of arrays of shapely geometries, optional
-        Those of the columns of solids by their names. Their rings run outward round the solid, not counter-clockwise
-        in plan, so no orientation is stated. The footprint is the outline of the solids, so that the
-        `bbox` column covers both. Coarser solids are listed if there are any; rows may lack them, so `bbox` does not
-        cover them.
+    `solids` are the geometries of the columns of solids by their names. Their rings run outward round the solid, not
+    counter-clockwise in plan, so no orientation is stated. The footprint is the outline of the solids, so the `bbox`
+    column covers both. Coarser solids are listed if there are any; rows may lack them, so `bbox` does not cover them.
     """
     column = _column_metadata(geometries, projjson)
     column["orientation"] = "counterclockwise"
@@ -98,14 +90,9 @@ def _column_metadata(geometries: Any, projjson: Mapping[str, Any] | None) -> dic
 
 
 def geo_table(table_name: str, rows: Sequence[Mapping[str, Any]], projjson: Mapping[str, Any] | None) -> pa.Table:
-    """Rows as an Arrow table with GeoParquet metadata, sorted by the table's key.
+    """Rows of `pipeline.export.records` as an Arrow table with GeoParquet metadata, sorted by the table's key.
 
-    Parameters
-    ----------
-    rows : sequence of mapping
-        As `pipeline.export.records` makes them; may be empty.
-    projjson : mapping or None
-        The coordinate reference system of the geometries; None where it is unknown.
+    `projjson` is the CRS of the geometries; None if it is unknown.
     """
     schema, key = SCHEMAS[table_name], KEYS[table_name]
     ordered = sorted(rows, key=lambda row: tuple(row[column] for column in key))
@@ -173,19 +160,9 @@ def table_batches(
     tiles: Sequence[str] | None = None,
     rows: int = 65_536,
 ) -> Iterator[pa.RecordBatch]:
-    """Columns of one table of a run, some rows at a time; quicker to begin than `table_dataset`.
+    """Stored columns (not `tile`) of one table of a run, at most `rows` at a time; begins faster than `table_dataset`.
 
-    Parameters
-    ----------
-    columns : sequence of str
-        Columns that are stored, so not `tile`.
-    rows : int
-        Most rows of a batch.
-
-    Raises
-    ------
-    RunError
-        The folder does not exist, or holds a file that is not Parquet.
+    Raises RunError if the folder does not exist, or holds a file that is not Parquet.
     """
     schema = stored_schema(table_name)
     try:
@@ -216,19 +193,8 @@ def table_dataset(
 ) -> pads.Dataset:
     """All files of one table of a run, `tile` added as a text column from the folders' names.
 
-    Parameters
-    ----------
-    run_dir : str
-        The run directory: a local path, or a path of `filesystem`.
-    filesystem : pyarrow.fs.FileSystem, optional
-        Where the run lies; local by default.
-    tiles : sequence of str, optional
-        Keys of the tiles that have files, which are then not looked for.
-
-    Raises
-    ------
-    RunError
-        Where the folder does not exist.
+    The run directory is a local path, or a path of `filesystem`. If the keys of the `tiles` that have files are given,
+    the files are not looked for. Raises RunError if the folder does not exist.
     """
     filesystem = filesystem or pafs.LocalFileSystem()
     schema = stored_schema(table_name).append(pa.field("tile", pa.string()))
@@ -238,10 +204,7 @@ def table_dataset(
 def read_table(run_dir: str, table_name: str, filesystem: pafs.FileSystem | None = None) -> pa.Table:
     """One table of a run as a whole, sorted by its key; the arguments are those of `table_dataset`.
 
-    Raises
-    ------
-    RunError
-        Where the folder does not exist or a file in it is damaged.
+    Raises RunError if the folder does not exist or a file in it is damaged.
     """
     dataset = table_dataset(run_dir, table_name, filesystem)
     try:

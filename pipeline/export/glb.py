@@ -71,26 +71,12 @@ class _Mesh:
 def glb_bytes(
     lines: Iterable[str], horizontal_unit_m: float = 1.0, vertical_unit_m: float = 1.0, lod: str | None = None
 ) -> bytes:
-    """The buildings of a CityJSONSeq text as a GLB file; the same text gives the same bytes.
+    """The buildings of a CityJSONSeq text (`cityjson_lines`) as a GLB file; the same text gives the same bytes.
 
-    Parameters
-    ----------
-    lines : iterable of str
-        As `pipeline.export.cityjson.cityjson_lines` makes them. Buildings without a solid are left out.
-    horizontal_unit_m, vertical_unit_m : float
-        Metres in one unit of easting and northing, and of elevation.
-    lod : str, optional
-        The finest level of detail that is taken; None for the finest of each building.
-
-    Returns
-    -------
-    bytes
-        The file; empty if no building has a solid, since glTF has no empty scene of meshes.
-
-    Raises
-    ------
-    ValueError
-        A face cannot be cut into triangles: it crosses or touches itself.
+    Units are metres in one unit of easting and northing, and of elevation. `lod` is the finest level of detail that is
+    taken; None for the finest of each building. Buildings without a solid are left out; without any the file is empty,
+    since glTF has no empty scene of meshes. Raises ValueError if a face cannot be cut into triangles: it crosses or
+    touches itself.
     """
     heading, *features = (json.loads(line) for line in lines)
     frame = _Frame.of(heading["transform"], (horizontal_unit_m, horizontal_unit_m, vertical_unit_m))
@@ -193,20 +179,10 @@ def _triangulated(
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Triangles of many faces, each of corners of its own.
 
-    Parameters
-    ----------
-    corners : (n, 3) int64
-        Corners of all rings of all faces in mm, each face's outer ring first.
-    ring_starts : (r + 1,) int64
-        Where each ring starts in corners, and n.
-    face_starts : (f + 1,) int64
-        Where each face starts in ring_starts, and r.
-
-    Returns
-    -------
-    (t, 3) int64, (f,) int64 and (n, 3) float64
-        Triangles as indices into corners, how many each face has, and the unit normal of the face of each corner; where
-        a face cannot be cut, the counts end before it.
+    `corners` (n, 3) are those of all rings of all faces in mm, each face's outer ring first; rings start in them at
+    `ring_starts` (r + 1,), faces in the rings at `face_starts` (f + 1,). Returns triangles (t, 3) as indices into
+    corners, how many each face has (f,), and the unit normal of the face of each corner (n, 3); the counts end before a
+    face that cannot be cut.
     """
     n_faces = len(face_starts) - 1
     triangles = np.empty((len(corners) + 2 * len(ring_starts), 3), np.int64)

@@ -69,17 +69,9 @@ def to_newer_format(raw: ByteArray, point_format: int, size: int) -> npt.NDArray
     """Records of any format but those with waveforms, as records of format 6, 7 or 8.
 
     A scan angle rank in whole degrees becomes a scan angle in units of 0.006 deg; the old class 12 (overlap) becomes
-    the overlap flag as well, since the class will be another one; a format without GPS time gets zeros.
-
-    Parameters
-    ----------
-    raw : (n * size,) uint8
-        The file's records.
-
-    Returns
-    -------
-    (n,) structured array
-        Of `record_dtype(NEWER_FORMAT[point_format], …)`; a view of `raw` where the format is one of the newer ones.
+    the overlap flag as well, since the class will be another one; a format without GPS time gets zeros. From the bytes
+    of the file's records, (n * size,), returns (n,) of `record_dtype(NEWER_FORMAT[point_format], …)`; a view of them if
+    the format is one of the newer ones.
     """
     old = raw.view(record_dtype(point_format, size))
     if point_format >= 6:
@@ -118,22 +110,11 @@ def header_of(
     older: bytes = bytes(HEADER_SIZE),
     wkt: bool = True,
 ) -> bytes:
-    """The public header block of LAS 1.4, with what an older header says about the survey.
+    """The public header block of LAS 1.4 in point format 6, 7 or 8; the writer fills in counts, bounds and places.
 
-    Counts, bounds and places are filled in by the writer.
-
-    Parameters
-    ----------
-    point_format, size : int
-        6, 7 or 8, and the bytes of a record with its extra bytes.
-    scales, offsets : tuple of float
-        Of the integer coordinates.
-    software : str
-        Goes into the field of the generating software.
-    older : bytes
-        Header to take over source id, encoding, GUID, system and day of creation from.
-    wkt : bool
-        Set the bit that says that the CRS is stored as WKT.
+    `size` is the bytes of a record with its extra bytes; scales and offsets are those of the integer coordinates.
+    Source id, encoding, GUID, system and day of creation are taken over from an `older` header. `wkt` sets the bit that
+    says that the CRS is stored as WKT.
     """
     header = bytearray(HEADER_SIZE)
     header[:90] = older[:90]  # signature, source id, encoding, GUID, version, system, software
@@ -152,14 +133,8 @@ def header_of(
 class LazWriter:
     """A LAZ 1.4 file under way: records come in pieces, header and extended records when it ends.
 
-    Parameters
-    ----------
-    stream : binary file
-        Open for writing and seeking, empty.
-    header : bytes
-        Of `header_of`.
-    records : sequence of (user id, record id, description, data)
-        The variable length records, without that of LAZ.
+    The stream is empty, and open for writing and seeking; the header is that of `header_of`. The variable length
+    records (user id, record id, description, data) do not include that of LAZ.
     """
 
     def __init__(
@@ -196,10 +171,7 @@ class LazWriter:
     def close(self, extended: Iterable[tuple[bytes, int, bytes, int, Iterator[bytes]]] = ()) -> None:
         """End the points, write extended records and the header; the stream stays open.
 
-        Parameters
-        ----------
-        extended : iterable of (user id, record id, description, size, pieces of data)
-            The extended variable length records.
+        Extended variable length records are user id, record id, description, size and pieces of data.
         """
         self._compressor.done()
         self._stream.seek(0, 2)

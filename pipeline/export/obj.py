@@ -17,17 +17,10 @@ _KINDS = (FaceKind.ROOF, FaceKind.WALL, FaceKind.GROUND)
 
 
 def obj_text(results: Iterable[BuildingResult], reference: SpatialReference, lod: str | None = None) -> str:
-    """The solids of one or more buildings as one OBJ file.
+    """The solids of one or more buildings as one OBJ file; buildings without a solid are left out.
 
-    Every solid has its own vertices, so it is closed. Faces without holes stay polygons, those with
-    holes become triangles on the same vertices.
-
-    Parameters
-    ----------
-    results : iterable of BuildingResult
-        Those without a solid are left out.
-    lod : str, optional
-        A coarser level of detail in place of the records' own (`model_at`).
+    Every solid has its own vertices, so it is closed. Faces without holes stay polygons, those with holes become
+    triangles on the same vertices. `lod` is a coarser level of detail in place of the records' own (`model_at`).
     """
     unit = f"{reference.horizontal_unit_m:.12g} m horizontally, {reference.vertical_unit_m:.12g} m vertically"
     lines = [f"# coordinates are easting, northing, elevation; one unit is {unit}"]

@@ -54,10 +54,7 @@ class RasterLattice:
     def over(cls, bounds_m: tuple[float, float, float, float], cell: float, unit_m: float) -> RasterLattice:
         """The cells that x_min, y_min, x_max, y_max in metres meet.
 
-        Raises
-        ------
-        SettingsError
-            The cell has no extent, or the area too many cells.
+        Raises SettingsError if the cell has no extent, or the area too many cells.
         """
         if not (math.isfinite(cell) and cell > 0.0):
             raise SettingsError([f"raster cell is {cell:g}: use a length above 0 in units of the CRS"])
@@ -92,17 +89,10 @@ def write_cog(
     description: str,
     unit: str,
 ) -> None:
-    """Write a raster of one band.
+    """Write a raster of one band; its CRS is compound if the values are elevations in it.
 
-    Parameters
-    ----------
-    working : Path
-        A file that does not exist: holds the raster meanwhile and is removed.
-    windows : iterable of (column, row, cells)
-        Pieces: first column and southernmost row on the lattice, and (rows, columns) float32 values with the
-        southernmost row first, nan where there is none.
-    crs_wkt : str or None
-        The CRS, compound where the values are elevations in it.
+    A `working` file, which must not exist, holds the raster meanwhile and is removed. `windows` are first column and
+    southernmost row on the lattice, and (rows, columns) float32 values with the southernmost row first, nan for none.
     """
     import rasterio
     import rasterio.shutil

@@ -21,8 +21,6 @@ COARSER_LODS = ("1.2", "1.3")
 def lod_suffix(lod: str) -> str:
     """What ends the names of columns and files of a coarser level of detail.
 
-    Examples
-    --------
     >>> lod_suffix("1.3")
     'lod13'
     """

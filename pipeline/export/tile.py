@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
@@ -37,8 +38,6 @@ class TileFiles:
 def mesh_path(tile_key: str, building_id: str, meshes: str, lod: str | None = None) -> str | None:
     """Where a building's mesh lies in the run directory; None where none is written.
 
-    Examples
-    --------
     >>> mesh_path("x85_y447", "abc", "building"), mesh_path("x85_y447", "abc", "glb", "1.2")
     ('meshes/x85_y447/abc.obj', 'meshes/x85_y447/x85_y447-lod12.glb')
     """
@@ -49,17 +48,24 @@ def mesh_path(tile_key: str, building_id: str, meshes: str, lod: str | None = No
     return f"meshes/{tile_key}/{stem}{ending}.{'glb' if meshes == 'glb' else 'obj'}"
 
 
+def building_rows(
+    results: Sequence[BuildingResult], context: RecordContext, tile_key: str, meshes: str
+) -> list[dict[str, Any]]:
+    """The rows of the buildings of a tile."""
+    return [
+        building_row(
+            result, context, mesh_path=mesh_path(tile_key, result.building_id, meshes) if result.solids else None
+        )
+        for result in results
+    ]
+
+
 def mesh_files(
     tile_key: str, results: Sequence[BuildingResult], lines: Sequence[str], context: RecordContext, meshes: str
 ) -> Iterator[tuple[str, bytes]]:
     """The mesh files of a tile as path and content: one set with the records' models, one per coarser level of detail.
 
-    Parameters
-    ----------
-    lines : sequence of str
-        The tile's CityJSONSeq, which the GLB files are made of.
-    meshes : str
-        One of `pipeline.export.mesh_kinds.MESHES`.
+    GLB files are made of the lines of the tile's CityJSONSeq. `meshes` is one of `pipeline.export.mesh_kinds.MESHES`.
     """
     units_m = context.reference.horizontal_unit_m, context.reference.vertical_unit_m
     for lod in (None, *context.coarser_lods):
@@ -88,7 +94,7 @@ def write_tile(
     """Publish one tile's buildings, planes, rejected objects, meshes and city objects.
 
     Every file is put atomically and depends on the arguments only, so a task may run twice, also at the same time.
-    Tables without rows are written, too.
+    Tables without rows are written, too. Buildings and rejected objects come in any order.
 
     Parameters
     ----------
@@ -96,10 +102,6 @@ def write_tile(
         The local run directory; used only in messages if `put` is given.
     tile_key : str
         The hive key, such as x85_y447; never a bare integer, which readers would take for a number.
-    results : sequence of BuildingResult
-        The buildings that the tile owns, in any order.
-    rejected : sequence of RejectedObject
-        The rejected objects that the tile owns, in any order.
     meshes : str
         One of `pipeline.export.mesh_kinds.MESHES`.
     put : callable, optional
@@ -146,12 +148,7 @@ def _tile_files(
 ) -> Iterator[tuple[str, bytes]]:
     """The tile's files as path and content: meshes first, so that no row names a mesh that is not there yet."""
     reference = context.reference
-    rows = [
-        building_row(
-            result, context, mesh_path=mesh_path(tile_key, result.building_id, meshes) if result.solids else None
-        )
-        for result in results
-    ]
+    rows = building_rows(results, context, tile_key, meshes)
     lines = list(cityjson_lines(list(zip(results, rows, strict=True)), reference, f"buildings of tile {tile_key}"))
     yield from mesh_files(tile_key, results, lines, context, meshes)
     yield f"cityjson/tile={tile_key}/part-0.city.jsonl", "".join(f"{line}\n" for line in lines).encode()

@@ -21,8 +21,8 @@ from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.obj import obj_text
-from pipeline.export.records import KEYS, SCHEMAS, building_row, plane_rows, rejected_row
-from pipeline.export.tile import mesh_files, mesh_path
+from pipeline.export.records import KEYS, SCHEMAS, plane_rows, rejected_row
+from pipeline.export.tile import building_rows, mesh_files, mesh_path
 from pipeline.model import BuildingResult
 
 
@@ -52,30 +52,13 @@ def updated_tile(
 ) -> TileUpdate:
     """The files of a published tile with some of its buildings replaced.
 
-    Parameters
-    ----------
-    replaced : collection of str
-        Ids whose rows go, in `buildings`, `planes` and `rejected` alike.
-    results, rejected : sequences
-        What takes their place.
-    context : RecordContext
-        Facts of the run, and those of `results`.
-    meshes : str
-        As the run was written: one of `pipeline.export.mesh_kinds.MESHES`.
-
-    Raises
-    ------
-    RunError
-        A file of the tile is not there or cannot be read.
+    The rows of `replaced` ids go, in `buildings`, `planes` and `rejected` alike; `results` and `rejected` take their
+    place. `context` has the facts of the run, and those of `results`; `meshes` is that of the run. Raises RunError if a
+    file of the tile is not there or cannot be read.
     """
     root, names = Path(run_dir), frozenset(replaced)
     results = sorted(results, key=lambda result: result.building_id)
-    rows = [
-        building_row(
-            result, context, mesh_path=mesh_path(tile_key, result.building_id, meshes) if result.solids else None
-        )
-        for result in results
-    ]
+    rows = building_rows(results, context, tile_key, meshes)
     path = f"cityjson/tile={tile_key}/part-0.city.jsonl"
     fresh = cityjson_lines(list(zip(results, rows, strict=True)), context.reference, "")
     text = _merged_cityjson(_text(root / path), names, fresh)

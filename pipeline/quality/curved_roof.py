@@ -29,17 +29,7 @@ def is_curved_roof(planes: Sequence[Plane], faces: Sequence[RoofFace], solids: S
     """Whether most of a roof is one surface that bends steadily outwards.
 
     Planes that meet in a ridge with a small turn belong to one surface; it is curved where its planes have at least
-    five directions, and it is most of the roof.
-
-    Parameters
-    ----------
-    planes, faces, solids : sequences
-        The model.
-
-    Returns
-    -------
-    bool
-        False for fewer planes than `MIN_NORMALS`.
+    five directions (`MIN_NORMALS`), and it is most of the roof.
     """
     normals = [plane.normal for plane in planes]
     if len(planes) < MIN_NORMALS or not _has_directions(normals):

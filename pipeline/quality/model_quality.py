@@ -41,28 +41,13 @@ def model_quality(
     outline_sigma_m: float,
     is_planar: bool,
 ) -> tuple[ResidualSummary, ModelQuality]:
-    """Measure a delivered model by its points.
+    """Measure a delivered model by all points (n, 3) of its candidate, local metres.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        All points of the candidate, local metres.
-    faces, planes, solids : sequences
-        The model.
-    spacing_m : float
-        Typical distance of neighbouring points in plan.
-    outline_sigma_m : float
-        Standard deviation of the outline's place in plan; 0 where it was given.
-    is_planar : bool
-        Whether the faces follow the roof's planes (LoD2). Residuals of a block are the roof's form, not noise, and the
-        top of a block is not a ridge: both figures are then nan.
+    `spacing_m` is the typical distance of neighbouring points in plan, `outline_sigma_m` the standard deviation of the
+    outline's place in plan, 0 if it was given. `is_planar` says that the faces follow the roof's planes (LoD2):
+    residuals of a block are the roof's form, not noise, and the top of a block is not a ridge, so both figures are nan.
 
-    Returns
-    -------
-    ResidualSummary
-        Of all points, with `TOLERANCE_M`.
-    ModelQuality
-        nan where no points say anything; `bic_margin` is left open.
+    Residuals are summarised with `TOLERANCE_M`. Figures are nan if no points say anything; `bic_margin` is left open.
     """
     surface = surface_of(faces, planes)
     top, face_of_point = surface.at(points[:, 0], points[:, 1])

@@ -58,21 +58,10 @@ def _principal_axes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @kernel
 def fitted_plane(corners: IntArray) -> tuple[float, float, FloatArray]:
-    """The least-squares plane of a face.
+    """The least-squares plane of a face, by the corners (n, 3) of all its rings in mm.
 
-    Parameters
-    ----------
-    corners : (n, 3) int64
-        Corners of all its rings in mm.
-
-    Returns
-    -------
-    distance_mm : float
-        The largest of a corner to the plane.
-    slenderness : float
-        How far the corners spread across the face in the plane, over how far they spread along it.
-    axes : (3, 3) float64
-        Columns: unit normal, direction across, direction along.
+    Returns the largest distance of a corner to the plane, mm; how far the corners spread across the face in the plane,
+    over how far they spread along it; and (3, 3) with the columns unit normal, direction across, direction along.
     """
     count = len(corners)
     centre = np.zeros(3)
@@ -151,21 +140,9 @@ def _unit_normal(corners: IntArray, a: int, b: int, c: int) -> tuple[float, floa
 
 @kernel
 def min_cosine_of_normals(corners: IntArray, triangles: IntArray, enough: float) -> float:
-    """Cosine of the largest angle between the normals of any two triangles of a face.
+    """Cosine of the largest angle between the normals of any two triangles of a face; 1 for a plane.
 
-    Parameters
-    ----------
-    corners : (n, 3) int64
-        Corners of the face in mm.
-    triangles : (t, 3) int64
-        Indices into corners; no triangle is degenerate.
-    enough : float
-        The search ends once the cosine is below this threshold.
-
-    Returns
-    -------
-    float
-        1 for a plane; some value below `enough` where there is one.
+    Triangles (t, 3) index corners (n, 3) in mm; none is degenerate. The search ends at a cosine below `enough`.
     """
     count = len(triangles)
     normals = np.empty((count, 3))

@@ -146,18 +146,8 @@ def _laid_out(
 ) -> tuple[FloatArray, IntArray, FloatArray, LabelArray, IntArray, float, float, float, int, int]:
     """Edges of all faces, where each face's start, their boxes; faces by cells, where each cell's start; the cells.
 
-    Parameters
-    ----------
-    xy : (v, 2) float64
-        Vertices of the rings, each closed, ring after ring.
-    ring_of : (v,) int64
-        Ring of each.
-    face_of_ring : (r,) int64
-        Face of each ring, ascending.
-    n : int
-        Faces; those without a ring are in no cell.
-    tolerance : float
-        By how much the boxes are widened.
+    Vertices `xy` (v, 2) come ring after ring, each closed; `ring_of` (v,) is their ring, `face_of_ring` (r,) the face
+    of each ring, ascending. Those of the `n` faces without a ring are in no cell. Boxes are widened by `tolerance`.
     """
     edges = np.empty((len(xy), 4))
     edge_starts = np.zeros(n + 1, np.int64)
@@ -232,19 +222,11 @@ class TopSurface:
     Coordinates are taken relative to a corner in whole metres, which is exact: nothing is lost at 1e6 m. A place on
     the border of two faces belongs to exactly one of them; of faces of one height the first counts.
 
-    Parameters
-    ----------
-    polygons : sequence of shapely Polygon or MultiPolygon
-        Plan shapes, metres; elevations in them are not looked at.
-    coefficients : (n, 3) float64
-        z = a (x - origin_x) + b (y - origin_y) + c + origin_z of each.
-    origins : (n, 3) float64, optional
-        The places that the planes are given about; (0, 0, 0) by default.
-    tolerance_m : float
-        A place that no face covers takes the highest face whose border is this near: with coordinates rounded to
-        1 mm, two faces that meet leave gaps.
-    corner : tuple of float, optional
-        Place of the local frame; whole metres at the lower left of all faces by default.
+    Elevations in the polygons, which are in metres, are not looked at. The plane of each is
+    z = a (x - origin_x) + b (y - origin_y) + c + origin_z, by coefficients (n, 3) and origins (n, 3), (0, 0, 0) by
+    default. A place that no face covers takes the highest face whose border is as near as `tolerance_m`: with
+    coordinates rounded to 1 mm, two faces that meet leave gaps. `corner` is the place of the local frame; whole metres
+    at the lower left of all faces by default.
     """
 
     def __init__(
@@ -293,19 +275,9 @@ class TopSurface:
         return low[0] + east, low[1] + north, high[0] + east, high[1] + north
 
     def at(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, LabelArray]:
-        """Elevation of the highest face at places, and its number.
+        """Elevation of the highest face at places x, y, each (n,) finite metres, and its index into the polygons.
 
-        Parameters
-        ----------
-        x, y : (n,) float64
-            Easting, northing, metres; finite.
-
-        Returns
-        -------
-        elevation : (n,) float64
-            Metres; nan where no face is.
-        face : (n,) int32
-            Index into the polygons; -1 where no face is.
+        Both are (n,); nan and -1 where no face is.
         """
         if self._empty or len(x) == 0:
             return np.full(len(x), np.nan), np.full(len(x), -1, np.int32)
@@ -322,27 +294,11 @@ class TopSurface:
     ) -> tuple[int, int, float]:
         """How much of the faces points are near to, by the cells of a raster.
 
-        Parameters
-        ----------
-        points : (n, 3) float64
-            Metres.
-        residuals : (n,) float64
-            Points minus this surface, metres; nan where there is no face.
-        raster : Raster
-            Its cells.
-        tolerance_m : float
-            Vertical distance up to which a point is on the surface.
-        gap_m : float
-            Distance in plan from which on a cell is far from points.
+        Points (n, 3) are in metres; residuals (n,) are points minus this surface, nan where there is no face. A point
+        is on the surface up to `tolerance_m` vertically, and a cell is far from points from `gap_m` in plan on.
 
-        Returns
-        -------
-        cells : int
-            With a face at their middle.
-        far : int
-            Those of them far from all points on the surface.
-        square_m2 : float
-            Largest squared distance in plan of one of them to any point over or under a face; infinite without points.
+        Returns the cells with a face at their middle, those of them far from all points on the surface, and the largest
+        squared distance in plan of one of them to any point over or under a face, m2; infinite without points.
         """
         if self._empty:
             return 0, 0, 0.0
@@ -366,26 +322,6 @@ def plan_index(polygons: Sequence[Polygon | MultiPolygon]) -> TopSurface:
     return TopSurface(polygons, np.zeros((len(polygons), 3)))
 
 
-def top_surface(points: FloatArray, faces: Sequence[RoofFace], planes: Sequence[Plane]) -> FloatArray:
-    """Elevation of the model's highest roof face over or under every point.
-
-    Parameters
-    ----------
-    points : (n, 2) or (n, 3) float64
-        Easting, northing in the faces' frame, metres.
-    faces : sequence of RoofFace
-        Roof faces; only their plan shape and plane number are used.
-    planes : sequence of Plane
-        The planes.
-
-    Returns
-    -------
-    (n,) float64
-        Metres; nan where no face covers the point.
-    """
-    return surface_of(faces, planes).elevation(points[:, 0], points[:, 1])
-
-
 def surface_of(faces: Sequence[RoofFace], planes: Sequence[Plane]) -> TopSurface:
     """The top surface of a model's roof faces, about its local origin; numbers are those of the faces."""
     coefficients = np.array([planes[face.plane].coefficients for face in faces]).reshape(-1, 3)
@@ -393,23 +329,8 @@ def surface_of(faces: Sequence[RoofFace], planes: Sequence[Plane]) -> TopSurface
 
 
 def vertical_residuals(points: FloatArray, faces: Sequence[RoofFace], planes: Sequence[Plane]) -> FloatArray:
-    """Points minus top surface.
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Original points, metres.
-    faces : sequence of RoofFace
-        The model's roof faces.
-    planes : sequence of Plane
-        Their planes.
-
-    Returns
-    -------
-    (n,) float64
-        Metres, positive above the roof; nan where no face covers the point.
-    """
-    residuals: FloatArray = points[:, 2] - top_surface(points, faces, planes)
+    """Original points (n, 3) minus top surface of a model, (n,) m: positive above it, nan where no face covers."""
+    residuals: FloatArray = points[:, 2] - surface_of(faces, planes).elevation(points[:, 0], points[:, 1])
     return residuals
 
 
@@ -422,22 +343,10 @@ def _quantile(ascending: FloatArray, share: float) -> float:
 
 
 def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummary:
-    """Figures of a building's residuals.
+    """Figures of the `vertical_residuals` (n,) of a building; `tolerance_m` is that of `share_within`.
 
-    Parameters
-    ----------
-    residuals : (n,) float64
-        From `vertical_residuals`: nan is a point without a roof.
-    tolerance_m : float
-        For `share_within`.
+    Sums are exact, so they do not depend on the order of points.
 
-    Returns
-    -------
-    ResidualSummary
-        Sums are exact, so that they do not depend on the order of points.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> summary = summarise(np.array([0.1, -0.1, np.nan, 0.5]))
     >>> summary.share_within, summary.coverage

@@ -37,29 +37,12 @@ def ridge_height_sigma_m(
     solids: Sequence[Solid],
     outline_sigma_m: float,
 ) -> float:
-    """Standard deviation of the highest roof point.
+    """Standard deviation of the highest roof point of a delivered model, metres.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Local metres.
-    residuals : (n,) float64
-        Points minus roof; nan where there is none.
-    plane_of_point : (n,) int32
-        Plane that each point was held against; -1 for none.
-    reach_m : float
-        Points farther from their plane do not support it.
-    planes : sequence of Plane
-        The delivered planes.
-    solids : sequence of Solid
-        The delivered solids.
-    outline_sigma_m : float
-        Standard deviation of edges in plan that no other plane determines.
-
-    Returns
-    -------
-    float
-        Metres; nan without a roof, and where a plane at the top has fewer than four points of its own.
+    Points (n, 3) are in local metres; residuals (n,) are points minus roof, nan where there is none; `plane_of_point`
+    (n,) is the plane that each point was held against, -1 for none. Points farther than `reach_m` from their plane do
+    not support it. `outline_sigma_m` is the standard deviation of edges in plan that no other plane determines. The
+    result is nan without a roof, and where a plane at the top has fewer than four points of its own.
     """
     top = _top(solids)
     if top is None:

@@ -149,22 +149,11 @@ def _place_of_inner_rings(flat: IntArray, ring_offsets: IntArray) -> int:
 
 @kernel
 def polygon_code(flat: IntArray, ids: IntArray, ring_offsets: IntArray) -> int:
-    """The first fault of a polygon whose plane is known, 0 where there is none.
+    """The first fault of a polygon whose plane is known: 0, or a code of 104 and 201 to 208 without 203, 204.
 
-    Parameters
-    ----------
-    flat : (n, 2) int64
-        Corners of all rings in mm, projected so that the outer ring is counter-clockwise.
-    ids : (n,) int64
-        Vertices of the corners.
-    ring_offsets : (r + 1,) int64
-        Where each ring starts, and n; the outer ring comes first.
-
-    Returns
-    -------
-    int
-        0 or a code of 104 and 201 to 208 without 203, 204. A ring that touches another off its vertices counts as
-        crossing, since no neighbour could share such an edge.
+    `flat` (n, 2) are the corners of all rings in mm, projected so that the outer ring is counter-clockwise; `ids` (n,)
+    their vertices; `ring_offsets` (r + 1,) where each ring starts, and n; the outer ring comes first. A ring that
+    touches another off its vertices counts as crossing, since no neighbour could share such an edge.
     """
     rings = len(ring_offsets) - 1
     for r in range(rings):

@@ -115,21 +115,9 @@ def triangles_intersect(vertices: IntArray, first: IntArray, second: IntArray) -
 
 @kernel
 def shell_intersects_itself(vertices: IntArray, triangles: IntArray, face_of: IntArray) -> bool:
-    """Whether triangles of different faces intersect.
+    """Whether triangles (t, 3) of different faces intersect; ends at the first pair.
 
-    Parameters
-    ----------
-    vertices : (v, 3) int64
-        Coordinates in mm.
-    triangles : (t, 3) int64
-        Vertex indices; no triangle is degenerate.
-    face_of : (t,) int64
-        The face of each triangle; triangles of one face are not tested against one another.
-
-    Returns
-    -------
-    bool
-        True at the first pair that intersects.
+    They index vertices (v, 3) in mm; none is degenerate. `face_of` (t,) is the face of each.
     """
     count = len(triangles)
     low, high = np.empty((count, 3), np.int64), np.empty((count, 3), np.int64)

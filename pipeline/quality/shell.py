@@ -22,21 +22,9 @@ POLYGON_WRONG_ORIENTATION = 307
 
 @kernel
 def is_sound_shell(triangles: IntArray, vertex_count: int, found: BoolArray) -> bool:
-    """Whether the mesh is a 2-manifold without border; sets found[code] for every fault.
+    """Whether the mesh is a 2-manifold without border; sets found[code] for every fault: 302, 303, 305, 307.
 
-    Parameters
-    ----------
-    triangles : (t, 3) int64
-        Vertex indices of all triangles of all faces; no triangle uses a vertex twice.
-    vertex_count : int
-        One more than the largest index.
-    found : (n,) bool
-        Gets True at the codes 302, 303, 305, 307 that hold.
-
-    Returns
-    -------
-    bool
-        True where none holds.
+    Triangles (t, 3) of all faces index vertices below `vertex_count`; none uses a vertex twice.
     """
     keys, order = edges_in_order(triangles, len(triangles), vertex_count)
     component = np.arange(len(triangles))

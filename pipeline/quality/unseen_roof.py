@@ -47,20 +47,7 @@ def unseen_cells(
 ) -> tuple[int, int, float]:
     """Cells on the roof, those of them far from all points on it, and the largest squared distance to any point, m2.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Metres.
-    residuals : (n,) float64
-        Points minus roof; nan where there is none.
-    on_roof : (rows * columns,) bool
-        Cells whose middle has a roof.
-    raster : Raster
-        Its cells, line by line.
-    tolerance_m : float
-        Points this near to the roof, vertically, are on it.
-    gap_m : float
-        A cell farther than this from all of them is unseen.
+    As `TopSurface.seen`; `on_roof` (rows * columns,) are the cells, line by line, whose middle has a roof.
     """
     squares = _nearest_squares(points, residuals, tolerance_m, raster)
     places = 0
@@ -83,14 +70,11 @@ def _nearest_squares(
 ) -> FloatArray:
     """Squared distance in plan from every cell's middle to the nearest point over or under a roof, and to one on it.
 
+    The result is (rows * columns, 2) m2, infinite without points.
+
     Each cell keeps the point nearest to its middle, and cells hand theirs on to their neighbours, in two sweeps of the
     raster with two of each line (Danielsson 1980): distances are too large by less than a cell, most not at all. Both
     searches run side by side: each step waits for the one before it, so two take hardly longer than one.
-
-    Returns
-    -------
-    (rows * columns, 2) float64
-        m2; infinite without points.
     """
     low_x, low_y, cell, columns, rows = raster
     n = rows * columns

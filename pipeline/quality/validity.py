@@ -35,7 +35,6 @@ standards.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from itertools import chain
 
 import numpy as np
@@ -91,20 +90,10 @@ DEFAULT_TOLERANCES = ValidityTolerances()
 
 
 def check_solid(solid: Solid, tolerances: ValidityTolerances = DEFAULT_TOLERANCES) -> tuple[int, ...]:
-    """The codes of a solid's faults.
+    """The codes of a solid's faults, ascending, each once; empty for a valid solid.
 
-    Parameters
-    ----------
-    solid : Solid
-        Vertices are taken to the nearest millimetre; unused ones do not matter.
-    tolerances : ValidityTolerances
-        Snapping and planarity.
-
-    Returns
-    -------
-    tuple of int
-        Ascending, each code once; empty for a valid solid. A pair of vertices exactly as far apart as the snapping
-        tolerance is judged both as one vertex and as two, and the codes of both verdicts are given.
+    Vertices are taken to the nearest millimetre; unused ones do not matter. A pair of vertices exactly as far apart as
+    the snapping tolerance is judged both as one vertex and as two, and the codes of both verdicts are given.
     """
     vertices = np.ascontiguousarray(np.rint(solid.vertices * MILLIMETRES_PER_METRE), dtype=np.int64)
     rings = [ring for face in solid.faces for ring in face.rings]
@@ -116,13 +105,6 @@ def check_solid(solid: Solid, tolerances: ValidityTolerances = DEFAULT_TOLERANCE
     snap_mm = tolerances.snap_m * MILLIMETRES_PER_METRE
     found = _faults(vertices, ring_vertices, ring_offsets, face_offsets, snap_mm, planarity_mm, min_cosine)
     return tuple(int(code) for code in np.flatnonzero(found))
-
-
-def check_solids(
-    solids: Iterable[Solid], tolerances: ValidityTolerances = DEFAULT_TOLERANCES
-) -> tuple[tuple[int, ...], ...]:
-    """The codes of several solids, each judged alone, in their order."""
-    return tuple(check_solid(solid, tolerances) for solid in solids)
 
 
 def _offsets(lengths: list[int]) -> IntArray:

@@ -105,7 +105,7 @@ def draw_map(title: str, layers: Sequence[Layer]) -> Map | None:
         _draw_layer(axes, layer, is_small=typical * width_px < _SMALL_PX, zorder=place + 1)
     axes.set_xlim(west, east)
     axes.set_ylim(south, north)
-    length_m = _round_length(width_m / 5.0)
+    length_m = round_length(width_m / 5.0)
     return Map(
         title=title,
         png=png_of(figure),
@@ -143,7 +143,7 @@ def _extent(bounds: FloatArray) -> tuple[float, float, float, float]:
     return x - width / 2.0, y - height / 2.0, x + width / 2.0, y + height / 2.0
 
 
-def _round_length(wanted_m: float) -> float:
+def round_length(wanted_m: float) -> float:
     """The largest of 1, 2, 5, 10 ... up to the wanted length."""
     step = 10.0 ** math.floor(math.log10(wanted_m))
     return float(max(step * factor for factor in (1.0, 2.0, 5.0) if step * factor <= wanted_m * (1.0 + 1e-9)))

@@ -22,6 +22,7 @@ from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
 from pipeline.io import arrow_at
 from pipeline.model import RoofType, Status
+from pipeline.report.maps import round_length
 from pipeline.report.perspective import MAP_SUN, View, ViewedFace, draw_view, drawn_path, lambert, shaded
 from pipeline.report.statistics import run_statistics
 from pipeline.runtime.manifest import NAME, read_manifest
@@ -59,23 +60,9 @@ def render_run(
     """Draw a finished run to a PNG file.
 
     Roof faces have the colour of their roof type, lit from the north-west; fallbacks are hatched, failed candidates
-    hatched in red, rejected objects thin grey outlines.
-
-    Parameters
-    ----------
-    run_dir : str or Path
-        The run directory: a path or URL, or a path of `filesystem`.
-    png_path : str or Path
-        The local file to write.
-    truth : str or Path, optional
-        A local run directory of true models, whose footprints are drawn as dashed lines.
-    filesystem : pyarrow.fs.FileSystem, optional
-        File system of the run; by default that of `run_dir`.
-
-    Raises
-    ------
-    RunError
-        The directory has no run, or the picture cannot be written.
+    hatched in red, rejected objects thin grey outlines. Footprints of a local run directory of true models are dashed
+    lines. The run directory is a path or URL, or a path of `filesystem`. Raises RunError if it has no run, or the
+    picture cannot be written.
     """
     filesystem, run = arrow_at(run_dir) if filesystem is None else (filesystem, str(run_dir))
     buildings = read_table(run, "buildings", filesystem)
@@ -203,9 +190,7 @@ def _draw_scale_bar(axes: Axes, unit_m: float) -> None:
     """A bar of a round number of metres, about a fifth of the map's width, in its lower left corner."""
     west, east = axes.get_xlim()
     south, north = axes.get_ylim()
-    wanted_m = (east - west) * unit_m / 5.0
-    step = 10.0 ** math.floor(math.log10(wanted_m))
-    length_m = max(step * factor for factor in (1.0, 2.0, 5.0) if step * factor <= wanted_m)
+    length_m = round_length((east - west) * unit_m / 5.0)
     x, y = west + 0.02 * (east - west), south + 0.02 * (north - south)
     height = 0.006 * (north - south)
     axes.add_patch(Rectangle((x, y), length_m / unit_m, height, color="#222222", zorder=5))

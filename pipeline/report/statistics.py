@@ -22,20 +22,12 @@ _COLUMNS = ("status", "reason", "roof_type", "lod", "validity_codes", "touches_d
 
 
 def run_statistics(run_dir: str, filesystem: pafs.FileSystem | None = None) -> dict[str, Any]:
-    """The figures of a finished run as plain JSON values.
+    """The figures of a finished run as plain JSON values; RunError if the directory has no run.
 
-    Returns
-    -------
-    dict
-        `candidates`, `rejected`: counts. `statuses`, `shares`: of all candidates. `reasons`: of those not ok, by status
-        and reason. `rejected_reasons`, `roof_types`, `lods`, `validity_codes`: counts. `touches_data_edge`: count.
-        `sums`: totals of areas, volume, planes, points. `quantiles`: of each figure over the buildings that have it,
-        with their number as `n`.
-
-    Raises
-    ------
-    RunError
-        The directory has no run.
+    `candidates`, `rejected`: counts. `statuses`, `shares`: of all candidates. `reasons`: of those not ok, by status and
+    reason. `rejected_reasons`, `roof_types`, `lods`, `validity_codes`: counts. `touches_data_edge`: count. `sums`:
+    totals of areas, volume, planes, points. `quantiles`: of each figure over the buildings that have it, with their
+    number as `n`.
     """
     if filesystem is None:
         filesystem, run_dir = arrow_at(run_dir)

@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import shapely
+from labels import labels_of
 
 from pipeline.errors import SettingsError
 from pipeline.model import FloatArray
@@ -22,7 +23,7 @@ from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.simulation.als import ScanBlock, scan_all
 from pipeline.ruler.simulation.city import CITY_SCANNER, CityPlan, city
 from pipeline.ruler.simulation.conditions import terrain_slope_deg
-from pipeline.ruler.simulation.dataset import ScenePaths, read_truth, simulate, tile_extents
+from pipeline.ruler.simulation.dataset import ScenePaths, simulate, tile_extents
 from pipeline.ruler.simulation.scene import Defect, Scene
 from pipeline.ruler.simulation.strips import reached
 from pipeline.ruler.simulation.suites import SUITES
@@ -60,15 +61,16 @@ def test_the_tiles_together_hold_exactly_the_points_of_the_whole_scan(whole: Sce
 def test_labels_of_all_tiles_stand_in_the_order_of_their_points(made: ScenePaths) -> None:
     manifest = json.loads((made.truth / "scene.json").read_text())
     xyz = np.concatenate([laspy.read(made.truth / tile["laz"]).xyz for tile in manifest["tiles"]])
-    truth = read_truth(made.truth)
-    assert len(truth.classification) == len(xyz) == made.points
+    labels = labels_of(made.truth)
+    assert len(labels["class"]) == len(xyz) == made.points
     models = {model.building_id: model for model in read_models(made.truth).models}
-    assert set(truth.building_ids) <= set(models)
+    seen = set(labels["building_id"]) - {None}
+    assert seen <= set(models)
     source = np.concatenate([laspy.read(made.truth / tile["laz"]).point_source_id for tile in manifest["tiles"]])
     unshifted = xyz - np.array(manifest["strip_shifts_m"])[source.astype(int) - 1]
     errors = []
-    for number, name in enumerate(truth.building_ids):
-        mine = (truth.building == number) & (truth.face >= 0) & ~truth.mixed
+    for name in seen:
+        mine = (labels["building_id"] == name) & (labels["face"] >= 0) & ~labels["mixed"]
         x, y, z = unshifted[mine].T
         errors.append(z - models[name].top(x, y))
     away = np.abs(np.concatenate(errors))
@@ -119,7 +121,7 @@ def test_a_smaller_city_in_the_same_folder_leaves_nothing_of_the_larger_one(tmp_
     again = simulate(tiled, tmp_path, 7, size_m=(50.0, 50.0))
     assert [path.name for path in (tmp_path / "tiles").iterdir()] == ["city_x0_y0.laz"]
     assert len(read_models(again.truth).models) == again.buildings
-    assert len(read_truth(again.truth).classification) == again.points
+    assert len(labels_of(again.truth)["class"]) == again.points
 
 
 @pytest.mark.slow
@@ -230,8 +232,7 @@ def test_a_city_on_a_hillside_has_one_slope_all_over(tmp_path: Path, slope_deg: 
     slopes = np.array(table["terrain_slope_deg"].to_pylist())
     assert len(slopes) > 2
     assert np.abs(slopes - slope_deg).max() < 1.0
-    truth = read_truth(made.truth)
-    ground = laspy.read(made.laz / "city_x0_y0.laz").xyz[truth.classification == 2]
+    ground = laspy.read(made.laz / "city_x0_y0.laz").xyz[labels_of(made.truth)["class"] == 2]
     fitted = np.linalg.lstsq(np.column_stack((ground[:, :2] - ground[0, :2], np.ones(len(ground)))), ground[:, 2])[0]
     assert np.degrees(np.arctan(np.hypot(*fitted[:2]))) == pytest.approx(slope_deg, abs=1.0)
 

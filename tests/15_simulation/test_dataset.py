@@ -13,12 +13,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import shapely
+from labels import labels_of
 
 from pipeline.errors import InputError, SettingsError
 from pipeline.io import open_source
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.simulation.conditions import CONDITIONS
-from pipeline.ruler.simulation.dataset import Output, ScenePaths, read_truth, simulate
+from pipeline.ruler.simulation.dataset import Output, ScenePaths, simulate
 from pipeline.ruler.simulation.suites import SUITES
 
 SIZE = (110.0, 90.0)
@@ -60,23 +61,23 @@ def test_the_tile_is_read_by_our_own_reader(made: ScenePaths) -> None:
 def test_the_tile_is_raw_and_holds_classes_only_when_asked(made: ScenePaths, tmp_path: Path) -> None:
     assert set(np.asarray(laspy.read(made.laz).classification).tolist()) == {1}
     classified = simulate("suburb", tmp_path, 5, size_m=SIZE, output=Output(with_classes=True))
-    truth = read_truth(classified.truth)
-    assert np.array_equal(np.asarray(laspy.read(classified.laz).classification), truth.classification)
+    assert np.array_equal(np.asarray(laspy.read(classified.laz).classification), labels_of(classified.truth)["class"])
 
 
 def test_labels_stand_in_the_order_of_the_points(made: ScenePaths) -> None:
     xyz = laspy.read(made.laz).xyz
-    truth = read_truth(made.truth)
-    assert len(truth.classification) == len(xyz)
+    labels = labels_of(made.truth)
+    assert len(labels["class"]) == len(xyz)
     models = {model.building_id: model for model in read_models(made.truth).models}
-    assert sorted(models) == list(truth.building_ids)
-    for number, name in enumerate(truth.building_ids):
-        mine = (truth.building == number) & (truth.face >= 0) & ~truth.mixed
+    assert set(models) == set(labels["building_id"]) - {None}
+    for name, model in models.items():
+        mine = (labels["building_id"] == name) & (labels["face"] >= 0) & ~labels["mixed"]
         x, y, z = xyz[mine].T
-        assert np.nanstd(z - models[name].top(x, y)) < 0.06, name
-    assert truth.wall.any()
-    assert (truth.suite, truth.seed, truth.crs) == ("suburb", 5, "EPSG:25832+7837")
-    assert truth.extent == (565_000.0, 5_934_000.0, 565_110.0, 5_934_090.0)
+        assert np.nanstd(z - model.top(x, y)) < 0.06, name
+    assert (labels["building_id"].astype(bool) & (labels["face"] < 0)).any()  # walls
+    scene = json.loads((made.truth / "scene.json").read_text())
+    assert (scene["suite"], scene["seed"], scene["crs"]) == ("suburb", 5, "EPSG:25832+7837")
+    assert scene["extent"] == [565_000.0, 5_934_000.0, 565_110.0, 5_934_090.0]
 
 
 def test_the_truth_is_a_run_directory_of_the_exact_models(made: ScenePaths) -> None:
@@ -127,9 +128,8 @@ def test_the_same_call_gives_the_same_bytes_whatever_the_chunks(made: ScenePaths
     assert digest(again.laz) == digest(small.laz) == digest(made.laz)
     assert digest(again.labels) == digest(made.labels)
     assert pq.ParquetFile(small.labels).num_row_groups > 3
-    ours, theirs = read_truth(small.truth), read_truth(made.truth)
-    assert np.array_equal(ours.building, theirs.building)
-    assert np.array_equal(ours.face, theirs.face)
+    ours, theirs = labels_of(small.truth), labels_of(made.truth)
+    assert all(np.array_equal(ours[name], theirs[name]) for name in ("building_id", "face"))
 
 
 def test_density_and_noise_can_be_chosen(tmp_path: Path) -> None:
@@ -140,8 +140,8 @@ def test_density_and_noise_can_be_chosen(tmp_path: Path) -> None:
     assert found[-1] == paths.points
     assert found == sorted(found)
     assert len(found) > 2
-    truth, models = read_truth(paths.truth), read_models(paths.truth).models
-    roof = (truth.face >= 0) & ~truth.mixed
+    labels, models = labels_of(paths.truth), read_models(paths.truth).models
+    roof = (labels["face"] >= 0) & ~labels["mixed"]
     x, y, z = laspy.read(paths.laz).xyz[roof].T
     assert np.nanmedian(np.abs(z - models[0].top(x, y))) < 0.001
     assert json.loads((paths.truth / "scene.json").read_text())["scanner"]["range_noise_m"] == 0.0
@@ -212,11 +212,6 @@ def test_a_folder_that_cannot_be_one_is_an_error(tmp_path: Path) -> None:
         simulate("cube", tmp_path / "file")
     with pytest.raises(SettingsError, match=r"out is s3://bucket/scene: simulate writes to a folder of this machine"):
         simulate("cube", "s3://bucket/scene")
-
-
-def test_missing_truth_is_an_error_that_names_the_fix(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no readable truth.*gablework simulate"):
-        read_truth(tmp_path)
 
 
 @pytest.mark.slow

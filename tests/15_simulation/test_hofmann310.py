@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections import Counter
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from pipeline.errors import SettingsError
 from pipeline.model import RoofType
 from pipeline.ruler.simulation.als import scan_all
 from pipeline.ruler.simulation.conditions import terrain_slope_deg
-from pipeline.ruler.simulation.dataset import ScenePaths, read_truth, simulate
+from pipeline.ruler.simulation.dataset import ScenePaths, simulate
 from pipeline.ruler.simulation.hofmann310 import SCANNER, hofmann310
 from pipeline.ruler.simulation.roofs import RoofShape
 from pipeline.ruler.simulation.scene import Defect, FaultKind, Scene
@@ -131,9 +132,9 @@ def test_the_ground_slopes_by_0_to_15_deg(scene: Scene) -> None:
 
 
 def test_points_are_1_2_m_apart_and_single_returns(made: ScenePaths) -> None:
-    tile, truth = laspy.read(made.laz), read_truth(made.truth)
-    assert set(np.asarray(tile.number_of_returns).tolist()) == {1}
-    area = (truth.extent[2] - truth.extent[0]) * (truth.extent[3] - truth.extent[1])
+    assert set(np.asarray(laspy.read(made.laz).number_of_returns).tolist()) == {1}
+    west, south, east, north = json.loads((made.truth / "scene.json").read_text())["extent"]
+    area = (east - west) * (north - south)
     assert np.sqrt(area / made.points) == pytest.approx(1.2, abs=0.03)
 
 

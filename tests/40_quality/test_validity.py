@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pipeline.errors import SettingsError
 from pipeline.model import FaceKind, FloatArray, Solid, SolidFace
 from pipeline.quality import validity
-from pipeline.quality.validity import ValidityTolerances, check_solid, check_solids
+from pipeline.quality.validity import ValidityTolerances, check_solid
 
 Codes = tuple[int, ...]
 Case = tuple[Codes, Solid]
@@ -41,7 +41,7 @@ def test_every_documented_code_but_the_last_resort_is_shown_by_a_broken_solid(
 
 def test_several_solids_are_judged_one_by_one(valid_solid: Solid, broken_solid: Case) -> None:
     codes, broken = broken_solid
-    assert check_solids([valid_solid, broken, valid_solid]) == ((), codes, ())
+    assert [check_solid(solid) for solid in (valid_solid, broken, valid_solid)] == [(), codes, ()]
 
 
 def _turned(solid: Solid, quarters: int, axis: int) -> Solid:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from shapely import Polygon
 
 from pipeline.model import Plane, RoofFace
-from pipeline.quality.residuals import TopSurface, plan_index, summarise, top_surface, vertical_residuals
+from pipeline.quality.residuals import TopSurface, plan_index, summarise, surface_of, vertical_residuals
 
 
 def plane(a: float, b: float, c: float) -> Plane:
@@ -43,7 +43,8 @@ def test_the_top_surface_is_that_of_a_plain_search(seed: int) -> None:
         p = planes[f.plane]
         z = p.a * points[:, 0] + p.b * points[:, 1] + p.c
         expected = np.where(inside, np.fmax(expected, z), expected)
-    assert top_surface(points, faces, planes) == pytest.approx(expected, nan_ok=True, abs=1e-9)
+    found = surface_of(faces, planes).elevation(points[:, 0], points[:, 1])
+    assert found == pytest.approx(expected, nan_ok=True, abs=1e-9)
 
 
 def test_a_point_on_the_border_of_two_faces_belongs_to_exactly_one() -> None:

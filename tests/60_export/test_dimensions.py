@@ -11,7 +11,7 @@ import small_buildings as small
 from scipy.spatial import ConvexHull
 from small_buildings import Builder
 
-from pipeline.export.dimensions import dimensions, eave_elevation, roof_percentiles, volume
+from pipeline.export.dimensions import dimensions, roof_percentiles, volume
 from pipeline.model import FaceKind, Solid, SolidFace
 
 
@@ -46,7 +46,7 @@ def test_a_gable_has_its_textbook_dimensions() -> None:
 
 
 def test_the_high_edge_of_a_pent_roof_is_no_eave() -> None:
-    assert eave_elevation(small.pent().solids) == 3.0
+    assert dimensions(small.pent().solids).eave_z_m == 3.0
 
 
 def test_a_courtyard_is_no_part_of_the_volume() -> None:
@@ -72,7 +72,7 @@ def test_a_jump_between_level_roofs_is_answered_by_one_of_them() -> None:
 def test_the_eave_is_that_of_the_larger_roof_face() -> None:
     low = small.gable_solid(30.0)
     high = moved(small.pent().solids[0], 0.0, 0.0, 7.0)
-    assert eave_elevation([low, high]) == 3.0
+    assert dimensions([low, high]).eave_z_m == 3.0
 
 
 def test_no_solid_has_no_dimensions() -> None:

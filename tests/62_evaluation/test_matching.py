@@ -41,8 +41,7 @@ def test_each_model_stands_for_one_building_and_the_best_overlap_wins() -> None:
     assert matching.model_of.tolist() == [1, 2]
     assert matching.reference_of.tolist() == [-1, 0, 1]
     assert matching.iou.tolist() == pytest.approx([0.9, 7 / 13])
-    assert matching.models_over(0).tolist() == [0, 1]
-    assert matching.models_over(1).tolist() == [2]
+    assert (matching.overlaps.first.tolist(), matching.overlaps.second.tolist()) == ([0, 0, 1], [0, 1, 2])
 
 
 def test_an_overlap_of_exactly_one_half_is_found_and_less_is_not() -> None:
@@ -108,7 +107,7 @@ def test_random_footprints_match_as_in_naive_loops(seed: int) -> None:
         assert matching.share_on_reference[m] == pytest.approx(share)
     for t, one in enumerate(true):
         over = [m for m, other in enumerate(models) if one.intersection(other).area > 1e-6]
-        assert matching.models_over(t).tolist() == over
+        assert matching.overlaps.second[matching.overlaps.first == t].tolist() == over
 
 
 def test_the_centroid_of_the_common_area_comes_with_the_pair() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 
 import numpy as np
@@ -12,7 +11,7 @@ import roofs_by_hand as by_hand
 import shapely
 from roofs_by_hand import flat, gable, hip, lifted, moved, reference, shrunk, with_face
 
-from pipeline.ruler.evaluation import surface
+from pipeline.ruler.evaluation import residuals
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.subsets import subsets
@@ -34,7 +33,7 @@ def test_the_truth_scored_against_itself_is_perfect(truth: list[RoofModel]) -> N
     assert [figures[name] for name in ("median", "p95", "rmse", "bias")] == pytest.approx([0.0] * 4, abs=2e-6)
     rows = score_surface(truth, reference(truth))
     area = sum(one.footprint.area for one in truth)
-    assert sum(row.n_places for row in rows) * 0.0625 == pytest.approx(area, rel=0.01)
+    assert sum(row.n_points for row in rows) * 0.0625 == pytest.approx(area, rel=0.01)
 
 
 @pytest.mark.parametrize(("lift", "within"), [(0.2, 1.0), (0.21, 0.0), (-0.3, 0.0)])
@@ -52,13 +51,13 @@ def test_a_flatter_roof_is_off_by_the_integral_over_it() -> None:
     assert row.rmse_m == pytest.approx(0.1 * 4.0 / math.sqrt(3), rel=0.01)
     assert row.bias_m == pytest.approx(-0.2, rel=0.01)
     assert row.median_m == pytest.approx(0.2, rel=0.02)
-    assert row.within == pytest.approx(0.5, abs=0.02)
+    assert row.share_within == pytest.approx(0.5, abs=0.02)
 
 
 def test_shrunk_footprints_cover_less_and_cannot_buy_a_better_score() -> None:
     (row,) = score_surface([shrunk(gable("m"), 0.5)], reference(TRUTH[:1]))
     share = 11.0 * 7.0 / 96.0
-    assert row.coverage == row.within == pytest.approx(share, abs=0.01)
+    assert row.coverage == row.share_within == pytest.approx(share, abs=0.01)
     assert row.rmse_m == pytest.approx(0.0, abs=1e-9)
 
 
@@ -69,7 +68,7 @@ def test_a_removed_face_and_a_dropped_building_are_misses() -> None:
     assert figures["within_0_2m_mean"] == pytest.approx((0.5 + 1.0 + 0.0) / 3)
     assert figures["rmse"] == pytest.approx(0.0, abs=1e-9)
     row = score_surface([TRUTH[0]], reference(TRUTH))[1]
-    assert (row.coverage, row.within, row.n_covered) == (0.0, 0.0, 0)
+    assert (row.coverage, row.share_within, row.n_covered) == (0.0, 0.0, 0)
     assert math.isnan(row.rmse_m)
     assert math.isnan(row.bias_m)
     assert math.isnan(row.median_m)
@@ -86,8 +85,7 @@ def test_all_models_together_are_compared_and_the_upper_face_is_the_roof() -> No
 
 
 def test_a_naive_lattice_gives_the_same_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    exact = functools.partial(surface.top_surface_of, tolerance_m=0.0)  # no millimetre more at the eaves
-    monkeypatch.setattr(surface, "top_surface_of", exact)
+    monkeypatch.setattr(residuals, "ROUNDING_M", 0.0)  # no millimetre more at the eaves
     truth = by_hand.models_of_scene(suburb(21, size_m=(90.0, 90.0)))
     random = np.random.default_rng(2)
     models = [shrunk(moved(one, *random.normal(0.0, 0.3, 3)), random.uniform(0.0, 0.4)) for one in truth[:-1]]
@@ -107,7 +105,7 @@ def test_a_naive_lattice_gives_the_same_figures(monkeypatch: pytest.MonkeyPatch)
                 tops = [top for top in tops if not math.isnan(top)]
                 if tops:
                     differences.append(max(tops) - float(one.top(*at)[0]))
-        assert row.n_places == places
+        assert row.n_points == places
         assert row.n_covered == len(differences)
         if differences:
             assert row.rmse_m == pytest.approx(math.sqrt(np.mean(np.square(differences))))
@@ -122,7 +120,7 @@ def test_pooled_quantiles_follow_the_places_within_a_bin() -> None:
     models = [moved(one, 0.0, 0.0, random.normal(0.0, 0.4)) for one in truth]
     figures = figures_of(models, reference(truth))
     rows = score_surface(models, reference(truth))
-    pooled = np.concatenate([np.full(row.n_places, row.median_m) for row in rows])
+    pooled = np.concatenate([np.full(row.n_points, row.median_m) for row in rows])
     assert figures["median"] == pytest.approx(np.median(pooled), abs=0.006)
     assert figures["p95"] == pytest.approx(np.quantile(pooled, 0.95), abs=0.006)
     assert all(row.histogram.sum() == row.n_covered for row in rows)
@@ -137,14 +135,14 @@ def test_the_lattice_does_not_depend_on_the_buildings() -> None:
     assert len(more) == 22 * 6
     assert set(x.tolist()) <= set(more.tolist())
     one, other = (score_surface([gable("m", slope=0.6)], reference(truth))[0] for truth in (TRUTH[:1], TRUTH))
-    assert (one.n_places, one.sum_m) == (other.n_places, pytest.approx(other.sum_m))
+    assert (one.n_points, one.sum_m) == (other.n_points, pytest.approx(other.sum_m))
 
 
 def test_a_building_is_measured_by_its_own_roof_though_others_stand_within_its_bounds() -> None:
     row = [moved(gable(str(x), x), 0.0, 0.0, 0.0, 45.0) for x in (0.0, 12.0, 24.0)]
     rows = score_surface([row[0], moved(row[1], 0.0, 0.0, 1.0)], reference(row))
-    assert [one.n_places * 0.0625 for one in rows] == pytest.approx([96.0] * 3, rel=0.01)
-    assert [one.within for one in rows] == pytest.approx([1.0, 0.0, 0.0], abs=0.002)
+    assert [one.n_points * 0.0625 for one in rows] == pytest.approx([96.0] * 3, rel=0.01)
+    assert [one.share_within for one in rows] == pytest.approx([1.0, 0.0, 0.0], abs=0.002)
 
 
 def test_buildings_batch_by_batch_give_what_all_at_once_give(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,10 +154,10 @@ def test_buildings_batch_by_batch_give_what_all_at_once_give(monkeypatch: pytest
         monkeypatch.setattr("pipeline.ruler.evaluation.surface._PLACES_A_BATCH", places)
         for row, other in zip(score_surface(models, truth), whole, strict=True):
             assert dataclasses.replace(row, histogram=other.histogram) == pytest.approx(other, nan_ok=True) or (
-                math.isnan(row.median_m) and math.isnan(other.median_m) and row.n_places == other.n_places
+                math.isnan(row.median_m) and math.isnan(other.median_m) and row.n_points == other.n_points
             )
             assert np.array_equal(row.histogram, other.histogram)
-    assert [row.n_places > 0 for row in whole] == [False, True, True, True, False, True, False]
+    assert [row.n_points > 0 for row in whole] == [False, True, True, True, False, True, False]
 
 
 def test_the_data_edge_and_subsets_choose_the_buildings() -> None:

@@ -11,13 +11,7 @@ from pipeline.ruler.epochs.epoch import Epoch
 
 
 def check_agreement(old: Epoch, new: Epoch) -> tuple[str, ...]:
-    """Warnings about two runs that are compared, one sentence each.
-
-    Raises
-    ------
-    CrsError
-        Their coordinate reference systems or their units differ.
-    """
+    """Warnings about two runs that are compared, one sentence each; CrsError if their CRS or units differ."""
     warnings = _check_reference(old, new)
     for epoch in (old, new):
         manifest = epoch.manifest

@@ -64,20 +64,10 @@ class _Members:
 
 
 def compare_epochs(old: Epoch, new: Epoch, settings: DiffSettings, on_part: OnPart) -> Iterator[pa.Table]:
-    """Compare two epochs.
+    """Compare two epochs with one CRS, as `pipeline.ruler.epochs.agreement` checks.
 
-    Parameters
-    ----------
-    old, new : Epoch
-        With one CRS, as `pipeline.ruler.epochs.agreement` checks.
-    on_part : callable
-        Called with the groups done and all groups after every part.
-
-    Yields
-    ------
-    pa.Table
-        With the schema of `records`; one part of the plan after the other, `change_id` ascending within each. Rows
-        without geometry come last.
+    Yields tables with the schema of `records`: one part of the plan after the other, `change_id` ascending within each.
+    Rows without geometry come last. `on_part` is called with the groups done and all groups after every part.
     """
     pairs, old_m2, new_m2 = all_pairs(old, new)
     groups = grouped(pairs, old_m2, new_m2, settings)
@@ -332,11 +322,6 @@ def _table(
         "geometry": _wkb(before, after, epoch.reference.horizontal_unit_m),
         "change_id": _change_ids(before, after),
     }
-    return _sorted_table(columns)
-
-
-def _sorted_table(columns: dict[str, Any]) -> pa.Table:
-    """Columns as a table with rounded figures, `change_id` ascending."""
     rounded = {
         name: _rounded(values, _DIGITS) if isinstance(values, np.ndarray) and values.dtype.kind == "f" else values
         for name, values in columns.items()

@@ -103,17 +103,8 @@ def diff(
 ) -> Diff:
     """Compare two runs and write `changes.parquet`, `changes.geojson` and `changes.json`.
 
-    Parameters
-    ----------
-    take_in : sequence of callable
-        Further consumers of the rows of every part, such as a map.
-
-    Raises
-    ------
-    RunError
-        A directory has no run that ended, or the results cannot be written.
-    CrsError
-        The runs have different reference systems or units.
+    `take_in` are further consumers of the rows of every part, such as a map. Raises RunError if a directory has no run
+    that ended, or the results cannot be written, and CrsError if the runs have different reference systems or units.
     """
     refuse_run_as_out(request.out, (request.old, request.new))
     storage = LocalStorage(root=Path(request.out))

@@ -131,13 +131,7 @@ class Epoch:
 
 
 def open_epoch(name: str, run_dir: str) -> Epoch:
-    """Open a run for a comparison; `name` is OLD or NEW.
-
-    Raises
-    ------
-    RunError
-        There is no run that ended, or it is damaged.
-    """
+    """Open a run for a comparison; `name` is OLD or NEW. RunError if there is no run that ended, or it is damaged."""
     manifest = read_manifest(run_dir)
     if manifest.status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
         raise RunError(f"{name}, the run in {run_dir}, is {manifest.status.value}: compare runs that ended")

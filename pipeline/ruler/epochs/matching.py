@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.ruler.epochs.epoch import Epoch
 from pipeline.ruler.epochs.settings import DiffSettings
+from pipeline.ruler.evaluation.matching import summed
 
 ROWS_PER_PART = 20_000
 """Buildings of one epoch whose geometry is in memory at once, about."""
@@ -57,13 +58,8 @@ class Groups:
 def parts_of(xy: FloatArray, most: int = ROWS_PER_PART) -> Iterator[IntArray]:
     """Split places (n, 2) into compact parts of at most `most`, by halving at the median of the longer side.
 
-    The parts depend on the places alone, not on their order. Coinciding places stay together, whatever their number.
-    Places that are nan come last.
-
-    Yields
-    ------
-    (k,) int64
-        Indices of a part, ascending.
+    Yields the indices of each part, ascending. The parts depend on the places alone, not on their order. Coinciding
+    places stay together, whatever their number. Places that are nan come last.
     """
     known = np.isfinite(xy).all(axis=1)
     stack = [np.flatnonzero(known)]
@@ -124,7 +120,7 @@ def all_pairs(old: Epoch, new: Epoch) -> tuple[Pairs, FloatArray, FloatArray]:
     Geometry is read part by part; a pair is found with the part of its earlier building.
     """
     old_m2, new_m2 = np.zeros(len(old)), np.zeros(len(new))
-    found: list[tuple[IntArray, IntArray, FloatArray]] = []
+    found = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
     for part in parts_of(middles(old.boxes)):
         if not np.isfinite(old.boxes[part]).all():
             continue
@@ -138,11 +134,7 @@ def all_pairs(old: Epoch, new: Epoch) -> tuple[Pairs, FloatArray, FloatArray]:
     for part in parts_of(middles(new.boxes[unseen])):
         alone = new.buildings(unseen[part], ("geometry",))
         new_m2[alone.rows] = shapely.area(alone.footprints)
-    a, b, common = (
-        (np.concatenate([one[k] for one in found]) for k in range(3))
-        if found
-        else (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
-    )
+    a, b, common = (np.concatenate(column) for column in zip(*found, strict=True))
     order = np.lexsort((b, a))
     return Pairs(old=a[order], new=b[order], common_m2=common[order]), old_m2, new_m2
 
@@ -152,23 +144,17 @@ def grouped(pairs: Pairs, old_m2: FloatArray, new_m2: FloatArray, settings: Diff
     smaller = np.minimum(old_m2[pairs.old], new_m2[pairs.new])
     kept = pairs.common_m2 >= settings.min_overlap_share * smaller
     count, labels = _components(pairs, kept, len(old_m2), len(new_m2))
-    common = _summed(labels[pairs.old[kept]], pairs.common_m2[kept], count)
+    common = summed(labels[pairs.old[kept]], pairs.common_m2[kept], count)
     areas = np.bincount(labels, weights=np.concatenate([old_m2, new_m2]), minlength=count)
     iou = np.divide(common, areas - common, out=np.zeros(count), where=areas > common)
     dissolved = (common > 0.0) & (iou < settings.min_iou)
     if dissolved.any():
         kept &= ~dissolved[labels[pairs.old]]
         count, labels = _components(pairs, kept, len(old_m2), len(new_m2))
-        common = _summed(labels[pairs.old[kept]], pairs.common_m2[kept], count)
+        common = summed(labels[pairs.old[kept]], pairs.common_m2[kept], count)
     return Groups(
         of_old=labels[: len(old_m2)], of_new=labels[len(old_m2) :], count=count, common_m2=common, pairs=pairs
     )
-
-
-def _summed(index: IntArray, values: FloatArray, count: int) -> FloatArray:
-    """Sums of values (n,) by an index (n,) in 0 to count - 1: (count,)."""
-    sums: FloatArray = np.bincount(index, weights=values, minlength=count).astype(np.float64)
-    return sums
 
 
 def _components(pairs: Pairs, kept: BoolArray, n_old: int, n_new: int) -> tuple[int, IntArray]:

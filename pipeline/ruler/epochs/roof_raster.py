@@ -98,22 +98,14 @@ class _Limits(NamedTuple):
 def compare_roofs(faces: RoofFaces, groups: RoofGroups, uniform_share: float, vertical_shift_m: float) -> FloatArray:
     """Figures of each group, (g, 16) float64.
 
-    Parameters
-    ----------
-    uniform_share : float
-        Share of the common roof that must be higher (lower) for a shift of the whole.
-    vertical_shift_m : float
-        Subtracted from every difference, later less earlier.
+    By column: area where both epochs have a roof; the median difference there; the difference that at least
+    `uniform_share` of that area reaches, 0 without a common sign; the shift: the same if it counts, else 0; the mean
+    absolute difference; the areas added, removed, raised, lowered, and with another form (besides the shift); the
+    volume gained, lost, and of the parts with another form or outline; the largest rise and drop of parts that count;
+    the area of parts with another form or outline on rough faces. Median and mean are nan without a common roof.
 
-    Returns
-    -------
-    (g, 16) float64
-        By column: area where both epochs have a roof; the median difference there; the difference that at least
-        `uniform_share` of that area reaches, 0 without a common sign; the shift: the same if it counts, else 0; the
-        mean absolute difference; the areas added, removed, raised, lowered, and with another form (besides the shift);
-        the volume gained, lost, and of the parts with another form or outline; the largest rise and drop of parts that
-        count; the area of parts with another form or outline on rough faces. Median and mean are nan without a common
-        roof.
+    `uniform_share` of the common roof must be higher (lower) for a shift of the whole. `vertical_shift_m` is subtracted
+    from every difference, later less earlier.
     """
     figures = np.zeros((len(groups.starts) - 1, N_FIGURES))
     _compare_all(faces, groups, uniform_share, vertical_shift_m, figures)

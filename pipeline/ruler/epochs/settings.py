@@ -94,10 +94,7 @@ class DiffSettings(Parameters):
 def read_settings(path: str | None, options: Mapping[str, Any]) -> DiffSettings:
     """The settings of the `[diff]` table of a TOML file, overridden by options that are not None.
 
-    Raises
-    ------
-    SettingsError
-        The file cannot be read or parsed, or has faults: the error lists all of them.
+    Raises SettingsError, which lists all faults, if the file cannot be read or parsed, or has faults.
     """
     table: dict[str, Any] = {}
     if path is not None:

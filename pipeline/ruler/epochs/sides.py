@@ -11,10 +11,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
 
-from pipeline.model import BoolArray, FloatArray, IntArray, RoofType, Status
+from pipeline.model import BoolArray, FloatArray, IntArray, Status
 from pipeline.ruler.epochs.epoch import Buildings, floats
-
-_ROOF_TYPES = [kind.value for kind in RoofType]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -88,8 +86,7 @@ def side_of(buildings: Buildings, group: IntArray, count: int, vertical_unit_m: 
         return sums
 
     def some(flags: BoolArray) -> BoolArray:
-        found: BoolArray = np.bincount(group[flags], minlength=count) > 0
-        return found
+        return np.greater(np.bincount(group[flags], minlength=count), 0)
 
     spread = np.fmax(floats(table["noise_m"]), floats(table["ridge_z_sigma_m"]))
     sigma_m = np.nan_to_num(np.where(is_block | np.isnan(spread), floats(table["rmse_m"]), spread))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import datetime as dt
+import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -59,15 +60,12 @@ def parquet_sink(storage: LocalStorage, reference: SpatialReference) -> Iterator
 def geojson_sink(storage: LocalStorage, reference: SpatialReference, rows: GeoJson) -> Iterator[TakeIn]:
     """A function that appends rows to `changes.geojson`: longitude and latitude of WGS 84, as in RFC 7946.
 
-    Raises
-    ------
-    ValueError
-        The CRS is unknown.
+    Raises ValueError if the CRS is unknown.
     """
     to_degrees = _to_degrees(reference)
     with _writing(storage, GEOJSON) as path, path.open("w", encoding="utf-8", newline="\n") as stream:
         stream.write('{"type":"FeatureCollection","features":[')
-        feature = _FeatureWriter(stream)
+        separators = itertools.chain(["\n"], itertools.repeat(",\n"))
 
         def take_in(table: pa.Table) -> None:
             if rows == "changed":
@@ -76,27 +74,16 @@ def geojson_sink(storage: LocalStorage, reference: SpatialReference, rows: GeoJs
             turned = shapely.orient_polygons(shapely.transform(geometries, to_degrees))
             texts = shapely.to_geojson(turned)
             for row, text in zip(table.drop_columns("geometry").to_pylist(), texts, strict=True):
-                feature.write(row, text)
+                stream.write(next(separators) + _feature(row, text))
 
         yield take_in
         stream.write("\n]}\n")
 
 
-class _FeatureWriter:
-    """Writes features one after the other."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-        self._separator = "\n"
-
-    def write(self, row: Mapping[str, Any], geometry: str | None) -> None:
-        identity = json.dumps(row["change_id"])
-        properties = json.dumps(row, separators=(",", ":"), ensure_ascii=False, allow_nan=False, default=_text)
-        self._stream.write(
-            f'{self._separator}{{"type":"Feature","id":{identity},"geometry":{geometry or "null"},'
-            f'"properties":{properties}}}'
-        )
-        self._separator = ",\n"
+def _feature(row: Mapping[str, Any], geometry: str | None) -> str:
+    identity = json.dumps(row["change_id"])
+    properties = json.dumps(row, separators=(",", ":"), ensure_ascii=False, allow_nan=False, default=_text)
+    return f'{{"type":"Feature","id":{identity},"geometry":{geometry or "null"},"properties":{properties}}}'
 
 
 def _text(value: Any) -> str:

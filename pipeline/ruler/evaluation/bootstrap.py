@@ -64,22 +64,11 @@ class Estimate:
 
 
 def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws: int = DRAWS) -> Estimate:
-    """A figure with its percentile interval.
+    """A figure with its percentile interval; the same for the same columns: resamples are drawn from a fixed seed.
 
-    Parameters
-    ----------
-    columns : mapping of name to (units,) or (units, k) float64
-        Columns to sum over the units.
-    statistic : callable
-        From sums, each (draws,) or (draws, k), to the figure, (draws,); nan where it is undefined.
+    The columns, (units,) or (units, k) float64, are summed over the units. From sums, each (draws,) or (draws, k), the
+    statistic computes the figure, (draws,); nan where it is undefined.
 
-    Returns
-    -------
-    Estimate
-        The same for the same columns: the resamples are drawn from a fixed seed.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> found = {"found": np.array([1.0, 1.0, 0.0, 1.0]), "all": np.ones(4)}
     >>> estimate = bootstrap(found, share("found", "all"))
@@ -96,7 +85,7 @@ def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws:
     if count < _MIN_UNITS:
         return Estimate(value=value, low=math.nan, high=math.nan)
     figures = []
-    for counts in _resamples(count, draws):
+    for counts in (_kept_resamples if count <= _MAX_KEPT_UNITS else _drawn_resamples)(count, draws):
         weights = counts.astype(np.float64)
         figures.append(_figures(statistic, {name: weights @ column for name, column in arrays.items()}))
     drawn = np.concatenate(figures)
@@ -110,21 +99,14 @@ def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws:
     return Estimate(value=value, low=float(low), high=float(high))
 
 
-def _resamples(units: int, draws: int) -> Iterator[npt.NDArray[np.uint8]]:
-    """How often each unit is drawn, (rows, units), some rows at a time; deterministic."""
-    if units <= _MAX_KEPT_UNITS:
-        yield from _kept_resamples(units, draws)
-        return
-    yield from _drawn_resamples(units, draws)
-
-
 @functools.lru_cache(maxsize=4)
 def _kept_resamples(units: int, draws: int) -> tuple[npt.NDArray[np.uint8], ...]:
-    """All of them, cached: most figures of an evaluation have the same units, and drawing costs most."""
+    """All resamples, cached: most figures of an evaluation have the same units, and drawing costs most."""
     return tuple(_drawn_resamples(units, draws))
 
 
 def _drawn_resamples(units: int, draws: int) -> Iterator[npt.NDArray[np.uint8]]:
+    """How often each unit is drawn, (rows, units), some rows at a time; deterministic."""
     random = np.random.default_rng(_SEED)
     chances = np.full(units, 1.0 / units)
     for first in range(0, draws, _ROWS_A_BLOCK):

@@ -216,10 +216,7 @@ class PointRaster:
         _vote(balance, slot.astype(np.int64), x, y, is_building, CELL_M, WINDOW_CELLS)
         for place, votes in zip(keys.tolist(), balance, strict=True):
             row, column = (place + (1 << 31)) >> 32, ((place + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
-            if (row, column) in self._open:
-                self._open[row, column] += votes
-            else:
-                self._open[row, column] = votes.copy()
+            self._open[row, column] = self._open.get((row, column), 0) + votes
 
     def finish(self, still_to_come: Sequence[Sequence[float]] = ()) -> None:
         """Close the windows that no tile to come reaches, given x_min, y_min, x_max, y_max of each of them."""
@@ -237,9 +234,7 @@ class PointRaster:
         """
         inner = window.grown(_REACH_CELLS)
         cells = np.zeros((inner.rows, inner.columns), np.bool_)
-        for place in windows_over(
-            (*inner.bounds[:2], inner.bounds[2] - CELL_M, inner.bounds[3] - CELL_M),
-        ):
+        for place in windows_over((*inner.bounds[:2], inner.bounds[2] - CELL_M, inner.bounds[3] - CELL_M)):
             bits = self._done.get((place.row // WINDOW_CELLS, place.column // WINDOW_CELLS))
             if bits is None:
                 continue
@@ -272,17 +267,10 @@ class PointRaster:
 
 
 def outlines_of(runs: IntArray) -> list[Polygon]:
-    """Outlines of the 4-connected components of runs of cells.
+    """Outlines in metres of the 4-connected components of runs of cells, with vertices only at corners.
 
-    Parameters
-    ----------
-    runs : (n, 3) int64
-        Row, first column, column after the last; runs of one row may abut and must not overlap.
-
-    Returns
-    -------
-    list of Polygon
-        Metres; vertices only at corners. In the order of each component's first run.
+    Runs (n, 3) are row, first column, column after the last; those of one row may abut and must not overlap. Outlines
+    are in the order of each component's first run.
     """
     if len(runs) == 0:
         return []

@@ -153,8 +153,6 @@ def unit_sign(unit: str) -> str:
 def supported_decimals(low: float, high: float, unit: str) -> int:
     """Decimals of a printed figure: those of its unit, and at most two digits of half its interval (nan without one).
 
-    Examples
-    --------
     >>> supported_decimals(0.90, 0.96, "share"), supported_decimals(0.5, 0.9, "share")
     (1, 0)
     >>> supported_decimals(0.051, 0.055, "m"), supported_decimals(0.4, 0.9, "m")
@@ -170,8 +168,6 @@ def supported_decimals(low: float, high: float, unit: str) -> int:
 def number_text(value: float, unit: str, decimals: int, *, signed: bool = False) -> str:
     """A figure without the sign of its unit; only whole shares are printed as 0 or 100 %.
 
-    Examples
-    --------
     >>> number_text(0.99996, "share", 1), number_text(1.0, "share", 1), number_text(12345.0, "count", 0)
     ('> 99.9', '100.0', '12,345')
     """

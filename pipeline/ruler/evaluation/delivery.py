@@ -11,13 +11,12 @@ import numpy as np
 from pipeline.model import FloatArray, Status
 from pipeline.ruler.evaluation.bootstrap import share
 from pipeline.ruler.evaluation.matching import MIN_SHARE, Matching, excused_models
-from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.subsets import Subset, measured, summed_over_units, total
+from pipeline.ruler.evaluation.subsets import MODELS_ALONE, Subset, measured, summed_over_units, total
 
 _ROUNDING = 1e-9
-_ALONE = Subset(name="all", buildings=np.zeros(0, np.bool_), elsewhere=True)
 
 
 class Delivered(StrEnum):
@@ -209,78 +208,80 @@ def record_measures(models: ModelSet) -> list[Measure]:
     columns = {"records": np.ones(len(status))}
     columns |= {kind.value: np.array([one is kind for one in status], np.float64) for kind in Status}
     return [
-        measured(f"delivery.records_{kind.value}", columns, share(kind.value, "records"), n=len(status), subset=_ALONE)
+        measured(
+            f"delivery.records_{kind.value}", columns, share(kind.value, "records"), n=len(status), subset=MODELS_ALONE
+        )
         for kind in Status
     ]
-
-
-def _definition(name: str, label: str, formula: str, better: Better, unit: str = "share") -> Definition:
-    return Definition(
-        name=f"delivery.{name}", group=Group.DELIVERY, label=label, unit=unit, better=better, formula=formula
-    )
 
 
 _OF_ALL = "share of all reference buildings "
 _FOR = "(footprint IoU >= 0.5, one to one)"
 
 DEFINITIONS = (
-    _definition(
-        "lod2",
+    defined(
+        "delivery.lod2",
         "buildings with an LoD2 model",
         f"{_OF_ALL}for which a model of status ok and level of detail >= 2 stands {_FOR}",
         Better.HIGHER,
     ),
-    _definition(
-        "block",
+    defined(
+        "delivery.block",
         "buildings with a block only",
         f"{_OF_ALL}for which a fallback or LoD1 model stands {_FOR}",
         Better.LOWER,
     ),
-    _definition("nothing", "buildings without a model", f"{_OF_ALL}for which no model stands {_FOR}", Better.LOWER),
-    _definition(
-        "split",
+    defined(
+        "delivery.nothing", "buildings without a model", f"{_OF_ALL}for which no model stands {_FOR}", Better.LOWER
+    ),
+    defined(
+        "delivery.split",
         "buildings split",
         f"{_OF_ALL}with several models: the one that stands for it, if any, and those that stand for none, lie on "
         "reference buildings by at least half, and on this one most",
         Better.LOWER,
     ),
-    _definition(
-        "joined",
+    defined(
+        "delivery.joined",
         "buildings joined with others",
         f"{_OF_ALL}at least half covered by a model that covers at least half of another one too",
         Better.LOWER,
     ),
-    _definition(
-        "correctness",
+    defined(
+        "delivery.correctness",
         "models that stand on buildings",
         "1 - false models / models, without those at the data edge or where the reference says nothing",
         Better.HIGHER,
     ),
-    _definition(
-        "false_models",
+    defined(
+        "delivery.false_models",
         "models where no building is",
         "models of which less than half lies on reference buildings, that stand for none, half in the extent of the "
         "reference or over several buildings, and not at the data edge",
         Better.LOWER,
         "count",
     ),
-    _definition(
-        "part_models",
+    defined(
+        "delivery.part_models",
         "models that are parts of buildings",
         "models that stand for no building, of which at least half lies on reference buildings",
         Better.LOWER,
         "count",
     ),
-    _definition(
-        "joining_models",
+    defined(
+        "delivery.joining_models",
         "models that join buildings",
         "models that cover at least half of each of several reference buildings, and lie on such by at least half or "
         "stand for one",
         Better.LOWER,
         "count",
     ),
-    _definition("records_ok", "records ok", "records of status ok / all records of the run", Better.HIGHER),
-    _definition("records_fallback", "records with a block", "records of status fallback / all records", Better.LOWER),
-    _definition("records_failed", "records without a model", "records of status failed / all records", Better.LOWER),
+    defined("delivery.records_ok", "records ok", "records of status ok / all records of the run", Better.HIGHER),
+    defined(
+        "delivery.records_fallback", "records with a block", "records of status fallback / all records", Better.LOWER
+    ),
+    defined(
+        "delivery.records_failed", "records without a model", "records of status failed / all records", Better.LOWER
+    ),
 )
 """The measures."""

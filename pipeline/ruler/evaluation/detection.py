@@ -12,10 +12,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 from shapely import Polygon
 
@@ -37,10 +35,10 @@ from pipeline.ruler.evaluation.matching import (
     sound_polygons,
     where_judged,
 )
-from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.measure import Definition, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.subsets import Subset, measured
+from pipeline.ruler.evaluation.subsets import Subset, measured, summed_over_units
 from pipeline.scene import BUILDING_CLASS
 
 MIN_OVERLAP = 0.5
@@ -49,8 +47,6 @@ OBJECT_AREAS_M2 = (0.0, 10.0, 50.0)
 """Least areas of the objects that are measured."""
 BLOCK_CELLS = 100
 """Side of the blocks of 50 m that are the units of the bootstrap by area."""
-
-Geometries: TypeAlias = npt.NDArray[np.object_]
 
 _COUNTS = ("both", "reference", "found")
 _EVERYWHERE = (-np.inf, -np.inf, np.inf, np.inf)
@@ -261,24 +257,14 @@ def _definitions() -> tuple[Definition, ...]:
         ):
             note = f"; objects{label}, none that touches the edge of the data"
             found.append((f"object_{name}{_suffix(least)}", f"{name} by object{label}", formula + note))
-    return tuple(
-        Definition(
-            name=f"detection.{name}",
-            group=Group.DETECTION,
-            label=label,
-            unit="share",
-            better=Better.HIGHER,
-            formula=formula,
-        )
-        for name, label, formula in found
-    )
+    return tuple(defined(f"detection.{name}", label, formula) for name, label, formula in found)
 
 
 def _suffix(min_m2: float) -> str:
     return f"_{min_m2:g}m2" if min_m2 else ""
 
 
-DEFINITIONS: tuple[Definition, ...] = _definitions()
+DEFINITIONS = _definitions()
 """The measures."""
 
 
@@ -321,27 +307,22 @@ def _object_measures(rows: Detection, subset: Subset) -> list[Measure]:
     if not rows.buildings and not rows.has_correctness:
         return []
     found = []
-    place = np.cumsum(subset.buildings) - 1
     for least in OBJECT_AREAS_M2:
-        columns: dict[str, list[float]] = {name: [0.0] * subset.size for name in ("hit", "wanted", "right", "made")}
-        for building in rows.buildings:
-            if building.counts and building.area_m2 >= least and subset.buildings[building.building]:
-                columns["wanted"][place[building.building]] += 1.0
-                columns["hit"][place[building.building]] += float(building.found)
-        for model in rows.models:
-            if not (model.counts and model.area_m2 >= least):
-                continue
-            if model.building >= 0 and subset.buildings[model.building]:
-                unit = int(place[model.building])
-            elif model.building < 0 and subset.elsewhere:
-                unit = len(columns["made"])
-                for column in columns.values():
-                    column.append(0.0)
-            else:
-                continue
-            columns["made"][unit] += 1.0
-            columns["right"][unit] += float(model.found)
-        arrays = {name: np.array(column) for name, column in columns.items()}
+        buildings = [one for one in rows.buildings if one.counts and one.area_m2 >= least]
+        models = [one for one in rows.models if one.counts and one.area_m2 >= least]
+        objects, zeros = (*buildings, *models), ([0.0] * len(buildings), [0.0] * len(models))
+        columns: dict[str, list[float]] = {
+            "wanted": [*(1.0 for _ in buildings), *zeros[1]],
+            "hit": [*(float(one.found) for one in buildings), *zeros[1]],
+            "made": [*zeros[0], *(1.0 for _ in models)],
+            "right": [*zeros[0], *(float(one.found) for one in models)],
+        }
+        arrays = summed_over_units(
+            subset,
+            np.array([one.building for one in objects], np.int64),
+            np.arange(len(objects)),
+            {name: np.array(column, np.float64) for name, column in columns.items()},
+        )
         wanted, made = arrays["wanted"].sum(), arrays["made"].sum()
         figures: list[tuple[str, Statistic, float]] = [("completeness", share("hit", "wanted"), wanted)]
         if rows.has_correctness:

@@ -37,13 +37,7 @@ class Evaluation:
     """Assumptions and omissions of the measures."""
 
     def measure(self, name: str, subset: str = "all") -> Measure:
-        """One figure.
-
-        Raises
-        ------
-        KeyError
-            It was not possible here.
-        """
+        """One figure; KeyError if it was not possible here."""
         for measure in self.measures:
             if measure.name == name and measure.subset == subset:
                 return measure
@@ -69,24 +63,11 @@ def evaluate(
     ground: FoundGround | None = None,
     on_step: Callable[[str], None] = lambda _: None,
 ) -> Evaluation:
-    """Measure models.
+    """Measure models; without a reference only delivery and validity.
 
-    Parameters
-    ----------
-    reference : Reference, optional
-        From `read_truth_reference` or `read_points_reference`; without one only delivery and validity are measured.
-    blocks : bool, optional
-        Join true buildings that touch; by default as in `needs_blocks`.
-    ground : callable, optional
-        The found ground; without it the ground measures are left out.
-    on_step : callable
-        Called with the name of each step as it begins.
-
-    Returns
-    -------
-    Evaluation
-        The points of the reference are read once for the residuals, and once each for detection against points and for
-        the ground.
+    `blocks` joins true buildings that touch; by default as in `needs_blocks`. Without the found ground its measures
+    are left out. `on_step` is called with the name of each step as it begins. The points of the reference are read once
+    for the residuals, and once each for detection against points and for the ground.
     """
     on_step("solids")
     solids = validity.validity(models)

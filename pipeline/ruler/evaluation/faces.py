@@ -30,7 +30,7 @@ from pipeline.ruler.evaluation.matching import (
     summed,
     where_judged,
 )
-from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.subsets import Subset, measured, summed_over_units, total
@@ -405,10 +405,6 @@ def _quality_by_area(sums: Sums) -> FloatArray:
     )
 
 
-def _definition(name: str, label: str, formula: str, better: Better = Better.HIGHER, unit: str = "share") -> Definition:
-    return Definition(name=name, group=Group.FACES, label=label, unit=unit, better=better, formula=formula)
-
-
 _MATCH = "matched: mutual overlap >= 50 % in plan, normals within 10 deg, mean offset within 0.3 m, one to one"
 
 TOPOLOGY_NAMES = {
@@ -427,52 +423,48 @@ _COMPONENTS = (
 )
 
 DEFINITIONS = (
-    _definition(
+    defined(
         "faces.completeness_10m2",
         "true faces >= 10 m2 found",
         "TP / (TP + FN) over true faces >= 10 m2 with >= 11 points (groups count as one face); TP = found; " + _MATCH,
     ),
-    _definition(
+    defined(
         "faces.correctness_10m2",
         "model faces >= 10 m2 right",
         "TP / (TP + FP); TP as in completeness, FP = model faces >= 10 m2 that match no true face of any size",
     ),
-    _definition("faces.quality_10m2", "quality of faces >= 10 m2", "TP / (TP + FN + FP)"),
-    _definition(
+    defined("faces.quality_10m2", "quality of faces >= 10 m2", "TP / (TP + FN + FP)"),
+    defined(
         "faces.completeness_all",
         "true faces found, all sizes",
         "TP / (TP + FN) over all true faces of any size; " + _MATCH,
     ),
-    _definition(
+    defined(
         "faces.correctness_all",
         "model faces right, all sizes",
         "TP / (TP + FP), FP = model faces of any size that match no true face",
     ),
-    _definition("faces.quality_all", "quality of faces, all sizes", "TP / (TP + FN + FP)"),
-    _definition(
+    defined("faces.quality_all", "quality of faces, all sizes", "TP / (TP + FN + FP)"),
+    defined(
         "faces.completeness_area", "true roof area in found faces", "area of found true faces / area of all true faces"
     ),
-    _definition(
+    defined(
         "faces.correctness_area",
         "model roof area in right faces",
         "area of matched model faces / area of all model faces",
     ),
-    _definition("faces.quality_area", "quality by area", "1 / (1 / completeness_area + 1 / correctness_area - 1)"),
-    _definition(
+    defined("faces.quality_area", "quality by area", "1 / (1 / completeness_area + 1 / correctness_area - 1)"),
+    defined(
         "faces.topology_1_1",
         "faces 1:1",
         _COMPONENTS + "one of each (model faces that match pieces of one group count as one)",
         Better.HIGHER,
         "count",
     ),
-    _definition("faces.topology_1_n", "true faces split (1:N)", _COMPONENTS + "one true face", Better.LOWER, "count"),
-    _definition("faces.topology_n_1", "true faces joined (N:1)", _COMPONENTS + "one model face", Better.LOWER, "count"),
-    _definition("faces.topology_n_m", "faces N:M", _COMPONENTS + "several of both", Better.LOWER, "count"),
-    _definition(
-        "faces.topology_1_0", "true faces without any (1:0)", _COMPONENTS + "no model face", Better.LOWER, "count"
-    ),
-    _definition(
-        "faces.topology_0_1", "model faces without any (0:1)", _COMPONENTS + "no true face", Better.LOWER, "count"
-    ),
+    defined("faces.topology_1_n", "true faces split (1:N)", _COMPONENTS + "one true face", Better.LOWER, "count"),
+    defined("faces.topology_n_1", "true faces joined (N:1)", _COMPONENTS + "one model face", Better.LOWER, "count"),
+    defined("faces.topology_n_m", "faces N:M", _COMPONENTS + "several of both", Better.LOWER, "count"),
+    defined("faces.topology_1_0", "true faces without any (1:0)", _COMPONENTS + "no model face", Better.LOWER, "count"),
+    defined("faces.topology_0_1", "model faces without any (0:1)", _COMPONENTS + "no true face", Better.LOWER, "count"),
 )
 """The measures."""

@@ -59,13 +59,7 @@ class EvaluationRequest:
 
 
 def read_reference(request: EvaluationRequest) -> Reference | None:
-    """The reference of a request; None without one. Its models are not read.
-
-    Raises
-    ------
-    InputError
-        The reference cannot be read.
-    """
+    """The reference of a request; None without one. Its models are not read. InputError if it cannot be read."""
     if request.truth is not None:
         return read_truth_reference(request.truth, as_surveyed=request.as_surveyed)
     if request.points:
@@ -81,12 +75,7 @@ def evaluate_files(
 ) -> Evaluation:
     """Read and measure; `reference` is that of the same request, if it serves several models.
 
-    Raises
-    ------
-    InputError
-        Models or reference cannot be read.
-    RunError
-        A run directory is damaged.
+    Raises InputError if models or reference cannot be read, and RunError if a run directory is damaged.
     """
     on_step("models")
     models = read_models(request.models)

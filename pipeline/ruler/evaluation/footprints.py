@@ -12,7 +12,7 @@ import shapely
 from pipeline.model import FloatArray
 from pipeline.ruler.evaluation.bootstrap import ratio, share
 from pipeline.ruler.evaluation.matching import MIN_SHARE, Geometries, Matching, sound_polygons
-from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.subsets import Subset, measured, measured_median
@@ -127,12 +127,6 @@ def _mean(name: str, values: FloatArray, subset: Subset) -> Measure:
     return measured(name, columns, ratio("value", "count"), n=len(values), subset=subset)
 
 
-def _definition(name: str, label: str, formula: str, unit: str = "share", better: Better = Better.HIGHER) -> Definition:
-    return Definition(
-        name=f"footprints.{name}", group=Group.FOOTPRINTS, label=label, unit=unit, better=better, formula=formula
-    )
-
-
 _IOU = "IoU = common area / area of the union, with the model that stands for the building"
 _ALL = "over all reference buildings, 0 where not found (IoU < 0.5)"
 _TOGETHER = (
@@ -141,31 +135,37 @@ _TOGETHER = (
 )
 
 DEFINITIONS = (
-    _definition("iou_median", "footprint IoU, median of all", f"median {_ALL}; {_IOU}"),
-    _definition("iou_mean", "footprint IoU, mean of all", f"mean {_ALL}; {_IOU}"),
-    _definition("iou_median_found", "footprint IoU, median of found", f"median over found buildings; {_IOU}"),
-    _definition("iou_mean_found", "footprint IoU, mean of found", f"mean over found buildings; {_IOU}"),
-    _definition(
-        "iou_together_median", "footprint IoU with all models, median", _TOGETHER + "median over all, 0 without any"
+    defined("footprints.iou_median", "footprint IoU, median of all", f"median {_ALL}; {_IOU}"),
+    defined("footprints.iou_mean", "footprint IoU, mean of all", f"mean {_ALL}; {_IOU}"),
+    defined("footprints.iou_median_found", "footprint IoU, median of found", f"median over found buildings; {_IOU}"),
+    defined("footprints.iou_mean_found", "footprint IoU, mean of found", f"mean over found buildings; {_IOU}"),
+    defined(
+        "footprints.iou_together_median",
+        "footprint IoU with all models, median",
+        _TOGETHER + "median over all, 0 without any",
     ),
-    _definition("iou_together_mean", "footprint IoU with all models, mean", _TOGETHER + "mean over all, 0 without any"),
-    _definition(
-        "area_bias_median",
+    defined(
+        "footprints.iou_together_mean",
+        "footprint IoU with all models, mean",
+        _TOGETHER + "mean over all, 0 without any",
+    ),
+    defined(
+        "footprints.area_bias_median",
         "footprint area bias, median",
         "median over found buildings of model area / reference area - 1",
-        "",
         Better.ZERO,
+        "",
     ),
-    _definition(
-        "offset_median",
+    defined(
+        "footprints.offset_median",
         "outline offset from areas, median",
         "median over found buildings of (model area - reference area) / mean of both perimeters; positive outwards",
-        "m",
         Better.ZERO,
+        "m",
     ),
     *(
-        _definition(
-            f"iou_from_{round(100 * limit)}",
+        defined(
+            f"footprints.iou_from_{round(100 * limit)}",
             f"footprint IoU >= {limit:g}",
             f"share of all reference buildings with IoU >= {limit:g}; {_IOU}",
         )

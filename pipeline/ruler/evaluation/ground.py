@@ -22,7 +22,7 @@ from pipeline.io import ReadOptions, open_source
 from pipeline.io.remote_file import file_at
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.ruler.evaluation.bootstrap import Statistic, Sums, share
-from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
 from pipeline.ruler.evaluation.subsets import Subset, measured
 from pipeline.scene import GROUND_CLASS
@@ -146,14 +146,9 @@ def tile_figures(rows: Sequence[GroundBlock]) -> list[TileGround]:
 
 
 class GroundOfFiles:
-    """Ground in classified files that another program wrote for the same points.
+    """Ground (class 2) in classified files that another program wrote for the same points.
 
-    Parameters
-    ----------
-    paths : sequence of str or Path
-        LAS, LAZ or other point files; class 2 is ground.
-    options : ReadOptions, optional
-        CRS and units as for the reference; no points are dropped.
+    CRS and units are read as for the reference; no points are dropped.
     """
 
     def __init__(self, paths: Sequence[str | Path], options: ReadOptions | None = None) -> None:
@@ -164,10 +159,7 @@ class GroundOfFiles:
     def __call__(self, points: ReferencePoints) -> BoolArray:
         """Labels of the points of a tile, matched by coordinates in whole millimetres and return number.
 
-        Raises
-        ------
-        InconsistentInputError
-            Points of the tile are in none of the files.
+        Raises InconsistentInputError if points of the tile are in none of the files.
         """
         if len(points.xyz) == 0:
             return np.zeros(0, np.bool_)
@@ -199,19 +191,10 @@ class GroundOfFiles:
 def matched_points(
     wanted: FloatArray, wanted_return: np.ndarray | None, offered: FloatArray, offered_return: np.ndarray | None
 ) -> IntArray:
-    """The offered point at the same place as each wanted one.
+    """The offered point (m, 3) at the same place as each wanted one (n, 3), in metres: (n,) int64, -1 for none.
 
-    Parameters
-    ----------
-    wanted, offered : (n, 3) and (m, 3) float64
-        Metres, compared on whole millimetres.
-    wanted_return, offered_return : (n,) and (m,) uint8, or None for both
-        Return numbers, which must agree too.
-
-    Returns
-    -------
-    (n,) int64
-        Index into the offered points, each used once; -1 if none is left. Equal points pair up in their order.
+    Places are compared on whole millimetres; return numbers, (n,) and (m,) or None for both, must agree too. Each
+    offered point is used once; equal points pair up in their order.
     """
     a, b = np.rint(wanted * MM).astype(np.int64), np.rint(offered * MM).astype(np.int64)
     r = np.zeros(len(a), np.int64) if wanted_return is None else wanted_return.astype(np.int64)
@@ -373,20 +356,15 @@ _STATISTICS: tuple[tuple[str, Statistic, str], ...] = (
     ("kappa", _kappa, "all"),
 )
 
-DEFINITIONS: tuple[Definition, ...] = tuple(
-    Definition(
-        name=f"ground.{name}",
-        group=Group.GROUND,
-        label=label,
-        unit=unit,
-        better=better,
-        formula=f"{formula}; last returns without noise and water, nor what is left unclassified beside objects",
-    )
-    for name, label, unit, better, formula in (
-        ("type_1", "type I error", "share", Better.LOWER, "ground taken for object / ground"),
-        ("type_2", "type II error", "share", Better.LOWER, "object taken for ground / object"),
-        ("total", "total error", "share", Better.LOWER, "points on the wrong side / all points"),
-        ("kappa", "kappa", "share", Better.HIGHER, "(agreement - agreement by chance) / (1 - agreement by chance)"),
+_JUDGED = "last returns without noise and water, nor what is left unclassified beside objects"
+
+DEFINITIONS = tuple(
+    defined(f"ground.{name}", label, f"{formula}; {_JUDGED}", better)
+    for name, label, better, formula in (
+        ("type_1", "type I error", Better.LOWER, "ground taken for object / ground"),
+        ("type_2", "type II error", Better.LOWER, "object taken for ground / object"),
+        ("total", "total error", Better.LOWER, "points on the wrong side / all points"),
+        ("kappa", "kappa", Better.HIGHER, "(agreement - agreement by chance) / (1 - agreement by chance)"),
     )
 )
 """The measures."""

@@ -8,8 +8,6 @@ from collections.abc import Iterable, Sequence
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
     r"""A Markdown table; columns after the first `texts` are set to the right.
 
-    Examples
-    --------
     >>> print(markdown_table(("roof", "m2"), [("a|b", "7")]))
     | roof | m2 |
     | --- | ---: |

@@ -81,11 +81,6 @@ class Matching:
     mostly_on: IntArray
     """(m,) int64, the reference building with the largest common area; -1 for none."""
 
-    def models_over(self, building: int) -> IntArray:
-        """All models that overlap a reference building, by index."""
-        low, high = np.searchsorted(self.overlaps.first, [building, building + 1])
-        return self.overlaps.second[low:high]
-
 
 def sound_polygons(polygons: Sequence[shapely.Geometry]) -> Geometries:
     """The polygons as an array; invalid ones are repaired to the area that they enclose."""

@@ -47,6 +47,12 @@ class Definition:
     """Its computation, one line of Markdown."""
 
 
+def defined(name: str, label: str, formula: str, better: Better = Better.HIGHER, unit: str = "share") -> Definition:
+    """A definition in the chapter that its name begins with."""
+    group = Group(name.partition(".")[0])
+    return Definition(name=name, group=group, label=label, unit=unit, better=better, formula=formula)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Measure:
     """A measured figure."""

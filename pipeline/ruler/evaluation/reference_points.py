@@ -47,26 +47,13 @@ def read_points_reference(
     vertical_unit: str | None = None,
     read_options: ReadOptions | None = None,
 ) -> Reference:
-    """Classified point files as a reference. Reads all points once, tile by tile.
+    """Classified point files of one CRS as a reference. Reads all points once, tile by tile.
 
-    Parameters
-    ----------
-    tiles : sequence of str or Path
-        Point files of one CRS. They may abut; points in two files count twice.
-    footprints : str or Path, optional
-        Outlines of buildings. Those with at least 11 points of class 6 are the reference buildings. The file may cover
-        only a part of the tiles, so nothing is known elsewhere. Without it, the buildings are the connected areas of
-        the raster of class 6 (see `building_raster`).
-
-    Returns
-    -------
-    Reference
-        Its kind is points. Without class 6 it has no buildings and serves the ground measures only.
-
-    Raises
-    ------
-    InputError
-        A file cannot be read, has neither class 2 nor 6, or its CRS is not that of the first.
+    Files may abut; points in two files count twice. Footprints with at least 11 points of class 6 are the reference
+    buildings; their file may cover only a part of the tiles, so nothing is known elsewhere. Without it, the buildings
+    are the connected areas of the raster of class 6 (see `building_raster`). Without class 6 there are no buildings,
+    and the reference serves the ground measures only. Raises InputError if a file cannot be read, has neither class 2
+    nor 6, or its CRS is not that of the first.
     """
     if not tiles:
         raise SettingsError(["no point files are given as a reference: name at least one"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,8 @@ from pipeline.errors import InconsistentInputError, InputError
 from pipeline.io import ReadOptions, open_source
 from pipeline.model import FloatArray, LabelArray, PointCloud
 from pipeline.quality.residuals import TopSurface, plan_index
-from pipeline.ruler.evaluation.models import ModelSet, RoofModel
-from pipeline.ruler.evaluation.reading import read_models as read_models_of_any_program
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reference import Conditions, Reference, ReferencePoints
 from pipeline.ruler.evaluation.survey_shift import mean_shifts, moved_buildings, strip_shifts
 
@@ -31,32 +31,16 @@ _LABELS_A_BATCH = 1_000_000
 _NOTE = "Returns that melt echoes of two surfaces are roof points where their label is a roof face: they were measured."
 
 
-def read_truth_reference(
-    truth_dir: str | Path,
-    read_models: Callable[[str | Path], ModelSet] = read_models_of_any_program,
-    *,
-    as_surveyed: bool = False,
-) -> Reference:
+def read_truth_reference(truth_dir: str | Path, *, as_surveyed: bool = False) -> Reference:
     """The truth of one simulated data set; its points are read tile by tile on demand.
 
-    Parameters
-    ----------
-    truth_dir : str or Path
-        The folder `truth` that `simulate` wrote: models as a run directory, scene.json, labels, and optionally
-        conditions.parquet. scene.json lists the point files; otherwise it is the one LAZ beside the folder.
-    as_surveyed : bool
-        Move each building by the mean shift of the strips of its points, to where the survey saw it.
+    The folder `truth` that `simulate` wrote has models as a run directory, scene.json, labels, and optionally
+    conditions.parquet. scene.json lists the point files; otherwise it is the one LAZ beside the folder. `as_surveyed`
+    moves each building by the mean shift of the strips of its points, to where the survey saw it.
 
-    Returns
-    -------
-    Reference
-        Its kind is truth. Roof points hit a roof face and lie inside the footprint of its building: no model can
-        explain a return that the survey put outside. Faces carry their groups.
-
-    Raises
-    ------
-    InputError
-        scene.json, labels or points are missing or unreadable, or do not belong together.
+    Roof points hit a roof face and lie inside the footprint of its building: no model can explain a return that the
+    survey put outside. Faces carry their groups. Raises InputError if scene.json, labels or points are missing or
+    unreadable, or do not belong together.
     """
     folder = Path(truth_dir)
     scene = _scene(folder)
@@ -177,7 +161,7 @@ def _points_of_faces(tables: Sequence[Path]) -> dict[tuple[str, int], int]:
     """Points on each true roof face, by building_id and plane_id: one pass over the labels, some at a time."""
     counts: dict[tuple[str, int], int] = {}
     for path in tables:
-        for names, holder, face in _label_batches(path, ("building_id", "face")):
+        for names, holder, face in _label_batches(path):
             on_roof = (holder >= 0) & (face >= 0)
             if not on_roof.any():
                 continue
@@ -189,11 +173,11 @@ def _points_of_faces(tables: Sequence[Path]) -> dict[tuple[str, int], int]:
     return counts
 
 
-def _label_batches(path: Path, columns: Sequence[str]) -> Any:
+def _label_batches(path: Path) -> Any:
     """Names, index into them (-1 for none), and face of the labels, batch by batch."""
     try:
         with pq.ParquetFile(path, read_dictionary=["building_id"]) as table:
-            for batch in table.iter_batches(_LABELS_A_BATCH, columns=list(columns)):
+            for batch in table.iter_batches(_LABELS_A_BATCH, columns=["building_id", "face"]):
                 ids = batch.column("building_id")
                 yield ids.dictionary.to_pylist(), _indices(ids), np.asarray(batch.column("face"))
     except (OSError, ValueError, KeyError) as error:

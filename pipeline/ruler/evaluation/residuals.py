@@ -23,7 +23,7 @@ from pipeline.geometry import top_visible
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.quality.residuals import TopSurface
 from pipeline.ruler.evaluation.bootstrap import Statistic, quantile, ratio, root_mean, share
-from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
 from pipeline.ruler.evaluation.subsets import Subset, measured, measured_median
@@ -45,31 +45,45 @@ _COLUMNS = ("n_points", "n_covered", "n_within")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ResidualTally:
-    """Sums over the residuals of points."""
+class Tally:
+    """Sums over vertical distances at places of a roof."""
 
     n_points: int
-    """Roof points."""
+    """Places, measured points or those of a lattice."""
     n_covered: int
-    """Points that a roof covers."""
+    """Places that a roof of the models covers."""
     n_within: int
-    """Covered points within 0.2 m."""
+    """Covered places within 0.2 m."""
     sum_m: float
-    """Sum of the residuals, point minus roof, of the covered ones."""
+    """Sum of the distances of the covered ones."""
     sum_squares_m2: float
     """Sum of their squares."""
     histogram: npt.NDArray[np.int32]
-    """(bins,) int32, the covered ones by |residual| over `EDGES_M`."""
+    """(bins,) int32, the covered ones by |distance| over `EDGES_M` of the module."""
 
     @property
     def rmse_m(self) -> float:
-        """Root mean square of the covered points; nan without any."""
+        """Root mean square of the covered places; nan without any."""
         return math.sqrt(self.sum_squares_m2 / self.n_covered) if self.n_covered else math.nan
 
     @property
     def bias_m(self) -> float:
-        """Mean of the covered points, positive if the points are above the roof; nan without any."""
+        """Mean of the covered places; nan without any."""
         return self.sum_m / self.n_covered if self.n_covered else math.nan
+
+    @property
+    def share_within(self) -> float:
+        """Share of all places within 0.2 m; uncovered is a miss; nan without places."""
+        return self.n_within / self.n_points if self.n_points else math.nan
+
+    @property
+    def coverage(self) -> float:
+        """Share of all places that a roof covers; nan without places."""
+        return self.n_covered / self.n_points if self.n_points else math.nan
+
+
+class ResidualTally(Tally):
+    """Sums over the residuals of roof points: point minus roof, positive if the points are above the roof."""
 
     @property
     def median_m(self) -> float:
@@ -80,16 +94,6 @@ class ResidualTally:
     def p95_m(self) -> float:
         """95th percentile of the same."""
         return self._quantile(0.95)
-
-    @property
-    def share_within(self) -> float:
-        """Share of all points within 0.2 m; nan without points."""
-        return self.n_within / self.n_points if self.n_points else math.nan
-
-    @property
-    def coverage(self) -> float:
-        """Share of all points that a roof covers; nan without points."""
-        return self.n_covered / self.n_points if self.n_points else math.nan
 
     def _quantile(self, share: float) -> float:
         return float(quantile("h", EDGES_M, share)({"h": self.histogram[None].astype(np.float64)})[0])
@@ -112,18 +116,10 @@ class BuildingResiduals:
     dense town they are connected, and the blocks that are cut have most of the points."""
 
 
-def top_surface_of(
-    models: Sequence[RoofModel], tolerance_m: float = ROUNDING_M, *, near: Sequence[RoofModel] | None = None
-) -> TopSurface:
-    """The highest roof face of all models at any place.
+def top_surface_of(models: Sequence[RoofModel], *, near: Sequence[RoofModel] | None = None) -> TopSurface:
+    """The highest roof face of all models at any place, if given `near` the bounds of some footprints.
 
-    Parameters
-    ----------
-    tolerance_m : float
-        Narrower gaps between faces are closed.
-    near : sequence of RoofModel, optional
-        Limits the surface to the bounds of these footprints: one model at a wrong place in the world would make the
-        index of all others coarse.
+    One model at a wrong place in the world would make the index of all others coarse.
     """
     surfaces = [surface for model in models for surface in model.surfaces]
     polygons = [surface.polygon for surface in surfaces]
@@ -142,7 +138,7 @@ def top_surface_of(
         polygons,
         np.array([surface.coefficients for surface in surfaces]).reshape(-1, 3),
         np.array([surface.origin for surface in surfaces]).reshape(-1, 3),
-        tolerance_m=tolerance_m,
+        tolerance_m=ROUNDING_M,
     )
 
 
@@ -153,15 +149,7 @@ def _area_within(polygon: Polygon, reach: Polygon) -> Polygon | MultiPolygon:
 
 
 def point_residuals(points: ReferencePoints, surface: TopSurface) -> tuple[IntArray, FloatArray]:
-    """The roof points of a tile and their residuals.
-
-    Returns
-    -------
-    index : (k,) int64
-        Places of the roof points in the tile.
-    residual : (k,) float64
-        Point minus roof, metres; nan without a roof.
-    """
+    """Places of the roof points in a tile, (k,), and their residuals, (k,) m: point minus roof; nan without a roof."""
     index = np.flatnonzero(points.is_roof & (points.building >= 0))
     x, y, z = points.xyz[index].T
     residual: FloatArray = z - surface.elevation(x, y)
@@ -238,12 +226,8 @@ class _Seam:
         """Coordinates, buildings, residuals of the kept points, and which of them are still to be judged."""
         empty = (np.zeros((0, 3)), np.zeros(0, np.int32), np.zeros(0), np.zeros(0, np.bool_))
         kept = [empty, *self._kept]
-        return (
-            np.concatenate([part[0] for part in kept]),
-            np.concatenate([part[1] for part in kept]),
-            np.concatenate([part[2] for part in kept]),
-            np.concatenate([part[3] for part in kept]),
-        )
+        xyz, building, residual, judged = (np.concatenate(column) for column in zip(*kept, strict=True))
+        return xyz, building, residual, judged
 
 
 class _Tallies:
@@ -322,15 +306,8 @@ _FORMULAS = (
 )
 _MEANING = "dz: elevation of a point less that of the highest roof face of all models there; covered: there is one"
 
-DEFINITIONS: tuple[Definition, ...] = tuple(
-    Definition(
-        name=f"residuals.{name}{suffix}",
-        group=Group.RESIDUALS,
-        label=f"{label}{suffix_label}",
-        unit=unit,
-        better=better,
-        formula=f"{formula}; P: {points}; {_MEANING}",
-    )
+DEFINITIONS = tuple(
+    defined(f"residuals.{name}{suffix}", f"{label}{suffix_label}", f"{formula}; P: {points}; {_MEANING}", better, unit)
     for suffix, (suffix_label, points) in _SUFFIXES.items()
     for name, label, unit, better, formula in _FORMULAS
 )

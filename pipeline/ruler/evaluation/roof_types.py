@@ -12,7 +12,7 @@ from pipeline.model import FloatArray, RoofType
 from pipeline.ruler.evaluation.bootstrap import Sums, share
 from pipeline.ruler.evaluation.faces import FaceScore, FaceVerdict
 from pipeline.ruler.evaluation.matching import Matching
-from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.subsets import Subset, measured
@@ -130,8 +130,6 @@ def score_roof_types(
 def outcome(faces_to_find: int, faces_found: int, wrong_faces: int, *, type_right: bool) -> Outcome:
     """The verdict on a building.
 
-    Examples
-    --------
     >>> outcome(4, 4, 0, type_right=True).value, outcome(4, 2, 3, type_right=False).value
     ('correct', 'passable')
     """
@@ -206,33 +204,31 @@ def _kappa(sums: Sums) -> FloatArray:
     return np.where(count > 0.0, np.where(expected < 1.0, (agreed - expected) / (1.0 - expected), 1.0), np.nan)
 
 
-def _definition(name: str, label: str, formula: str, better: Better = Better.HIGHER, unit: str = "share") -> Definition:
-    return Definition(
-        name=f"roof_types.{name}", group=Group.ROOF_TYPES, label=label, unit=unit, better=better, formula=formula
-    )
-
-
 _OF_ALL = "share of all reference buildings "
 
 DEFINITIONS = (
-    _definition(
-        "correct",
+    defined(
+        "roof_types.correct",
         "outcome correct",
         f"{_OF_ALL}of which all faces to be found are found, no model face >= 10 m2 is wrong, and the type is right",
     ),
-    _definition(
-        "passable",
+    defined(
+        "roof_types.passable",
         "outcome passable",
         f"{_OF_ALL}that are not correct, of which at least half of the faces to be found are found",
         Better.NEITHER,
     ),
-    _definition("false", "outcome false", f"{_OF_ALL}that are neither correct nor passable", Better.LOWER),
-    _definition(
-        "accuracy", "roof type right", f"{_OF_ALL}for which a model of the same type stands (footprint IoU >= 0.5)"
+    defined("roof_types.false", "outcome false", f"{_OF_ALL}that are neither correct nor passable", Better.LOWER),
+    defined(
+        "roof_types.accuracy",
+        "roof type right",
+        f"{_OF_ALL}for which a model of the same type stands (footprint IoU >= 0.5)",
     ),
-    _definition("accuracy_found", "roof type right, of found", "the same as share of the buildings with a model"),
-    _definition(
-        "kappa",
+    defined(
+        "roof_types.accuracy_found", "roof type right, of found", "the same as share of the buildings with a model"
+    ),
+    defined(
+        "roof_types.kappa",
         "kappa of roof types",
         "Cohen's (p_o - p_e) / (1 - p_e) of the confusion matrix true x model type, none where not found",
         Better.HIGHER,

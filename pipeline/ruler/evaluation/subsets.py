@@ -42,6 +42,10 @@ class Subset:
         return int(self.buildings.sum())
 
 
+MODELS_ALONE = Subset(name="all", buildings=np.zeros(0, np.bool_), elsewhere=True)
+"""The subset of figures without a reference."""
+
+
 def subsets(reference: Reference) -> tuple[Subset, ...]:
     """All reference buildings first, then the good and the hard ones if conditions are known.
 
@@ -64,19 +68,10 @@ def subsets(reference: Reference) -> tuple[Subset, ...]:
 def summed_over_units(
     subset: Subset, building: IntArray, model: IntArray, columns: Mapping[str, FloatArray]
 ) -> dict[str, FloatArray]:
-    """Columns of things summed to the units of a bootstrap.
+    """Columns (n,) of things summed to the units of a bootstrap, (units,).
 
-    Parameters
-    ----------
-    building : (n,) int64
-        Reference building of each thing; -1 for none.
-    model : (n,) int64
-        Its model, which is its unit if it is on no building. Any number >= 0 otherwise.
-
-    Returns
-    -------
-    dict of name to (units,) float64
-        The buildings of the subset, including empty ones, then the models on no building.
+    Units are the buildings of the subset, including empty ones, then the models on no building. `building` (n,) is the
+    reference building of each thing, -1 for none; `model` (n,) its model, any number >= 0 if it is on a building.
     """
     place = np.cumsum(subset.buildings) - 1
     held = subset.holds(building)
@@ -103,12 +98,9 @@ def measured(
 
 
 def measured_median(name: str, values: FloatArray, subset: Subset) -> Measure:
-    """The median over buildings with its percentile interval: one value per unit, so the units are redrawn.
+    """The median over buildings with its percentile interval: one finite value (n,) per unit, so the units are redrawn.
 
-    Parameters
-    ----------
-    values : (n,) float64
-        One finite value per building. Without values the result is nan, with one there is no interval.
+    Without values the result is nan, with one there is no interval.
     """
     count = len(values)
     if count == 0:

@@ -11,14 +11,13 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.model import FloatArray, IntArray
 from pipeline.ruler.evaluation.bootstrap import quantile, ratio, root_mean, share
-from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.residuals import top_surface_of
+from pipeline.ruler.evaluation.residuals import Tally, top_surface_of
 from pipeline.ruler.evaluation.subsets import Subset, measured
 
 SAMPLE_M = 0.25
@@ -43,47 +42,15 @@ _PLACES_A_BATCH = 2_000_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SurfaceRow:
-    """One reference building; differences are models minus truth."""
+class SurfaceRow(Tally):
+    """One reference building: lattice places on its true roof; distances are models minus truth."""
 
     building: int
     """Its index."""
     building_id: str
     """Its name."""
-    n_places: int
-    """Lattice places on its true roof."""
-    n_covered: int
-    """Places that a model covers."""
-    n_within: int
-    """Places where the models are within 0.2 m."""
-    sum_m: float
-    """Sum of the differences where covered."""
-    sum_squares_m2: float
-    """Sum of their squares."""
     median_m: float
-    """Median of the absolute differences where covered; nan without any."""
-    histogram: npt.NDArray[np.int32]
-    """(bins,) int32, absolute differences where covered over `EDGES_M`."""
-
-    @property
-    def coverage(self) -> float:
-        """Share of the true roof, in plan, that models cover; nan without a roof."""
-        return self.n_covered / self.n_places if self.n_places else math.nan
-
-    @property
-    def within(self) -> float:
-        """Share of the true roof where the models are within 0.2 m; uncovered is a miss; nan without a roof."""
-        return self.n_within / self.n_places if self.n_places else math.nan
-
-    @property
-    def bias_m(self) -> float:
-        """Mean difference where covered; nan without any."""
-        return self.sum_m / self.n_covered if self.n_covered else math.nan
-
-    @property
-    def rmse_m(self) -> float:
-        """Root mean square of the differences where covered; nan without any."""
-        return math.sqrt(self.sum_squares_m2 / self.n_covered) if self.n_covered else math.nan
+    """Median of the absolute distances where covered; nan without any."""
 
 
 def score_surface(
@@ -132,8 +99,6 @@ def _together(held: Sequence[tuple[int, FloatArray, FloatArray]]) -> tuple[IntAr
 def lattice_over(bounds: Sequence[tuple[float, float, float, float]], sample_m: float) -> tuple[FloatArray, FloatArray]:
     """Places (x, y) of a lattice of whole multiples of sample_m, shifted by half of it, over all of some bounds.
 
-    Examples
-    --------
     >>> lattice_over([(0.1, 0.1, 0.9, 0.4)], 0.5)
     (array([0.25, 0.75]), array([0.25, 0.25]))
     """
@@ -153,7 +118,7 @@ def _row(reference: Reference, building: int, difference: FloatArray) -> Surface
     return SurfaceRow(
         building=building,
         building_id=reference.buildings[building].building_id,
-        n_places=len(difference),
+        n_points=len(difference),
         n_covered=len(covered),
         n_within=int((sizes <= GOOD_M + _ROUNDING).sum()),
         sum_m=float(covered.sum()),
@@ -170,17 +135,17 @@ def measures(rows: Sequence[SurfaceRow], subset: Subset) -> list[Measure]:
     counted = [row for row in rows if subset.buildings[row.building]]
     columns: dict[str, FloatArray] = {
         name: np.array([getattr(row, name) for row in counted], np.float64)
-        for name in ("n_places", "n_covered", "n_within", "sum_m", "sum_squares_m2")
+        for name in ("n_points", "n_covered", "n_within", "sum_m", "sum_squares_m2")
     }
-    with_roof = columns["n_places"] > 0.0
+    with_roof = columns["n_points"] > 0.0
     columns["buildings"] = with_roof.astype(np.float64)
-    columns["within"] = np.divide(columns["n_within"], columns["n_places"], out=np.zeros(len(counted)), where=with_roof)
+    columns["within"] = np.divide(columns["n_within"], columns["n_points"], out=np.zeros(len(counted)), where=with_roof)
     histogram = np.array([row.histogram for row in counted], np.float64).reshape(-1, len(EDGES_M) - 1)
-    places, covered = float(columns["n_places"].sum()), float(columns["n_covered"].sum())
+    places, covered = float(columns["n_points"].sum()), float(columns["n_covered"].sum())
     bins = {"bins": histogram}
     return [
-        measured("surface.coverage", columns, share("n_covered", "n_places"), n=places, subset=subset),
-        measured("surface.within_0_2m", columns, share("n_within", "n_places"), n=places, subset=subset),
+        measured("surface.coverage", columns, share("n_covered", "n_points"), n=places, subset=subset),
+        measured("surface.within_0_2m", columns, share("n_within", "n_points"), n=places, subset=subset),
         measured(
             "surface.within_0_2m_mean", columns, ratio("within", "buildings"), n=float(with_roof.sum()), subset=subset
         ),
@@ -191,50 +156,46 @@ def measures(rows: Sequence[SurfaceRow], subset: Subset) -> list[Measure]:
     ]
 
 
-def _definition(name: str, label: str, formula: str, unit: str, better: Better) -> Definition:
-    return Definition(
-        name=f"surface.{name}", group=Group.SURFACE, label=label, unit=unit, better=better, formula=formula
-    )
-
-
 _PLACES = f"places of a {SAMPLE_M} m lattice on the true roofs"
 _DZ = "dz = highest face of all models - true roof"
 
 DEFINITIONS = (
-    _definition(
-        "coverage",
+    defined(
+        "surface.coverage",
         "true roof with a model over it",
         f"share of the {_PLACES} that a model covers",
-        "share",
-        Better.HIGHER,
     ),
-    _definition(
-        "within_0_2m",
+    defined(
+        "surface.within_0_2m",
         "true roof within 0.2 m",
         f"share of the {_PLACES} with abs(dz) <= 0.2 m; no model is a miss; {_DZ}",
-        "share",
-        Better.HIGHER,
     ),
-    _definition(
-        "within_0_2m_mean",
+    defined(
+        "surface.within_0_2m_mean",
         "true roof within 0.2 m, mean of buildings",
         f"mean over the reference buildings of their share with abs(dz) <= 0.2 m; {_DZ}",
-        "share",
-        Better.HIGHER,
     ),
-    _definition(
-        "median", "vertical difference, median", f"median of abs(dz) over covered {_PLACES}; {_DZ}", "m", Better.LOWER
+    defined(
+        "surface.median",
+        "vertical difference, median",
+        f"median of abs(dz) over covered {_PLACES}; {_DZ}",
+        Better.LOWER,
+        "m",
     ),
-    _definition(
-        "p95",
+    defined(
+        "surface.p95",
         "vertical difference, 95th percentile",
         f"95th percentile of abs(dz) over covered {_PLACES}; {_DZ}",
-        "m",
         Better.LOWER,
+        "m",
     ),
-    _definition(
-        "rmse", "vertical difference, RMSE", f"sqrt(mean(dz^2)) over covered {_PLACES}; {_DZ}", "m", Better.LOWER
+    defined(
+        "surface.rmse",
+        "vertical difference, RMSE",
+        f"sqrt(mean(dz^2)) over covered {_PLACES}; {_DZ}",
+        Better.LOWER,
+        "m",
     ),
-    _definition("bias", "vertical difference, mean", f"mean(dz) over covered {_PLACES}; {_DZ}", "m", Better.ZERO),
+    defined("surface.bias", "vertical difference, mean", f"mean(dz) over covered {_PLACES}; {_DZ}", Better.ZERO, "m"),
 )
 """The measures."""

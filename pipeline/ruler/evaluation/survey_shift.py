@@ -22,13 +22,7 @@ _FIX = "Simulate the scene again with this version, or measure against the truth
 
 
 def strip_shifts(scene: Mapping[str, Any], path: str) -> FloatArray:
-    """(strips, 3) float64, metres, from scene.json.
-
-    Raises
-    ------
-    InputError
-        The scene has none.
-    """
+    """(strips, 3) float64, metres, from scene.json; InputError if it has none."""
     shifts = np.array(scene.get("strip_shifts_m") or np.zeros((0, 3)), np.float64)
     if shifts.ndim != 2 or shifts.shape[1:] != (3,) or len(shifts) == 0:
         raise InputError(path, "strip_shifts_m is missing: the shift of each strip is unknown", _FIX)
@@ -36,19 +30,10 @@ def strip_shifts(scene: Mapping[str, Any], path: str) -> FloatArray:
 
 
 def mean_shifts(count: int, hits: Iterable[tuple[LabelArray, LabelArray]], shifts: FloatArray) -> FloatArray:
-    """Mean shift of the points of each building.
+    """Mean shift (count, 3) of the points of each building, metres; zero for buildings without points.
 
-    Parameters
-    ----------
-    hits : iterable of (building, strip), each (n,) int32
-        Index of the building and number of the strip, from 0, of points on roofs.
-    shifts : (strips, 3) float64
-        By strip.
-
-    Returns
-    -------
-    (count, 3) float64
-        Zero for buildings without points.
+    `hits` are index of the building and number of the strip, from 0, of points on roofs, each (n,); `shifts`
+    (strips, 3) go by strip.
     """
     sums, points = np.zeros((count, 3)), np.zeros(count)
     for building, strip in hits:

@@ -88,7 +88,7 @@ def building_table(
     if surface:
         columns |= {
             "surface_coverage": [_known(row.coverage) for row in surface],
-            "surface_within": [_known(row.within) for row in surface],
+            "surface_within": [_known(row.share_within) for row in surface],
             "surface_median_m": [_known(row.median_m) for row in surface],
             "surface_rmse_m": [_known(row.rmse_m) for row in surface],
             "surface_bias_m": [_known(row.bias_m) for row in surface],

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.quality.validity import DEFAULT_TOLERANCES, ValidityTolerances, check_solid
-from pipeline.ruler.evaluation.bootstrap import bootstrap, share
-from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.bootstrap import share
+from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import ModelSet
 from pipeline.ruler.evaluation.reading.raw import is_closed
+from pipeline.ruler.evaluation.subsets import MODELS_ALONE, measured
 
 NO_SOLID = "no_solid"
 """Instead of a code, for a model of surfaces alone."""
@@ -23,40 +24,29 @@ MODELS_NO_SOLID = "validity.models_no_solid"
 FAULTY_SOLIDS = "validity.faulty_solids"
 
 
-def _definition(name: str, label: str, unit: str, better: Better, formula: str) -> Definition:
-    return Definition(name=name, group=Group.VALIDITY, label=label, unit=unit, better=better, formula=formula)
-
-
-DEFINITIONS: tuple[Definition, ...] = (
-    _definition(
+DEFINITIONS = (
+    defined(
         SOLIDS_VALID,
         "solids valid",
-        "share",
-        Better.HIGHER,
         "Solids without any code of ISO 19107 (val3dity's codes and default tolerances, vertices to 1 mm) / solids.",
     ),
-    _definition(
+    defined(
         MODELS_VALID,
         "models with all solids valid",
-        "share",
-        Better.HIGHER,
         "Models with at least one solid, all of them valid / models delivered; a model of surfaces alone is not valid.",
     ),
-    _definition(
+    defined(
         MODELS_CLOSED,
         "models with closed solids",
-        "share",
-        Better.HIGHER,
         "Models with at least one solid, every edge of each run both ways equally often / models delivered.",
     ),
-    _definition(
+    defined(
         MODELS_NO_SOLID,
         "models without a solid",
-        "share",
-        Better.LOWER,
         "Models of surfaces alone (MultiSurface, open meshes) / models delivered.",
+        Better.LOWER,
     ),
-    _definition(FAULTY_SOLIDS, "faulty solids", "count", Better.LOWER, "Solids with at least one code."),
+    defined(FAULTY_SOLIDS, "faulty solids", "Solids with at least one code.", Better.LOWER, "count"),
 )
 """The measures of this chapter."""
 
@@ -114,7 +104,7 @@ def code_counts(rows: Sequence[ModelValidity]) -> dict[str, int]:
     return {**counts, NO_SOLID: without} if without else counts
 
 
-def measures(rows: Sequence[ModelValidity], subset: str = "all") -> list[Measure]:
+def measures(rows: Sequence[ModelValidity]) -> list[Measure]:
     """The figures of `DEFINITIONS` over some models, each model a unit of the bootstrap."""
     columns = {
         "models": np.ones(len(rows)),
@@ -131,9 +121,7 @@ def measures(rows: Sequence[ModelValidity], subset: str = "all") -> list[Measure
         (MODELS_CLOSED, "models_closed", "models", len(rows)),
         (MODELS_NO_SOLID, "no_solid", "models", len(rows)),
     )
-    found = []
-    for name, part, whole, n in shares:
-        estimate = bootstrap({key: columns[key] for key in (part, whole)}, share(part, whole))
-        found.append(Measure(name=name, value=estimate.value, low=estimate.low, high=estimate.high, n=n, subset=subset))
-    faulty = float(n_solids - columns["solids_valid"].sum())
-    return [*found, Measure(name=FAULTY_SOLIDS, value=faulty, n=n_solids, subset=subset)]
+    return [
+        *(measured(name, columns, share(part, whole), n=n, subset=MODELS_ALONE) for name, part, whole, n in shares),
+        Measure(name=FAULTY_SOLIDS, value=float(n_solids - columns["solids_valid"].sum()), n=n_solids),
+    ]

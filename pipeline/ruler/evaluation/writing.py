@@ -55,10 +55,7 @@ def write_tables(
 ) -> list[Path]:
     """Write `measures.parquet`, one Parquet file per table, and `report.md`; returns their paths in that order.
 
-    Raises
-    ------
-    RunError
-        The folder cannot be made.
+    Raises RunError if the folder cannot be made.
     """
     storage = LocalStorage(root=Path(out_dir))
     storage.put(MEASURES, parquet_bytes(measures_table(evaluation, definitions)))

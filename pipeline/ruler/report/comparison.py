@@ -35,14 +35,8 @@ def write_comparison(
     The runs have the same candidates and are the columns. Points of the drawn buildings are read again from `points`;
     without it the pictures have none. `on_step` is called with the name of each step as it begins.
 
-    Raises
-    ------
-    SettingsError
-        There is no run, or two have one label.
-    RunError
-        A directory has no run, the runs have different candidates, or the folder cannot be created.
-    InputError
-        A point file cannot be read.
+    Raises SettingsError if there is no run, or two have one label; RunError if a directory has no run, the runs have
+    different candidates, or the folder cannot be created; InputError if a point file cannot be read.
     """
     _check(runs)
     on_step("records")

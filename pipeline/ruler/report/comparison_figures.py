@@ -151,8 +151,6 @@ def _seconds(columns: Sequence[Records]) -> FigureTable:
 def seconds_text(seconds: float) -> str:
     """Three digits, at most milliseconds.
 
-    Examples
-    --------
     >>> [seconds_text(s) for s in (0.0123, 0.5, 1.234, 12.34, 1234.5)]
     ['0.012 s', '0.500 s', '1.23 s', '12.3 s', '1,234 s']
     """

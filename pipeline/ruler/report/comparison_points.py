@@ -27,12 +27,7 @@ def points_within(files: PointFiles, areas: Sequence[shapely.Geometry]) -> list[
     """The points within each area (polygons in metres): streamed, without files that meet no area.
 
     Returns one (n, 3) float64 array in metres per area, ordered by easting, northing, elevation. Points in several
-    files occur once.
-
-    Raises
-    ------
-    InputError
-        A file cannot be read.
+    files occur once. Raises InputError if a file cannot be read.
     """
     kept: list[list[FloatArray]] = [[] for _ in areas]
     for path in files.paths:

@@ -57,10 +57,7 @@ _TRUTH_FIELDS = (
 def read_buildings(runs: Sequence[ComparedRun], manifests: Sequence[RunManifest]) -> tuple[list[ComparedBuilding], int]:
     """The buildings that all runs have, by building_id, and the number that a run with failed tiles lacks.
 
-    Raises
-    ------
-    RunError
-        The runs have different buildings although none has failed tiles: their candidates differ.
+    Raises RunError if the runs have different buildings although none has failed tiles: their candidates differ.
     """
     tables = [_rows_of(run) for run in runs]
     everywhere = set(tables[0]).intersection(*tables)

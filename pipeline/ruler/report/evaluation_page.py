@@ -45,13 +45,7 @@ HEADLINE_FIGURES = 8
 def write_page(
     evaluation: Evaluation, out_dir: str | Path, definitions: Mapping[str, Definition] = DEFINITIONS
 ) -> Path:
-    """Write `report.html` with its images and styles.
-
-    Raises
-    ------
-    RunError
-        The folder cannot be created.
-    """
+    """Write `report.html` with its images and styles; RunError if the folder cannot be created."""
     storage = LocalStorage(root=Path(out_dir))
     storage.put(PAGE, page(evaluation, definitions).encode())
     return storage.path(PAGE)

@@ -163,15 +163,9 @@ def profile_line(
 ) -> tuple[FloatArray, FloatArray, float]:
     """The place of the profile: across the building, where its points are farthest from the models.
 
-    Returns
-    -------
-    middle : (2,) float64
-        On the longer axis of the rectangle of the footprint, not at its ends: the stretch of 2 m with the largest sum
-        of distances beyond 0.2 m, each at most 1 m; the middle of the building if no stretch is clearly worse.
-    along : (2,) float64
-        Unit vector of the shorter side.
-    half : float
-        Half the length of that side, metres.
+    Returns its middle (2,), the unit vector (2,) of the shorter side of the rectangle of the footprint, and half the
+    length of that side, metres. The middle lies on the longer axis, not at its ends: in the stretch of 2 m with the
+    largest sum of distances beyond 0.2 m, each at most 1 m; at the middle of the building if none is clearly worse.
     """
     rectangle = shapely.get_coordinates(shapely.minimum_rotated_rectangle(truth.footprint))
     sides = np.diff(rectangle[:3], axis=0)

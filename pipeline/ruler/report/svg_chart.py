@@ -61,8 +61,6 @@ class Ordinate:
 def ticks(low: float, high: float, wanted: int) -> list[float]:
     """About `wanted` round values from low to high.
 
-    Examples
-    --------
     >>> ticks(0.0, 1.0, 4), ticks(-0.4, 0.4, 4)
     ([0.0, 0.2, 0.4, 0.6, 0.8, 1.0], [-0.4, -0.2, 0.0, 0.2, 0.4])
     """
@@ -184,17 +182,9 @@ def _svg(parts: Sequence[str], x_name: str, description: str) -> Markup:
 
 
 def rebinned(edges_low: FloatArray, edges_high: FloatArray, counts: FloatArray, edges: FloatArray) -> FloatArray:
-    """Counts of bins distributed to other bins, evenly within each; values beyond go to the outermost ones.
+    """Counts of bins distributed to other bins, (m,), with the same sum; values beyond go to the outermost ones.
 
-    Parameters
-    ----------
-    edges_low, edges_high : (n,) float64
-        Borders of the given bins, adjoining and ascending; the outermost may be infinite.
-
-    Returns
-    -------
-    (m,) float64
-        Counts with the same sum.
+    Counts are even within each given bin. Their borders (n,) adjoin and ascend; the outermost may be infinite.
     """
     low = np.where(np.isfinite(edges_low), edges_low, np.minimum(edges[0], edges_high) - 1.0)
     high = np.where(np.isfinite(edges_high), edges_high, np.maximum(edges[-1], edges_low) + 1.0)

@@ -48,12 +48,8 @@ def addition_parts(base: RoofFaces, additions: Sequence[Addition]) -> list[RoofP
     """The parts of the additions to a bare roof, one each; they follow the parts of the roof.
 
     A box has a flat top above all of the roof beneath it. A dormer stands on one sloping face: its front wall is at the
-    low side of its rectangle, and its roof runs into the face at the high side.
-
-    Raises
-    ------
-    ValueError
-        One hangs over the outline, or a dormer does not stand on one sloping face or does not run into it.
+    low side of its rectangle, and its roof runs into the face at the high side. Raises ValueError if one hangs over the
+    outline, or if a dormer does not stand on one sloping face or does not run into it.
     """
     if not additions:
         return []

@@ -73,24 +73,9 @@ def scan(
     are fired that aim into the tile, so that the tiles together give the returns of the whole. For that each tile holds
     all objects and survey faults within `reach_m` of its extent, in one order everywhere.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the scanner. The content depends on scene, settings and seed alone.
-    chunk_points : int
-        Smallest number of returns per chunk, except the last; a chunk has at most some 100,000 more.
-    threads : int
-        Threads that work ahead. They cost memory and do not change the content.
-
-    Yields
-    ------
-    ScanBlock
-        A chunk of returns. A scene without any return yields nothing.
-
-    Raises
-    ------
-    SettingsError
-        If the terrain is so steep that beams graze it.
+    The content depends on scene, settings and seed alone. Each chunk except the last has at least `chunk_points`
+    returns and at most some 100,000 more; a scene without any return yields nothing. `threads` work ahead, which costs
+    memory. Raises SettingsError if the terrain is so steep that beams graze it.
     """
     margin_m = settings.beam_radius_m + settings.pulse_spacing_m
     arrays = scene_arrays(scene, settings.max_lean, margin_m, settings.beam_radius_m)
@@ -108,13 +93,7 @@ def scan(
 
 
 def scan_all(scene: Scene, settings: ScannerSettings, seed: int) -> ScanBlock:
-    """The whole scan in memory, for small scenes.
-
-    Raises
-    ------
-    ValueError
-        If no pulse hit the scene's extent.
-    """
+    """The whole scan in memory, for small scenes; ValueError if no pulse hit the scene's extent."""
     blocks = list(scan(scene, settings, seed))
     if not blocks:
         raise ValueError(f"no pulse of {settings.pulse_density_per_m2:g} per m2 hit the extent {scene.extent}")

@@ -194,19 +194,10 @@ def scan_lines(
     floats: FloatArray,
     integers: LabelArray,
 ) -> int:
-    """Scan the lines first_line to stop_line - 1 of a strip.
+    """Scan the lines first_line to stop_line - 1 of a strip; returns the number of returns.
 
-    Parameters
-    ----------
-    floats : ndarray (capacity, 5)
-        Receives x, y, z (scene frame), GPS time, scan angle in degrees.
-    integers : ndarray (capacity, COLUMNS) int32
-        Receives the rest.
-
-    Returns
-    -------
-    int
-        Number of returns.
+    `floats` (capacity, 5) receives x, y, z (scene frame), GPS time, scan angle in degrees; `integers`
+    (capacity, COLUMNS) the rest.
     """
     grid, cells_across, cells_up = scene.grid, scene.cells_across, scene.cells_up
     things, faces = np.empty(RAYS_PER_BEAM, np.int64), np.empty(RAYS_PER_BEAM, np.int64)

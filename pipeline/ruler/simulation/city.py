@@ -63,31 +63,17 @@ def city_terrain(seed: int) -> Terrain:
 
 
 def hillside(seed: int, slope_deg: float) -> Terrain:
-    """A plane of one slope all over, its aspect drawn, with waves over it that add less than a degree.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the aspect and the waves; not negative.
-    slope_deg : float
-        0 to `STEEPEST_DEG` + 1; 0 is level ground with the waves alone.
-    """
+    """A plane of one slope (0 to `STEEPEST_DEG` + 1), its aspect drawn, with waves that add less than a degree."""
     random = np.random.default_rng([seed, 0xC2])
     aspect_deg = float(random.uniform(0.0, 360.0))
     return undulating_terrain(_BASE_Z_M, slope_deg, aspect_deg, _WAVE_M, _WAVE_LENGTH_M, random)
 
 
 class CityPlan:
-    """A city that is made tile by tile.
+    """A city that is made tile by tile; its survey determines how far a tile can see.
 
-    Parameters
-    ----------
-    size_m : tuple of float
-        Extent east and north. A larger city contains the smaller one unchanged, except at the edge of the smaller one.
-    settings : ScannerSettings
-        The survey, which determines how far a tile can see.
-    terrain : Terrain, optional
-        The ground; `city_terrain` by default.
+    A larger city contains the smaller one unchanged, except at the edge of the smaller one. The ground is that of
+    `city_terrain` by default.
     """
 
     def __init__(
@@ -175,7 +161,7 @@ class CityPlan:
         return block
 
 
-def city(seed: int, *, size_m: tuple[float, float] = (1000.0, 1000.0), name: str = "city") -> Scene:
+def city(seed: int, size_m: tuple[float, float] = (1000.0, 1000.0), name: str = "city") -> Scene:
     """A whole small city in memory. A square kilometre has about 1,500 buildings."""
     plan = CityPlan(seed, size_m, name=name)
     return plan.part(plan.whole)

@@ -31,9 +31,7 @@ from pipeline.ruler.simulation.strips import survey_extent
 from pipeline.ruler.simulation.suites import Suite, suite_named
 from pipeline.ruler.simulation.survey_files import TileFiles, last_returns, write_points
 from pipeline.ruler.simulation.sweep import Cell, chosen_cells
-from pipeline.ruler.simulation.truth_files import SceneTruth, read_truth, write_manifest, write_models
-
-__all__ = ["Output", "ScenePaths", "SceneTruth", "read_truth", "simulate"]
+from pipeline.ruler.simulation.truth_files import write_manifest, write_models
 
 _BUILDINGS_PER_PART = 500
 """Buildings per file of the exact models."""
@@ -95,24 +93,18 @@ def simulate(
     slope_deg: float | None = None,
     output: Output = _DEFAULT_OUTPUT,
 ) -> ScenePaths:
-    """Make the scene of a suite, scan it, write the tiles and the truth.
+    """Make the scene of a suite, scan it, write the tiles and the truth. The same call gives the same bytes.
 
     Parameters
     ----------
     suite : str or Suite
-        A suite, or the name of one.
+        A suite, or the name of one. By default its own seed (of layout and scanner) and size (east, north) are taken.
     out_dir : str or Path
         Folder, created if missing. The files of an earlier call are replaced, whatever its suite was.
-    seed : int, optional
-        Seed of layout and scanner; the suite's own by default. The same call gives the same bytes.
-    size_m : tuple of float, optional
-        Extent east and north; the suite's own by default.
     density_per_m2, noise_m : float, optional
         Replace the pulse density and range noise of the suite, or select cells of a suite of several surveys.
     slope_deg : float, optional
         Put a city on ground with this slope everywhere, 0 to 30 deg, instead of its plain and hillside.
-    output : Output
-        How it is written.
 
     Raises
     ------

@@ -44,18 +44,10 @@ class RoofPart:
 
 
 def envelope(parts: Sequence[RoofPart]) -> RoofFaces:
-    """The faces that are visible from above; of two parts of equal height, the first one.
+    """The faces that are visible from above; of two parts of equal height, the first one. ValueError without any area.
 
-    Returns
-    -------
-    RoofFaces
-        In the order of parts and planes. Faces share vertices where they meet at one height, and have vertices of
-        their own where one stands over the other; every vertex on an edge is a vertex of the faces on both sides.
-
-    Raises
-    ------
-    ValueError
-        No part has an area.
+    They are in the order of parts and planes. Faces share vertices where they meet at one height, and have vertices of
+    their own where one stands over the other; every vertex on an edge is a vertex of the faces on both sides.
     """
     regions = _visible_regions(parts)
     if not regions:
@@ -75,7 +67,7 @@ def envelope(parts: Sequence[RoofPart]) -> RoofFaces:
         for polygon in sorted(joined, key=lambda polygon: polygon.bounds):
             polygons.append(polygon)
             faces.append((key[0], parts[part].planes[plane]))
-    return _faces(polygons, faces, _outline_lines(parts))
+    return _faces(polygons, faces, [line for part in parts for line in _sides(part)])
 
 
 def _clipped(polygon: list[Place], line: Line) -> list[Place]:
@@ -124,12 +116,8 @@ def _under_all(polygon: list[Place], lower: Line, planes: Sequence[Line], wins_t
     return polygon
 
 
-def _outline_lines(parts: Sequence[RoofPart]) -> list[Line]:
-    """Lines of all outlines: unit normal to the inside, offset."""
-    return [line for part in parts for line in _sides(part)]
-
-
 def _sides(part: RoofPart) -> list[Line]:
+    """Lines of its outline: unit normal to the inside, offset."""
     lines = []
     for k, (x2, y2) in enumerate(part.outline):
         x1, y1 = part.outline[k - 1]
@@ -221,8 +209,8 @@ def _with_nodes_between(ring: IntArray, nodes: IntArray, places: FloatArray) -> 
             continue
         if len(clean) > 1 and clean[-2] == node:
             clean.pop()
-            continue
-        clean.append(node)
+        else:
+            clean.append(node)
     while len(clean) > 2 and (clean[0] == clean[-1] or clean[1] == clean[-1] or clean[0] == clean[-2]):
         if clean[1] == clean[-1]:
             clean.pop(0)

@@ -49,26 +49,9 @@ def packed_plots(
 ) -> tuple[list[Plot], tuple[float, float]]:
     """Pack plots in rows across parallel strips that run north; no plot crosses the border of two strips.
 
-    Parameters
-    ----------
-    buildings : sequence of PlannedBuilding
-        In the order in which rows are filled.
-    strip_width_m : float
-        Width of a strip; wide enough for any plot.
-    gap_m : float
-        Kept free at both sides of a strip.
-
-    Returns
-    -------
-    plots : list of Plot
-        One per building, in their order.
-    size_m : tuple of float
-        Extent of all strips: east, north; whole metres.
-
-    Raises
-    ------
-    ValueError
-        If a plot is wider than a strip.
+    Rows are filled in the order of the buildings; `gap_m` is kept free at both sides of a strip. Returns one plot per
+    building, in their order, and the extent of all strips: east, north; whole metres. Raises ValueError if a plot is
+    wider than a strip.
     """
     boxes = [building.bounds for building in buildings]
     sizes = [high - low + 2 * building.margin_m for (low, high), building in zip(boxes, buildings, strict=True)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 
@@ -46,7 +47,7 @@ _WITH_RIDGE = {RoofShape.HIP, RoofShape.HALF_HIP, RoofShape.BENT_HIP, RoofShape.
 def random_dimensions(
     shape: RoofShape, random: np.random.Generator, *, area_m2: float | None = None, pitch_deg: float | None = None
 ) -> RoofDimensions:
-    """Draw the size of a roof; nothing stands on it.
+    """Draw the size of a roof, in whole centimetres; nothing stands on it.
 
     Parameters
     ----------
@@ -55,11 +56,6 @@ def random_dimensions(
     pitch_deg : float, optional
         Pitch of the sloping faces: the upper ones of a bent hip, the lower ones of mansard and gambrel, the right one
         of an unequal gable. By default 25 to 45; pent 7.5 to 20, too steep to be flat; mansard and gambrel steeper.
-
-    Returns
-    -------
-    RoofDimensions
-        Lengths are whole centimetres.
 
     Raises
     ------
@@ -158,14 +154,6 @@ def _l_or_t_shape(aspect: float, random: np.random.Generator, *, at_the_end: boo
     return size, aspect + out * wing
 
 
-def _l_shape(aspect: float, random: np.random.Generator) -> tuple[RoofDimensions, float]:
-    return _l_or_t_shape(aspect, random, at_the_end=True)
-
-
-def _t_shape(aspect: float, random: np.random.Generator) -> tuple[RoofDimensions, float]:
-    return _l_or_t_shape(aspect, random, at_the_end=False)
-
-
 def _u_shape(aspect: float, random: np.random.Generator) -> tuple[RoofDimensions, float]:
     wing = _equal_or_narrower(0.7, 0.92, 0.2, random)
     out, second = (float(length) for length in random.uniform(0.4, 1.0, 2))
@@ -221,8 +209,8 @@ def _multi_level_flat(aspect: float, random: np.random.Generator) -> tuple[RoofD
 
 
 _COMPOUND: dict[RoofShape, Callable[[float, np.random.Generator], tuple[RoofDimensions, float]]] = {
-    RoofShape.L_SHAPE: _l_shape,
-    RoofShape.T_SHAPE: _t_shape,
+    RoofShape.L_SHAPE: functools.partial(_l_or_t_shape, at_the_end=True),
+    RoofShape.T_SHAPE: functools.partial(_l_or_t_shape, at_the_end=False),
     RoofShape.U_SHAPE: _u_shape,
     RoofShape.CROSS: _cross,
     RoofShape.COURTYARD: _courtyard,

@@ -275,28 +275,11 @@ def place_building(
     terrain: Terrain,
     block_id: str | None = None,
 ) -> Building:
-    """Put a building without defects on the terrain.
+    """Put a building without defects on the terrain, with exact roof vertices and planes.
 
-    Parameters
-    ----------
-    at : tuple of float
-        Middle of the main rectangle: easting and northing in the scene frame, metres.
-    azimuth_deg : float
-        Direction of the ridge, clockwise from north.
-    eave_height_m : float
-        Height of the eave above the *highest* terrain at the outline, so that no wall vanishes uphill.
-    block_id : str, optional
-        Shared by buildings that touch.
-
-    Returns
-    -------
-    Building
-        With exact roof vertices and planes. Its floor is the lowest terrain at the outline, rounded down to 1 mm.
-
-    Raises
-    ------
-    ValueError
-        The dimensions give no such roof.
+    `at` is the middle of its main rectangle, easting and northing in the scene frame. The eave is above the *highest*
+    terrain at the outline, so that no wall vanishes uphill; the floor is the lowest, rounded down to 1 mm. Raises
+    ValueError if the dimensions give no such roof.
     """
     roof = ROOFS[shape](dimensions)
     plan = turned(roof.vertices[:, :2], *at, azimuth_deg)

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.errors import SettingsError
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.ruler.simulation.roofs import FaceRings
-from pipeline.ruler.simulation.scene import Building, Scene, Terrain
+from pipeline.ruler.simulation.scene import Scene, Terrain
 
 CELL_M = 5.0
 """Edge of the grid's cells."""
@@ -71,10 +71,7 @@ def steepest_slope(terrain: Terrain) -> float:
 def landing_m(terrain: Terrain, extent: tuple[float, float, float, float], max_lean: float) -> float:
     """How far outside an extent rays land that aim into it at the base elevation of the terrain, metres.
 
-    Raises
-    ------
-    SettingsError
-        If the terrain is as steep as the flattest ray: a ray would meet it more than once, or never.
+    Raises SettingsError if the terrain is as steep as the flattest ray, which would meet it more than once, or never.
     """
     closeness = steepest_slope(terrain) * max_lean
     if closeness >= 0.95:
@@ -88,21 +85,10 @@ def landing_m(terrain: Terrain, extent: tuple[float, float, float, float], max_l
 
 
 def scene_arrays(scene: Scene, max_lean: float = 0.0, margin_m: float = 0.5, beam_radius_m: float = 0.0) -> SceneArrays:
-    """Flatten a scene.
+    """Flatten a scene for rays up to a lean; raises SettingsError as `landing_m` does.
 
-    Parameters
-    ----------
-    max_lean : float
-        Largest lean of the rays: objects are entered into all cells from whose terrain they can be hit.
-    margin_m : float
-        Added to the reach, for beams with a footprint.
-    beam_radius_m : float
-        Radius of that footprint.
-
-    Raises
-    ------
-    SettingsError
-        If the terrain is as steep as the flattest line.
+    Objects are entered into all cells from whose terrain they can be hit. `margin_m` is added to the reach, for beams
+    with a footprint of `beam_radius_m`.
     """
     pad_m = max(_PAD_M, CELL_M * math.ceil((landing_m(scene.terrain, scene.extent, max_lean) + margin_m) / CELL_M))
     slope = steepest_slope(scene.terrain)
@@ -125,7 +111,7 @@ def scene_arrays(scene: Scene, max_lean: float = 0.0, margin_m: float = 0.5, bea
             planes.append(plane.coefficients)
             edge_start.append(edge_start[-1] + len(edges[-1]))
         face_start.append(len(planes))
-        spots += _spots(building)
+        spots += [(spot.x, spot.y, spot.radius_m * spot.radius_m) for spot in building.wet_spots]
         spot_start.append(len(spots))
         reaches.append(_widened(low, high, reach(high[2] - building.floor_z_m)))
         circles.append(_circle(building.vertices[:, :2], building.ridge_z_m))
@@ -183,10 +169,6 @@ def _face_bounds(edges: FloatArray, start: LabelArray) -> FloatArray:
         return np.zeros((0, 4))
     low, high = np.minimum.reduceat(edges[:, :2], start[:-1]), np.maximum.reduceat(edges[:, :2], start[:-1])
     return np.hstack([low, high])
-
-
-def _spots(building: Building) -> list[tuple[float, float, float]]:
-    return [(spot.x, spot.y, spot.radius_m * spot.radius_m) for spot in building.wet_spots]
 
 
 def _widened(low: FloatArray, high: FloatArray, reach_m: float) -> tuple[float, float, float, float]:

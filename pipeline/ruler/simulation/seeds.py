@@ -24,15 +24,8 @@ DRAWS = 89_000
 
 
 def seed_of(split: str, draw: int) -> int:
-    """The seed of a draw of a split.
+    """The seed of a draw of a split; SettingsError if one is out of range.
 
-    Raises
-    ------
-    SettingsError
-        Split or draw is out of range.
-
-    Examples
-    --------
     >>> seed_of("dev", 0), seed_of("test", 3)
     (1000, 90003)
     """
@@ -49,8 +42,6 @@ def seed_of(split: str, draw: int) -> int:
 def split_of(seed: int) -> Split | None:
     """The split of a seed; None if it belongs to neither.
 
-    Examples
-    --------
     >>> split_of(1005), split_of(90_000), split_of(7)
     (<Split.DEV: 'dev'>, <Split.TEST: 'test'>, None)
     """

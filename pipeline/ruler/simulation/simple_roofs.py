@@ -40,13 +40,7 @@ def gable(size: RoofDimensions) -> RoofFaces:
 
 
 def hip(size: RoofDimensions) -> RoofFaces:
-    """Four faces of equal pitch; a square footprint gives a pyramid.
-
-    Raises
-    ------
-    ValueError
-        If the roof is wider than long: its ridge would have a negative length.
-    """
+    """Four faces of equal pitch; a square footprint gives a pyramid. ValueError if it is wider than long."""
     half_ridge = (size.length_m - size.width_m) / 2
     if half_ridge < 0:
         raise ValueError(f"a hip roof {size.length_m:g} m long and {size.width_m:g} m wide has no ridge: turn it")
@@ -61,12 +55,8 @@ def l_shape(size: RoofDimensions) -> RoofFaces:
     """Two crossing gables of one pitch and one eave; the wing stands at the far end of the left side.
 
     Both valleys run from the end of the wing's ridge, inside the main roof, to the eave. The main gable's end wall and
-    the wing's outer wall are one plane.
-
-    Raises
-    ------
-    ValueError
-        If the wing is as wide as the main part, longer than its side, or missing.
+    the wing's outer wall are one plane. Raises ValueError if the wing is as wide as the main part, longer than its
+    side, or missing.
     """
     u, v, wing, out = size.length_m / 2, size.width_m / 2, size.wing_width_m, size.wing_length_m
     if not (0 < wing < min(size.width_m, size.length_m) and out > 0):

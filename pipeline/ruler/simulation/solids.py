@@ -47,14 +47,8 @@ def building_solid(building: Building, origin: tuple[float, float, float] = (0.0
     """The closed, outward oriented solid of a building.
 
     Each straight run of the outline is one wall, so the end wall of a gable is one face of five vertices. A step edge
-    between roof faces is a wall. Vertices are relative to `origin` and rounded to whole millimetres.
-
-    Raises
-    ------
-    ValueError
-        The roof falls into parts that share no edge.
-    BuildingError
-        Its parts are connected by a corner alone.
+    between roof faces is a wall. Vertices are relative to `origin` and rounded to whole millimetres. Raises ValueError
+    if the roof falls into parts that share no edge, and BuildingError if a corner alone connects them.
     """
     if has_steps(building):
         return _stepped_solid(building, origin)

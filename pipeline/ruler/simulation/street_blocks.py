@@ -23,18 +23,8 @@ def in_street_frame(places: FloatArray, azimuth_deg: float) -> FloatArray:
 class StreetBlock:
     """The buildings, trees and cars of one block, all drawn from its own random state.
 
-    Places are given by u along the long streets and v across them, metres from the middle of the block.
-
-    Parameters
-    ----------
-    name : str
-        Prefix of the names of its buildings.
-    middle : (2,) float64
-        Scene coordinates of its middle.
-    azimuth_deg : float
-        Direction of the long streets, clockwise from north.
-    state : sequence of int
-        Seed of its random numbers.
+    Places are given by u along the long streets, which run to `azimuth_deg`, and v across them, metres from the middle
+    (2,) of the block. Names of buildings begin with that of the block; `state` is the seed of its random numbers.
     """
 
     def __init__(

@@ -85,12 +85,7 @@ def reach_m(
     """How far outside an extent the pulses that aim into it can hit objects of a height.
 
     A tile of a survey must contain all objects up to this distance, in metres; objects farther out cannot change its
-    returns. `height_m` is that of the highest object over the lowest terrain below it.
-
-    Raises
-    ------
-    SettingsError
-        If the terrain is as steep as the flattest beam.
+    returns. `height_m` is that of the highest object over the lowest terrain below it. Raises as `landing_m` does.
     """
     lean = settings.max_lean
     beams = landing_m(terrain, extent, lean) + height_m * lean / (1.0 - steepest_slope(terrain) * lean)

@@ -90,7 +90,7 @@ def car_at(x: float, y: float, azimuth_deg: float, terrain: Terrain, random: np.
     return Box(corners=turned(corners, x, y, azimuth_deg), top_z_m=ground + height)
 
 
-def suburb(seed: int, *, size_m: tuple[float, float] = (200.0, 200.0), name: str = "suburb") -> Scene:
+def suburb(seed: int, size_m: tuple[float, float] = (200.0, 200.0), name: str = "suburb") -> Scene:
     """A suburb of detached houses on gentle terrain; 200 x 200 m hold about 35 houses."""
     random = np.random.default_rng([seed, 0x5B])
     terrain = undulating_terrain(86.0, random.uniform(1.0, 3.0), random.uniform(0, 360), 0.8, 110.0, random)

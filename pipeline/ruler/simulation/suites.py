@@ -51,32 +51,6 @@ class Suite:
     """As `part`, on ground with one slope in degrees everywhere; None if the ground of the suite is fixed."""
 
 
-def _suburb(seed: int, size_m: tuple[float, float]) -> Scene:
-    return suburb(seed, size_m=size_m)
-
-
-def _town(seed: int, size_m: tuple[float, float]) -> Scene:
-    return town(seed, size_m=size_m)
-
-
-def _hofmann310(seed: int, size_m: tuple[float, float]) -> Scene:
-    del size_m
-    return hofmann310(seed)
-
-
-def _sweep(seed: int, size_m: tuple[float, float]) -> Scene:
-    del size_m
-    return sweep(seed)
-
-
-def _city(seed: int, size_m: tuple[float, float]) -> Scene:
-    return city(seed, size_m=size_m)
-
-
-def _city_part(seed: int, size_m: tuple[float, float], settings: ScannerSettings) -> Callable[[Extent], Scene]:
-    return CityPlan(seed, size_m, settings).part
-
-
 def _city_on_slope(
     seed: int, size_m: tuple[float, float], settings: ScannerSettings, slope_deg: float
 ) -> Callable[[Extent], Scene]:
@@ -141,12 +115,7 @@ def single_building(
 ) -> Scene:
     """One building in the middle of a field; the seed turns it and places the trees.
 
-    Parameters
-    ----------
-    size_m : tuple of float
-        Extent east and north.
-    dimensions : RoofDimensions, optional
-        Its size; without one a house of about 110 m2 with 35 deg of pitch (pent: 15).
+    Without `dimensions` it is a house of about 110 m2 with 35 deg of pitch (pent: 15).
     """
     random = np.random.default_rng([seed, 0x1B])
     terrain = undulating_terrain(100.0, slope_deg, random.uniform(0, 360), 0.0, 100.0, random)
@@ -176,13 +145,10 @@ def single_building(
 
 
 def _single_suite(shape: RoofShape) -> Suite:
-    def make(seed: int, size_m: tuple[float, float]) -> Scene:
-        return single_building(shape, seed, size_m)
-
     return Suite(
         name=str(shape),
         summary=f"one {str(shape).replace('_', '-')} building on level ground, 4 points per m2, 3 cm of noise",
-        make=make,
+        make=lambda seed, size_m: single_building(shape, seed, size_m),
         scanner=ScannerSettings(pulse_density_per_m2=4.0),
         size_m=(40.0, 40.0),
         seed=1,
@@ -199,7 +165,7 @@ SUITES: dict[str, Suite] = {
         Suite(
             name="suburb",
             summary="detached houses of all five roof shapes on gentle terrain, with trees and cars",
-            make=_suburb,
+            make=suburb,
             scanner=ScannerSettings(pulse_density_per_m2=7.0, flight_azimuth_deg=90.0),
             size_m=(200.0, 200.0),
             seed=7,
@@ -207,7 +173,7 @@ SUITES: dict[str, Suite] = {
         Suite(
             name="town",
             summary="streets with rows of touching houses of several levels, courtyards and parks, of any size",
-            make=_town,
+            make=town,
             scanner=ScannerSettings(
                 pulse_density_per_m2=7.0, altitude_m=900.0, strip_spacing_m=300.0, flight_azimuth_deg=90.0
             ),
@@ -225,7 +191,7 @@ SUITES: dict[str, Suite] = {
         Suite(
             name="hofmann310",
             summary="the 310 buildings of Hofmann, Maas and Streilein: types, sizes, 1.2 m spacing, nuisances",
-            make=_hofmann310,
+            make=lambda seed, _: hofmann310(seed),
             scanner=HOFMANN_SCANNER,
             size_m=(700.0, 700.0),
             seed=1,
@@ -235,7 +201,7 @@ SUITES: dict[str, Suite] = {
         Suite(
             name="sweep",
             summary="all roof shapes under 21 surveys: 0.5 to 50 pulses per m2, 2 to 10 cm of noise; a data set each",
-            make=_sweep,
+            make=lambda seed, _: sweep(seed),
             scanner=SWEEP_SCANNER,
             size_m=(300.0, 250.0),
             seed=1,
@@ -245,11 +211,11 @@ SUITES: dict[str, Suite] = {
         Suite(
             name="city",
             summary="rows, courtyards, halls, towers and houses of all shapes up to a hillside, of any size, in tiles",
-            make=_city,
+            make=city,
             scanner=CITY_SCANNER,
             size_m=(1000.0, 1000.0),
             seed=1,
-            part=_city_part,
+            part=lambda seed, size_m, settings: CityPlan(seed, size_m, settings).part,
             tile_m=TILE_M,
             on_slope=_city_on_slope,
         ),
@@ -260,13 +226,7 @@ SUITES: dict[str, Suite] = {
 
 
 def suite_named(name: str) -> Suite:
-    """The suite of that name.
-
-    Raises
-    ------
-    SettingsError
-        The name is unknown; the message lists the valid ones.
-    """
+    """The suite of that name; a SettingsError lists the valid names."""
     if name not in SUITES:
         raise SettingsError([f"suite is {name!r}: use one of {', '.join(SUITES)}"])
     return SUITES[name]

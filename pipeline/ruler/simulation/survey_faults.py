@@ -30,16 +30,10 @@ def fault_rows(faults: tuple[SurveyFault, ...], places: FloatArray) -> FloatArra
 
 @kernel
 def move_faulty(places: FloatArray, lines: LabelArray, faults: FloatArray, seed: int, strip: int) -> None:
-    """Move the returns that faults affect, in place.
+    """Move the returns at places (n, >= 3) of the scene frame that faults (k, 11) affect, in place.
 
-    Parameters
-    ----------
-    places : ndarray (n, >= 3)
-        x, y, z in the scene frame. The place without any fault decides whether a return is affected.
-    lines : ndarray (n,) int32
-        Scan line of each return.
-    seed, strip : int
-        With the scan line they decide which rows are wrong.
+    The place without any fault decides whether a return is affected; seed, strip and the scan line of each return (n,)
+    decide which rows are wrong.
     """
     for k in range(len(places)):
         x, y = places[k, 0], places[k, 1]

@@ -15,7 +15,6 @@ from laspy.vlrs.known import WktCoordinateSystemVlr
 
 import pipeline
 from pipeline.io.crs import UNKNOWN_REFERENCE, SpatialReference
-from pipeline.model import PointCloud
 from pipeline.ruler.simulation.als import ScanBlock
 from pipeline.ruler.simulation.scene import Scene
 
@@ -136,5 +135,4 @@ def last_returns(blocks: Iterator[ScanBlock]) -> Iterator[ScanBlock]:
             for field in dataclasses.fields(ScanBlock)
             if field.name != "points"
         }
-        points = {field.name: getattr(cloud, field.name) for field in dataclasses.fields(PointCloud)}
-        yield ScanBlock(points=PointCloud(**{**points, "return_number": single, "return_count": single}), **kept)
+        yield ScanBlock(points=dataclasses.replace(cloud, return_number=single, return_count=single), **kept)

@@ -32,8 +32,6 @@ SCANNER = ScannerSettings(altitude_m=800.0, strip_spacing_m=_STRIP_M, strip_over
 def cell_name(density_per_m2: float, noise_m: float) -> str:
     """Folder of a cell.
 
-    Examples
-    --------
     >>> cell_name(0.5, 0.1)
     'd0.5_n0.10'
     """
@@ -59,13 +57,7 @@ CELLS = tuple(Cell(density_per_m2=density, noise_m=noise) for density in DENSITI
 
 
 def chosen_cells(cells: tuple[Cell, ...], density_per_m2: float | None, noise_m: float | None) -> tuple[Cell, ...]:
-    """The cells of a density, of a noise, or of both; all where neither is given.
-
-    Raises
-    ------
-    SettingsError
-        There are none; the message lists those that exist.
-    """
+    """The cells of a density, of a noise, or of both; all where neither is given. A SettingsError lists what exists."""
     chosen = tuple(
         cell
         for cell in cells

@@ -25,7 +25,7 @@ _ROW_INSET_M = 2.0
 _ROW_DEPTH_M = 11.0
 
 
-def town(seed: int, *, size_m: tuple[float, float] = (400.0, 400.0), name: str = "town") -> Scene:
+def town(seed: int, size_m: tuple[float, float] = (400.0, 400.0), name: str = "town") -> Scene:
     """A town on gentle terrain with about 2,300 buildings per square kilometre.
 
     Buildings that touch share a block_id; some stand across the end of the data.

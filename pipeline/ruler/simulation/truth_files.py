@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 import dataclasses
 import json
 import os
@@ -11,97 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import shapely
 
 import pipeline
-from pipeline.errors import InputError
 from pipeline.export.facts import RecordContext
 from pipeline.export.tile import write_tile
-from pipeline.model import BoolArray, ByteArray, LabelArray
 from pipeline.ruler.simulation.conditions import condition_row
 from pipeline.ruler.simulation.scene import Building, Scene
 from pipeline.ruler.simulation.seeds import split_of
 from pipeline.ruler.simulation.solids import truth_record
 from pipeline.ruler.simulation.strips import ScannerSettings, flight_lines, reached
 from pipeline.ruler.simulation.survey_files import TileFiles, spatial_reference
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SceneTruth:
-    """The truth of a simulated data set without its models, which are read like those of any run directory."""
-
-    folder: Path
-    """The folder of the truth: a run directory of the exact models, plus labels and scene.json."""
-    suite: str
-    """Name of the suite."""
-    seed: int
-    """Seed of layout and scanner."""
-    crs: str | None
-    """As in `Scene.crs`."""
-    extent: tuple[float, float, float, float]
-    """CRS coordinates: smallest x, smallest y, largest x, largest y."""
-    building_ids: tuple[str, ...]
-    """Ids of all buildings in the labels, sorted."""
-    classification: ByteArray
-    """(n,) uint8, true ASPRS class of every point in the order of the LAZ (tile after tile); 1 for small things."""
-    building: LabelArray
-    """(n,) int32, index into building_ids; -1 for none."""
-    face: LabelArray
-    """(n,) int32, roof plane of the building; -1 for walls and other objects."""
-    mixed: BoolArray
-    """(n,) bool, True where echoes of different surfaces melted into the return."""
-
-    @property
-    def wall(self) -> BoolArray:
-        """(n,) bool, True where a wall was hit."""
-        return (self.building >= 0) & (self.face < 0)
-
-
-def read_truth(truth_dir: str | Path) -> SceneTruth:
-    """Read the truth that `simulate` wrote, with all labels in memory: 10 bytes per point.
-
-    The labels of a data set of several tiles follow one another in the order of the tiles in scene.json.
-
-    Raises
-    ------
-    InputError
-        If scene.json or the labels are missing or not readable.
-    """
-    folder = Path(truth_dir)
-    try:
-        manifest = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
-        names = [tile["labels"] for tile in manifest.get("tiles", [{"labels": "labels.parquet"}])]
-        tables = [pq.read_table(folder / name) for name in names]
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(
-            str(folder), f"no readable truth ({error})", "Give the folder `truth` that `gablework simulate` wrote"
-        ) from error
-    columns = [table["building_id"].combine_chunks() for table in tables]
-    ids = sorted({str(name) for column in columns for name in column.dictionary.to_pylist()})
-    labels = pa.concat_tables([table.drop_columns("building_id") for table in tables])
-    return SceneTruth(
-        folder=folder,
-        suite=manifest["suite"],
-        seed=manifest["seed"],
-        crs=manifest["crs"],
-        extent=tuple(manifest["extent"]),
-        building_ids=tuple(ids),
-        classification=labels["class"].to_numpy(),
-        building=np.concatenate([_numbers(column, ids) for column in columns]),
-        face=labels["face"].to_numpy().astype(np.int32),
-        mixed=labels["mixed"].to_numpy(),
-    )
-
-
-def _numbers(names: pa.DictionaryArray, ids: Sequence[str]) -> LabelArray:
-    """Places of the names of a column in the sorted ids; -1 for none."""
-    place = np.array([bisect.bisect_left(ids, name) for name in names.dictionary.to_pylist()], np.int32)
-    building = np.full(len(names), -1, np.int32)
-    known = names.indices.is_valid().to_numpy(zero_copy_only=False)
-    building[known] = place[names.indices.drop_null().to_numpy()]
-    return building
 
 
 def write_models(

@@ -9,7 +9,7 @@ from pathlib import Path
 from pipeline.errors import InputError
 from pipeline.io import is_url, shown
 from pipeline.ruler.evaluation.models import ModelSet
-from pipeline.ruler.evaluation.reading.cityjson import is_cityjson, read_cityjson_file, read_cityjsonseq_file
+from pipeline.ruler.evaluation.reading.cityjson import is_cityjson, read_cityjson_files, read_cityjsonseq_files
 from pipeline.ruler.evaluation.reading.collected import Collected, Kind
 from pipeline.ruler.evaluation.reading.obj import read_obj_files
 from pipeline.ruler.evaluation.reading.run import is_run, read_run
@@ -34,18 +34,9 @@ class Reader:
 def read_models(path: str | Path) -> ModelSet:
     """The models of a file or folder, in metres.
 
-    Parameters
-    ----------
-    path : str or Path
-        A run directory, or its URL; the truth of a simulated data set; a CityJSON, CityJSONSeq or OBJ file; or a folder
-        of such files of one kind, with its subfolders.
-
-    Raises
-    ------
-    InputError
-        It has no format that can be read, is broken, or its coordinates are degrees.
-    RunError
-        A run directory is damaged.
+    The path is a run directory, or its URL; the truth of a simulated data set; a CityJSON, CityJSONSeq or OBJ file; or
+    a folder of such files of one kind, with its subfolders. Raises InputError if it has no format that can be read, is
+    broken, or its coordinates are degrees, and RunError if a run directory is damaged.
     """
     if isinstance(path, str) and is_url(path):
         if is_run(path):
@@ -122,16 +113,6 @@ def _reads(
     return reads
 
 
-def _each(read: Callable[[Path, Collected], None]) -> Callable[[list[Path], Collected], None]:
-    """A reader of several files from one of one file."""
-
-    def reads(files: list[Path], into: Collected) -> None:
-        for file in files:
-            read(file, into)
-
-    return reads
-
-
 READERS: tuple[Reader, ...] = (
     Reader(
         description="a run directory, or the folder `truth` of a simulated data set (with run.json or buildings/)",
@@ -141,12 +122,12 @@ READERS: tuple[Reader, ...] = (
     Reader(
         description="a CityJSON 1.0, 1.1 or 2.0 file (.city.json, .json), or a folder of them",
         recognises=_only(CITYJSON),
-        read=_reads("cityjson", CITYJSON, _each(read_cityjson_file)),
+        read=_reads("cityjson", CITYJSON, read_cityjson_files),
     ),
     Reader(
         description="a CityJSONSeq file (.city.jsonl, .jsonl), or a folder of them",
         recognises=_only(CITYJSONSEQ),
-        read=_reads("cityjsonseq", CITYJSONSEQ, _each(read_cityjsonseq_file)),
+        read=_reads("cityjsonseq", CITYJSONSEQ, read_cityjsonseq_files),
     ),
     Reader(
         description="an OBJ file (.obj), or a folder of them",

@@ -75,23 +75,20 @@ def is_cityjson(path: Path) -> bool:
         raise _unreadable(path, str(error)) from error
 
 
-def read_cityjson_file(path: Path, into: Collected) -> None:
-    """Read the buildings of one CityJSON file, which is in memory as a whole.
+def read_cityjson_files(paths: Sequence[Path], into: Collected) -> None:
+    """Read the buildings of CityJSON files, each in memory as a whole.
 
-    Raises
-    ------
-    InputError
-        It is broken, or not CityJSON of a supported version.
+    Raises InputError if one is broken, or not CityJSON of a supported version.
     """
-    try:
-        document = json.loads(path.read_bytes())
-    except OSError as error:
-        raise _unreadable(path, str(error)) from error
-    except ValueError as error:
-        raise _unreadable(
-            path, f"no JSON ({error})", "A CityJSONSeq has one JSON text a line: name it .city.jsonl"
-        ) from error
-    _read_document(path, document, into)
+    for path in paths:
+        try:
+            document = json.loads(path.read_bytes())
+        except OSError as error:
+            raise _unreadable(path, str(error)) from error
+        except ValueError as error:
+            fix = "A CityJSONSeq has one JSON text a line: name it .city.jsonl"
+            raise _unreadable(path, f"no JSON ({error})", fix) from error
+        _read_document(path, document, into)
 
 
 def _read_document(path: Path, document: Any, into: Collected) -> None:
@@ -106,21 +103,16 @@ def _read_document(path: Path, document: Any, into: Collected) -> None:
         raise _broken(path, f"building {where!r}: " if where else "", fault) from fault
 
 
-def read_cityjsonseq_file(path: Path, into: Collected) -> None:
-    """Read the buildings of a CityJSONSeq file, one feature in memory at a time.
-
-    Raises
-    ------
-    InputError
-        A line is broken; the message names it.
-    """
-    for feature, places, where in features(path, into):
-        try:
-            objects = feature["CityObjects"]
-            for name, parts in _buildings(objects, into):
-                into.add(_model(name, parts, objects, places, into))
-        except _FAULTS as fault:
-            raise _broken(path, where, fault) from fault
+def read_cityjsonseq_files(paths: Sequence[Path], into: Collected) -> None:
+    """Read the buildings of CityJSONSeq files, one feature in memory at a time; an InputError names a broken line."""
+    for path in paths:
+        for feature, places, where in features(path, into):
+            try:
+                objects = feature["CityObjects"]
+                for name, parts in _buildings(objects, into):
+                    into.add(_model(name, parts, objects, places, into))
+            except _FAULTS as fault:
+                raise _broken(path, where, fault) from fault
 
 
 def features(
@@ -128,17 +120,8 @@ def features(
 ) -> Iterator[tuple[Object, Places, str]]:
     """The features of a CityJSONSeq file, with their vertices and lines, for messages.
 
-    Parameters
-    ----------
-    into : Collected
-        Receives the coordinate reference system.
-    units_m : tuple of float, optional
-        Metres per horizontal and per vertical unit; overrides the file.
-
-    Raises
-    ------
-    InputError
-        A line is not JSON, or neither metadata nor a feature.
+    `into` receives the coordinate reference system. `units_m`, metres per horizontal and per vertical unit, overrides
+    the file. Raises InputError if a line is not JSON, or neither metadata nor a feature.
     """
     frame: Frame | None = None
     try:

@@ -46,8 +46,6 @@ class Places:
 def level(lod: object) -> float:
     """A level of detail as a number; -1 if it is not one.
 
-    Examples
-    --------
     >>> level("2.2"), level(1), level(None)
     (2.2, 1.0, -1.0)
     """

@@ -23,23 +23,11 @@ _MIN_UP = 1e-9
 
 @kernel
 def face_vectors(xyz: FloatArray, corners: IntArray, ring_offsets: IntArray, face_rings: IntArray) -> FloatArray:
-    """Area vectors of faces (Newell): the direction is the normal, the length the area less the holes'.
+    """Area vectors of faces (Newell), (f, 3) m2: the direction is the normal, the length the area less the holes'.
 
-    Parameters
-    ----------
-    xyz : (v, 3) float64
-        Vertices in metres, about a nearby origin.
-    corners : (c,) int64
-        Vertices of all rings, one ring after the other.
-    ring_offsets : (r + 1,) int64
-        Where each ring starts in corners.
-    face_rings : (f + 1,) int64
-        Where each face starts in the rings; its outer ring first, holes the other way round.
-
-    Returns
-    -------
-    (f, 3) float64
-        Square metres.
+    Vertices `xyz` (v, 3) are in metres, about a nearby origin; `corners` (c,) are the vertices of all rings, one ring
+    after the other, which start at `ring_offsets` (r + 1,). Faces start in the rings at `face_rings` (f + 1,), the
+    outer ring first, holes the other way round.
     """
     vectors = np.zeros((len(face_rings) - 1, 3))
     for f in range(len(vectors)):
@@ -149,19 +137,9 @@ def coplanar_regions(
 ) -> IntArray:
     """Regions of faces that share edges and lie in one plane, grown from the largest; each new face refits the plane.
 
-    Parameters
-    ----------
-    xyz, corners, ring_offsets, face_rings
-        As for `face_vectors`, with one vertex per place.
-    vectors : (f, 3) float64
-        Area vectors; their direction does not matter.
-    planes : (f,) int64
-        Faces with different numbers stay apart.
-
-    Returns
-    -------
-    (f,) int64
-        The number of the region of each face, in the order of growing.
+    Faces are given as for `face_vectors`, with one vertex per place. The direction of their area vectors (f, 3) does
+    not matter; faces with different `planes` (f,) stay apart. Returns the number of the region of each face, (f,), in
+    the order of growing.
     """
     areas, normals = _upward_normals(vectors)
     offsets, others = _neighbours(corners, ring_offsets, face_rings, len(xyz))

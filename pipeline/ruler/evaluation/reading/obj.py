@@ -67,12 +67,8 @@ def read_obj_files(paths: Sequence[Path], into: Collected) -> None:
 
     Each `o` is a building; in files of this program, a part of one. Without `o`, each group is a building if it does
     not name a kind and has enough faces for a solid. Otherwise a file is a building, or if it is the only one, all
-    faces that touch in plan are a building. Coarser levels of detail are skipped if the finest is there.
-
-    Raises
-    ------
-    InputError
-        A file is broken; the message names file and line.
+    faces that touch in plan are a building. Coarser levels of detail are skipped if the finest is there. An InputError
+    names file and line of what is broken.
     """
     pieces: dict[str, list[RawPart]] = {}
     known = set(paths)

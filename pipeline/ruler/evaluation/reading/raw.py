@@ -46,10 +46,7 @@ class RawPart:
 def raw_part(vertices: FloatArray, faces: Iterable[RawFace], *, is_solid: bool) -> RawPart:
     """A part with only those of many vertices (n, 3) that its faces use.
 
-    Raises
-    ------
-    ValueError
-        A face names a missing vertex, or one beyond `FARTHEST_M`.
+    Raises ValueError if a face names a missing vertex, or one beyond `FARTHEST_M`.
     """
     listed = tuple(faces)
     used = sorted(set(chain.from_iterable(ring for face in listed for ring in face.rings)))
@@ -131,8 +128,6 @@ def _by_edges(faces: Sequence[RawFace], names: Sequence[int]) -> list[list[int]]
 def grouped(count: int, pairs: Iterable[Sequence[int]]) -> list[list[int]]:
     """Numbers below count connected by pairs: sorted groups in the order of their first members.
 
-    Examples
-    --------
     >>> grouped(4, [(0, 2), (3, 3)])
     [[0, 2], [1], [3]]
     """

@@ -44,12 +44,7 @@ def is_run(place: str | Path) -> bool:
 def read_run(place: str | Path) -> ModelSet:
     """The buildings of a run directory, or of the truth that `simulate` writes, in metres.
 
-    Raises
-    ------
-    RunError
-        The tables are missing or damaged.
-    InputError
-        Its CityJSONSeq or the table of conditions is damaged.
+    Raises RunError if the tables are missing or damaged, and InputError if CityJSONSeq or conditions are damaged.
     """
     into = Collected()
     units_m = _units_m(place, into)
