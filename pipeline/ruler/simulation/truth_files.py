@@ -65,7 +65,7 @@ def write_manifest(
     truth: Path,
     **counts: int,
 ) -> None:
-    """Write scene.json: the scene, its survey, and its tiles in the order in which `read_truth` joins their labels.
+    """Write scene.json: the scene, its survey, and its tiles in their order.
 
     `scene` may be any part of a city. `counts` are the numbers of strips, buildings, trees and cars.
     """
