@@ -322,6 +322,11 @@ def _table(
         "geometry": _wkb(before, after, epoch.reference.horizontal_unit_m),
         "change_id": _change_ids(before, after),
     }
+    return _sorted_table(columns)
+
+
+def _sorted_table(columns: dict[str, Any]) -> pa.Table:
+    """Columns as a table with rounded figures, `change_id` ascending."""
     rounded = {
         name: _rounded(values, _DIGITS) if isinstance(values, np.ndarray) and values.dtype.kind == "f" else values
         for name, values in columns.items()
