@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import shapely
+from simulated import scene_on
 
 from pipeline.errors import SettingsError
 from pipeline.model import FloatArray, PointCloud
@@ -16,14 +17,7 @@ from pipeline.ruler.simulation.scene import Scene, Terrain
 from pipeline.ruler.simulation.suites import SUITES, single_building
 
 PLAIN = ScannerSettings(strip_overlap=0.0, strip_spacing_m=100.0, drop_out=0.0)
-FIELD = Scene(
-    name="field",
-    origin=(1000.0, 2000.0, 0.0),
-    crs=None,
-    extent=(0, 0, 100, 100),
-    terrain=Terrain(base_z_m=7.0),
-    buildings=(),
-)
+FIELD = scene_on(Terrain(base_z_m=7.0), 100, origin=(1000.0, 2000.0, 0.0))
 SUBURB = SUITES["suburb"].make(3, (120.0, 120.0))
 
 

@@ -66,15 +66,11 @@ def vertices_on_foreign_edges(roof: RoofFaces) -> int:
         for ring in rings:
             corners = roof.vertices[list(ring), :2]
             for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-                length = float(np.hypot(*(end - start)))
-                along = (roof.vertices[:, :2] - start) @ (end - start) / length
-                off = np.abs(np.cross(np.append((end - start) / length, 0.0), _flat(roof.vertices - [*start, 0.0])))
-                count += int(((along > 1e-7) & (along < length - 1e-7) & (off[:, 2] < 1e-7)).sum())
+                away, length = roof.vertices[:, :2] - start, float(np.hypot(*(end - start)))
+                u, v = (end - start) / length
+                along, off = away @ [u, v], np.abs(away @ [-v, u])
+                count += int(((along > 1e-7) & (along < length - 1e-7) & (off < 1e-7)).sum())
     return count
-
-
-def _flat(vertices: FloatArray) -> FloatArray:
-    return np.column_stack([vertices[:, :2], np.zeros(len(vertices))])
 
 
 @pytest.mark.parametrize("seed", range(25))
@@ -171,18 +167,12 @@ def test_parts_that_only_touch_share_their_border() -> None:
     assert len(roof.vertices) == 10
 
 
-def test_a_hidden_part_changes_nothing() -> None:
-    house = flat_part(0, 10, 0, 8, 3.0, "house")
-    alone, with_cellar = envelope([house]), envelope([house, flat_part(2, 4, 2, 4, 1.0, "cellar")])
-    assert np.array_equal(alone.vertices, with_cellar.vertices)
-    assert alone.faces == with_cellar.faces
-
-
-def test_the_same_parts_give_the_same_bits() -> None:
+def test_the_same_parts_give_the_same_bits_and_a_hidden_part_changes_nothing() -> None:
     parts = random_parts(np.random.default_rng(8))
-    first, second = envelope(parts), envelope(parts)
-    assert np.array_equal(first.vertices, second.vertices)
-    assert first.faces == second.faces
+    house, cellar = flat_part(0, 10, 0, 8, 3.0, "house"), flat_part(2, 4, 2, 4, 1.0, "cellar")
+    for first, second in ((parts, parts), ([house], [house, cellar])):
+        assert np.array_equal(envelope(first).vertices, envelope(second).vertices)
+        assert envelope(first).faces == envelope(second).faces
 
 
 def test_no_parts_are_refused() -> None:

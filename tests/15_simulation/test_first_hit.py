@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 import shapely
+from simulated import hits_of_lines, scene_on, top_surface
 
 from pipeline.ruler.simulation.first_hit import BOX, GROUND, ROOF, TREE, WALL, mixed_bits, uniform_of
-from pipeline.ruler.simulation.line_hits import hits_of_lines, top_surface
 from pipeline.ruler.simulation.scene import Scene, Terrain, Tree
 from pipeline.ruler.simulation.scene_arrays import scene_arrays
 from pipeline.ruler.simulation.solids import building_solid
@@ -46,7 +46,6 @@ def test_the_surface_is_that_of_the_solids_faces(scene: Scene) -> None:
     assert np.array_equal(hits.building[clear], owner[clear])
     assert np.array_equal(hits.face[clear], owner_face[clear])
     assert {GROUND, ROOF} <= set(hits.kind.tolist())
-    assert np.array_equal(hits.on_roof, hits.kind == ROOF)
 
 
 @pytest.mark.slow
@@ -70,15 +69,7 @@ def test_a_leaning_line_hits_where_walking_down_along_it_ends(scene: Scene) -> N
 
 def test_a_crown_lets_beams_pass_as_the_law_of_attenuation_says() -> None:
     tree = Tree(x=10.0, y=10.0, crown_z_m=8.0, crown_radius_m=3.0, crown_half_height_m=2.0, free_path_m=2.5)
-    scene = Scene(
-        name="tree",
-        origin=(0, 0, 0),
-        crs=None,
-        extent=(0, 0, 20, 20),
-        terrain=Terrain(base_z_m=0.0),
-        buildings=(),
-        trees=(tree,),
-    )
+    scene = scene_on(Terrain(base_z_m=0.0), 20, trees=(tree,))
     tries = 20_000
     states = np.array([mixed_bits(np.uint64(k)) for k in range(tries)], np.uint64)
     places = np.tile([10.0, 10.0, 0.0], (tries, 1))

@@ -12,16 +12,16 @@ import shapely
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from simulated import hits_of_lines, placed, scene_on
 
 from pipeline.errors import SettingsError
 from pipeline.model import FaceKind, FloatArray, IntArray
 from pipeline.ruler.simulation.additions import can_have_dormers, random_dormers, random_superstructures
 from pipeline.ruler.simulation.als import ScannerSettings, scan_all
 from pipeline.ruler.simulation.first_hit import GROUND, ROOF, WALL
-from pipeline.ruler.simulation.line_hits import hits_of_lines
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Building, Scene, Terrain, place_building, undulating_terrain
+from pipeline.ruler.simulation.scene import Building, Scene, Terrain, undulating_terrain
 from pipeline.ruler.simulation.scene_arrays import scene_arrays
 from pipeline.ruler.simulation.solids import building_solid
 
@@ -39,8 +39,8 @@ def scene_of(shape: RoofShape, seed: int, slope_deg: float = 4.0) -> Scene:
     if can_have_dormers(shape):
         size = dataclasses.replace(size, additions=(*boxes, *random_dormers(shape, size, random, besides=boxes)))
     azimuth = float(random.uniform(0, 360))
-    house = place_building("it", shape, size, at=(40.0, 40.0), azimuth_deg=azimuth, eave_height_m=5.0, terrain=terrain)
-    return Scene(name="one", origin=(0, 0, 0), crs=None, extent=(0, 0, 80, 80), terrain=terrain, buildings=(house,))
+    house = placed(shape, size, at=(40.0, 40.0), azimuth_deg=azimuth, eave_height_m=5.0, terrain=terrain)
+    return scene_on(terrain, 80, house)
 
 
 def aimed_lines(building: Building, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
@@ -178,11 +178,10 @@ def test_lines_land_on_steep_waving_terrain(
 ) -> None:
     random = np.random.default_rng(seed)
     terrain = undulating_terrain(100.0, slope_deg, aspect_deg, 3.0, 240.0, random)
-    scene = Scene(name="hill", origin=(0, 0, 0), crs=None, extent=(0, 0, 500, 500), terrain=terrain, buildings=())
+    scene = scene_on(terrain, 500)
     places = np.column_stack([random.uniform(0, 500, (200, 2)), np.full(200, 100.0)])
     leans = np.tile([lean * math.cos(turn), lean * math.sin(turn)], (200, 1))
-    arrays = scene_arrays(scene, max_lean=lean)
-    hits = hits_of_lines(arrays, places, leans)
+    hits = hits_of_lines(scene_arrays(scene, max_lean=lean), places, leans)
     x, y, z = hits.xyz.T
     assert np.abs(terrain.elevation(x, y) - z).max() < 1e-5
     assert np.abs(hits.xyz[:, :2] - places[:, :2] - (z - 100.0)[:, None] * leans).max() < 1e-9
@@ -190,9 +189,7 @@ def test_lines_land_on_steep_waving_terrain(
 
 def test_a_survey_of_a_30_degree_slope_measures_it() -> None:
     terrain = Terrain(base_z_m=200.0, slope_x=math.tan(math.radians(30.0)))
-    scene = Scene(name="hill", origin=(0, 0, 0), crs=None, extent=(0, 0, 150, 150), terrain=terrain, buildings=())
-    settings = ScannerSettings(range_noise_m=0.0, drop_out=0.0, altitude_m=400.0)
-    block = scan_all(scene, settings, 1)
+    block = scan_all(scene_on(terrain, 150), ScannerSettings(range_noise_m=0.0, drop_out=0.0, altitude_m=400.0), 1)
     x, y, z = block.points.xyz.T
     assert np.abs(terrain.elevation(x, y) - z).max() < 0.0015  # rounded to whole millimetres
     assert len(block) == pytest.approx(8.0 * 150.0 * 150.0 * (1 + 18 / 150), rel=0.05)
@@ -203,16 +200,9 @@ def test_a_house_on_a_steep_slope_is_hit_by_lines_that_land_far_below_it(shift_m
     """The grid must enter the house into cells down the slope: the cells' borders lie at any distance from it."""
     terrain = Terrain(base_z_m=50.0, slope_x=math.tan(math.radians(30.0)))
     size = RoofDimensions(length_m=10.0, width_m=10.0)
-    house = place_building(
-        "it",
-        RoofShape.FLAT,
-        size,
-        at=(60.0 + shift_m, 60.0),
-        azimuth_deg=0.0,
-        eave_height_m=6.0,
-        terrain=terrain,
-    )
-    scene = Scene(name="one", origin=(0, 0, 0), crs=None, extent=(0, 0, 120, 120), terrain=terrain, buildings=(house,))
+    stand = {"azimuth_deg": 0.0, "eave_height_m": 6.0, "terrain": terrain}
+    house = placed(RoofShape.FLAT, size, at=(60.0 + shift_m, 60.0), **stand)
+    scene = scene_on(terrain, 120, house)
     y = np.linspace(56.0, 64.0, 50)
     places = np.column_stack([np.full(50, house.x - 5.0 + 0.01), y, np.full(50, house.eave_z_m)])
     hits = hits_of_lines(scene_arrays(scene, max_lean=LEAN, margin_m=0.0), places, np.tile([LEAN, 0.0], (50, 1)))
@@ -220,7 +210,6 @@ def test_a_house_on_a_steep_slope_is_hit_by_lines_that_land_far_below_it(shift_m
 
 
 def test_beams_that_graze_the_terrain_are_refused_before_the_first_pulse() -> None:
-    terrain = Terrain(base_z_m=0.0, slope_y=1.0)
-    scene = Scene(name="cliff", origin=(0, 0, 0), crs=None, extent=(0, 0, 50, 50), terrain=terrain, buildings=())
+    scene = scene_on(Terrain(base_z_m=0.0, slope_y=1.0), 50)
     with pytest.raises(SettingsError, match=r"beams that lean 54 deg graze terrain of up to 45 deg: raise altitude_m"):
         scan_all(scene, ScannerSettings(altitude_m=50.0), 1)

@@ -9,6 +9,7 @@ from typing import cast
 import numpy as np
 import pytest
 import shapely
+from simulated import TWO_LEVELS, placed
 
 from pipeline.model import FloatArray
 from pipeline.roof.roof_type import roof_type
@@ -30,7 +31,6 @@ from pipeline.ruler.simulation.roofs import (
     RoofFaces,
     RoofShape,
 )
-from pipeline.ruler.simulation.scene import Building, Terrain, place_building
 from pipeline.ruler.simulation.solids import truth_record
 
 SHAPES = list(RoofShape)
@@ -51,13 +51,6 @@ def furnished(shape: RoofShape, seed: int) -> RoofDimensions:
     size = random_dimensions(shape, random)
     dormers = random_dormers(shape, size, random)
     return dataclasses.replace(size, additions=dormers + random_superstructures(shape, size, random, besides=dormers))
-
-
-def placed(shape: RoofShape, size: RoofDimensions, azimuth_deg: float = 33.0) -> Building:
-    terrain = Terrain(base_z_m=30.0)
-    return place_building(
-        "a", shape, size, at=(51.3, 47.9), azimuth_deg=azimuth_deg, eave_height_m=4.0, terrain=terrain
-    )
 
 
 def slope_of(pitch_deg: float) -> float:
@@ -203,15 +196,7 @@ def test_bare_roofs_are_continuous(shape: RoofShape) -> None:
 
 
 def test_flat_levels_have_steps_where_they_touch() -> None:
-    size = RoofDimensions(
-        length_m=20.0,
-        width_m=10.0,
-        levels=(
-            FlatPart(u_m=-5.0, v_m=0.0, length_m=10.0, width_m=10.0, height_m=3.0),
-            FlatPart(u_m=5.0, v_m=-1.0, length_m=10.0, width_m=8.0, height_m=0.0),
-        ),
-    )
-    roof = ROOFS[RoofShape.MULTI_LEVEL_FLAT](size)
+    roof = ROOFS[RoofShape.MULTI_LEVEL_FLAT](TWO_LEVELS)
     at_step = roof.vertices[np.abs(roof.vertices[:, 0]) < 1e-9]
     assert sorted(map(tuple, at_step.round(6).tolist())) == [
         *((0.0, -5.0, 0.0), (0.0, -5.0, 3.0), (0.0, 3.0, 0.0), (0.0, 3.0, 3.0), (0.0, 5.0, 3.0))
@@ -230,7 +215,7 @@ def test_symmetric_shapes_are_their_own_mirror_images(shape: RoofShape) -> None:
 @pytest.mark.parametrize("shape", SHAPES)
 def test_turning_the_building_turns_its_planes(shape: RoofShape) -> None:
     size = furnished(shape, 1)
-    here, there = placed(shape, size, 10.0), placed(shape, size, 83.0)
+    here, there = (placed(shape, size, azimuth_deg=azimuth_deg) for azimuth_deg in (10.0, 83.0))
     assert here.faces == there.faces
     assert here.groups == there.groups
     for plane, turned_plane in zip(here.planes, there.planes, strict=True):
@@ -342,14 +327,8 @@ def test_a_box_on_a_ridge_stands_over_its_highest_part() -> None:
 
 
 def test_dormers_on_hipped_ends_look_along_the_ridge() -> None:
-    size = RoofDimensions(
-        length_m=16.0,
-        width_m=12.0,
-        pitch_deg=40.0,
-        additions=(
-            Addition(kind=AdditionKind.PENT_DORMER, u_m=-5.5, v_m=0.0, length_m=2.4, width_m=1.6, height_m=1.2),
-        ),
-    )
+    dormer = Addition(kind=AdditionKind.PENT_DORMER, u_m=-5.5, v_m=0.0, length_m=2.4, width_m=1.6, height_m=1.2)
+    size = RoofDimensions(length_m=16.0, width_m=12.0, pitch_deg=40.0, additions=(dormer,))
     building = placed(RoofShape.HIP, size, azimuth_deg=90.0)  # the rear end looks west
     slopes = [(plane.slope_deg, plane.aspect_deg) for plane in building.planes]
     assert slopes[-1][0] < 30.0
@@ -370,6 +349,8 @@ def test_dormers_on_hipped_ends_look_along_the_ridge() -> None:
         (RoofShape.HALF_HIP, RoofDimensions(length_m=6, width_m=8, pitch_deg=30, break_share=0.9), "leave a ridge"),
         (RoofShape.BENT_HIP, RoofDimensions(length_m=9, width_m=8, pitch_deg=30, second_pitch_deg=40), "flatter"),
         (RoofShape.GAMBREL, RoofDimensions(length_m=9, width_m=8, pitch_deg=30, second_pitch_deg=40), "steeper"),
+        (RoofShape.HIP, RoofDimensions(length_m=5, width_m=6, pitch_deg=30), "has no ridge"),
+        (RoofShape.L_SHAPE, RoofDimensions(length_m=9, width_m=6, wing_width_m=6, wing_length_m=3), "does not fit"),
         (RoofShape.T_SHAPE, RoofDimensions(length_m=9, width_m=8, wing_width_m=9, wing_length_m=3), "does not fit"),
         (RoofShape.U_SHAPE, RoofDimensions(length_m=12, width_m=8, wing_width_m=6, wing_length_m=3), "no court"),
         (RoofShape.COURTYARD, RoofDimensions(length_m=12, width_m=8, wing_width_m=4), "leave no court"),
@@ -381,7 +362,11 @@ def test_impossible_roofs_are_refused(shape: RoofShape, size: RoofDimensions, me
         ROOFS[shape](size)
 
 
-def test_an_addition_needs_a_body() -> None:
+def test_sizes_that_make_no_roof_are_refused() -> None:
+    with pytest.raises(ValueError, match="no area"):
+        RoofDimensions(length_m=0.0, width_m=5.0)
+    with pytest.raises(ValueError, match="pitch_deg is 80"):
+        RoofDimensions(length_m=5.0, width_m=5.0, pitch_deg=80.0)
     with pytest.raises(ValueError, match="has no body"):
         Addition(kind=AdditionKind.BOX, u_m=0.0, v_m=0.0, length_m=1.0, width_m=1.0, height_m=0.0)
 

@@ -6,20 +6,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from simulated import placed, scene_on
 
 from pipeline.model import BoolArray, FloatArray
 from pipeline.ruler.simulation.als import ScanBlock, ScannerSettings, joined, reach_m, scan, scan_all, strip_count
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import (
-    Building,
-    FaultKind,
-    Scene,
-    SurveyFault,
-    Terrain,
-    WetSpot,
-    place_building,
-    undulating_terrain,
-)
+from pipeline.ruler.simulation.scene import FaultKind, Scene, SurveyFault, Terrain, WetSpot, undulating_terrain
 from pipeline.ruler.simulation.strips import flight_lines, lines_over
 from pipeline.ruler.simulation.town import town
 
@@ -36,9 +28,7 @@ SURVEY = ScannerSettings(
     wrong_row_lift_m=0.7,
 )
 TALLEST_M = 30.0
-FIELD = Scene(
-    name="field", origin=(0, 0, 0), crs=None, extent=(0, 0, 100, 100), terrain=Terrain(base_z_m=7.0), buildings=()
-)
+FIELD = scene_on(Terrain(base_z_m=7.0), 100)
 QUIET = ScannerSettings(range_noise_m=0.0, drop_out=0.0, altitude_m=2000.0, strip_spacing_m=60.0)
 
 
@@ -46,28 +36,17 @@ def tile_of(scene: Scene, extent: tuple[float, float, float, float], settings: S
     """What a tile must hold, and no more."""
     reach = reach_m(scene.terrain, extent, settings, TALLEST_M)
 
-    def is_near(x0: float, y0: float, x1: float, y1: float) -> bool:
+    def is_near(plan: FloatArray, radius_m: float = 0.0) -> bool:
+        (x0, y0), (x1, y1) = plan[:, :2].min(axis=0) - radius_m, plan[:, :2].max(axis=0) + radius_m
         return x0 < extent[2] + reach and y0 < extent[3] + reach and x1 > extent[0] - reach and y1 > extent[1] - reach
-
-    def around(plan: FloatArray) -> bool:
-        return is_near(*plan[:, :2].min(axis=0), *plan[:, :2].max(axis=0))
 
     return dataclasses.replace(
         scene,
         extent=extent,
-        buildings=tuple(one for one in scene.buildings if around(one.vertices)),
-        boxes=tuple(one for one in scene.boxes if around(one.corners)),
-        trees=tuple(
-            one
-            for one in scene.trees
-            if is_near(
-                one.x - one.crown_radius_m,
-                one.y - one.crown_radius_m,
-                one.x + one.crown_radius_m,
-                one.y + one.crown_radius_m,
-            )
-        ),
-        survey_faults=tuple(one for one in scene.survey_faults if is_near(*one.extent)),
+        buildings=tuple(one for one in scene.buildings if is_near(one.vertices)),
+        boxes=tuple(one for one in scene.boxes if is_near(one.corners)),
+        trees=tuple(one for one in scene.trees if is_near(np.array([[one.x, one.y]]), one.crown_radius_m)),
+        survey_faults=tuple(one for one in scene.survey_faults if is_near(np.reshape(one.extent, (2, 2)))),
     )
 
 
@@ -119,18 +98,12 @@ def test_the_tiles_of_a_survey_give_together_the_returns_of_the_whole(azimuth_de
 def test_tiles_of_a_steep_survey_hold_what_their_beams_can_reach() -> None:
     random = np.random.default_rng(8)
     terrain = undulating_terrain(100.0, 25.0, 100.0, 2.0, 200.0, random)
+    size = RoofDimensions(length_m=12.0, width_m=9.0, pitch_deg=35.0)
     houses = tuple(
-        place_building(
-            f"{k}",
-            RoofShape.GABLE,
-            RoofDimensions(length_m=12.0, width_m=9.0, pitch_deg=35.0),
-            at=(float(x), float(y)),
-            azimuth_deg=float(random.uniform(0, 360)),
-            eave_height_m=4.0,
-            terrain=terrain,
-        )
-        for k, (x, y) in enumerate(random.uniform(10, 150, (30, 2)))
+        placed(RoofShape.GABLE, size, at=(x, y), azimuth_deg=float(random.uniform(0, 360)), terrain=terrain)
+        for x, y in random.uniform(10, 150, (30, 2)).tolist()
     )
+    houses = tuple(dataclasses.replace(one, building_id=str(k)) for k, one in enumerate(houses))
     scene = dataclasses.replace(TOWN, terrain=terrain, buildings=houses, trees=(), boxes=())
     settings = dataclasses.replace(SURVEY, altitude_m=300.0)
     whole = scan_all(scene, settings, 1)
@@ -159,25 +132,16 @@ def test_a_scene_of_its_own_is_scanned_as_its_own_survey() -> None:
     assert rows(scan_all(plain, SURVEY, 2), plain) == rows(scan_all(as_tile, SURVEY, 2), as_tile)
 
 
-def hall(wet_spots: tuple[WetSpot, ...] = ()) -> Building:
-    """A flat roof of 30 x 20 m over the field."""
-    dry = place_building(
-        "hall",
-        RoofShape.FLAT,
-        RoofDimensions(length_m=30.0, width_m=20.0),
-        at=(50.0, 50.0),
-        azimuth_deg=90.0,
-        eave_height_m=6.0,
-        terrain=FIELD.terrain,
-    )
-    return dataclasses.replace(dry, wet_spots=wet_spots)
+def with_hall(*wet_spots: WetSpot) -> Scene:
+    """The field with a flat roof of 30 x 20 m."""
+    size, stand = RoofDimensions(length_m=30.0, width_m=20.0), {"azimuth_deg": 90.0, "eave_height_m": 6.0}
+    dry = placed(RoofShape.FLAT, size, at=(50.0, 50.0), terrain=FIELD.terrain, **stand)
+    return dataclasses.replace(FIELD, buildings=(dataclasses.replace(dry, wet_spots=wet_spots),))
 
 
 def test_a_wet_spot_takes_the_returns_of_its_roof_and_no_others() -> None:
     spots = (WetSpot(x=45.0, y=52.0, radius_m=3.0), WetSpot(x=65.0, y=50.0, radius_m=2.5))
-    dry_scene = dataclasses.replace(FIELD, buildings=(hall(),))
-    wet_scene = dataclasses.replace(FIELD, buildings=(hall(spots),))
-    dry, wet = scan_all(dry_scene, QUIET, 1), scan_all(wet_scene, QUIET, 1)
+    dry, wet = scan_all(with_hall(), QUIET, 1), scan_all(with_hall(*spots), QUIET, 1)
     roof = np.isin(dry.building, 0) & (dry.face == 0)
 
     def in_spot(xyz: FloatArray) -> BoolArray:
@@ -189,8 +153,7 @@ def test_a_wet_spot_takes_the_returns_of_its_roof_and_no_others() -> None:
     taken = in_spot(dry.points.xyz)
     assert (taken & roof).sum() > 200
     assert (taken & ~roof).sum() > 50  # the second spot reaches over the edge of the roof
-    left = rows(wet, wet_scene)
-    kept = {row[3:6] for row in left}
+    kept = {row[3:6] for row in rows(wet, with_hall(*spots))}
     single = dry.points.return_count == 1
     expected = [tuple(xyz) for xyz in dry.points.xyz[single & ~(taken & roof) & ~dry.mixed].tolist()]
     assert kept >= set(expected)
@@ -200,7 +163,7 @@ def test_a_wet_spot_takes_the_returns_of_its_roof_and_no_others() -> None:
 
 def test_a_wet_roof_does_not_hide_what_lies_beside_it_in_a_beam() -> None:
     """Half of a beam at the eave still gives the return of the ground."""
-    drowned = dataclasses.replace(FIELD, buildings=(hall((WetSpot(x=50.0, y=50.0, radius_m=60.0),)),))
+    drowned = with_hall(WetSpot(x=50.0, y=50.0, radius_m=60.0))
     block = scan_all(drowned, dataclasses.replace(QUIET, beam_radius_m=0.5), 1)
     assert not (block.face == 0).any()
     x, y = block.points.xyz[:, 0], block.points.xyz[:, 1]
