@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -16,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 from labels import labels_of
+from measured import printed
 
 from pipeline.errors import SettingsError
 from pipeline.model import FloatArray
@@ -210,16 +209,7 @@ def test_a_city_is_written_in_bounded_memory(tmp_path: Path) -> None:
         "made = simulate('city', sys.argv[1], 1000, size_m=(float(sys.argv[2]),) * 2, density_per_m2=6.0)\n"
         "print(made.points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
     )
-    figures = []
-    for size in (500, 1000):
-        done = subprocess.run(
-            [sys.executable, "-c", program, str(tmp_path / str(size)), str(size)],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        figures.append([int(word) for word in done.stdout.split()])
-    (few, small_kb), (many, large_kb) = figures
+    (few, small_kb), (many, large_kb) = (map(int, printed(program, tmp_path / f"{m}", m)) for m in (500, 1000))
     assert many > 3.6 * few
     assert large_kb - small_kb < 100_000
     assert large_kb < 1_500_000

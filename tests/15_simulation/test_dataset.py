@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import laspy
@@ -14,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 from labels import labels_of
+from measured import printed
 
 from pipeline.errors import InputError, SettingsError
 from pipeline.io import open_source
@@ -223,13 +222,7 @@ def test_ten_million_points_are_streamed_in_bounded_memory(tmp_path: Path) -> No
         "made = simulate('town', sys.argv[1], size_m=(float(sys.argv[2]),) * 2, output=Output(chunk_points=500_000))\n"
         "print(made.points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
     )
-    figures = []
-    for size in (350, 1100):
-        done = subprocess.run(
-            [sys.executable, "-c", program, str(tmp_path), str(size)], capture_output=True, text=True, check=True
-        )
-        figures.append([int(word) for word in done.stdout.split()])
-    (few, small_kb), (many, large_kb) = figures
+    (few, small_kb), (many, large_kb) = (map(int, printed(program, tmp_path, size)) for size in (350, 1100))
     assert few < 1_200_000
     assert many > 9_000_000
     assert large_kb - small_kb < 300_000

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import geopandas
 import numpy as np
 import pandas as pd
 import pytest
 import shapely
+from measured import printed
 from shapely import LineString, MultiPolygon, Point, Polygon, box
 from shapely.affinity import scale
 
@@ -212,8 +211,7 @@ def test_the_delft_footprints_read_as_geopandas_reads_them(shared_data):
 def test_importing_the_reader_needs_neither_pandas_nor_the_format_libraries():
     heavy = ("pandas", "geopandas", "pyogrio", "laspy", "scipy", "pyproj")
     code = f"import sys, pipeline.io; print([m for m in {heavy} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert printed(code) == ["[]"]
 
 
 # --- files that cover more than the data ------------------------------------------------------------------------------
@@ -289,14 +287,7 @@ def test_of_a_file_of_a_whole_country_only_a_little_is_held(tmp_path, suffix):
         "found = read_footprints(sys.argv[1], SpatialReference(), area=area); "
         "print(len(found), found.elsewhere, peak() - before)"
     )
-
-    def read(what):
-        command = [sys.executable, "-c", code, str(path), what]
-        return [
-            int(word) for word in subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
-        ]
-
-    near, whole = read("near"), read("all")
+    near, whole = ([int(word) for word in printed(code, path, what)] for what in ("near", "all"))
     assert (near[0] + near[1], whole[0], whole[1]) == (100_000, 100_000, 0)
     assert 25 <= near[0] <= 400
     assert near[2] < whole[2] / 2

@@ -210,7 +210,7 @@ nearly_roofs = st.tuples(some_sums, st.sets(st.sampled_from(list(Sum)), max_size
 def test_many_surfaces_are_judged_like_each_on_its_own(
     rows: list[dict[Sum, int]], kinds: list[FacetKind], somewhere: list[bool]
 ) -> None:
-    surfaces = surfaces_of(rows, [], [int(kind) for kind in kinds[: len(rows)]])
+    surfaces = surfaces_of(rows, [], kinds[: len(rows)])
     surfaces.lowest_point_mm[~np.array(somewhere[: len(rows)])] = NOWHERE
     found = judge_surfaces(surfaces, SETTINGS)
     for k, kind in enumerate(kinds[: len(rows)]):
@@ -228,10 +228,14 @@ def test_many_surfaces_are_judged_like_each_on_its_own(
 # -- levels ------------------------------------------------------------------------------------------------------------
 
 
-def surfaces_of(rows: list[dict[Sum, int]], along: list[tuple[int, int]], kinds: list[int] | None = None) -> Surfaces:
+def surfaces_of(
+    rows: list[dict[Sum, int]], along: list[tuple[int, int]], kinds: list[FacetKind] | None = None
+) -> Surfaces:
+    """Surfaces of these sums: steps and objects, unless the kinds are given."""
     count = len(rows)
+    usual = [FacetKind.STEP if row is STEP_ROW else FacetKind.OBJECT for row in rows]
     return Surfaces(
-        kind=np.array([FacetKind.OBJECT] * count if kinds is None else kinds, np.int8),
+        kind=np.array(usual if kinds is None else kinds, np.int8),
         sums=np.array([sums_of(changes) for changes in rows]).reshape(count, N_SUMS),
         boxes_mm=np.zeros((count, 4), np.int64),
         lowest_point_mm=np.array([[1000 * k, 0, 0] for k in range(count)], np.int64).reshape(count, 3),
@@ -245,52 +249,44 @@ def leaders(surfaces: Surfaces) -> list[int]:
 
 DORMER = {Sum.AREA2: 12_000_000, Sum.BOUNDARY: 10_000, Sum.WALL: 9000, Sum.WALL_TOP: 9000, Sum.STEP: 9000}
 STEP_ROW = {Sum.AREA2: 1_000_000}
+STOREYS = [{Sum.STEP: 30_000, Sum.AREA2: area2} for area2 in (60_000_000, 120_000_000, 200_000_000)]
 
 
-def test_a_dormer_joins_the_roof_across_its_step() -> None:
-    surfaces = surfaces_of([{}, DORMER, STEP_ROW], [(0, 2), (1, 2)], [3, 3, 5])
-    assert judge_surface(3, surfaces.sums[1], SETTINGS) is not None
-    assert leaders(surfaces) == [0, 0, -1]
-
-
-def test_a_dormer_joins_the_largest_of_the_roofs_beside_it() -> None:
-    rows = [{Sum.AREA2: 150_000_000}, {}, DORMER, STEP_ROW, STEP_ROW]
-    assert leaders(surfaces_of(rows, [(1, 3), (2, 3), (2, 4), (0, 4)], [3, 3, 3, 5, 5])) == [0, 1, 1, -1, -1]
+def test_a_dormer_alone_is_no_candidate() -> None:
+    assert judge_surface(FacetKind.OBJECT, sums_of(DORMER), SETTINGS) is not None
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("one", "other", "expected"),
     [
-        {Sum.STEP: 4900},
-        {Sum.HEIGHT: 400 * 1900},
-        {Sum.PLANAR: 10, Sum.ROUGH: 90},
-        {Sum.CANOPY: 3000},
+        ({}, DORMER, [0, 0]),
+        # what is hardly along steps, or like no roof, stays out
+        ({}, {**DORMER, Sum.STEP: 4900}, [0, -1]),
+        ({}, {**DORMER, Sum.HEIGHT: 400 * 1900}, [0, -1]),
+        ({}, {**DORMER, Sum.PLANAR: 10, Sum.ROUGH: 90}, [0, -1]),
+        ({}, {**DORMER, Sum.CANOPY: 3000}, [0, -1]),
+        # two equal roofs join at the smaller point
+        ({Sum.STEP: 30_000}, {Sum.STEP: 30_000}, [0, 0]),
+        # a candidate beside something that is none leads itself
+        ({Sum.PLANAR: 0, Sum.ROUGH: 100, Sum.AREA2: 800_000_000}, {Sum.STEP: 40_000}, [-1, 1]),
     ],
 )
-def test_what_is_hardly_along_steps_or_like_no_roof_stays_out(changes: dict[Sum, int]) -> None:
-    assert leaders(surfaces_of([{}, {**DORMER, **changes}, STEP_ROW], [(0, 2), (1, 2)], [3, 3, 5])) == [0, -1, -1]
+def test_two_surfaces_across_a_step_join_where_both_are_like_roofs(
+    one: dict[Sum, int], other: dict[Sum, int], expected: list[int]
+) -> None:
+    assert leaders(surfaces_of([one, other, STEP_ROW], [(0, 2), (1, 2)])) == [*expected, -1]
 
 
-def test_a_chain_of_storeys_ends_at_the_largest() -> None:
-    storey = {Sum.STEP: 30_000}
-    rows = [
-        {**storey, Sum.AREA2: 60_000_000},
-        {**storey, Sum.AREA2: 120_000_000},
-        {**storey, Sum.AREA2: 200_000_000},
-        STEP_ROW,
-        STEP_ROW,
-    ]
-    assert leaders(surfaces_of(rows, [(0, 3), (1, 3), (1, 4), (2, 4)], [3, 3, 3, 5, 5])) == [2, 2, 2, -1, -1]
-
-
-def test_two_equal_roofs_across_a_step_join_at_the_smaller_point() -> None:
-    rows = [{Sum.STEP: 30_000}, {Sum.STEP: 30_000}, STEP_ROW]
-    assert leaders(surfaces_of(rows, [(0, 2), (1, 2)], [3, 3, 5])) == [0, 0, -1]
-
-
-def test_a_candidate_beside_something_that_is_none_leads_itself() -> None:
-    rows = [{Sum.PLANAR: 0, Sum.ROUGH: 100, Sum.AREA2: 800_000_000}, {Sum.STEP: 40_000}, STEP_ROW]
-    assert leaders(surfaces_of(rows, [(0, 2), (1, 2)], [3, 3, 5])) == [-1, 1, -1]
+@pytest.mark.parametrize(
+    ("rows", "along", "expected"),
+    [
+        ([{Sum.AREA2: 150_000_000}, {}, DORMER], [(1, 3), (2, 3), (2, 4), (0, 4)], [0, 1, 1]),
+        (STOREYS, [(0, 3), (1, 3), (1, 4), (2, 4)], [2, 2, 2]),
+    ],
+    ids=["of the roofs beside a dormer", "of a chain of storeys"],
+)
+def test_the_largest_leads(rows: list[dict[Sum, int]], along: list[tuple[int, int]], expected: list[int]) -> None:
+    assert leaders(surfaces_of([*rows, STEP_ROW, STEP_ROW], along)) == [*expected, -1, -1]
 
 
 def test_no_surfaces_have_no_leaders() -> None:
@@ -312,7 +308,7 @@ scenes = st.lists(
 def drawn(members: list[tuple[int, int, int, FacetKind]], links: list[tuple[int, int]]) -> Surfaces:
     """Surfaces first, then four steps."""
     rows = [{Sum.AREA2: area, Sum.STEP: step, Sum.WALL_TOP: top} for area, step, top, _ in members]
-    kinds = [int(kind) for *_, kind in members] + [int(FacetKind.STEP)] * 4
+    kinds = [*(kind for *_, kind in members), *[FacetKind.STEP] * 4]
     along = sorted({(s % len(members), len(members) + step) for s, step in links})
     return surfaces_of([*rows, *[STEP_ROW] * 4], along, kinds)
 

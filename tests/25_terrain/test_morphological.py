@@ -230,15 +230,6 @@ def test_the_corner_of_a_hall_is_a_wide_object_where_the_first_openings_cut_it_o
     np.testing.assert_array_equal(found, expected)
 
 
-def test_a_hall_that_the_corner_of_the_data_cuts_is_no_ground_to_its_own_corner() -> None:
-    c, r = coordinates(150, 150)
-    u, v = (c + r) / math.sqrt(2.0), (c - r) / math.sqrt(2.0)
-    hall = (u < 25) & (v < 12)
-    found = ground_cells(millimetres(np.where(hall, 3.4, 0.01 * r), 20.0))
-    assert found[hall].mean() < 0.02
-    assert found[~hall].mean() > 0.99
-
-
 # -- the whole filter --------------------------------------------------------------------------------------------------
 
 
@@ -262,21 +253,23 @@ def test_a_block_is_cut_off_whole_and_the_ground_around_it_stays(size: tuple[int
     assert found[~block].mean() > 0.99
 
 
-def test_a_hall_that_the_edge_of_the_data_cuts_is_no_ground() -> None:
+def test_a_hall_that_the_edge_or_corner_of_the_data_cuts_is_no_ground_to_its_own_corner() -> None:
     c, r = coordinates(200, 200)
-    hall = (c < 45) & (np.abs(r - 100) < 40)
-    found = ground_cells(millimetres(np.where(hall, 9.0, 0.02 * r), 20.0))
-    assert found[hall].mean() < 0.02
-    assert found[~hall].mean() > 0.99
+    at_edge, at_corner = (c < 45) & (np.abs(r - 100) < 40), (c + r < 25 * math.sqrt(2)) & (c - r < 12 * math.sqrt(2))
+    for hall, height, slope in ((at_edge, 9.0, 0.02), (at_corner, 3.4, 0.01)):
+        found = ground_cells(millimetres(np.where(hall, height, slope * r), 20.0))
+        assert found[hall].mean() < 0.02
+        assert found[~hall].mean() > 0.99
 
 
-def test_hills_dams_and_cuttings_stay_ground() -> None:
+def test_hills_dams_and_cuttings_stay_ground_and_terraces_to_their_rims() -> None:
     c, r = coordinates(260, 260)
     hill = 20.0 * np.exp(-((c - 70) ** 2 + (r - 70) ** 2) / (2 * 22.0**2))
     dam = 6.0 - np.clip((np.abs(c - 180 - 0.15 * r) - 6.0) / 1.5, 0.0, 6.0)
     cutting = -4.0 + np.clip((np.abs(r - 215) - 5.0) / 1.5, 0.0, 4.0)
     found = ground_cells(millimetres(hill + np.where(c > 120, dam, 0.0) + cutting, 30.0))
     assert found.mean() > 0.99
+    assert ground_cells(millimetres(2.0 * np.floor(c / 12.0) + 0.05 * c, 30.0)).mean() > 0.97
 
 
 def test_a_house_and_low_bushes_on_a_slope_of_30_degrees_are_not_ground() -> None:
@@ -290,12 +283,6 @@ def test_a_house_and_low_bushes_on_a_slope_of_30_degrees_are_not_ground() -> Non
     assert not found[house].any()
     assert found[bush].mean() < 0.03
     assert found[~house & ~bush].mean() > 0.98
-
-
-def test_terraces_stay_ground_to_their_rims() -> None:
-    c, _ = coordinates(130, 130)
-    found = ground_cells(millimetres(2.0 * np.floor(c / 12.0) + 0.05 * c, 30.0))
-    assert found.mean() > 0.97
 
 
 def test_a_spur_of_a_plateau_that_narrows_grows_back_from_the_plateau() -> None:

@@ -53,34 +53,37 @@ def test_it_agrees_with_each_point_against_each_other(
     assert kept.tolist() == slow_twin(cloud, round(cube_m * 1000), min_neighbours)
 
 
-def test_it_agrees_with_a_convolution_of_the_counts() -> None:
-    random = np.random.default_rng(3)
-    cloud = random.integers(-60_000, 60_000, (6000, 3))
-    cubes = np.floor_divide(cloud, 5000) + 12
-    counts = np.zeros((24, 24, 24), np.int64)
+@pytest.mark.parametrize(("n", "low_mm", "cube_m", "few"), [(6000, -60_000, 5.0, 12), (60_000, 0, 2.0, 8)])
+def test_it_agrees_with_a_convolution_of_the_counts_also_where_a_table_of_many_cubes_grows(
+    n: int, low_mm: int, cube_m: float, few: int
+) -> None:
+    cloud = np.random.default_rng(3).integers(low_mm, low_mm + 120_000, (n, 3))
+    cubes = (cloud - low_mm) // round(cube_m * 1000)
+    counts = np.zeros((round(120 / cube_m),) * 3, np.int64)
     np.add.at(counts, tuple(cubes.T), 1)
+    assert n == 6000 or (counts > 0).sum() > 40_000
     around = convolve(counts, np.ones((3, 3, 3), np.int64), mode="constant")
-    expected = around[tuple(cubes.T)] - 1 >= 12
+    expected = around[tuple(cubes.T)] - 1 >= few
     assert 0.1 < expected.mean() < 0.9
-    np.testing.assert_array_equal(kept_of(cloud, OutlierSettings(min_neighbours=12)), expected)
+    np.testing.assert_array_equal(kept_of(cloud, OutlierSettings(cube_m=cube_m, min_neighbours=few)), expected)
 
 
-def test_points_far_below_and_above_a_town_are_dropped_and_the_town_stays() -> None:
-    random = np.random.default_rng(1)
-    cloud = town(random)
+def test_points_far_below_above_and_away_are_dropped_without_memory_for_the_cubes_between_and_the_town_stays() -> None:
+    cloud = town(np.random.default_rng(1))
     strays = cloud[[5, 700, 1400, 2100]].copy()
     strays[:, 2] += [-180_000, 180_000, -180_000, 180_000]
-    kept = kept_of(np.concatenate((cloud, strays)))
-    assert kept[: len(cloud)].all()
-    assert not kept[len(cloud) :].any()
+    for outside in (strays, [[10**9, 10**9, 2 * 10**9]]):
+        kept = kept_of(np.concatenate((cloud, outside)))
+        assert kept[: len(cloud)].all()
+        assert not kept[len(cloud) :].any()
 
 
-def test_a_lone_pair_is_dropped_and_five_close_points_stay() -> None:
-    pair = np.array([[0, 0, 0], [10, 10, 10]])
-    assert not kept_of(pair).any()
+def test_up_to_four_close_points_are_dropped_and_five_stay() -> None:
     five = np.column_stack((np.arange(5) * 100, np.zeros((5, 2), np.int64))).astype(np.int64)
     assert kept_of(five).all()
-    assert not kept_of(five[:4]).any()
+    for count in (1, 2, 4):
+        assert not kept_of(five[:count]).any()
+    assert kept_of(five[:1], OutlierSettings(min_neighbours=0)).all()
 
 
 @settings(deadline=None, max_examples=examples(25))
@@ -109,29 +112,10 @@ def test_the_decision_looks_no_further_than_its_support() -> None:
     np.testing.assert_array_equal(cut[inner], expected[inner])
 
 
-def test_a_table_of_many_cubes_grows_and_agrees_with_the_convolution() -> None:
-    random = np.random.default_rng(5)
-    cloud = random.integers(0, 120_000, (60_000, 3))
-    cubes = cloud // 2000
-    counts = np.zeros((60, 60, 60), np.int64)
-    np.add.at(counts, tuple(cubes.T), 1)
-    assert (counts > 0).sum() > 40_000
-    around = convolve(counts, np.ones((3, 3, 3), np.int64), mode="constant")
-    expected = around[tuple(cubes.T)] - 1 >= 8
-    assert 0.1 < expected.mean() < 0.9
-    np.testing.assert_array_equal(kept_of(cloud, OutlierSettings(cube_m=2.0, min_neighbours=8)), expected)
-
-
 def test_no_points_give_an_empty_mask() -> None:
     kept = kept_of(np.empty((0, 3), np.int64))
     assert kept.shape == (0,)
     assert kept.dtype == np.bool_
-
-
-def test_a_single_point_is_an_outlier_unless_no_neighbour_is_required() -> None:
-    point = np.array([[1, 2, 3]])
-    assert not kept_of(point)[0]
-    assert kept_of(point, OutlierSettings(min_neighbours=0))[0]
 
 
 def test_cubes_out_of_range_are_refused() -> None:
@@ -160,10 +144,3 @@ def test_borders_of_cubes_are_the_same_in_an_array_and_in_a_table(
         np.testing.assert_array_equal(dense_enough(x, y, z, OutlierSettings(cube_m=cube_m, min_neighbours=few)), table)
     assert not table.all()
     assert table.any()
-
-
-def test_a_stray_far_off_costs_no_memory() -> None:
-    cloud = np.concatenate((town(np.random.default_rng(8)), [[10**9, 10**9, 2 * 10**9]]))
-    kept = kept_of(cloud)
-    assert kept[:-1].all()
-    assert not kept[-1]

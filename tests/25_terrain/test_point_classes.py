@@ -118,12 +118,6 @@ def test_roof_wall_chimney_and_ground_get_their_classes() -> None:
     assert classes(ROOF, GROUND, wall, chimney) == [[6], [2], [6], [6]]
 
 
-def test_a_crown_above_the_roof_is_vegetation_though_it_is_no_higher_than_a_chimney() -> None:
-    rng = np.random.default_rng(1)
-    crown = rng.uniform(1, 7, 300), rng.uniform(1, 7, 300), rng.uniform(7.5, 8.4, 300), {"echoes": True}
-    assert classes(ROOF, GROUND, crown)[2] == [PointClass.VEGETATION]
-
-
 def test_a_hedge_beside_a_wall_is_vegetation_but_what_hangs_under_the_eaves_is_not() -> None:
     rng = np.random.default_rng(1)
     across, height = rng.uniform(1, 7, 300), rng.uniform(2.2, 4.5, 300)
@@ -146,11 +140,12 @@ def test_a_mast_is_building_up_to_a_height_above_the_roof() -> None:
     assert set(found[plate[1] == 2].tolist()) == {PointClass.BUILDING}
 
 
-def test_a_tree_is_vegetation_with_echoes_or_without() -> None:
+def test_a_tree_is_vegetation_with_echoes_or_without_and_a_crown_above_the_roof_no_higher_than_a_chimney() -> None:
     rng = np.random.default_rng(3)
-    for echoes in (True, False):
-        tree = rng.uniform(11, 16, 400), rng.uniform(0, 5, 400), rng.uniform(3, 8, 400), {"echoes": echoes}
-        assert classes(ROOF, GROUND, tree)[2] == [PointClass.VEGETATION]
+    crown = rng.uniform(1, 7, 300), rng.uniform(1, 7, 300), rng.uniform(7.5, 8.4, 300), {"echoes": True}
+    tree = rng.uniform(11, 16, 400), rng.uniform(0, 5, 400), rng.uniform(3, 8, 400)
+    for part in (crown, (*tree, {"echoes": True}), (*tree, {"echoes": False})):
+        assert classes(ROOF, GROUND, part)[2] == [PointClass.VEGETATION]
 
 
 def test_smooth_things_without_echoes_are_no_vegetation() -> None:
@@ -159,31 +154,23 @@ def test_smooth_things_without_echoes_are_no_vegetation() -> None:
     assert classes(ROOF, GROUND, container, car)[2:] == [[PointClass.OTHER], [PointClass.OTHER]]
 
 
-def test_few_points_far_below_the_terrain_are_noise_and_a_pit_is_ground() -> None:
+def test_few_points_far_below_the_terrain_are_noise_and_a_pit_and_a_lonely_point_on_it_are_ground() -> None:
     lonely = np.full(3, 14.0), np.array([3.0, 3.1, 3.2]), -4.0, {}
     pit = (*grid(10, 8, 14, 12), -4.0, {})
     bird = np.full(1, 4.0), np.full(1, 4.0), 60.0, {"outlier": True}
-    assert classes(ROOF, GROUND, lonely, pit, bird)[2:] == [[7], [2], [7]]
+    on_terrain = np.full(1, 40.0), np.full(1, 40.0), 0.1, {"outlier": True}
+    assert classes(ROOF, GROUND, lonely, pit, bird, on_terrain)[2:] == [[7], [2], [7], [2]]
 
 
-def test_noise_looks_no_farther_than_its_box() -> None:
+def test_noise_looks_no_farther_than_its_box_and_must_lie_lower_on_a_slope() -> None:
     x, y, deep = np.arange(4) * PIT_REACH_MM, np.zeros(4, np.int64), np.full(4, -DEEP_MM - 1)
     none, level = np.zeros(4, np.bool_), np.zeros(4, np.int64)
     assert noise_of(x, y, deep, level, none).all()
     assert not noise_of(x, y, deep + 1, level, none).any()
     assert not noise_of(x // 4, y, deep, level, none).any()
-
-
-def test_a_lonely_point_on_the_terrain_is_ground() -> None:
-    lonely = np.full(1, 40.0), np.full(1, 40.0), 0.1, {"outlier": True}
-    assert classes(ROOF, GROUND, lonely)[2] == [PointClass.GROUND]
-
-
-def test_on_a_slope_noise_must_lie_lower() -> None:
-    x, y, none = np.arange(2) * 9000, np.zeros(2, np.int64), np.zeros(2, np.bool_)
-    rise = np.full(2, 500)
-    lowest = -DEEP_MM - 500 * PIT_REACH_MM // 1000
-    assert noise_of(x, y, np.array([lowest, lowest - 1]), rise, none).tolist() == [False, True]
+    lowest = deep + 1 - 500 * PIT_REACH_MM // 1000
+    assert not noise_of(9 * x, y, lowest, level + 500, none).any()
+    assert noise_of(9 * x, y, lowest - 1, level + 500, none).all()
 
 
 def test_without_terrain_only_buildings_and_vegetation_are_known() -> None:

@@ -185,9 +185,8 @@ def test_facet_kinds_agree_with_a_slow_twin() -> None:
 
 def test_facet_kinds_do_not_depend_on_the_first_vertex() -> None:
     scene = built(town, seed=4)
-    turned = dataclasses.replace(
-        scene, tin=Tin(facets=np.roll(scene.tin.facets, 1, axis=1), neighbours=scene.tin.neighbours)
-    )
+    tin = Tin(facets=np.roll(scene.tin.facets, 1, axis=1), neighbours=scene.tin.neighbours)
+    turned = dataclasses.replace(scene, tin=tin)
     np.testing.assert_array_equal(turned.facet_kinds(), scene.facet_kinds())
 
 
@@ -398,15 +397,10 @@ def test_points_inside_facets_are_assigned_as_a_slow_twin_does() -> None:
             expected = ranked[0][2] if ranked and ranked[0][0] <= 1000 else -1
         assert labels[i] == expected
         seen.add((int(kinds[f]), expected >= 0))
-    assert {
-        (FacetKind.OBJECT, True),
-        (FacetKind.OBJECT, False),
-        (FacetKind.BORDER, True),
-        (FacetKind.STEP, True),
-    } <= seen
-    np.testing.assert_array_equal(
-        fragments.sums[:, Sum.POINTS], np.bincount(labels[labels >= 0], minlength=len(fragments.kind))
-    )
+    assert {(kind, True) for kind in (FacetKind.OBJECT, FacetKind.BORDER, FacetKind.STEP)} <= seen
+    assert (FacetKind.OBJECT, False) in seen
+    counts = np.bincount(labels[labels >= 0], minlength=len(fragments.kind))
+    np.testing.assert_array_equal(fragments.sums[:, Sum.POINTS], counts)
 
 
 def test_earlier_returns_above_a_surface_are_its_canopy_and_no_points_of_it() -> None:
@@ -508,20 +502,9 @@ def test_a_shift_changes_nothing_but_coordinates() -> None:
 
 
 def test_a_scene_of_two_points_has_no_fragments() -> None:
-    nothing = np.zeros(2, np.int64)
-    x = np.array([0, 1000])
-    vertices = SceneVertices(
-        x_mm=x, y_mm=nothing, z_mm=nothing, height_mm=nothing, kind=np.zeros(2, np.int8), planar=np.zeros(2, np.int8)
-    )
-    points = ScenePoints(
-        x_mm=x,
-        y_mm=nothing,
-        z_mm=nothing + 3000,
-        height_mm=nothing + 3000,
-        last=np.ones(2, np.bool_),
-        allowed=np.ones(2, np.int8),
-    )
-    tin = triangulate(np.column_stack((x, nothing)))
-    fragments, labels = fragments_of(tin, vertices, points, EVERYWHERE, SETTINGS, canopy_m=1.0, ground_m=0.5)
+    scene = built(lambda x, _: np.full(len(x), 3.0))
+    vertices, points = (type(part)(*(values[:2] for values in part)) for part in (scene.vertices, scene.points))
+    tin = triangulate(np.column_stack((vertices.x_mm, vertices.y_mm)))
+    fragments, labels = Scene(vertices=vertices, tin=tin, points=points).cut()
     assert len(fragments.kind) == len(fragments.sums) == len(fragments.crossing_keys) == 0
     assert labels.tolist() == [-1, -1]

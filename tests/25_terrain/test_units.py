@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -247,23 +248,21 @@ def test_units_are_numbered_by_their_smallest_points() -> None:
     assert first == sorted(first)
 
 
-def test_gutters_part_only_where_ridges_count() -> None:
-    cloud = cloud_of(_parallel_gables)
-    assert cloud.units(UnitSettings(split="steps")).max() == 0
-    assert cloud_of(_row((6.0, 7.0))).units(UnitSettings(split="steps")).max() == 1
-    assert cloud_of(_row((6.0, 7.0))).units(UnitSettings(split="nothing")).max() == 0
-
-
-def test_steps_below_the_least_step_do_not_part() -> None:
-    cloud = cloud_of(_row((6.0, 6.6)))
-    assert cloud.units(UnitSettings(min_step_m=0.5)).max() == 1
-    assert cloud.units(UnitSettings(min_step_m=0.8)).max() == 0
-
-
-def test_a_unit_below_the_least_area_joins_its_neighbour() -> None:
-    cloud = cloud_of(_row((6.0, 7.0)))
-    assert cloud.units(UnitSettings(min_area_m2=60.0)).max() == 1
-    assert cloud.units(UnitSettings(min_area_m2=90.0)).max() == 0
+@pytest.mark.parametrize(
+    ("roof", "own", "last"),
+    [
+        (_parallel_gables, {"split": "steps"}, 0),  # gutters part only where ridges count
+        (_row((6.0, 7.0)), {"split": "steps"}, 1),
+        (_row((6.0, 7.0)), {"split": "nothing"}, 0),
+        (_row((6.0, 6.6)), {"min_step_m": 0.5}, 1),
+        (_row((6.0, 6.6)), {"min_step_m": 0.8}, 0),
+        (_row((6.0, 7.0)), {"min_area_m2": 60.0}, 1),
+        (_row((6.0, 7.0)), {"min_area_m2": 90.0}, 0),  # too small a unit joins its neighbour
+        (_lower_wing, {"annex_share": 0.0}, 1),
+    ],
+)
+def test_the_settings_say_what_parts_units(roof: Roof, own: dict[str, Any], last: int) -> None:
+    assert cloud_of(roof).units(UnitSettings(**own)).max() == last
 
 
 def test_a_gap_in_the_data_parts_nothing() -> None:
@@ -280,10 +279,6 @@ def test_a_gap_in_sparse_data_parts_nothing_though_it_is_hardly_wider_than_the_p
     x, y = (v.ravel() for v in np.meshgrid(2200 * np.arange(14, dtype=np.int64), 2200 * np.arange(9, dtype=np.int64)))
     x[x > 14_000] += 3800
     assert units_of(x, y, np.full(len(x), 8000), SETTINGS).max() == 0
-
-
-def test_an_annex_is_a_unit_of_its_own_where_the_settings_say_so() -> None:
-    assert cloud_of(_lower_wing).units(UnitSettings(annex_share=0.0)).max() == 1
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 13, 40])
