@@ -40,23 +40,6 @@ class Clustering:
     """Epochs until nothing changed any more, or the limit."""
 
 
-def vector_degree_of_match(template: npt.ArrayLike, vector: npt.ArrayLike) -> float:
-    """VDM of Eq. 3, product of the module and the angle degree of match: in [0, 1], 1 for equal vectors; symmetric.
-
-    `template` and `vector`, shape (3,), are T and X. Where one of them is the zero vector nothing matches: 0.
-    """
-    t, x = np.asarray(template, np.float64), np.asarray(vector, np.float64)
-    t_module, x_module = math.sqrt(_dot(t, t)), math.sqrt(_dot(x, x))
-    if t_module == 0.0 or x_module == 0.0:
-        return 0.0
-    cosine = _dot(t, x) / (t_module * x_module)
-    return float(_module_degree(t_module, x_module) * _angle_degree(cosine))
-
-
-def _dot(t: FloatArray, x: FloatArray) -> float:
-    return float(t[0] * x[0] + t[1] * x[1] + t[2] * x[2])
-
-
 @kernel
 def _module_degree(t_module: float, x_module: float) -> float:
     """MDM of Eq. 4."""

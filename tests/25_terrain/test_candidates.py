@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from slow_join import slowly_judged
+from slow_join import slowly_judged, slowly_united
 
 from pipeline.errors import SettingsError
 from pipeline.model import IntArray, Reason
@@ -320,45 +322,18 @@ def is_solid(kind: int) -> bool:
     return kind not in {FacetKind.STEP, FacetKind.GROUND}
 
 
-def slow_twin(surfaces: Surfaces) -> list[int]:
-    """Climb from each surface to the largest larger candidate across a step, while it is one that joins."""
-    found = []
-    for k in range(len(surfaces.kind)):
-        here: int = k
-        while True:
-            sums, kind = surfaces.sums[here], surfaces.kind[here]
-            verdict = judge_surface(int(kind), sums, SETTINGS) if is_solid(kind) else None
-            accepted = is_solid(kind) and verdict is None
-            roof_like = accepted or (
-                verdict is not None and verdict.reason in {Reason.TOO_SMALL, Reason.TOO_NARROW, Reason.BELOW_Z_AVG}
-            )
-            larger = []
-            if roof_like and 2 * sums[Sum.STEP] >= sums[Sum.BOUNDARY]:
-                steps = {step for s, step in surfaces.along_steps.tolist() if s == here}
-                for s, step in surfaces.along_steps.tolist():
-                    other = surfaces.sums[s, Sum.AREA2]
-                    is_larger = other > sums[Sum.AREA2] or (other == sums[Sum.AREA2] and s < here)
-                    if (
-                        step in steps
-                        and is_larger
-                        and is_solid(surfaces.kind[s])
-                        and judge_surface(int(surfaces.kind[s]), surfaces.sums[s], SETTINGS) is None
-                    ):
-                        larger.append((-int(other), s))
-            if not larger:
-                found.append(here if accepted else -1)
-                break
-            here = min(larger)[1]
-    return found
-
-
 @settings(deadline=None, max_examples=examples(200))
 @given(members=scenes, links=link_lists)
-def test_uniting_agrees_with_climbing_from_each_surface(
+def test_uniting_agrees_with_a_slow_twin(
     members: list[tuple[int, int, int, FacetKind]], links: list[tuple[int, int]]
 ) -> None:
     surfaces = drawn(members, links)
-    assert leaders(surfaces) == slow_twin(surfaces)
+    verdicts = [
+        slowly_judged(kind, sums, SETTINGS) if is_solid(kind) else Verdict(reason=Reason.TOO_FEW_POINTS, detail="")
+        for kind, sums in zip(surfaces.kind.tolist(), surfaces.sums, strict=True)
+    ]
+    with_lengths = dataclasses.replace(surfaces, along_steps=np.pad(surfaces.along_steps, ((0, 0), (0, 1))))
+    assert leaders(surfaces) == slowly_united(with_lengths, verdicts, SETTINGS).tolist()
 
 
 @settings(deadline=None, max_examples=examples(200))

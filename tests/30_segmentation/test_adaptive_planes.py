@@ -6,13 +6,14 @@ import math
 
 import numpy as np
 import pytest
+from candidates_by_hand import turned_plan
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
 from pipeline.geometry import nearest_neighbours, point_spacing_m
-from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
+from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.segmentation.adaptive_planes import DetectedPlanes, detect_planes, mean_nodes, merge_by_f_test
 from pipeline.segmentation.plane_regression import cluster_sums
 from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
@@ -99,17 +100,10 @@ def test_the_noise_is_reported(density_per_m2: float, noise_m: float) -> None:
     assert detected(gable(density_per_m2, noise_m)).sigma_m == pytest.approx(noise_m * cosine, rel=0.15)
 
 
-def with_box(points: FloatArray, x: float, y: float, size_m: float, height_m: float) -> tuple[FloatArray, BoolArray]:
-    """A flat box on the roof: its points, and which they are."""
-    inside = (np.abs(points[:, 0] - x) < size_m / 2) & (np.abs(points[:, 1] - y) < size_m / 2)
-    raised = points.copy()
-    raised[inside, 2] = 9.0 + height_m + 0.02 * np.sin(37 * points[inside, 0])
-    return raised, inside
-
-
-def test_a_superstructure_is_found_where_points_are_dense() -> None:
+def test_a_superstructure_is_found_where_points_are_dense_and_it_is_not_below_the_least_area() -> None:
     points = gable(10.0, 0.02, seed=4)
-    points, inside = with_box(points, 10.0, 3.0, 2.4, 2.0)
+    inside = (np.abs(points[:, 0] - 10.0) < 1.2) & (np.abs(points[:, 1] - 3.0) < 1.2)
+    points[inside, 2] = 11.0 + 0.02 * np.sin(37 * points[inside, 0])
     found = detected(points)
     assert len(found.coefficients) == 3
     label = np.bincount(found.labels[inside & (found.labels >= 0)]).argmax()
@@ -118,14 +112,9 @@ def test_a_superstructure_is_found_where_points_are_dense() -> None:
     assert 10 * a + 3 * b + c == pytest.approx(11.0, abs=0.03)
     assert (found.labels[inside] == label).mean() > 0.9
     assert (found.labels[~inside] == label).mean() < 0.01
-
-
-def test_what_is_smaller_than_the_least_area_is_no_plane() -> None:
-    points = gable(10.0, 0.02, seed=4)
-    points, inside = with_box(points, 10.0, 3.0, 2.4, 2.0)
-    found = detected(points, AdaptivePlaneSettings(min_area_m2=8.0))
-    assert len(found.coefficients) == 2
-    assert (found.labels[inside] == -1).mean() > 0.9
+    only_larger = detected(points, AdaptivePlaneSettings(min_area_m2=8.0))
+    assert len(only_larger.coefficients) == 2
+    assert (only_larger.labels[inside] == -1).mean() > 0.9
 
 
 def test_a_porch_of_two_square_metres_beside_the_roof_is_a_plane() -> None:
@@ -248,10 +237,7 @@ def test_whole_metres_of_shift_change_no_label(seed: int, east: int, north: int,
 @given(seed=st.integers(0, 50), turn_deg=st.floats(0, 360), density=st.sampled_from([2.0, 8.0, 24.0]))
 def test_a_turned_hip_roof_keeps_its_four_planes(seed: int, turn_deg: float, density: float) -> None:
     points, face = hip(density, 0.03, seed)
-    cos, sin = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
-    turned = np.column_stack(
-        [cos * points[:, 0] - sin * points[:, 1], sin * points[:, 0] + cos * points[:, 1], points[:, 2]]
-    )
+    turned = np.column_stack([turned_plan(points[:, :2], turn_deg), points[:, 2]])
     order = np.lexsort((turned[:, 2], turned[:, 1], turned[:, 0]))
     found = detected(np.ascontiguousarray(turned[order]))
     assert len(found.coefficients) == 4

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.model import FloatArray, Reason
 from pipeline.segmentation.clustering_settings import FuzzySartClusteringSettings
-from pipeline.segmentation.fuzzy_sart import centre_of_building, cluster, facet_vectors, vector_degree_of_match
+from pipeline.segmentation.fuzzy_sart import _degree, centre_of_building, cluster, facet_vectors
 
 coordinate = st.floats(-100, 100, allow_nan=False).filter(lambda value: abs(value) > 1e-3)
 vector = st.tuples(coordinate, coordinate, coordinate)
@@ -88,60 +88,58 @@ def noisy_normals(seed: int, count: int = 60, spread: float = 0.1) -> tuple[Floa
     return normals / np.linalg.norm(normals, axis=1)[:, None], random.uniform(0.1, 5, count)
 
 
-@settings(deadline=None)
-@given(vector, vector)
-def test_the_degree_of_match_is_its_scalar_twin(template: Sequence[float], other: Sequence[float]) -> None:
-    assert vector_degree_of_match(template, other) == pytest.approx(scalar_vdm(template, other), abs=1e-12)
+def degree_of_match(template: Sequence[float], other: Sequence[float], vigilance: float = 0.0) -> float:
+    """What the kernel says of one neuron and one vector."""
+    t, x = np.array([template], np.float64), np.array([other], np.float64)
+    return _degree(t, np.linalg.norm(t, axis=1), 0, x, np.linalg.norm(x, axis=1), 0, -2.0, vigilance)
 
 
 @settings(deadline=None)
 @given(vector, vector)
-def test_the_degree_of_match_is_symmetric_and_between_0_and_1(
+def test_the_degree_of_match_is_its_scalar_twin_and_symmetric(
     template: Sequence[float], other: Sequence[float]
 ) -> None:
-    degree = vector_degree_of_match(template, other)
-    assert degree == pytest.approx(vector_degree_of_match(other, template), abs=1e-12)
+    degree = degree_of_match(template, other)
+    assert degree == pytest.approx(scalar_vdm(template, other), abs=1e-12)
+    assert degree == pytest.approx(degree_of_match(other, template), abs=1e-12)
     assert 0.0 <= degree <= 1.0
 
 
-@settings(deadline=None)
-@given(vector)
-def test_a_vector_matches_itself_entirely_and_its_opposite_not_at_all(template: Sequence[float]) -> None:
-    assert vector_degree_of_match(template, template) == pytest.approx(1.0, abs=1e-7)
-    assert vector_degree_of_match(template, [-value for value in template]) == pytest.approx(0.0, abs=1e-7)
+@pytest.mark.parametrize(
+    ("template", "other", "degree"),
+    [
+        ([3, -4, 5], [3, -4, 5], 1.0),
+        ([3, -4, 5], [-3, 4, -5], 0.0),
+        ([1, 2, 2], [2, 4, 4], 0.5),  # one direction: the ratio of the modules
+        ([1, 0, 0], [0, 0, 1], 0.5),  # a right angle
+        ([0, 0, 0], [1, 0, 0], -1.0),
+    ],
+)
+def test_the_degree_of_match_of_clear_cases(template: list[float], other: list[float], degree: float) -> None:
+    assert degree_of_match(template, other) == pytest.approx(degree, abs=1e-7)
 
 
-def test_equal_directions_match_by_the_ratio_of_their_modules() -> None:
-    assert vector_degree_of_match([1, 2, 2], [2, 4, 4]) == pytest.approx(0.5, abs=1e-7)
+def test_modules_whose_ratio_is_below_the_vigilance_are_no_match() -> None:
+    assert degree_of_match([1, 2, 2], [2, 4, 4], 0.51) == -1.0
 
 
-def test_equal_modules_at_a_right_angle_match_by_half() -> None:
-    assert vector_degree_of_match([1, 0, 0], [0, 0, 1]) == pytest.approx(0.5, abs=1e-12)
-
-
-def test_the_zero_vector_matches_nothing() -> None:
-    assert vector_degree_of_match([0, 0, 0], [1, 0, 0]) == 0.0
-    assert vector_degree_of_match([0, 0, 0], [0, 0, 0]) == 0.0
-
-
-@pytest.mark.parametrize("vigilance", [0.7, 0.9, 0.95])
+@pytest.mark.parametrize(
+    ("settings", "feet"),
+    [
+        *(({"vigilance": vigilance}, False) for vigilance in (0.7, 0.9, 0.95)),
+        ({"vigilance": 0.7, "tau_epochs": 2}, True),
+    ],
+)
 @pytest.mark.parametrize("seed", range(4))
-def test_the_clustering_equals_its_plain_twin(seed: int, vigilance: float) -> None:
-    normals, areas = noisy_normals(seed)
-    chosen = FuzzySartClusteringSettings(vigilance=vigilance)
-    found = cluster(normals, areas, chosen)
-    labels, templates = plain_clustering(normals.tolist(), areas.tolist(), chosen)
-    assert found.labels.tolist() == labels
-    np.testing.assert_allclose(found.templates, templates, atol=1e-9)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_clustering_of_footpoints_equals_its_plain_twin(seed: int) -> None:
-    normals, areas = noisy_normals(seed)
-    offsets = np.random.default_rng(seed + 100).uniform(2, 9, len(normals))
-    chosen = FuzzySartClusteringSettings(vigilance=0.7, tau_epochs=2)
-    found = cluster(normals * offsets[:, None], areas, chosen)
-    labels, templates = plain_clustering((normals * offsets[:, None]).tolist(), areas.tolist(), chosen)
+def test_the_clustering_of_normals_and_footpoints_equals_its_plain_twin(
+    seed: int, settings: dict[str, Any], feet: bool
+) -> None:
+    vectors, areas = noisy_normals(seed)
+    if feet:
+        vectors *= np.random.default_rng(seed + 100).uniform(2, 9, len(vectors))[:, None]
+    chosen = FuzzySartClusteringSettings(**settings)
+    found = cluster(vectors, areas, chosen)
+    labels, templates = plain_clustering(vectors.tolist(), areas.tolist(), chosen)
     assert found.labels.tolist() == labels
     np.testing.assert_allclose(found.templates, templates, atol=1e-9)
 
@@ -152,7 +150,7 @@ def test_every_clustered_vector_matches_its_own_neuron_best(seed: int) -> None:
     normals, areas = noisy_normals(seed, count=25)
     found = cluster(normals, areas, FuzzySartClusteringSettings(vigilance=0.9))
     for normal, label in zip(normals, found.labels, strict=True):
-        degrees = [vector_degree_of_match(t, normal) for t in found.templates]
+        degrees = [scalar_vdm(t, normal) for t in found.templates]
         assert max(degrees) < 0.9 if label < 0 else degrees[label] >= max(max(degrees) - 1e-12, 0.9 - 1e-12)
 
 

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from candidates_by_hand import same_partition
 from sklearn.cluster import KMeans
 from sklearn.metrics import silhouette_score
 
@@ -40,11 +41,6 @@ def directions(
     centres = np.column_stack([np.sin(slope) * np.sin(aspect), np.sin(slope) * np.cos(aspect), np.cos(slope)])
     truth = random.permutation(np.repeat(np.arange(len(centres), dtype=np.int32), count))
     return unit(centres[truth] + random.normal(0, spread, (len(truth), 3))), truth
-
-
-def same_partition(a: LabelArray, b: LabelArray) -> bool:
-    pairs = set(zip(a.tolist(), b.tolist(), strict=True))
-    return len(pairs) == len(set(a.tolist())) == len(set(b.tolist()))
 
 
 def plain_kmeans(normals: FloatArray, weights: FloatArray, start: FloatArray) -> tuple[LabelArray, float]:
@@ -98,17 +94,10 @@ def test_the_silhouette_is_that_of_scikit_learn_with_the_cosine(seed: int, k: in
     normals, _ = directions(FOUR, 40, 0.3, seed)
     ones = np.ones(len(normals))
     labels = cluster_normals(normals, ones, k, SETTINGS).labels
-    assert silhouette(normals, ones, labels, k) == pytest.approx(
-        silhouette_score(normals, labels, metric="cosine"), abs=1e-9
-    )
-
-
-def test_a_cluster_of_one_facet_counts_nothing_in_the_silhouette_as_in_scikit_learn() -> None:
-    normals, _ = directions(FOUR[:2], 10, 0.1, 1)
-    labels = np.array([0] * 12 + [1] * 7 + [2], np.int32)
-    assert silhouette(normals, np.ones(20), labels, 3) == pytest.approx(
-        silhouette_score(normals, labels, metric="cosine"), abs=1e-9
-    )
+    with_one_alone = np.append(labels[:-1], np.int32(k))  # a cluster of one facet counts nothing
+    for partition in (labels, with_one_alone):
+        expected = silhouette_score(normals, partition, metric="cosine")
+        assert silhouette(normals, ones, partition, int(partition.max()) + 1) == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -201,16 +190,11 @@ def test_the_number_of_directions_is_found(k: int) -> None:
     assert same_partition(found.labels, truth)
 
 
-def test_one_plane_stays_one_cluster_although_noise_can_always_be_split() -> None:
+def test_one_plane_stays_one_cluster_although_noise_can_always_be_split_and_a_given_k_is_kept() -> None:
     normals, _ = directions([(2.0, 0.0)], 200, 0.1, 1)
-    found = choose_clusters(normals, np.ones(200), lambda _: 0.98, SETTINGS)
-    assert len(found.centres) == 1
-
-
-def test_a_given_k_is_kept() -> None:
-    normals, _ = directions(FOUR, 50, 0.05, 1)
-    found = choose_clusters(normals, np.ones(200), lambda _: 0.0, NormalClusteringSettings(clusters=2))
-    assert len(found.centres) == 2
+    assert len(choose_clusters(normals, np.ones(200), lambda _: 0.98, SETTINGS).centres) == 1
+    given = NormalClusteringSettings(clusters=2)
+    assert len(choose_clusters(normals, np.ones(200), lambda _: 0.0, given).centres) == 2
 
 
 def test_too_much_work_is_refused_with_its_figure() -> None:

@@ -34,9 +34,10 @@ def test_two_leftover_planes_become_two_clusters() -> None:
     assert {first, second} == {1, 2}
 
 
-def test_too_few_leftovers_stay_leftovers() -> None:
+def test_too_few_leftovers_stay_leftovers_and_without_any_nothing_changes() -> None:
     points, labels = roof_with_dormer()
-    assert cluster_leftovers(points, nearest_neighbours(points, 9), labels, 0.15, 31).tolist() == labels.tolist()
+    for known, fewest in ((labels, 31), (np.arange(330, dtype=np.int32) % 7, 6)):
+        assert cluster_leftovers(points, nearest_neighbours(points, 9), known, 0.15, fewest).tolist() == known.tolist()
 
 
 def test_clutter_makes_no_large_cluster() -> None:
@@ -44,12 +45,6 @@ def test_clutter_makes_no_large_cluster() -> None:
     labels = np.full(200, -1, np.int32)
     grown = cluster_leftovers(points, nearest_neighbours(points, 9), labels, 0.15, 25)
     assert (grown == -1).all()
-
-
-def test_without_leftovers_nothing_changes() -> None:
-    points, _ = roof_with_dormer()
-    labels = np.arange(330, dtype=np.int32) % 7
-    assert cluster_leftovers(points, nearest_neighbours(points, 9), labels, 0.15, 6).tolist() == labels.tolist()
 
 
 def test_every_cluster_lies_near_a_plane() -> None:

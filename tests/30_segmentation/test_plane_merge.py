@@ -92,20 +92,13 @@ def test_the_pieces_of_a_gable_become_its_two_sides() -> None:
     assert sums[:2, 0].sum() == 600
 
 
-def test_clusters_without_a_common_pair_stay_apart() -> None:
-    points, labels = strips(1)
-    sums = cluster_sums(points, labels, 16)
-    root, work = merge_planes(sums, fit(sums), np.empty(0, np.int64), 0.1, 12.0, 15, ALWAYS)
-    assert root.tolist() == list(range(16))
-    assert work == 0
-
-
-def test_merging_stops_where_its_work_is_limited_and_says_so() -> None:
+def test_clusters_without_a_common_pair_stay_apart_and_limited_work_ends_and_says_so() -> None:
     points, labels = strips(1)
     sums = cluster_sums(points, labels, 16)
     pairs = touching_pairs(nearest_neighbours(points, 9), labels, np.ones(16, np.bool_))
-    _, work = merge_planes(sums, fit(sums), pairs, 0.1, 12.0, 15, 5)
-    assert work > 5
+    root, work = merge_planes(sums.copy(), fit(sums), np.empty(0, np.int64), 0.1, 12.0, 15, ALWAYS)
+    assert (root.tolist(), work) == (list(range(16)), 0)
+    assert merge_planes(sums, fit(sums), pairs, 0.1, 12.0, 15, 5)[1] > 5
 
 
 def test_a_step_of_parallel_planes_does_not_merge() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from candidates_by_hand import TURNS, Matrix, same_partition
 
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.geometry import nearest_neighbours
@@ -24,22 +25,10 @@ def gable(seed: int = 0, count: int = 400, noise: float = 0.03, rise: float = 0.
 
 
 def refine(
-    points: FloatArray, labels: LabelArray, *, distance_m: float = 0.15, fewest_points: int = 8, **changes: Any
+    points: FloatArray, labels: LabelArray, *, fewest_points: int = 8, **changes: Any
 ) -> tuple[FloatArray, LabelArray]:
-    chosen = PlaneRefinementSettings(**changes)
-    return refine_planes(
-        points,
-        nearest_neighbours(points, 9),
-        labels.astype(np.int32),
-        distance_m=distance_m,
-        fewest_points=fewest_points,
-        settings=chosen,
-    )
-
-
-def same_partition(a: LabelArray, b: LabelArray) -> bool:
-    pairs = set(zip(a.tolist(), b.tolist(), strict=True))
-    return len(pairs) == len(set(a.tolist())) == len(set(b.tolist()))
+    chosen = {"distance_m": 0.15, "fewest_points": fewest_points, "settings": PlaneRefinementSettings(**changes)}
+    return refine_planes(points, nearest_neighbours(points, 9), labels.astype(np.int32), **chosen)
 
 
 def test_shattered_clusters_of_a_gable_become_two_planes() -> None:
@@ -89,7 +78,7 @@ def test_parts_of_one_plane_that_do_not_touch_are_one_plane_within_reach_only() 
     assert len(refine(points, parts, merge_reach_m=1.0)[0]) == 2
 
 
-def test_steep_planes_and_small_ones_are_dropped() -> None:
+def test_steep_planes_and_small_ones_are_dropped_and_no_cluster_gives_none() -> None:
     points, side = gable()
     below = np.random.default_rng(3).uniform(0, 1, 60)
     wall = np.column_stack([np.linspace(0, 12, 60), -4 - below, 6 - 3.5 * below])
@@ -99,16 +88,10 @@ def test_steep_planes_and_small_ones_are_dropped() -> None:
     gentle = wall * [1, 1, 0.5] + [0, 0, 3]
     assert len(refine(np.concatenate([points, gentle]), np.concatenate([side, np.full(60, 2, np.int32)]))[0]) == 3
     few = np.where(np.arange(len(points)) < 5, 2, -1)
-    planes, labels = refine(points, few, fewest_points=500)
-    assert planes.shape == (0, 3)
-    assert (labels == -1).all()
-
-
-def test_no_cluster_gives_no_plane() -> None:
-    points, _ = gable()
-    planes, labels = refine(points, np.full(len(points), -1))
-    assert planes.shape == (0, 3)
-    assert labels.tolist() == [-1] * len(points)
+    for rough, fewest_points in ((few, 500), (np.full(len(points), -1), 8)):
+        planes, labels = refine(points, rough, fewest_points=fewest_points)
+        assert planes.shape == (0, 3)
+        assert (labels == -1).all()
 
 
 def test_the_order_of_points_and_the_names_of_clusters_do_not_matter() -> None:
@@ -122,10 +105,8 @@ def test_the_order_of_points_and_the_names_of_clusters_do_not_matter() -> None:
     np.testing.assert_allclose(sorted(planes.tolist()), sorted(moved_planes.tolist()), atol=1e-9)
 
 
-@pytest.mark.parametrize("matrix", [((-1, 0), (0, 1)), ((0, -1), (1, 0)), ((0, 1), (1, 0))])
-def test_mirrored_or_turned_by_90_degrees_the_partition_is_the_same(
-    matrix: tuple[tuple[int, int], tuple[int, int]],
-) -> None:
+@pytest.mark.parametrize("matrix", TURNS)
+def test_mirrored_or_turned_by_90_degrees_the_partition_is_the_same(matrix: Matrix) -> None:
     points, side = gable(noise=0.08)
     rough = 2 * (points[:, 0] / 2).astype(np.int32) + side
     _, labels = refine(points, rough)

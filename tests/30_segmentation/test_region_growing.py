@@ -24,17 +24,10 @@ SIDES = np.array([[0.0, 0.6], [0.0, -0.6]])
 
 
 def grown(
-    points: FloatArray, clusters: LabelArray, gradients: FloatArray, fewest: int = 6
+    points: FloatArray, clusters: LabelArray, gradients: FloatArray, fewest: int = 6, **limit: int
 ) -> tuple[FloatArray, LabelArray]:
-    return grow_regions(
-        points,
-        nearest_neighbours(points, 9),
-        clusters,
-        gradients,
-        distance_m=0.15,
-        fewest_points=fewest,
-        settings=RegionGrowingSettings(),
-    )
+    chosen = {"distance_m": 0.15, "fewest_points": fewest, "settings": RegionGrowingSettings()}
+    return grow_regions(points, nearest_neighbours(points, 9), clusters, gradients, **chosen, **limit)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -70,21 +63,16 @@ def test_parallel_faces_of_one_cluster_become_two_regions() -> None:
     assert set(labels[upper].tolist()) & set(labels[~upper].tolist()) <= {-1}
 
 
-def test_points_far_from_every_plane_and_small_regions_have_no_label() -> None:
+def test_points_far_from_every_plane_small_regions_and_what_has_no_members_have_no_label() -> None:
     points, side = gable(3)
     points[:4, 2] += 3.0
     _, labels = grown(points, side, SIDES)
     assert labels[:4].tolist() == [-1] * 4
-    planes, labels = grown(points, side, SIDES, fewest=400)
-    assert len(planes) == 0
-    assert (labels == -1).all()
-
-
-def test_without_members_nothing_grows() -> None:
-    points, _ = gable()
-    planes, labels = grown(points, np.full(280, -1, np.int32), SIDES)
-    assert planes.shape == (0, 3)
-    assert (labels == -1).all()
+    # regions too small, and no members
+    for members, fewest in ((side, 400), (np.full(280, -1, np.int32), 6)):
+        planes, labels = grown(points, members, SIDES, fewest)
+        assert planes.shape == (0, 3)
+        assert (labels == -1).all()
 
 
 def test_the_order_of_points_does_not_matter() -> None:
@@ -101,16 +89,7 @@ def test_points_on_a_line_are_grown_over_from_every_seed_until_the_work_is_too_m
     planes, _ = grown(line, members, level)
     assert len(planes) == 0
     with pytest.raises(BuildingError, match="of 400 points, the limit is 100000") as caught:
-        grow_regions(
-            line,
-            nearest_neighbours(line, 9),
-            members,
-            level,
-            distance_m=0.15,
-            fewest_points=6,
-            settings=RegionGrowingSettings(),
-            work_limit=100_000,
-        )
+        grown(line, members, level, work_limit=100_000)
     assert caught.value.reason is Reason.TOO_COMPLEX
 
 

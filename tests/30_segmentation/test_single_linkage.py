@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from candidates_by_hand import same_partition
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from pipeline.errors import BuildingError, SettingsError
-from pipeline.model import FloatArray, LabelArray, Reason
+from pipeline.model import FloatArray, Reason
 from pipeline.segmentation.clustering_settings import SingleLinkageSettings
 from pipeline.segmentation.single_linkage import cluster_by_linkage, link
-
-
-def same_partition(a: LabelArray, b: LabelArray) -> bool:
-    pairs = set(zip(a.tolist(), b.tolist(), strict=True))
-    return len(pairs) == len(set(a.tolist())) == len(set(b.tolist()))
 
 
 def scattered(seed: int, n: int, low: float = 0.0, high: float = 360.0) -> tuple[FloatArray, FloatArray]:

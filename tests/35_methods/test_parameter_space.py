@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from candidates_by_hand import TURNS, Matrix, candidate, moved, strewn, turned
 
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.methods import METHODS
@@ -25,49 +26,28 @@ Height = Callable[[FloatArray, FloatArray], FloatArray]
 Segment = Callable[[Candidate], Segmentation]
 
 RECIPES: dict[str, Segment] = {
-    "2d faithful": lambda candidate: segment_2d(prepare_cloud(candidate), ParameterSpace2dSettings.faithful()),
-    "3d faithful": lambda candidate: segment_3d(prepare_cloud(candidate), ParameterSpace3dSettings.faithful()),
-    "2d robust": lambda candidate: segment_2d(prepare_cloud(candidate), ParameterSpace2dSettings()),
-    "3d robust": lambda candidate: segment_3d(prepare_cloud(candidate), ParameterSpace3dSettings()),
+    "2d faithful": lambda one: segment_2d(prepare_cloud(one), ParameterSpace2dSettings.faithful()),
+    "3d faithful": lambda one: segment_3d(prepare_cloud(one), ParameterSpace3dSettings.faithful()),
+    "2d robust": lambda one: segment_2d(prepare_cloud(one), ParameterSpace2dSettings()),
+    "3d robust": lambda one: segment_3d(prepare_cloud(one), ParameterSpace3dSettings()),
 }
 FAITHFUL = [name for name in RECIPES if "faithful" in name]
 ROBUST = [name for name in RECIPES if "robust" in name]
 
 
-def candidate_of(points: FloatArray, *, slope: float = 0.0, seed: int = 9) -> Candidate:
-    """Points in canonical order, with terrain on a 1 m lattice beneath and 12 m around."""
+def candidate_of(points: FloatArray, *, slope: float = 0.0) -> Candidate:
+    """Points with terrain on a 1 m lattice beneath and 12 m around."""
     low, high = np.floor(points[:, :2].min(axis=0)) - 12, np.ceil(points[:, :2].max(axis=0)) + 12
     x, y = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
-    z = slope * x.ravel() + np.random.default_rng(seed).normal(0, 0.03, x.size)
-    points = np.rint(points * 1000) / 1000
-    return Candidate(
-        building_id="roof",
-        origin=(0.0, 0.0, 0.0),
-        points=points[np.lexsort(points.T[::-1])],
-        ground=np.rint(np.column_stack([x.ravel(), y.ravel(), z]) * 1000) / 1000,
-        ground_z_m=float(z.min()),
-    )
+    z = slope * x.ravel() + np.random.default_rng(9).normal(0, 0.03, x.size)
+    ground = np.rint(np.column_stack([x.ravel(), y.ravel(), z]) * 1000) / 1000
+    return candidate(points, ground=ground, ground_z_m=float(z.min()))
 
 
-def roof(
-    height: Height,
-    *,
-    length: float = 14.0,
-    width: float = 10.0,
-    density: float = 1.0,
-    noise: float = 0.04,
-    seed: int = 0,
-    slope: float = 0.0,
-    turn_deg: float = 17.0,
-) -> Candidate:
+def roof(height: Height, *, slope: float = 0.0, **options: Any) -> Candidate:
     """Points strewn over a turned rectangle, heights by its own axes u and v."""
-    random = np.random.default_rng(seed)
-    uv = random.uniform(-0.5, 0.5, (random.poisson(density * length * width), 2)) * [length, width]
-    turn = math.radians(turn_deg)
-    xy = uv @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
-    return candidate_of(
-        np.column_stack([xy, height(uv[:, 0], uv[:, 1]) + random.normal(0, noise, len(uv))]), slope=slope
-    )
+    usual = {"width": 10.0, "density": 1.0, "noise": 0.04, "seed": 0}
+    return candidate_of(strewn(height, **{**usual, **options}), slope=slope)
 
 
 def gable(pitch_deg: float = 35.0, **options: Any) -> Candidate:
@@ -118,14 +98,14 @@ def test_a_pent_roof_on_level_terrain_is_one_plane(recipe: str) -> None:
 
 
 def test_sloping_terrain_spoils_a_pent_roof_in_two_dimensions_and_not_in_three() -> None:
-    candidate = pent(25.0, slope=0.2)
-    assert RECIPES["2d faithful"](candidate).roof_type is RoofType.UNKNOWN
-    assert RECIPES["3d faithful"](candidate).roof_type is RoofType.PENT
+    one = pent(25.0, slope=0.2)
+    assert RECIPES["2d faithful"](one).roof_type is RoofType.UNKNOWN
+    assert RECIPES["3d faithful"](one).roof_type is RoofType.PENT
 
 
 def test_parallel_gables_are_separated_in_three_dimensions_alone() -> None:
-    candidate = two_gables(density=1.5)
-    flat, deep = RECIPES["2d faithful"](candidate), RECIPES["3d faithful"](candidate)
+    one = two_gables(density=1.5)
+    flat, deep = RECIPES["2d faithful"](one), RECIPES["3d faithful"](one)
     assert (flat.roof_type, len(flat.planes)) == (RoofType.GABLE, 2)
     assert (deep.roof_type, len(deep.planes)) == (RoofType.COMBINATION, 4)
 
@@ -157,30 +137,17 @@ def test_a_flat_roof_is_one_plane_where_terrain_is_left_out(recipe: str) -> None
 
 @pytest.mark.parametrize("choice", ["keep", "drop", "leave_out"])
 def test_clusters_of_terrain_and_walls_carry_no_plane_whatever_becomes_of_them(choice: str) -> None:
-    candidate = gable(slope=0.2)
-    for found in (
-        segment_2d(
-            prepare_cloud(candidate), ParameterSpace2dSettings(ground_clusters=choice, point_groups="membership")
-        ),
-        segment_3d(
-            prepare_cloud(candidate), ParameterSpace3dSettings(ground_clusters=choice, point_groups="membership")
-        ),
-    ):
+    cloud, chosen = prepare_cloud(gable(slope=0.2)), {"ground_clusters": choice, "point_groups": "membership"}
+    flat = segment_2d(cloud, ParameterSpace2dSettings(**chosen))
+    for found in (flat, segment_3d(cloud, ParameterSpace3dSettings(**chosen))):
         assert all(25 < plane.slope_deg < 45 for plane in found.planes if plane.n_points > 20)
         assert sum(plane.n_points > 20 for plane in found.planes) == 2
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_moved_by_whole_metres_the_labels_stay_the_same(recipe: str) -> None:
-    candidate = hip()
     shift = np.array([1203.0, -777.0, 41.0])
-    moved = dataclasses.replace(
-        candidate,
-        points=np.rint((candidate.points + shift) * 1000) / 1000,
-        ground=np.rint((candidate.ground + shift) * 1000) / 1000,
-        ground_z_m=candidate.ground_z_m + shift[2],
-    )
-    here, there = RECIPES[recipe](candidate), RECIPES[recipe](moved)
+    here, there = RECIPES[recipe](hip()), RECIPES[recipe](moved(hip(), shift))
     assert here.labels.tolist() == there.labels.tolist()
     assert here.roof_type == there.roof_type
     for a, b in zip(here.planes, there.planes, strict=True):
@@ -189,21 +156,13 @@ def test_moved_by_whole_metres_the_labels_stay_the_same(recipe: str) -> None:
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
-@pytest.mark.parametrize(
-    "matrix", [((-1, 0), (0, 1)), ((0, -1), (1, 0)), ((0, 1), (1, 0))], ids=["mirrored", "turned", "swapped"]
-)
-def test_mirrored_or_turned_by_90_degrees_planes_and_type_are_the_same(
-    recipe: str, matrix: tuple[tuple[int, int], tuple[int, int]]
-) -> None:
-    candidate = gable(seed=2)
-    turn = np.array(matrix, dtype=np.float64)
-    points, ground = candidate.points.copy(), candidate.ground.copy()
-    points[:, :2], ground[:, :2] = points[:, :2] @ turn.T, ground[:, :2] @ turn.T
-    order = np.lexsort(points.T[::-1])
-    here = RECIPES[recipe](candidate)
-    there = RECIPES[recipe](dataclasses.replace(candidate, points=points[order], ground=ground))
+@pytest.mark.parametrize("matrix", TURNS)
+def test_mirrored_or_turned_by_90_degrees_planes_and_type_are_the_same(recipe: str, matrix: Matrix) -> None:
+    one = gable(seed=2)
+    other, order = turned(one, matrix)
+    here, there = RECIPES[recipe](one), RECIPES[recipe](other)
     assert here.roof_type == there.roof_type
-    gradients = sorted((np.array([plane.a, plane.b]) @ turn.T).round(1).tolist() for plane in here.planes)
+    gradients = sorted((np.array([plane.a, plane.b]) @ np.array(matrix).T).round(1).tolist() for plane in here.planes)
     assert gradients == sorted([round(plane.a, 1), round(plane.b, 1)] for plane in there.planes)
     # four terrain samples on a common circle are cut along either diagonal, and boxes have borders
     agreed = [
@@ -215,19 +174,19 @@ def test_mirrored_or_turned_by_90_degrees_planes_and_type_are_the_same(
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_the_order_of_points_before_they_are_sorted_does_not_matter_and_twice_gives_the_same_bits(recipe: str) -> None:
-    candidate = hip(seed=3)
-    shuffled = candidate.points[np.random.default_rng(0).permutation(len(candidate.points))]
-    again = dataclasses.replace(candidate, points=shuffled[np.lexsort(shuffled.T[::-1])], ground=candidate.ground[::-1])
-    first, second, third = (RECIPES[recipe](c) for c in (candidate, candidate, again))
+    one = hip(seed=3)
+    shuffled = candidate(np.random.default_rng(0).permutation(one.points))
+    again = dataclasses.replace(one, points=shuffled.points, ground=one.ground[::-1])
+    first, second, third = (RECIPES[recipe](c) for c in (one, one, again))
     assert first.planes == second.planes == third.planes
     assert first.labels.tobytes() == second.labels.tobytes() == third.labels.tobytes()
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_points_beneath_the_roof_take_no_part(recipe: str) -> None:
-    candidate = gable()
-    facade = np.column_stack([candidate.points[::7, :2] + 0.1, np.linspace(0.5, 3.5, len(candidate.points[::7]))])
-    both = candidate_of(np.concatenate([candidate.points, facade]))
+    points = gable().points
+    facade = np.column_stack([points[::7, :2] + 0.1, np.linspace(0.5, 3.5, len(points[::7]))])
+    both = candidate_of(np.concatenate([points, facade]))
     found = RECIPES[recipe](both)
     assert (found.labels[both.points[:, 2] < 3.6] == -1).all()
     assert (found.labels[both.points[:, 2] >= 3.6] >= 0).mean() > 0.85
@@ -334,14 +293,7 @@ def test_a_city_block_of_100_000_points_is_segmented_whole() -> None:
 def test_a_roof_without_any_noise_is_one_plane(segment: Any, settings: Any, rise: float) -> None:
     steps = np.arange(0.25, 10.0, 0.5)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
-    candidate = Candidate(
-        building_id="b",
-        origin=(0.0, 0.0, 0.0),
-        points=np.rint(np.column_stack((x, y, 6.0 + rise * x)) * 1e3) / 1e3,
-        ground=np.zeros((0, 3)),
-        ground_z_m=0.0,
-    )
-    found = segment(prepare_cloud(candidate), settings)
+    found = segment(prepare_cloud(candidate(np.column_stack((x, y, 6.0 + rise * x)))), settings)
     assert len(found.planes) == 1
     assert found.planes[0].a == pytest.approx(rise, abs=1e-3)
     assert (found.labels == 0).all()

@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 import shapely
+from candidates_by_hand import candidate
 
 from pipeline.errors import SettingsError
 from pipeline.methods import METHODS, ReconstructSettings, method_named
 from pipeline.methods.settings import RoofFaceSettings
-from pipeline.model import BuildingResult, Candidate, FloatArray, RoofType, Status
+from pipeline.model import BuildingResult, Candidate, RoofType, Status
 from pipeline.reconstruct import reconstruct_building
 from pipeline.settings import RunSettings
 
@@ -19,24 +20,12 @@ OF_PAPERS = [name for name, entry in METHODS.items() if entry.faithful is not No
 OUTLINE = shapely.box(0.0, 0.0, 12.0, 8.0)
 
 
-def candidate(points: FloatArray) -> Candidate:
-    points = np.rint(points * 1e3) / 1e3
-    return Candidate(
-        building_id="house",
-        origin=(0.0, 0.0, 0.0),
-        points=points[np.lexsort((points[:, 2], points[:, 1], points[:, 0]))],
-        ground=np.zeros((0, 3)),
-        ground_z_m=0.0,
-        footprint=OUTLINE,
-    )
-
-
 def hip(n: int) -> Candidate:
     """Points on a hip roof of 40 % all around, its ridge at 4.6 m."""
     rng = np.random.default_rng(2)
     x, y = rng.uniform((0.0, 0.0), (12.0, 8.0), (n, 2)).T
     z = 3.0 + 0.4 * np.minimum(np.minimum(x, 12.0 - x), np.minimum(y, 8.0 - y))
-    return candidate(np.column_stack((x, y, z + rng.normal(0.0, 0.02, n))))
+    return candidate(np.column_stack((x, y, z + rng.normal(0.0, 0.02, n))), footprint=OUTLINE)
 
 
 def modelled(name: str, faces: str, one: Candidate) -> BuildingResult:
@@ -82,7 +71,8 @@ def test_arranged_ridges_and_hips_meet_in_one_point(name: str) -> None:
 
 @pytest.mark.parametrize("name", OF_PAPERS)
 def test_where_no_plane_is_found_a_simple_shape_stands_in_only_for_arranged_faces(name: str) -> None:
-    one = candidate(np.array([(1, 1, 3.0), (11, 1, 2.98), (2, 7, 3.01), (7, 6, 3.0), (11, 7, 2.99)]))
+    points = [(1, 1, 3.0), (11, 1, 2.98), (2, 7, 3.01), (7, 6, 3.0), (11, 7, 2.99)]
+    one = candidate(points, footprint=OUTLINE)
     arranged, traced = (modelled(name, faces, one) for faces in ("arranged", "traced"))
     assert (arranged.status, arranged.lod, arranged.roof_type) == (Status.OK, "2.2", RoofType.FLAT)
     assert (traced.status, traced.lod) == (Status.FALLBACK, "1.2")

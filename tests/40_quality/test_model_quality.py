@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import shapely
 from examples import examples
+from faces_by_hand import level, partition_of, plane
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,7 +19,6 @@ from pipeline.quality.curved_roof import is_curved_roof
 from pipeline.quality.model_quality import model_quality
 from pipeline.quality.ridge_height import _weights
 from pipeline.quality.unseen_roof import Raster, _nearest_squares
-from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import SolidPart, solid_parts
 
 Modelled = tuple[list[SolidPart], list[Plane]]
@@ -26,30 +26,20 @@ Modelled = tuple[list[SolidPart], list[Plane]]
 
 def modelled(shapes: list[shapely.Polygon], planes: list[Plane]) -> Modelled:
     """Solids over faces in plan, metres."""
-    whole = tuple(shapely.transform(shape, lambda xy: np.rint(xy * 1e3)) for shape in shapes)
-    partition = RoofPartition(polygons=whole, labels=np.arange(len(shapes), dtype=np.int32))
-    return solid_parts(partition, planes, 0.0), planes
+    return solid_parts(partition_of(shapes), planes, 0.0), planes
 
 
-def level(z: float) -> Plane:
-    return Plane(a=0.0, b=0.0, c=z, n_points=9, rmse_m=0.0)
+def flat_roof(width: float, depth: float) -> Modelled:
+    return modelled([shapely.box(0, 0, width, depth)], [level(5.0)])
 
 
 def measured(
-    points: FloatArray, model: Modelled, *, spacing_m: float = 0.5, outline_sigma_m: float = 0.0, is_planar: bool = True
+    points: FloatArray, model: Modelled, *, outline_sigma_m: float = 0.0, is_planar: bool = True
 ) -> ModelQuality:
     parts, planes = model
     faces = [face for part in parts for face in part.faces]
-    _, quality = model_quality(
-        points,
-        faces,
-        planes,
-        [part.solid for part in parts],
-        spacing_m=spacing_m,
-        outline_sigma_m=outline_sigma_m,
-        is_planar=is_planar,
-    )
-    return quality
+    given = {"spacing_m": 0.5, "outline_sigma_m": outline_sigma_m, "is_planar": is_planar}
+    return model_quality(points, faces, planes, [part.solid for part in parts], **given)[1]
 
 
 def lattice(width: float, depth: float, step: float = 0.5) -> FloatArray:
@@ -64,7 +54,7 @@ def flat_points(width: float, depth: float, z: float) -> FloatArray:
 
 
 def test_points_on_the_roof_leave_nothing_unexplained() -> None:
-    quality = measured(flat_points(10, 8, 5.0), modelled([shapely.box(0, 0, 10, 8)], [level(5.0)]))
+    quality = measured(flat_points(10, 8, 5.0), flat_roof(10, 8))
     assert (quality.share_within, quality.unexplained_m2, quality.noise_m) == (1.0, 0.0, 0.0)
     assert quality.largest_hole_m < 1.0
     assert (quality.is_curved, math.isnan(quality.bic_margin)) == (False, True)
@@ -73,40 +63,33 @@ def test_points_on_the_roof_leave_nothing_unexplained() -> None:
 def test_a_part_of_the_roof_that_points_contradict_is_unexplained_but_no_hole() -> None:
     points = flat_points(20, 10, 5.0)
     points[points[:, 0] > 10.0, 2] += 0.5
-    quality = measured(points, modelled([shapely.box(0, 0, 20, 10)], [level(5.0)]))
+    quality = measured(points, flat_roof(20, 10))
     assert quality.share_within == 0.5
     assert quality.unexplained_m2 == pytest.approx(100.0 - 10.0 * 0.5, abs=5.0)  # less the reach of the points beside
     assert quality.largest_hole_m < 1.0
 
 
-def test_a_hole_in_the_data_is_reported_by_its_diameter_and_its_area() -> None:
+def test_a_hole_is_reported_by_its_diameter_and_area_and_ground_seen_through_it_fills_it_but_explains_nothing() -> None:
     points = flat_points(20, 20, 5.0)
-    points = points[np.hypot(points[:, 0] - 10.0, points[:, 1] - 10.0) > 4.0]
-    quality = measured(points, modelled([shapely.box(0, 0, 20, 20)], [level(5.0)]))
-    assert quality.largest_hole_m == pytest.approx(8.0, abs=0.8)
-    assert quality.unexplained_m2 == pytest.approx(math.pi * (4.0 - 0.75) ** 2, rel=0.15)
-    assert quality.share_within == 1.0
-
-
-def test_ground_seen_through_a_hole_in_the_roof_fills_it_with_points_but_explains_nothing() -> None:
-    points = flat_points(20, 20, 5.0)
-    court = np.hypot(points[:, 0] - 10.0, points[:, 1] - 10.0) < 4.0
+    court = np.hypot(points[:, 0] - 10.0, points[:, 1] - 10.0) <= 4.0
+    empty = measured(points[~court], flat_roof(20, 20))
     points[court, 2] = 0.0
-    quality = measured(points, modelled([shapely.box(0, 0, 20, 20)], [level(5.0)]))
-    assert quality.largest_hole_m < 1.0
-    assert quality.unexplained_m2 == pytest.approx(math.pi * (4.0 - 0.75) ** 2, rel=0.15)
+    with_ground = measured(points, flat_roof(20, 20))
+    for quality in (empty, with_ground):
+        assert quality.unexplained_m2 == pytest.approx(math.pi * (4.0 - 0.75) ** 2, rel=0.15)
+    assert empty.largest_hole_m == pytest.approx(8.0, abs=0.8)
+    assert empty.share_within == 1.0
+    assert with_ground.largest_hole_m < 1.0
 
 
 def test_a_roof_away_from_all_points_says_nothing() -> None:
-    quality = measured(
-        flat_points(5, 5, 5.0) + np.array([50.0, 0.0, 0.0]), modelled([shapely.box(0, 0, 5, 5)], [level(5.0)])
-    )
+    quality = measured(flat_points(5, 5, 5.0) + np.array([50.0, 0.0, 0.0]), flat_roof(5, 5))
     assert quality.share_within == 0.0
     assert all(math.isnan(v) for v in (quality.noise_m, quality.unexplained_m2, quality.ridge_z_sigma_m))
 
 
 def test_a_block_has_neither_noise_nor_a_ridge() -> None:
-    quality = measured(flat_points(5, 5, 5.3), modelled([shapely.box(0, 0, 5, 5)], [level(5.0)]), is_planar=False)
+    quality = measured(flat_points(5, 5, 5.3), flat_roof(5, 5), is_planar=False)
     assert math.isnan(quality.noise_m)
     assert math.isnan(quality.ridge_z_sigma_m)
     assert quality.unexplained_m2 == pytest.approx(25.0)
@@ -116,8 +99,7 @@ def test_noise_is_that_of_the_points_whatever_stands_on_the_roof() -> None:
     points = flat_points(40, 40, 5.0)
     points[:, 2] += np.random.default_rng(1).normal(0.0, 0.05, len(points))
     points[::10, 2] += 3.0
-    quality = measured(points, modelled([shapely.box(0, 0, 40, 40)], [level(5.0)]))
-    assert quality.noise_m == pytest.approx(0.05, rel=0.2)
+    assert measured(points, flat_roof(40, 40)).noise_m == pytest.approx(0.05, rel=0.2)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -192,26 +174,19 @@ def test_more_points_and_less_noise_make_a_ridge_better_known() -> None:
     assert sigma(100_000, 0.01) == pytest.approx(0.004, abs=0.0005)
 
 
-def test_the_border_of_two_strips_on_a_roof_makes_its_ridge_less_known() -> None:
+def test_the_border_of_two_strips_on_a_roof_makes_its_ridge_less_known_and_what_all_points_share_does_not() -> None:
     points = gable_points(np.random.default_rng(5), 2000, 0.02)
-    shifted = points.copy()
-    shifted[shifted[:, 0] > 8.0, 2] += 0.1
-    one, other = (measured(p, fitted_gable(p)).ridge_z_sigma_m for p in (points, shifted))
-    assert other > 2.0 * one
-
-
-def test_what_all_points_share_does_not_change_the_sigma() -> None:
-    points = gable_points(np.random.default_rng(5), 500, 0.03)
     lifted = points + np.array([0.0, 0.0, 0.4])
-    assert measured(lifted, fitted_gable(lifted)).ridge_z_sigma_m == pytest.approx(
-        measured(points, fitted_gable(points)).ridge_z_sigma_m, abs=1e-3
-    )
+    shifted = np.where(points[:, :1] > 8.0, points + np.array([0.0, 0.0, 0.1]), points)
+    sigma, of_lifted, of_shifted = (measured(p, fitted_gable(p)).ridge_z_sigma_m for p in (points, lifted, shifted))
+    assert of_shifted > 2.0 * sigma
+    assert of_lifted == pytest.approx(sigma, abs=1e-3)
 
 
 def test_the_top_edge_of_a_pent_roof_is_as_uncertain_as_its_outline_is_steep() -> None:
     xy = lattice(10, 8)
     points = np.column_stack((xy, 3.0 + 0.5 * xy[:, 1]))
-    model = modelled([shapely.box(0, 0, 10, 8)], [Plane(a=0.0, b=0.5, c=3.0, n_points=9, rmse_m=0.0)])
+    model = modelled([shapely.box(0, 0, 10, 8)], [plane(0.0, 0.5, 3.0)])
     assert measured(points, model).ridge_z_sigma_m == pytest.approx(0.004)
     assert measured(points, model, outline_sigma_m=0.2).ridge_z_sigma_m == pytest.approx(math.hypot(0.1, 0.004))
 
@@ -225,8 +200,7 @@ def test_an_error_of_the_outline_does_not_move_a_ridge() -> None:
 
 def test_a_plane_of_three_points_has_no_sigma() -> None:
     points = np.array([[1.0, 1.0, 5.0], [4.0, 1.0, 5.0], [1.0, 4.0, 5.0]])
-    model = modelled([shapely.box(0, 0, 5, 5)], [level(5.0)])
-    assert math.isnan(measured(points, model).ridge_z_sigma_m)
+    assert math.isnan(measured(points, flat_roof(5, 5)).ridge_z_sigma_m)
 
 
 @given(st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=6))
@@ -250,7 +224,7 @@ def along_a_curve(slopes_deg: list[float], width: float = 1.5) -> Modelled:
     for k, slope in enumerate(slopes_deg):
         rise = math.tan(math.radians(slope))
         shapes.append(shapely.box(0, k * width, 20, (k + 1) * width))
-        planes.append(Plane(a=0.0, b=rise, c=z - rise * k * width, n_points=50, rmse_m=0.0))
+        planes.append(plane(0.0, rise, z - rise * k * width))
         z += rise * width
     return modelled(shapes, planes)
 
@@ -289,7 +263,7 @@ def pyramid(sides: int, rise: float, radius: float = 6.0) -> Modelled:
         shapes.append(shapely.Polygon([(10, 10), corners[k], corners[(k + 1) % sides]]))
         middle = angles[k] + math.pi / sides
         a, b = -rise * math.cos(middle), -rise * math.sin(middle)
-        planes.append(Plane(a=a, b=b, c=5.0 + rise * radius - 10 * a - 10 * b, n_points=50, rmse_m=0.0))
+        planes.append(plane(a, b, 5.0 + rise * radius - 10 * a - 10 * b))
     return modelled(shapes, planes)
 
 

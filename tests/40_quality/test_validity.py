@@ -8,12 +8,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from candidates_by_hand import turned_plan
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
-from pipeline.model import FaceKind, FloatArray, Solid, SolidFace
+from pipeline.model import FaceKind, Solid, SolidFace
 from pipeline.quality import validity
 from pipeline.quality.validity import ValidityTolerances, check_solid
 
@@ -85,10 +86,7 @@ moves = st.tuples(millimetres, millimetres, millimetres, st.integers(0, 3), st.i
 @given(move=moves, chance=st.randoms(use_true_random=False), which=st.integers(0, 10_000))
 @settings(max_examples=examples(200), deadline=None)
 def test_moves_and_relabelling_keep_the_verdict(
-    move: tuple[int, int, int, int, int, bool],
-    chance: random.Random,
-    which: int,
-    all_cases: list[Case],
+    move: tuple[int, int, int, int, int, bool], chance: random.Random, which: int, all_cases: list[Case]
 ) -> None:
     codes, solid = all_cases[which % len(all_cases)]
     *shift, quarters, axis, mirror = move
@@ -102,20 +100,8 @@ def test_moves_and_relabelling_keep_the_verdict(
 def test_a_sound_solid_stays_sound_when_turned_and_rounded(angle: float, which: int, all_cases: list[Case]) -> None:
     sound = [solid for codes, solid in all_cases if not codes]
     solid = sound[which % len(sound)]
-    assert check_solid(dataclasses.replace(solid, vertices=_turned_about_z(solid.vertices, angle))) == ()
-
-
-def _turned_about_z(vertices: FloatArray, angle: float) -> FloatArray:
-    """Vertices turned about the z axis, rounded to 1 mm."""
-    cosine, sine = np.cos(angle), np.sin(angle)
-    turned: FloatArray = np.column_stack(
-        [
-            cosine * vertices[:, 0] - sine * vertices[:, 1],
-            sine * vertices[:, 0] + cosine * vertices[:, 1],
-            vertices[:, 2],
-        ]
-    ).round(3)
-    return turned
+    turned = np.column_stack([turned_plan(solid.vertices[:, :2], np.degrees(angle)), solid.vertices[:, 2]]).round(3)
+    assert check_solid(dataclasses.replace(solid, vertices=turned)) == ()
 
 
 def test_vertices_at_the_snapping_distance_must_be_sound_both_as_one_and_as_two(valid_solid: Solid) -> None:

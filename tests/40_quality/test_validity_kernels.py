@@ -80,10 +80,9 @@ def test_triangle_pairs_intersect_as_in_rational_numbers(
     places = {tuple(map(int, vertices[i])) for i in {*first.tolist(), *second.tolist()}}
     if len(places) != 6 - shared:
         return
-    assert triangles_intersect(vertices, first, second) == _rational_twin(vertices, first, second)
-    assert triangles_intersect(vertices, np.roll(second, 1), first[::-1].copy()) == _rational_twin(
-        vertices, first, second
-    )
+    expected = _rational_twin(vertices, first, second)
+    assert triangles_intersect(vertices, first, second) == expected
+    assert triangles_intersect(vertices, np.roll(second, 1), first[::-1].copy()) == expected
 
 
 @given(

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import shapely
+from candidates_by_hand import candidate
 
 from pipeline.model import Candidate, FloatArray, LabelArray, Plane, Solid
 from pipeline.prepared_cloud import prepare_cloud
@@ -23,31 +24,27 @@ Body = tuple[shapely.Polygon, tuple[tuple[float, float, float], ...]]
 """A polygon and planes (a, b, c): the body's roof is the lowest of the planes; the building's the highest body."""
 
 
-def _box(x0: float, y0: float, x1: float, y1: float) -> shapely.Polygon:
-    return shapely.box(x0, y0, x1, y1)
-
-
 ROOFS: dict[str, tuple[Body, ...]] = {
-    "flat": ((_box(0, 0, 12, 8), ((0.0, 0.0, 5.0),)),),
-    "pent": ((_box(0, 0, 12, 8), ((0.3, 0.0, 4.0),)),),
-    "gable": ((_box(0, 0, 12, 8), ((0.0, 0.7, 3.0), (0.0, -0.7, 8.6))),),
-    "hip": ((_box(0, 0, 14, 8), ((0.0, 0.6, 3.0), (0.0, -0.6, 7.8), (0.6, 0.0, 3.0), (-0.6, 0.0, 11.4))),),
+    "flat": ((shapely.box(0, 0, 12, 8), ((0.0, 0.0, 5.0),)),),
+    "pent": ((shapely.box(0, 0, 12, 8), ((0.3, 0.0, 4.0),)),),
+    "gable": ((shapely.box(0, 0, 12, 8), ((0.0, 0.7, 3.0), (0.0, -0.7, 8.6))),),
+    "hip": ((shapely.box(0, 0, 14, 8), ((0.0, 0.6, 3.0), (0.0, -0.6, 7.8), (0.6, 0.0, 3.0), (-0.6, 0.0, 11.4))),),
     "l": (
-        (_box(0, 0, 16, 8), ((0.0, 0.7, 3.0), (0.0, -0.7, 8.6))),
-        (_box(0, 0, 6, 16), ((0.7, 0.0, 3.0), (-0.7, 0.0, 7.2))),
+        (shapely.box(0, 0, 16, 8), ((0.0, 0.7, 3.0), (0.0, -0.7, 8.6))),
+        (shapely.box(0, 0, 6, 16), ((0.7, 0.0, 3.0), (-0.7, 0.0, 7.2))),
     ),
     "stepped": (
-        (_box(0, 0, 7, 8), ((0.0, 0.0, 9.0),)),
-        (_box(7, 0, 14, 8), ((0.0, 0.0, 5.0),)),
+        (shapely.box(0, 0, 7, 8), ((0.0, 0.0, 9.0),)),
+        (shapely.box(7, 0, 14, 8), ((0.0, 0.0, 5.0),)),
     ),
-    "courtyard": ((_box(0, 0, 20, 20).difference(_box(6, 6, 14, 14)), ((0.0, 0.1, 5.0),)),),
+    "courtyard": ((shapely.box(0, 0, 20, 20).difference(shapely.box(6, 6, 14, 14)), ((0.0, 0.1, 5.0),)),),
     "dormer": (
-        (_box(0, 0, 12, 10), ((0.0, 0.8, 3.0), (0.0, -0.8, 11.0))),
-        (_box(4, 1, 7, 5), ((0.0, 0.1, 5.6),)),
+        (shapely.box(0, 0, 12, 10), ((0.0, 0.8, 3.0), (0.0, -0.8, 11.0))),
+        (shapely.box(4, 1, 7, 5), ((0.0, 0.1, 5.6),)),
     ),
     "tower": (
-        (_box(0, 0, 16, 12), ((0.0, 0.0, 5.0),)),
-        (_box(6, 4, 10, 8), ((0.0, 0.0, 14.0),)),
+        (shapely.box(0, 0, 16, 12), ((0.0, 0.0, 5.0),)),
+        (shapely.box(6, 4, 10, 8), ((0.0, 0.0, 14.0),)),
     ),
 }
 
@@ -123,19 +120,13 @@ def sample(
     turned = np.column_stack((cosine * xy[:, 0] - sine * xy[:, 1], sine * xy[:, 0] + cosine * xy[:, 1]))
     points = np.rint(np.column_stack((turned, z)) * 1e3) / 1e3
     order = np.lexsort((points[:, 2], points[:, 1], points[:, 0]))
+    made = candidate(points, origin=(0.0, 0.0, 0.0))
     outline = shapely.affinity.rotate(footprint, turn_deg, origin=(0.0, 0.0))
     step = 0.05
     lattice = np.stack(np.meshgrid(np.arange(x0 + step / 2, x1, step), np.arange(y0 + step / 2, y1, step)), -1)
     planes = [(cosine * a - sine * b, sine * a + cosine * b, c) for _, group in bodies for a, b, c in group]
     return ExactRoof(
-        candidate=Candidate(
-            building_id=kind,
-            origin=(0.0, 0.0, 0.0),
-            points=points[order],
-            ground=np.zeros((0, 3)),
-            ground_z_m=FLOOR_M,
-            footprint=outline if with_footprint else None,
-        ),
+        candidate=dataclasses.replace(made, footprint=outline if with_footprint else None),
         labels=labels[order],
         planes=tuple(Plane(a=a, b=b, c=c, n_points=1, rmse_m=0.0) for a, b, c in planes),
         volume_m3=float(np.nansum(heights(bodies, lattice.reshape(-1, 2))[0]) * step * step),

@@ -69,13 +69,10 @@ def test_with_more_labels_no_expansion_is_left_that_costs_less(seed: int) -> Non
         assert cost(*graph, np.where(taken, alpha, labels).astype(np.int32)) >= least
 
 
-def test_a_label_that_costs_the_same_is_not_taken() -> None:
+def test_a_label_that_costs_the_same_is_not_taken_and_only_allowed_nodes_take_one() -> None:
     costs = np.array([[5, 5], [5, 5]])
     labels = expanded(costs, np.array([[0, 1]]), np.array([3]), np.array([1, 1], np.int32))
     assert labels.tolist() == [1, 1]
-
-
-def test_only_allowed_nodes_take_a_label() -> None:
     costs = np.array([[9, 0], [9, 0]])
     labels = np.zeros(2, np.int32)
     lists = neighbour_lists(2, np.zeros((0, 2), np.int32), np.zeros(0, np.int64))
@@ -225,13 +222,10 @@ def test_a_hole_stays_in_the_cell_that_it_lies_in() -> None:
     loops(plan)
 
 
-def test_a_chord_through_a_hole_is_not_drawn() -> None:
+def test_a_chord_through_a_hole_is_not_drawn_and_a_vertex_close_to_another_edge_not_inserted() -> None:
     plan = square(holes=2)
     assert insert_chord(plan, 0, 2, 0, 0) == -1
     assert plan.counts.tolist() == [12, 24, 1]
-
-
-def test_a_vertex_close_to_another_edge_is_not_inserted() -> None:
     plan = square()
     assert not insert_vertex(plan, 0, 4, 0)
     assert insert_vertex(plan, 0, 40, 0)

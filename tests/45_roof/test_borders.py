@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import shapely
 from examples import examples
+from faces_by_hand import plane
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.model import Plane
 from pipeline.roof.borders import straighten_borders
 from pipeline.roof.footprint import clip_partition
 from pipeline.roof.partition import RoofPartition, march
@@ -23,10 +23,6 @@ from pipeline.tin.delaunay import triangulate
 ExactRoofs = Callable[..., Any]
 SETTINGS = RoofSettings()
 WIDTH_MM = 10_000
-
-
-def plane(a: float, b: float, c: float) -> Plane:
-    return Plane(a=a, b=b, c=c, n_points=1, rmse_m=0.0)
 
 
 def is_coverage(partition: RoofPartition) -> bool:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import shapely
+from candidates_by_hand import turned_plan
 from shapely import MultiPolygon, Polygon
 
 from pipeline.model import BoolArray, FloatArray, IntArray
@@ -18,15 +19,9 @@ from pipeline.roof.lines import Run
 from pipeline.roof.settings import RoofSettings
 
 LENGTH_M, DEPTH_M = 14.0, 9.0
+BOX_MM = shapely.box(0.0, 0.0, LENGTH_M * 1e3, DEPTH_M * 1e3)
 Pattern = Callable[[np.random.Generator, float], FloatArray]
 """Positions over a square of 40 m about the origin, at a spacing in metres."""
-
-
-def turned(xy: FloatArray, angle: float) -> FloatArray:
-    """Positions turned about the origin."""
-    cosine, sine = math.cos(angle), math.sin(angle)
-    rotated: FloatArray = xy @ np.array([[cosine, sine], [-sine, cosine]])
-    return rotated
 
 
 def strewn(rng: np.random.Generator, spacing_m: float) -> FloatArray:
@@ -36,7 +31,7 @@ def strewn(rng: np.random.Generator, spacing_m: float) -> FloatArray:
 def lattice(rng: np.random.Generator, spacing_m: float) -> FloatArray:
     steps = np.arange(-30.0, 30.0, spacing_m)
     xy = np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2) + rng.uniform(0.0, spacing_m, 2)
-    return turned(xy, rng.uniform(0.0, math.pi))
+    return turned_plan(xy, rng.uniform(0.0, 180.0))
 
 
 def scan_rows(rng: np.random.Generator, spacing_m: float) -> FloatArray:
@@ -44,7 +39,7 @@ def scan_rows(rng: np.random.Generator, spacing_m: float) -> FloatArray:
     along, across = spacing_m / math.sqrt(3.0), spacing_m * math.sqrt(3.0)
     xy = np.stack(np.meshgrid(np.arange(-30.0, 30.0, along), np.arange(-30.0, 30.0, across)), -1).reshape(-1, 2)
     xy = xy + rng.uniform(0.0, 1.0, 2) * (along, across) + rng.normal(0.0, 0.1 * along, xy.shape)
-    return turned(xy, rng.uniform(0.0, math.pi))
+    return turned_plan(xy, rng.uniform(0.0, 180.0))
 
 
 def in_mm(xy: FloatArray) -> IntArray:
@@ -101,32 +96,29 @@ def scanned(seed: int, spacing_m: float, reach_m: float) -> tuple[FloatArray, Bo
 @pytest.mark.parametrize("reach_m", [0.1, 0.3])
 @pytest.mark.parametrize("spacing_m", [0.25, 0.7])
 def test_split_pulses_tell_how_far_the_roof_is_seen_too_large(spacing_m: float, reach_m: float) -> None:
-    box = shapely.box(0.0, 0.0, LENGTH_M * 1e3, DEPTH_M * 1e3)
     reaches, edges = [], []
     for seed in range(30):
         xy, split = scanned(seed, spacing_m, reach_m)
         points = EdgePoints.of(in_mm(xy), split, spacing_m)
-        reaches.append(mixed_pulse_reach_mm(box, points) * 1e-3)
+        reaches.append(mixed_pulse_reach_mm(BOX_MM, points) * 1e-3)
         edges.append(edge_of(xy, split, spacing_m, reach_m=reaches[-1]))
     assert np.mean(reaches) == pytest.approx(reach_m, rel=0.12)
     assert abs(np.mean(edges)) < 0.05 * spacing_m + 0.1 * reach_m
 
 
 def test_without_split_pulses_nothing_is_drawn_back() -> None:
-    box = shapely.box(0.0, 0.0, LENGTH_M * 1e3, DEPTH_M * 1e3)
     xy, split = scanned(1, 0.3, 0.2)
-    assert mixed_pulse_reach_mm(box, EdgePoints.of(in_mm(xy), np.zeros_like(split), 0.3)) == 0.0
+    assert mixed_pulse_reach_mm(BOX_MM, EdgePoints.of(in_mm(xy), np.zeros_like(split), 0.3)) == 0.0
     found = [edge_of(xy, np.zeros(len(xy), np.bool_), 0.3) for xy, _ in (scanned(seed, 0.3, 0.2) for seed in range(20))]
     assert np.mean(found) == pytest.approx(0.2, abs=0.03)
 
 
 def test_split_pulses_all_over_a_roof_are_not_taken_for_its_edge() -> None:
-    box = shapely.box(0.0, 0.0, LENGTH_M * 1e3, DEPTH_M * 1e3)
     rng = np.random.default_rng(2)
     xy = strewn(rng, 0.25)
     xy = xy[in_box(xy)]
     split = rng.uniform(size=len(xy)) < 0.1
-    assert mixed_pulse_reach_mm(box, EdgePoints.of(in_mm(xy), split, 0.25)) < 25.0
+    assert mixed_pulse_reach_mm(BOX_MM, EdgePoints.of(in_mm(xy), split, 0.25)) < 25.0
 
 
 def test_an_edge_to_a_neighbour_without_split_pulses_is_not_drawn_back() -> None:
@@ -198,7 +190,7 @@ def test_a_straightened_outline_has_the_area_of_the_roof(turn_deg: float) -> Non
     bias = []
     for seed in range(12):
         xy, split = scanned(seed, 0.5, 0.15)
-        xy = turned(xy, math.radians(turn_deg))
+        xy = turned_plan(xy, turn_deg)
         raw = MultiPolygon([Polygon(np.rint(shapely.get_coordinates(truth.buffer(0.2, join_style="mitre")) * 1e3))])
         drawn = straighten(raw, 0.5, RoofSettings(), EdgePoints.of(in_mm(xy), split, 0.5))
         assert drawn.is_valid

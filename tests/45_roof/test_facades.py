@@ -8,8 +8,9 @@ import math
 import numpy as np
 import pytest
 import shapely
+from candidates_by_hand import candidate
 
-from pipeline.model import Candidate, FloatArray
+from pipeline.model import FloatArray
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.block import block_plane
 from pipeline.roof.facades import Eave, FacadePoints, at_walls, eave_of, mean_overhang_m
@@ -90,26 +91,14 @@ def test_a_line_along_a_neighbour_stays() -> None:
     assert np.allclose(bounds[1:], (0.4, 11.6, 7.6), atol=0.03)
 
 
-def test_plants_before_a_wall_are_not_a_wall() -> None:
-    random = np.random.default_rng(4)
-    bush = np.column_stack(
-        (random.uniform(0.5, 11.5, 200), random.uniform(-1.5, 0.5, 200), random.uniform(0, 5.0, 200))
-    )
-    points = facades(street(), bush)
-    assert south(points) == Eave(length_m=12.0, is_open=True, overhang_m=None)
-
-
-def test_a_parked_row_of_cars_or_a_fence_is_not_a_wall() -> None:
-    low = wall(0, 0.3, 80)
-    low[:, 2] *= 0.9 / 5.5
-    assert south(facades(street(), low)).overhang_m is None
-
-
-def test_points_of_one_corner_alone_are_not_a_wall() -> None:
+def test_plants_a_row_of_cars_or_a_fence_and_points_of_one_corner_alone_are_not_a_wall() -> None:
+    bush = np.random.default_rng(4).uniform((0.5, -1.5, 0.0), (11.5, 0.5, 5.0), (200, 3))
+    low = wall(0, 0.3, 80) * (1.0, 1.0, 0.9 / 5.5)
     corner = wall(0, 0.3, 200)
     corner = corner[corner[:, 0] < 2.0]
     assert len(corner) > 10
-    assert south(facades(street(), corner)).overhang_m is None
+    for points in (bush, low, corner):
+        assert south(facades(street(), points)) == Eave(length_m=12.0, is_open=True, overhang_m=None)
 
 
 def test_a_courtyard_grows_to_its_walls() -> None:
@@ -203,17 +192,10 @@ def test_scanned_buildings_without_overhangs_keep_their_true_area() -> None:
         own = (block.building[index] == number) & (block.face[index] >= 0)
         of, order = block.points.return_count[index], block.points.return_number[index]
         floor = float(np.median(xyz[block.building[index] < 0, 2]))
-        candidate = Candidate(
-            building_id="b",
-            origin=(0.0, 0.0, 0.0),
-            points=xyz[own],
-            ground=NONE,
-            ground_z_m=floor,
-            split_returns=xyz[own & (order == 1) & (of > 1)],
-            beside=xyz[~own & (of == 1)],
-            beside_later=xyz[~own & (of > 1) & (order == of)],
-        )
-        bare = roof_points(prepare_cloud(candidate), settings)
+        beside = {"beside": xyz[~own & (of == 1)], "beside_later": xyz[~own & (of > 1) & (order == of)]}
+        split = xyz[own & (order == 1) & (of > 1)]
+        house = candidate(xyz[own], ground_z_m=floor, split_returns=split, **beside)
+        bare = roof_points(prepare_cloud(house), settings)
         labelled = dataclasses.replace(bare, labels=np.zeros(len(bare.points), np.int32))
         planes = [block_plane(bare.points, floor, 70.0)]
         at_eaves = partition_roof(dataclasses.replace(labelled, facades=None), planes, settings).outline_mm

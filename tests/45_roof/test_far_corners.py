@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from candidates_by_hand import Plane
 from shapely import MultiPolygon
 
 from pipeline.model import FloatArray
@@ -40,7 +41,7 @@ def grid(west: float, east: float, plane: tuple[float, float, float], depth: flo
 class Hall:
     """12 m by 6 m, one cell; its west rises, its east is something else, and all of it has the rising plane."""
 
-    def __init__(self, east: tuple[float, float, float], planes: list[tuple[float, float, float]]) -> None:
+    def __init__(self, east: Plane, planes: list[Plane]) -> None:
         self.points = np.concatenate([grid(0.0, 8.0, RISING), grid(8.0, 12.0, east)])
         ring = np.array([[0, 0], [12_000, 0], [12_000, 6_000], [0, 6_000]], np.int64)
         self.plan = subdivision_of(ring, np.array([0, 4]), np.zeros(1, np.int64), 40)
@@ -84,36 +85,24 @@ def test_far_from_all_points_there_are_no_heights() -> None:
     assert (lowest[:4] > highest[:4]).tolist() == [False, True, True, False]
 
 
-def test_a_cell_is_cut_where_its_plane_meets_that_of_the_part_beyond() -> None:
-    hall = Hall(FALLING, [RISING, FALLING])
+@pytest.mark.parametrize("planes", [[RISING, FALLING], [RISING, (-0.8, 0.0, 14.5), FALLING]])
+def test_a_cell_is_cut_where_its_plane_meets_the_best_of_those_that_fit_beyond(planes: list[Plane]) -> None:
+    hall = Hall(FALLING, planes)
     assert hall.cut() == 1
     assert hall.areas() == pytest.approx([24.0, 48.0], abs=0.01)
 
 
-def test_a_cell_is_cut_where_it_gets_near_the_points_if_planes_do_not_meet_in_it() -> None:
-    hall = Hall(LOW, [RISING, LOW])
-    assert hall.cut() == 1
-    # points in the next cell of the raster and its slope allow the plane to go on
-    east, west = hall.areas()
-    assert 6.0 * 1.5 < east < 6.0 * 4.0
-    assert east + west == pytest.approx(72.0, abs=0.01)
-
-
-def test_a_plane_below_the_points_is_cut_off_too() -> None:
-    sinking = (-0.5, 0.0, 9.0)
-    hall = Hall((0.0, 0.0, 9.0), [sinking, (0.0, 0.0, 9.0)])
-    hall.points[hall.points[:, 0] < 8.0, 2] = 9.0 - 0.5 * hall.points[hall.points[:, 0] < 8.0, 0]
-    hall.look_around()
-    assert hall.cut() == 1
-    east, west = hall.areas()
-    assert 6.0 * 1.5 < east < 6.0 * 4.0
-    assert east + west == pytest.approx(72.0, abs=0.01)
-
-
-def test_the_better_of_two_planes_that_fit_beyond_decides_where_to_cut() -> None:
-    hall = Hall(FALLING, [RISING, (-0.8, 0.0, 14.5), FALLING])
-    assert hall.cut() == 1
-    assert hall.areas() == pytest.approx([24.0, 48.0], abs=0.01)
+def test_a_cell_is_cut_where_it_gets_near_the_points_if_planes_do_not_meet_in_it_from_above_or_below() -> None:
+    above, below = Hall(LOW, [RISING, LOW]), Hall((0.0, 0.0, 9.0), [(-0.5, 0.0, 9.0), (0.0, 0.0, 9.0)])
+    west = below.points[:, 0] < 8.0
+    below.points[west, 2] = 9.0 - 0.5 * below.points[west, 0]
+    below.look_around()
+    for hall in (above, below):
+        assert hall.cut() == 1
+        # points in the next cell of the raster and its slope allow the plane to go on
+        smaller, larger = hall.areas()
+        assert 6.0 * 1.5 < smaller < 6.0 * 4.0
+        assert smaller + larger == pytest.approx(72.0, abs=0.01)
 
 
 @pytest.mark.parametrize("swapped", [False, True])

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import collections
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 import shapely
+from faces_by_hand import assert_closed, level, partition_of, plane
 from shapely import Polygon
 
 from pipeline.model import FaceKind, FloatArray, Plane, Solid
 from pipeline.quality.validity import check_solid
 from pipeline.roof.lower_lods import LodParts, level_forms, lower_lods
-from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.simplification import without_idle_vertices
 from pipeline.roof.solid import solid_parts
@@ -27,20 +26,13 @@ KINDS = ["flat", "pent", "gable", "hip", "l", "stepped", "courtyard", "dormer", 
 LODS = ("1.2", "1.3", "2.2")
 
 
-def plane(z: float, slope: float = 0.0) -> Plane:
-    """A plane that rises along y."""
-    return Plane(a=0.0, b=slope, c=z, n_points=1, rmse_m=0.0)
-
-
 def sampled(polygons: Sequence[Polygon], planes: Sequence[Plane], pitch: float = 0.5) -> FloatArray:
     """Points on a roof, on a lattice amid its faces."""
     rows = []
     for polygon, own in zip(polygons, planes, strict=True):
-        x0, y0, x1, y1 = polygon.bounds
-        x, y = (
-            axis.ravel()
-            for axis in np.meshgrid(np.arange(x0 + pitch / 2, x1, pitch), np.arange(y0 + pitch / 2, y1, pitch))
-        )
+        (x0, y0, x1, y1), half = polygon.bounds, pitch / 2
+        axes = np.meshgrid(np.arange(x0 + half, x1, pitch), np.arange(y0 + half, y1, pitch))
+        x, y = (axis.ravel() for axis in axes)
         inside = shapely.contains_xy(polygon, x, y)
         rows.append(np.column_stack((x, y, own.a * x + own.b * y + own.c))[inside])
     return np.concatenate(rows)
@@ -48,9 +40,7 @@ def sampled(polygons: Sequence[Polygon], planes: Sequence[Plane], pitch: float =
 
 def built(polygons: Sequence[Polygon], planes: Sequence[Plane]) -> LodParts:
     """Roof faces as LoD2.2, the floor at 0."""
-    scaled = tuple(shapely.transform(p, lambda xy: np.rint(xy * 1e3)) for p in polygons)
-    partition = RoofPartition(polygons=scaled, labels=np.arange(len(polygons), dtype=np.int32))
-    return LodParts(lod="2.2", parts=solid_parts(partition, planes, 0.0), planes=list(planes))
+    return LodParts(lod="2.2", parts=solid_parts(partition_of(polygons), planes, 0.0), planes=list(planes))
 
 
 def lower(detailed: LodParts, points: FloatArray, lods: Sequence[str] = LODS, **changes: Any) -> list[LodParts]:
@@ -60,7 +50,7 @@ def lower(detailed: LodParts, points: FloatArray, lods: Sequence[str] = LODS, **
 def house_with_annexe(annexe_z: float) -> tuple[list[Polygon], list[Plane]]:
     """A gable of 10 m by 8 m, eaves at 5 m and the ridge at 8 m, with a flat annexe along one eave."""
     sides = [shapely.box(0, 0, 10, 4), shapely.box(0, 4, 10, 8)]
-    return [*sides, shapely.box(0, -3, 10, 0)], [plane(5.0, 0.75), plane(11.0, -0.75), plane(annexe_z)]
+    return [*sides, shapely.box(0, -3, 10, 0)], [plane(0.0, 0.75, 5.0), plane(0.0, -0.75, 11.0), level(annexe_z)]
 
 
 def heights(model: LodParts) -> list[float]:
@@ -92,7 +82,7 @@ def test_faces_with_a_low_step_between_them_are_one_level_part() -> None:
 def test_neighbouring_levels_differ_by_the_step_at_least() -> None:
     # a pent roof from 3 m to 9 m beside a flat one at 6.5 m: the mean step is 1.5 m, yet the levels differ by 0.7 m
     polygons = [shapely.box(0, 0, 6, 6), shapely.box(6, 0, 12, 6)]
-    planes = [plane(3.0, 1.0), plane(6.5)]
+    planes = [plane(0.0, 1.0, 3.0), level(6.5)]
     (levels,) = lower(built(polygons, planes), sampled(polygons, planes), ["1.3"], level_step_m=1.2)
     assert len(heights(levels)) == 1
 
@@ -100,7 +90,7 @@ def test_neighbouring_levels_differ_by_the_step_at_least() -> None:
 def test_a_small_tower_joins_the_roof_around_it() -> None:
     tower = shapely.box(4, 3, 5.5, 5)
     polygons = [shapely.Polygon(shapely.box(0, 0, 10, 8).exterior, [tower.exterior]), tower]
-    planes = [plane(6.0), plane(12.0)]
+    planes = [level(6.0), level(12.0)]
     (levels,) = lower(built(polygons, planes), sampled(polygons, planes), ["1.3"])
     assert heights(levels) == [6.0]
     (levels,) = lower(built(polygons, planes), sampled(polygons, planes), ["1.3"], min_part_area_m2=2.0)
@@ -119,37 +109,26 @@ def test_every_level_of_detail_is_valid_on_the_same_outline(exact_roof: ExactRoo
         assert [check_solid(part.solid) for part in model.parts] == [()] * len(parts)
         for part, own in zip(model.parts, parts, strict=True):
             assert shapely.symmetric_difference(part.footprint, own.footprint).area < 2e-3 * own.footprint.length
-            edges = collections.Counter(
-                edge
-                for face in part.solid.faces
-                for ring in face.rings
-                for edge in zip(ring, ring[1:] + ring[:1], strict=True)
-            )
-            assert set(edges.values()) == {1}
-            assert all((b, a) in edges for a, b in edges)
+            assert_closed(ring for face in part.solid.faces for ring in face.rings)
 
 
 def test_level_parts_share_one_wall_between_them() -> None:
     polygons, planes = house_with_annexe(2.5)
     (levels,) = lower(built(polygons, planes), sampled(polygons, planes), ["1.3"])
     solid = levels.parts[0].solid
-    inner = [
-        face
-        for face in solid.faces
-        if face.kind is FaceKind.WALL and np.all(solid.vertices[list(face.rings[0]), 1] == 0.0)
-    ]
-    assert len(inner) == 1
-    assert set(solid.vertices[list(inner[0].rings[0]), 2].tolist()) == set(heights(levels))
+    walls = [solid.vertices[list(face.rings[0])] for face in solid.faces if face.kind is FaceKind.WALL]
+    (inner,) = [wall for wall in walls if (wall[:, 1] == 0.0).all()]
+    assert set(inner[:, 2].tolist()) == set(heights(levels))
 
 
 def test_levels_that_meet_at_a_corner_only_are_joined_until_the_solid_is_sound() -> None:
     # high and low quarters: walls of four faces would meet in one edge
     polygons = [shapely.box(0, 0, 5, 5), shapely.box(5, 0, 10, 5), shapely.box(5, 5, 10, 10), shapely.box(0, 5, 5, 10)]
-    planes = [plane(9.0), plane(3.0), plane(9.0), plane(3.0)]
-    scaled = tuple(shapely.transform(p, lambda xy: np.rint(xy * 1e3)) for p in polygons)
-    (part,) = solid_parts(RoofPartition(polygons=scaled, labels=np.arange(4, dtype=np.int32)), planes, 0.0)
+    planes = [level(9.0), level(3.0), level(9.0), level(3.0)]
+    detailed = built(polygons, planes)
+    (part,) = detailed.parts
     assert check_solid(part.solid)
-    (levels,) = lower(LodParts(lod="2.2", parts=[part], planes=planes), sampled(polygons, planes), ["1.3"])
+    (levels,) = lower(detailed, sampled(polygons, planes), ["1.3"])
     assert check_solid(levels.parts[0].solid) == ()
     forms = list(level_forms(part, sampled(polygons, planes), planes[0], 0.0, SETTINGS))
     assert len(forms[0].solid_part.faces) == 4
@@ -158,7 +137,7 @@ def test_levels_that_meet_at_a_corner_only_are_joined_until_the_solid_is_sound()
 
 def test_a_part_without_points_takes_the_height_of_the_whole() -> None:
     polygons = [shapely.box(0, 0, 6, 6), shapely.box(20, 0, 26, 6)]
-    planes = [plane(5.0), plane(7.0)]
+    planes = [level(5.0), level(7.0)]
     levels, block = lower(built(polygons, planes), sampled(polygons[:1], planes[:1]), ["1.2", "1.3"])
     assert heights(levels) == heights(block) == [5.0, 5.0]
     assert [len(model.parts) for model in (levels, block)] == [2, 2]

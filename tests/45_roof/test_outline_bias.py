@@ -8,8 +8,8 @@ import functools
 import numpy as np
 import pytest
 import shapely
+from candidates_by_hand import candidate
 
-from pipeline.model import Candidate
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.block import block_plane
 from pipeline.roof.plan import partition_roof, roof_points
@@ -39,16 +39,10 @@ def outlines(density: float, beam_radius_m: float, *, with_returns: bool = True)
         xyz = np.rint((points.xyz[own] - origin) * 1e3) / 1e3
         split = (points.return_number[own] == 1) & (points.return_count[own] > 1)
         roof = block.face[own] >= 0
-        candidate = Candidate(
-            building_id="b",
-            origin=(0.0, 0.0, 0.0),
-            points=xyz,
-            ground=np.zeros((0, 3)),
-            ground_z_m=float(xyz[roof, 2].min()) - 3.0,
-            split_returns=xyz[split] if with_returns else np.zeros((0, 3)),
-        )
-        bare = roof_points(prepare_cloud(candidate), settings)
-        plane = block_plane(bare.points, candidate.ground_z_m, 70.0)
+        floor_m = float(xyz[roof, 2].min()) - 3.0
+        house = candidate(xyz, ground_z_m=floor_m, split_returns=xyz[split & with_returns])
+        bare = roof_points(prepare_cloud(house), settings)
+        plane = block_plane(bare.points, floor_m, 70.0)
         labelled = dataclasses.replace(bare, labels=np.zeros(len(bare.points), np.int32))
         drawn_mm = partition_roof(labelled, [plane], settings).outline_mm
         assert drawn_mm.is_valid

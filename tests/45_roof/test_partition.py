@@ -10,12 +10,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import shapely
+from candidates_by_hand import candidate, moved
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import BuildingError
-from pipeline.model import Candidate, IntArray, LabelArray, Plane, Reason, Solid, Tin
+from pipeline.model import IntArray, LabelArray, Plane, Reason, Solid, Tin
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.validity import check_solid
 from pipeline.roof.partition import MinAreas, RoofPartition, absorb_small_regions, connected_regions, march
@@ -45,6 +46,15 @@ def labelled(n: int, values: npt.ArrayLike) -> tuple[IntArray, Tin, LabelArray]:
     labels = np.full(len(xy), -1, np.int32)
     labels[: n * n] = np.asarray(values, np.int32).ravel()
     return xy, triangulate(xy), labels
+
+
+def absorbed(
+    xy: IntArray, z: npt.ArrayLike, tin: Tin, labels: LabelArray, levels_m: list[float], areas: MinAreas
+) -> LabelArray:
+    """The labels without small regions, where every vertex has a point at its elevation; level planes."""
+    x, y, z = xy[:, 0].copy(), xy[:, 1].copy(), np.broadcast_to(z, len(xy)).astype(np.float64)
+    planes = np.array([(0.0, 0.0, level) for level in levels_m])
+    return absorb_small_regions(x, y, z, tin.facets, labels, np.ones(len(xy), np.int32), planes, areas)
 
 
 def polygons_are_a_coverage(partition: RoofPartition) -> bool:
@@ -120,14 +130,10 @@ def test_a_lone_vertex_in_a_roof_is_absorbed_and_a_courtyard_stays() -> None:
     values[2, 2] = 1
     values[5:10, 5:10] = -1
     xy, tin, labels = labelled(12, values)
-    x, y = xy[:, 0].copy(), xy[:, 1].copy()
-    counted = np.ones(len(xy), np.int32)
-    z = np.full(len(xy), 5.0)
-    planes = np.array([[0.0, 0.0, 5.0], [0.0, 0.0, 6.0]])
-    cleaned = absorb_small_regions(x, y, z, tin.facets, labels, counted, planes, MinAreas(1.0, 4.0))
+    cleaned = absorbed(xy, 5.0, tin, labels, [5.0, 6.0], MinAreas(1.0, 4.0))
     assert (cleaned == 1).sum() == 0
     assert (cleaned[: 12 * 12] == -1).sum() == 25
-    filled = absorb_small_regions(x, y, z, tin.facets, labels, counted, planes, MinAreas(1.0, 40.0))
+    filled = absorbed(xy, 5.0, tin, labels, [5.0, 6.0], MinAreas(1.0, 40.0))
     assert (filled[: 12 * 12] == 0).all()
     assert (filled[12 * 12 :] == -1).all()
 
@@ -137,9 +143,7 @@ def test_any_number_of_gaps_in_one_roof_is_closed() -> None:
     values[2:-2:4, 2:-2:4] = -1
     assert (values < 0).sum() > 150
     xy, tin, labels = labelled(60, values)
-    counted = np.ones(len(xy), np.int32)
-    x, y, z = xy[:, 0].copy(), xy[:, 1].copy(), np.full(len(xy), 5.0)
-    closed = absorb_small_regions(x, y, z, tin.facets, labels, counted, np.array([[0.0, 0.0, 5.0]]), MinAreas(1.0, 4.0))
+    closed = absorbed(xy, 5.0, tin, labels, [5.0], MinAreas(1.0, 4.0))
     assert (closed[: 60 * 60] == 0).all()
 
 
@@ -148,12 +152,7 @@ def test_a_small_region_joins_the_plane_that_fits_it() -> None:
     values[:, 4] = 2
     values[:, 5:] = 1
     xy, tin, labels = labelled(9, values)
-    z = np.where(labels == 0, 3.0, 9.0)
-    planes = np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 9.0], [0.0, 0.0, 6.0]])
-    counted = np.ones(len(xy), np.int32)
-    cleaned = absorb_small_regions(
-        xy[:, 0].copy(), xy[:, 1].copy(), z, tin.facets, labels, counted, planes, MinAreas(5.0, 5.0)
-    )
+    cleaned = absorbed(xy, np.where(labels == 0, 3.0, 9.0), tin, labels, [3.0, 9.0, 6.0], MinAreas(5.0, 5.0))
     assert (cleaned[np.flatnonzero(labels == 2)] == 1).all()
 
 
@@ -185,12 +184,9 @@ def test_vertices_a_few_millimetres_apart_become_one_in_both_polygons() -> None:
 def test_a_shift_by_whole_metres_shifts_the_solid_to_the_bit(exact_roof: ExactRoofs) -> None:
     roof = exact_roof("l", noise_m=0.02, turn_deg=23.0)
     shift = np.array([137.0, -64.0, 0.0])
-    moved = dataclasses.replace(
-        roof,
-        candidate=dataclasses.replace(roof.candidate, points=np.rint((roof.candidate.points + shift) * 1e3) / 1e3),
-        planes=tuple(dataclasses.replace(p, c=p.c - p.a * shift[0] - p.b * shift[1]) for p in roof.planes),
-    )
-    for here, there in zip(roof.parts(), moved.parts(), strict=True):
+    planes = tuple(dataclasses.replace(p, c=p.c - p.a * shift[0] - p.b * shift[1]) for p in roof.planes)
+    elsewhere = dataclasses.replace(roof, candidate=moved(roof.candidate, shift), planes=planes)
+    for here, there in zip(roof.parts(), elsewhere.parts(), strict=True):
         assert here.solid.faces == there.solid.faces
         assert np.array_equal(np.rint((here.solid.vertices + shift) * 1e3), np.rint(there.solid.vertices * 1e3))
 
@@ -204,12 +200,8 @@ def test_the_order_of_points_does_not_matter(exact_roof: ExactRoofs) -> None:
         )
 
     order = np.random.default_rng(5).permutation(len(roof.labels))
-    shuffled = dataclasses.replace(
-        roof,
-        candidate=dataclasses.replace(roof.candidate, points=roof.candidate.points[order]),
-        labels=roof.labels[order],
-    )
-    assert faces(shuffled) == faces(roof)
+    mixed = dataclasses.replace(roof.candidate, points=roof.candidate.points[order])
+    assert faces(dataclasses.replace(roof, candidate=mixed, labels=roof.labels[order])) == faces(roof)
 
 
 @pytest.mark.parametrize("kind", ["hip", "l", "dormer"])
@@ -217,15 +209,10 @@ def test_a_mirrored_roof_gives_a_valid_solid_of_the_same_volume(
     exact_roof: ExactRoofs, volume: Volume, kind: str
 ) -> None:
     roof = exact_roof(kind, with_footprint=True)
-    mirrored = dataclasses.replace(
-        roof,
-        candidate=dataclasses.replace(
-            roof.candidate,
-            points=roof.candidate.points * [-1.0, 1.0, 1.0],
-            footprint=shapely.transform(roof.candidate.footprint, lambda xy: xy * [-1.0, 1.0]),
-        ),
-        planes=tuple(dataclasses.replace(p, a=-p.a) for p in roof.planes),
-    )
+    footprint = shapely.transform(roof.candidate.footprint, lambda xy: xy * [-1.0, 1.0])
+    planes = tuple(dataclasses.replace(p, a=-p.a) for p in roof.planes)
+    other = dataclasses.replace(roof.candidate, points=roof.candidate.points * [-1.0, 1.0, 1.0], footprint=footprint)
+    mirrored = dataclasses.replace(roof, candidate=other, planes=planes)
     (here,), (there,) = roof.parts(), mirrored.parts()
     assert check_solid(there.solid) == ()
     assert volume(there.solid) == pytest.approx(volume(here.solid), rel=0.004)
@@ -246,20 +233,13 @@ def test_random_labels_and_planes_always_give_some_valid_form(seed: int, with_fo
         Plane(a=float(a), b=float(b), c=float(rng.uniform(2, 12) - a * x - b * y), n_points=1, rmse_m=0.0)
         for (a, b), (x, y) in zip(slopes, centres, strict=True)
     ]
-    z = np.array([planes[max(v, 0)].a * x + planes[max(v, 0)].b * y + planes[max(v, 0)].c
-                  for v, (x, y) in zip(labels, xy, strict=True)])  # fmt: skip
+    a, b, c = np.array([plane.coefficients for plane in planes])[np.maximum(labels, 0)].T
+    z = a * xy[:, 0] + b * xy[:, 1] + c
     points = np.rint(np.column_stack((xy, np.maximum(z + rng.normal(0, 0.1, n), 1.6))) * 1e3) / 1e3
     footprint = shapely.affinity.rotate(shapely.box(*(0.05 * size), *(0.9 * size)), rng.uniform(0, 90))
-    candidate = Candidate(
-        building_id="noise",
-        origin=(0.0, 0.0, 0.0),
-        points=points,
-        ground=np.zeros((0, 3)),
-        ground_z_m=0.0,
-        footprint=footprint if with_footprint else None,
-    )
+    unordered = dataclasses.replace(candidate([], footprint=footprint if with_footprint else None), points=points)
     roof_settings = RoofSettings()
-    roof = roof_points(prepare_cloud(candidate), roof_settings)
+    roof = roof_points(prepare_cloud(unordered), roof_settings)
     roof = dataclasses.replace(roof, labels=labels[roof.index])
     if not (roof.labels >= 0).any():
         return

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 import pytest
 import shapely
+from candidates_by_hand import turned_plan
 
 from pipeline.errors import BuildingError
 from pipeline.geometry import fit_plane
@@ -19,8 +19,7 @@ from pipeline.roof.solid import solid_parts
 
 
 def turned(uv: FloatArray, degrees: float) -> FloatArray:
-    turn = math.radians(degrees)
-    return uv @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]) + np.array([20.0, 30.0])
+    return turned_plan(uv, degrees) + np.array([20.0, 30.0])
 
 
 def lattice(length: float, low: float, high: float, step: float = 0.5) -> FloatArray:

@@ -7,19 +7,10 @@ import math
 import numpy as np
 import pytest
 import shapely
+from faces_by_hand import plane
 
-from pipeline.model import FloatArray, Plane
-from pipeline.roof.rectangle import (
-    PlanLine,
-    convex_hull,
-    line_of_intersection,
-    minimum_rectangle,
-    rectangle_on_line,
-)
-
-
-def plane(a: float, b: float, c: float) -> Plane:
-    return Plane(a=a, b=b, c=c, n_points=0, rmse_m=0.0)
+from pipeline.model import FloatArray
+from pipeline.roof.rectangle import PlanLine, convex_hull, line_of_intersection, minimum_rectangle, rectangle_on_line
 
 
 def line_at(degrees: float, x: float = 0.0, y: float = 0.0) -> PlanLine:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from simulated import placed
 
 from pipeline.model import RoofType
 from pipeline.roof.roof_type import roof_type
@@ -15,7 +16,6 @@ from pipeline.roof.settings import RoofTypeSettings
 from pipeline.roof.solid import solid_parts
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import ROOF_TYPES, RoofShape
-from pipeline.ruler.simulation.scene import Terrain, place_building
 from pipeline.ruler.simulation.solids import truth_record
 
 ExactRoofs = Callable[..., Any]
@@ -56,17 +56,9 @@ def test_two_pent_roofs_that_fall_towards_one_another_are_not_a_gable(exact_roof
 @pytest.mark.parametrize("shape", list(RoofShape))
 def test_the_truth_of_every_shape_has_its_type(shape: RoofShape) -> None:
     random = np.random.default_rng([17, *str(shape).encode()])
-    for draw in range(8):
+    for _ in range(8):
         size = random_dimensions(shape, random)
-        building = place_building(
-            f"{shape}-{draw}",
-            shape,
-            size,
-            at=(50.0, 50.0),
-            azimuth_deg=float(random.uniform(0.0, 360.0)),
-            eave_height_m=4.0,
-            terrain=Terrain(base_z_m=0.0),
-        )
+        building = placed(shape, size, azimuth_deg=float(random.uniform(0.0, 360.0)))
         truth = truth_record(building, (0.0, 0.0, 0.0))
         found = roof_type(truth.planes, truth.faces, truth.solids, RoofTypeSettings())
         assert found is ROOF_TYPES[shape], size
@@ -90,11 +82,7 @@ def test_planes_meet_across_a_sliver_of_wall_and_not_across_a_step(exact_roof: E
 def test_a_roof_of_many_small_directions_is_a_combination_though_its_top_is_flat() -> None:
     size = random_dimensions(RoofShape.MANSARD, np.random.default_rng(5), area_m2=220.0)
     mansard = dataclasses.replace(size, second_pitch_deg=0.0, pitch_deg=65.0, break_share=0.2)
-    terrain = Terrain(base_z_m=0.0)
-    building = place_building(
-        "m", RoofShape.MANSARD, mansard, at=(0.0, 0.0), azimuth_deg=20.0, eave_height_m=4.0, terrain=terrain
-    )
-    truth = truth_record(building, (0.0, 0.0, 0.0))
+    truth = truth_record(placed(RoofShape.MANSARD, mansard, azimuth_deg=20.0), (0.0, 0.0, 0.0))
     shares = [face.polygon.area / truth.footprint.area for face in truth.faces]  # type: ignore[union-attr]
     assert sorted(shares)[-2] < RoofTypeSettings().minor_share
     assert roof_type(truth.planes, truth.faces, truth.solids, RoofTypeSettings()) is RoofType.COMBINATION

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import roofs_by_hand as hand
 import shapely
+from candidates_by_hand import candidate
 
 from pipeline.export.dimensions import dimensions
 from pipeline.methods import ReconstructSettings
@@ -42,30 +43,21 @@ def candidates(scene: Scene, seed: int, *, with_outline: bool) -> Iterator[tuple
     for number, true in enumerate(scene.buildings):
         place = np.floor([true.x, true.y, true.floor_z_m])
         points = returns.points.xyz[returns.building == number] - np.array(scene.origin) - place
-        points = np.rint(points * 1e3) / 1e3
         outline = shapely.transform(true.footprint, lambda xy, place=place: np.round(xy - place[:2], 3))
-        yield (
-            true,
-            Candidate(
-                building_id=true.building_id,
-                origin=tuple(place.tolist()),
-                points=points[np.lexsort((points[:, 2], points[:, 1], points[:, 0]))],
-                ground=np.zeros((0, 3)),
-                ground_z_m=true.floor_z_m - float(place[2]),
-                footprint=outline if with_outline else None,
-            ),
-        )
+        known = {"building_id": true.building_id, "ground_z_m": true.floor_z_m - float(place[2])}
+        footprint = outline if with_outline else None
+        yield true, candidate(points, origin=tuple(place.tolist()), footprint=footprint, **known)
 
 
 def models(*, with_outline: bool) -> list[Modelled]:
     found = []
     for seed in SCENES:
         scene = hand.scene_of_all_shapes(seed)
-        for true, candidate in candidates(scene, seed, with_outline=with_outline):
-            result = reconstruct_building(candidate, "arrangement", ReconstructSettings())
-            edge = shapely.get_coordinates(result.footprint) + np.array(candidate.origin[:2])
-            terrain = scene.terrain.elevation(edge[:, 0], edge[:, 1]) - candidate.origin[2]
-            found.append(Modelled(true=true, candidate=candidate, result=result, terrain_z_m=terrain))
+        for true, one in candidates(scene, seed, with_outline=with_outline):
+            result = reconstruct_building(one, "arrangement", ReconstructSettings())
+            edge = shapely.get_coordinates(result.footprint) + np.array(one.origin[:2])
+            terrain = scene.terrain.elevation(edge[:, 0], edge[:, 1]) - one.origin[2]
+            found.append(Modelled(true=true, candidate=one, result=result, terrain_z_m=terrain))
     return found
 
 

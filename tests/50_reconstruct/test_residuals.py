@@ -8,16 +8,13 @@ import numpy as np
 import pytest
 import shapely
 from examples import examples
+from faces_by_hand import plane
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import Polygon
 
-from pipeline.model import Plane, RoofFace
+from pipeline.model import RoofFace
 from pipeline.quality.residuals import TopSurface, plan_index, summarise, surface_of, vertical_residuals
-
-
-def plane(a: float, b: float, c: float) -> Plane:
-    return Plane(a=a, b=b, c=c, n_points=1, rmse_m=0.0)
 
 
 def face(polygon: Polygon, index: int) -> RoofFace:
@@ -28,15 +25,10 @@ def face(polygon: Polygon, index: int) -> RoofFace:
 @settings(max_examples=examples(40), deadline=None)
 def test_the_top_surface_is_that_of_a_plain_search(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    faces, planes = [], []
-    for k in range(int(rng.integers(1, 8))):
-        shape = shapely.affinity.rotate(shapely.box(0, 0, *rng.uniform(1, 9, 2)), rng.uniform(0, 90))
-        shape = shapely.affinity.translate(shape, *rng.uniform(-10, 10, 2))
-        if rng.uniform() < 0.5:
-            shape = shape.difference(shape.centroid.buffer(0.4))
-        faces.append(face(shape, k))
-        planes.append(plane(*rng.uniform(-1, 1, 2), rng.uniform(2, 9)))
-    points = np.column_stack((rng.uniform(-15, 20, (200, 2)), rng.uniform(0, 10, 200)))
+    polygons, coefficients = turned_faces(rng, int(rng.integers(1, 8)), spread_m=15.0)
+    faces = [face(polygon, k) for k, polygon in enumerate(polygons)]
+    planes = [plane(*row) for row in coefficients.tolist()]
+    points = np.column_stack((rng.uniform(-5, 25, (200, 2)), rng.uniform(0, 10, 200)))
     expected = np.full(len(points), np.nan)
     for f in faces:
         inside = shapely.contains_xy(f.polygon, points[:, 0], points[:, 1])
@@ -87,12 +79,12 @@ def test_nothing_covered_gives_nan_and_zero() -> None:
     assert len(vertical_residuals(np.zeros((0, 3)), [], [])) == 0
 
 
-def turned_faces(rng: np.random.Generator, n: int) -> tuple[list[Polygon], np.ndarray]:
+def turned_faces(rng: np.random.Generator, n: int, spread_m: float = 40.0) -> tuple[list[Polygon], np.ndarray]:
     """Turned rectangles with and without holes, whose planes are given about (0, 0)."""
     polygons = []
     for _ in range(n):
         shape = shapely.affinity.rotate(shapely.box(0, 0, *rng.uniform(2, 9, 2)), rng.uniform(0, 90))
-        shape = shapely.affinity.translate(shape, *rng.uniform(0, 40, 2))
+        shape = shapely.affinity.translate(shape, *rng.uniform(0, spread_m, 2))
         polygons.append(shape.difference(shape.centroid.buffer(0.5)) if rng.uniform() < 0.4 else shape)
     return polygons, np.column_stack((rng.uniform(-1, 1, (n, 2)), rng.uniform(2, 9, n)))
 

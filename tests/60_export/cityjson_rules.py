@@ -7,98 +7,53 @@ from typing import Any
 
 import jsonschema
 
-_NUMBERS = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
-_INDEX_RING = {"type": "array", "items": {"type": "integer", "minimum": 0}, "minItems": 3}
-_SURFACE = {
+Schema = dict[str, Any]
+
+
+def _array(items: Schema, least: int = 0, most: int | None = None) -> Schema:
+    return {"type": "array", "items": items, "minItems": least} | ({} if most is None else {"maxItems": most})
+
+
+def _object(optional: dict[str, Schema] | None = None, **required: Schema) -> Schema:
+    """An object of these members and no others."""
+    members = required | (optional or {})
+    return {"type": "object", "required": list(required), "properties": members, "additionalProperties": False}
+
+
+_TEXT, _NUMBER, _INTEGER = ({"type": name} for name in ("string", "number", "integer"))
+_NUMBERS = _array(_NUMBER, 3, 3)
+_RINGS = _array(_array({"type": "integer", "minimum": 0}, 3), 1)
+_SURFACE = _object(type={"enum": ["RoofSurface", "WallSurface", "GroundSurface"]}) | {"additionalProperties": True}
+_SOLID = _object(
+    type={"const": "Solid"},
+    lod=_TEXT | {"pattern": r"^[0-3](\.[0-3])?$"},
+    boundaries=_array(_array(_RINGS, 4), 1),
+    semantics=_object(surfaces=_array(_SURFACE), values=_array(_array(_INTEGER))),
+)
+_BUILDING = _object({"attributes": {"type": "object"}, "children": _array(_TEXT, 1)}, type={"const": "Building"})
+_PART = _object(type={"const": "BuildingPart"}, parents=_array(_TEXT, 1, 1), geometry=_array(_SOLID, 1))
+_METADATA = {
     "type": "object",
-    "required": ["type"],
-    "properties": {"type": {"enum": ["RoofSurface", "WallSurface", "GroundSurface"]}},
-}
-_SOLID = {
-    "type": "object",
-    "required": ["type", "lod", "boundaries", "semantics"],
-    "additionalProperties": False,
     "properties": {
-        "type": {"const": "Solid"},
-        "lod": {"type": "string", "pattern": r"^[0-3](\.[0-3])?$"},
-        "boundaries": {
-            "type": "array",
-            "minItems": 1,
-            "items": {"type": "array", "minItems": 4, "items": {"type": "array", "minItems": 1, "items": _INDEX_RING}},
-        },
-        "semantics": {
-            "type": "object",
-            "required": ["surfaces", "values"],
-            "additionalProperties": False,
-            "properties": {
-                "surfaces": {"type": "array", "items": _SURFACE},
-                "values": {"type": "array", "items": {"type": "array", "items": {"type": "integer"}}},
-            },
-        },
+        "title": _TEXT,
+        "referenceSystem": _TEXT | {"pattern": r"^https://www\.opengis\.net/def/crs/[A-Z]+/\d+/\d+$"},
+        "geographicalExtent": _array(_NUMBER, 6, 6),
     },
 }
-_BUILDING = {
-    "type": "object",
-    "required": ["type"],
-    "properties": {
-        "type": {"const": "Building"},
-        "attributes": {"type": "object"},
-        "children": {"type": "array", "items": {"type": "string"}, "minItems": 1},
-    },
-    "additionalProperties": False,
-}
-_PART = {
-    "type": "object",
-    "required": ["type", "parents", "geometry"],
-    "properties": {
-        "type": {"const": "BuildingPart"},
-        "parents": {"type": "array", "items": {"type": "string"}, "minItems": 1, "maxItems": 1},
-        "geometry": {"type": "array", "items": _SOLID, "minItems": 1},
-    },
-    "additionalProperties": False,
-}
-FIRST_LINE = {
-    "type": "object",
-    "required": ["type", "version", "transform", "CityObjects", "vertices"],
-    "properties": {
-        "type": {"const": "CityJSON"},
-        "version": {"const": "2.0"},
-        "transform": {
-            "type": "object",
-            "required": ["scale", "translate"],
-            "additionalProperties": False,
-            "properties": {"scale": _NUMBERS, "translate": _NUMBERS},
-        },
-        "metadata": {
-            "type": "object",
-            "properties": {
-                "title": {"type": "string"},
-                "referenceSystem": {
-                    "type": "string",
-                    "pattern": r"^https://www\.opengis\.net/def/crs/[A-Z]+/\d+/\d+$",
-                },
-                "geographicalExtent": {"type": "array", "items": {"type": "number"}, "minItems": 6, "maxItems": 6},
-            },
-        },
-        "CityObjects": {"const": {}},
-        "vertices": {"const": []},
-    },
-    "additionalProperties": False,
-}
-FEATURE = {
-    "type": "object",
-    "required": ["type", "id", "CityObjects", "vertices"],
-    "properties": {
-        "type": {"const": "CityJSONFeature"},
-        "id": {"type": "string"},
-        "CityObjects": {"type": "object", "additionalProperties": {"oneOf": [_BUILDING, _PART]}},
-        "vertices": {
-            "type": "array",
-            "items": {"type": "array", "items": {"type": "integer"}, "minItems": 3, "maxItems": 3},
-        },
-    },
-    "additionalProperties": False,
-}
+FIRST_LINE = _object(
+    {"metadata": _METADATA},
+    type={"const": "CityJSON"},
+    version={"const": "2.0"},
+    transform=_object(scale=_NUMBERS, translate=_NUMBERS),
+    CityObjects={"const": {}},
+    vertices={"const": []},
+)
+FEATURE = _object(
+    type={"const": "CityJSONFeature"},
+    id=_TEXT,
+    CityObjects={"type": "object", "additionalProperties": {"oneOf": [_BUILDING, _PART]}},
+    vertices=_array(_array(_INTEGER, 3, 3)),
+)
 
 
 def faults(lines: Sequence[dict[str, Any]]) -> list[str]:

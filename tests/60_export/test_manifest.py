@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime as dt
 import json
 from pathlib import Path
@@ -9,13 +10,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import RunError
-from pipeline.runtime.manifest import (
-    InputFile,
-    RunManifest,
-    RunStatus,
-    read_manifest,
-    write_manifest,
-)
+from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, read_manifest, write_manifest
 
 
 @pytest.fixture
@@ -48,15 +43,7 @@ def test_a_manifest_comes_back_as_it_was(tmp_path: Path, manifest: RunManifest) 
 
 
 def test_the_end_replaces_the_start(tmp_path: Path, manifest: RunManifest) -> None:
-    start = RunManifest(
-        status=RunStatus.RUNNING,
-        engine_version="0.1.0",
-        method="fuzzy-sart",
-        settings={},
-        settings_hash="ab",
-        started_at=manifest.started_at,
-    )
-    write_manifest(tmp_path, start)
+    write_manifest(tmp_path, dataclasses.replace(manifest, status=RunStatus.RUNNING, finished_at=None))
     assert read_manifest(tmp_path).status is RunStatus.RUNNING
     write_manifest(tmp_path, manifest)
     assert read_manifest(tmp_path).status is RunStatus.INCOMPLETE
@@ -92,11 +79,4 @@ def test_entries_of_a_later_version_are_left_out(tmp_path: Path, manifest: RunMa
 
 def test_a_time_without_zone_is_refused(manifest: RunManifest) -> None:
     with pytest.raises(RunError, match="give a time zone"):
-        RunManifest(
-            status=manifest.status,
-            engine_version="0",
-            method="m",
-            settings={},
-            settings_hash="s",
-            started_at=manifest.started_at.replace(tzinfo=None),
-        )
+        dataclasses.replace(manifest, started_at=manifest.started_at.replace(tzinfo=None))

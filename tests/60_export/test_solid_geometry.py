@@ -123,13 +123,8 @@ def test_duckdb_reads_the_solids_and_their_semantics(tmp_path: Path, contexts: C
             "SELECT building_id, lod, solid, len(list_filter(solid_surfaces, lambda s: s = 'RoofSurface'))"
             f" FROM '{path}' ORDER BY building_id"
         ).fetchall()
-    assert [(name, lod, n) for name, lod, _, n in rows] == [
-        ("courtyard", "1.2", 1),
-        ("failed", None, None),
-        ("gable", "2.2", 2),
-        ("pent", "2.2", 1),
-        ("two_parts", "2.2", 4),
-    ]
+    expected = {"courtyard": ("1.2", 1), "failed": (None, None), "gable": ("2.2", 2), "pent": ("2.2", 1)}
+    assert {name: (lod, n) for name, lod, _, n in rows} == expected | {"two_parts": ("2.2", 4)}
     for name, _, wkb, _ in rows:
         wanted = next((b() for b in BUILT if b.__name__ == name), small.failed())
         found = solid_columns(wanted, contexts["compound"].reference)["solid"]

@@ -47,28 +47,10 @@ def test_a_tile_writes_the_designed_files_and_says_their_digests(
     assert (reported.n_buildings, reported.n_planes, reported.n_rejected) == (3, 6, 2)
 
 
-def test_mesh_paths_of_the_table_are_those_of_the_files(tmp_path: Path, contexts: Contexts) -> None:
-    for meshes, wanted in (
-        ("building", {"meshes/t1/gable.obj", "meshes/t1/two_parts.obj"}),
-        ("tile", {"meshes/t1/t1.obj"}),
-    ):
-        folder = tmp_path / meshes
-        write_tile(folder, "t1", [build() for build in BUILT], [], contexts["compound"], meshes)
-        reported = read_table(str(folder), "buildings")["mesh_path"].to_pylist()
-        assert {path for path in reported if path} == wanted
-        assert {path.relative_to(folder).as_posix() for path in folder.rglob("*.obj")} == wanted
-    text = (tmp_path / "tile" / "meshes" / "t1" / "t1.obj").read_text()
-    assert [line for line in text.splitlines() if line.startswith("o ")] == [
-        "o gable-0",
-        "o two_parts-0",
-        "o two_parts-1",
-    ]
-
-
-def test_without_meshes_there_are_no_obj_files_and_no_paths(tmp_path: Path, contexts: Contexts) -> None:
-    write_tile(tmp_path, "t1", [small.gable()], [], contexts["compound"], "none")
-    assert not (tmp_path / "meshes").exists()
-    assert read_table(str(tmp_path), "buildings")["mesh_path"].to_pylist() == [None]
+def test_the_mesh_of_a_tile_names_every_solid(tmp_path: Path, contexts: Contexts) -> None:
+    write_tile(tmp_path, "t1", [build() for build in BUILT], [], contexts["compound"], "tile")
+    lines = (tmp_path / "meshes" / "t1" / "t1.obj").read_text().splitlines()
+    assert [line for line in lines if line.startswith("o ")] == ["o gable-0", "o two_parts-0", "o two_parts-1"]
 
 
 def test_publishing_twice_in_another_order_changes_nothing(
@@ -110,21 +92,24 @@ def test_another_store_gets_the_same_files(tmp_path: Path, contexts: Contexts) -
     assert write_tile(tmp_path, "t1", [small.gable()], [], contexts["compound"]) == reported
 
 
-@pytest.mark.parametrize("key", ["", "85", "-3", "a/b", "tile=x", "x 1"])
-def test_a_key_that_readers_would_misread_is_refused(tmp_path: Path, contexts: Contexts, key: str) -> None:
-    with pytest.raises(RunError, match="hive key"):
-        write_tile(tmp_path, key, [], [], contexts["compound"])
+@pytest.mark.parametrize(
+    ("key", "meshes", "fault"),
+    [
+        *((key, "building", "hive key") for key in ("", "85", "-3", "a/b", "tile=x", "x 1")),
+        ("t1", "all", "'all': use one of building, tile, glb, none"),
+    ],
+)
+def test_a_key_that_readers_would_misread_and_unknown_meshes_are_refused(
+    tmp_path: Path, contexts: Contexts, key: str, meshes: str, fault: str
+) -> None:
+    with pytest.raises(RunError, match=fault):
+        write_tile(tmp_path, key, [], [], contexts["compound"], meshes)
 
 
 def test_one_building_twice_is_refused(tmp_path: Path, contexts: Contexts) -> None:
     again = dataclasses.replace(small.pent(), building_id="gable")
     with pytest.raises(RunError, match="gable more than once"):
         write_tile(tmp_path, "t1", [small.gable(), again], [], contexts["compound"])
-
-
-def test_an_unknown_kind_of_meshes_lists_the_known_ones(tmp_path: Path, contexts: Contexts) -> None:
-    with pytest.raises(RunError, match="'all': use one of building, tile, glb, none"):
-        write_tile(tmp_path, "t1", [], [], contexts["compound"], "all")
 
 
 def test_the_command_line_and_the_service_offer_the_meshes_that_are_written() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+import roofs_by_hand as by_hand
 import shapely
 from roofs_by_hand import points_of
 from scipy import ndimage
@@ -39,10 +40,8 @@ def model(name: str, footprint: shapely.Polygon, *, edge: bool = False) -> RoofM
     )
 
 
-def truth_of(buildings: Sequence[RoofModel], extent: shapely.Polygon) -> Reference:
-    return Reference(
-        name="r", kind="truth", buildings=tuple(buildings), has_faces=True, outlines="truth", tiles=(), extent=extent
-    )
+def truth_of(buildings: Sequence[RoofModel], extent: shapely.Polygon | None) -> Reference:
+    return by_hand.reference(buildings, extent=extent)
 
 
 def classified(xyz: FloatArray, is_building: BoolArray, name: str = "t") -> Callable[[], ReferencePoints]:
@@ -239,15 +238,8 @@ def test_given_footprints_of_a_part_give_completeness_inside_them_only() -> None
     xyz = np.column_stack((rng.uniform((990, 1990), (1060, 2030), (60_000, 2)), np.zeros(60_000)))
     # two houses are built, the footprint of one is given; the points of the other prove nothing wrong
     built = shapely.union_all([shapely.box(1000, 2000, 1010, 2010), shapely.box(1030, 2000, 1040, 2010)])
-    given = [model("a", shapely.box(1000, 2000, 1010, 2010))]
-    reference = Reference(
-        name="p",
-        kind="points",
-        buildings=tuple(given),
-        has_faces=False,
-        outlines="given",
-        tiles=(classified(xyz, shapely.contains_xy(built, xyz[:, 0], xyz[:, 1])),),
-    )
+    tiles = (classified(xyz, shapely.contains_xy(built, xyz[:, 0], xyz[:, 1])),)
+    reference = dataclasses.replace(truth_of(squares(1), None), kind="points", outlines="given", tiles=tiles)
     half = [model("m", shapely.box(1000, 2000, 1005, 2010)), model("other", shapely.box(1020, 2000, 1025, 2005))]
     measured = figures(detect(half, reference), reference)
     assert set(measured) == {

@@ -171,27 +171,25 @@ def test_a_split_building_costs_no_faces() -> None:
 # ------------------------------------------------------------------------------------------------------- bent faces
 
 
-def one_sided(name: str, true: RoofModel) -> RoofModel:
-    """A bent gable modelled with one face a side: the chord from eave to ridge."""
-    middle, ridge, eave = 6.0, 4.0 + 2 * 0.4 + 4 * 0.6, 4.0
-    rise = (ridge - eave) / middle
-    sides = [
+def one_sided(true: RoofModel, rise: float, eave: float) -> RoofModel:
+    """A bent gable modelled with one face a side."""
+    sides = (
         surface(rectangle(0, 0, 12, 6), (0.0, rise, eave), 0),
         surface(rectangle(0, 6, 12, 12), (0.0, -rise, eave + 12 * rise), 1),
-    ]
-    return dataclasses.replace(true, building_id=name, surfaces=tuple(sides))
+    )
+    return dataclasses.replace(true, surfaces=sides)
 
 
 def test_a_bent_face_is_found_as_one_face_and_as_two() -> None:
     true = bent_gable("t")
-    for made in (true, one_sided("m", true)):
+    known = reference([true])
+    chord = (2 * 0.4 + 4 * 0.6) / 6  # from eave to ridge
+    for made in (true, one_sided(true, chord, 4.0)):
         facts = scored([made], [true])
         assert all(facts[name.split(".")[1]] == 1.0 for name in SHARES)
         assert (facts["topology_1_1"], facts["topology_1_n"]) == (2, 0)
-        known = reference([true])
-        assert {one.n for one in measures(score_faces([made], known), subsets(known)[0]) if "complete" in one.name} == {
-            2
-        }
+        found_of = measures(score_faces([made], known), subsets(known)[0])
+        assert {one.n for one in found_of if "complete" in one.name} == {2}
 
 
 @pytest.mark.parametrize(("lower", "upper", "bend"), [(0.30, 0.62, 3.0), (-0.10, 0.70, 2.0)])
@@ -202,19 +200,14 @@ def test_a_bent_face_is_found_by_its_mean_plane_where_no_piece_matches_alone(
     rest = 6.0 - bend
     rise = (bend * lower + rest * upper) / 6
     mean_z = (bend * (4.0 + lower * bend / 2) + rest * (4.0 + lower * bend + upper * rest / 2)) / 6
-    sides = [
-        surface(rectangle(0, 0, 12, 6), (0.0, rise, mean_z - 3 * rise), 0),
-        surface(rectangle(0, 6, 12, 12), (0.0, -rise, mean_z + 9 * rise), 1),
-    ]
-    score = score_faces([dataclasses.replace(true, surfaces=tuple(sides))], reference([true]))
+    made = one_sided(true, rise, mean_z - 3 * rise)
+    score = score_faces([made], reference([true]))
     assert all(row.found and row.as_group and row.matched for row in score.reference)
     assert [row.angle_deg for row in score.reference] == pytest.approx([0.0] * 4, abs=1e-9)
     assert [row.offset_m for row in score.reference] == pytest.approx([0.0] * 4, abs=1e-9)
     assert [row.overlap_reference for row in score.reference] == pytest.approx([1.0] * 4)
     assert [row.verdict for row in score.models] == [FaceVerdict.RIGHT] * 2
-    sides[0] = lifted(sides[0], 0.5)
-    score = score_faces([dataclasses.replace(true, surfaces=tuple(sides))], reference([true]))
-    assert [row.found for row in score.reference] == [False, False, True, True]
+    assert found([with_face(made, 0, lifted(made.surfaces[0], 0.5))], [true]) == [False, False, True, True]
 
 
 def test_a_model_face_that_matches_another_face_does_not_find_a_group_too() -> None:
@@ -310,11 +303,8 @@ def test_faces_of_models_that_call_themselves_cut_are_wrong_all_the_same() -> No
 
 def test_a_face_over_everything_is_wrong_however_far_it_goes_beyond_the_extent() -> None:
     known = reference(TRUTH)
-    lid = flat("lid")
-    lid = dataclasses.replace(
-        lid, surfaces=(dataclasses.replace(lid.surfaces[0], polygon=by_hand.EXTENT.buffer(2_000.0)),)
-    )
-    score = score_faces([*TRUTH, lid], known)
+    wide = dataclasses.replace(flat("lid").surfaces[0], polygon=by_hand.EXTENT.buffer(2_000.0))
+    score = score_faces([*TRUTH, with_face(flat("lid"), 0, wide)], known)
     assert score.models[-1].verdict is FaceVerdict.WRONG
 
 
@@ -333,27 +323,18 @@ def test_a_face_elsewhere_is_wrong_only_where_the_reference_is_complete() -> Non
 
 
 def test_good_and_hard_buildings_are_separate() -> None:
-    known = {
-        "a": by_hand.conditions(good=True),
-        "b": by_hand.conditions(good=False),
-        "c": by_hand.conditions(good=True),
-    }
-    truth = reference(TRUTH, conditions=known)
-    score = score_faces(
-        [TRUTH[0], with_face(TRUTH[1], 1, lifted(TRUTH[1].surfaces[1], 1.0)), flat("far", 200.0)], truth
-    )
-    everything, good, hard = ({one.name: one for one in measures(score, subset)} for subset in subsets(truth))
-    assert [facts["faces.completeness_10m2"].value for facts in (everything, good, hard)] == pytest.approx(
-        [5 / 7, 2 / 3, 3 / 4]
-    )
-    assert [facts["faces.correctness_10m2"].value for facts in (everything, good, hard)] == pytest.approx(
-        [5 / 7, 1.0, 3 / 4]
-    )
-    assert [facts["faces.quality_10m2"].value for facts in (everything, good, hard)] == pytest.approx(
-        [5 / 9, 2 / 3, 3 / 5]
-    )
-    assert [facts["faces.topology_0_1"].value for facts in (everything, good, hard)] == [1, 0, 0]
-    assert [facts["faces.completeness_10m2"].subset for facts in (everything, good, hard)] == ["all", "good", "hard"]
+    truth = reference(TRUTH, conditions={name: by_hand.conditions(good=name != "b") for name in "abc"})
+    raised = with_face(TRUTH[1], 1, lifted(TRUTH[1].surfaces[1], 1.0))
+    score = score_faces([TRUTH[0], raised, flat("far", 200.0)], truth)
+    by_subset = [figures(score, truth, number) for number in range(3)]
+    for name, wanted in {
+        "completeness_10m2": (5 / 7, 2 / 3, 3 / 4),
+        "correctness_10m2": (5 / 7, 1.0, 3 / 4),
+        "quality_10m2": (5 / 9, 2 / 3, 3 / 5),
+        "topology_0_1": (1, 0, 0),
+    }.items():
+        assert tuple(facts[name] for facts in by_subset) == pytest.approx(wanted), name
+    assert [measures(score, subset)[0].subset for subset in subsets(truth)] == ["all", "good", "hard"]
 
 
 def test_without_true_faces_there_is_nothing_to_say() -> None:

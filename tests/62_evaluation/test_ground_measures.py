@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import roofs_by_hand as by_hand
 from las_files import write_las
 from roofs_by_hand import points_of
 from scipy import stats
@@ -47,15 +48,8 @@ def reader(points: ReferencePoints) -> Callable[[], ReferencePoints]:
 
 
 def reference_of(parts: Sequence[ReferencePoints]) -> Reference:
-    return Reference(
-        name="g",
-        kind="points",
-        buildings=(),
-        has_faces=False,
-        outlines="raster",
-        tiles=tuple(reader(part) for part in parts),
-        has_ground=True,
-    )
+    tiles = tuple(reader(part) for part in parts)
+    return dataclasses.replace(by_hand.reference([], has_faces=False, has_ground=True), tiles=tiles)
 
 
 def block(right: int, missed: int, taken: int, other: int, name: str = "t", column: int = 0) -> GroundBlock:

@@ -123,11 +123,7 @@ def test_one_to_one_takes_the_largest_and_then_the_smaller_index() -> None:
 
 def test_subsets_leave_out_what_the_data_edge_cuts() -> None:
     buildings = [gable("a"), gable("b", 20.0), gable("c", 40.0), gable("cut", 60.0, touches_data_edge=True)]
-    known = {
-        "a": by_hand.conditions(good=True),
-        "b": by_hand.conditions(good=False),
-        "cut": by_hand.conditions(good=True),
-    }
+    known = {name: by_hand.conditions(good=name != "b") for name in ("a", "b", "cut")}
     everything, good, hard = subsets(reference(buildings, conditions=known))
     assert [one.name for one in (everything, good, hard)] == ["all", "good", "hard"]
     assert [one.buildings.tolist() for one in (everything, good, hard)] == [

@@ -24,7 +24,7 @@ from pipeline.ruler.evaluation.reading.cityjson import features
 from pipeline.ruler.evaluation.reading.collected import Collected
 
 SQUARE = [[0, 0], [8, 0], [8, 6], [0, 6]]
-SIDES = [[[1, 0, 4, 5]], [[2, 1, 5, 6]], [[3, 2, 6, 7]], [[0, 3, 7, 4]]]
+SIDES = [[[0, 1, 5, 4]], [[1, 2, 6, 5]], [[2, 3, 7, 6]], [[3, 0, 4, 7]]]
 
 
 def box(low: float, high: float, east: float = 0.0) -> list[list[float]]:
@@ -35,7 +35,6 @@ def box(low: float, high: float, east: float = 0.0) -> list[list[float]]:
 def box_faces(first: int = 0) -> list[list[list[int]]]:
     """Roof, floor and four walls of a box whose vertices start at a number, facing outward."""
     faces = [[[4, 5, 6, 7]], [[3, 2, 1, 0]], *SIDES]
-    faces[2:] = [[[a, b, c, d]] for ((b, a, d, c),) in SIDES]
     return [[[first + index for index in ring] for ring in face] for face in faces]
 
 

@@ -89,20 +89,18 @@ def test_what_cjio_makes_of_a_sequence_holds_the_same_models(run: Path, tmp_path
     assert document.crs == "EPSG:7415"
 
 
-def test_a_run_in_feet_comes_out_in_metres(run: Path, tmp_path: Path) -> None:
-    metres = read_models(run)
-    at = files.reference(2225, US_FOOT_M, US_FOOT_M)
-    feet = files.write_run(tmp_path / "feet", files.village(), at)
-    for path in (feet, feet / "cityjson", feet / "meshes"):
-        read = read_models(path)
-        files.assert_same_models(metres, read)
+@pytest.mark.parametrize(
+    ("reference", "folders"),
+    [((2225, US_FOOT_M, US_FOOT_M), ("", "cityjson", "meshes")), ((2992, FOOT_M, 1.0), ("meshes",))],
+)
+def test_a_run_in_feet_comes_out_in_metres(
+    reference: tuple[int, float, float], folders: tuple[str, ...], run: Path, tmp_path: Path
+) -> None:
+    feet = files.write_run(tmp_path / "feet", files.village(), files.reference(*reference))
+    for folder in folders:
+        read = read_models(feet / folder)
+        files.assert_same_models(read_models(run), read)
         assert all(check_solid(solid) == () for model in read.models for solid in model.solids)
-
-
-def test_a_run_in_feet_with_elevations_in_metres_comes_out_in_metres(run: Path, tmp_path: Path) -> None:
-    at = files.reference(2992, FOOT_M, 1.0)
-    mixed = files.write_run(tmp_path / "mixed", files.village(), at)
-    files.assert_same_models(read_models(run), read_models(mixed / "meshes"))
 
 
 @pytest.mark.parametrize("name", ["run", "town"])

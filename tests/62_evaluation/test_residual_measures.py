@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+import roofs_by_hand as by_hand
 import shapely
-from roofs_by_hand import points_of
+from roofs_by_hand import lifted, moved, points_of, shrunk, with_face
 from scipy.spatial import cKDTree
 
 from pipeline.model import FloatArray, LabelArray, RoofType
@@ -55,15 +56,8 @@ def reader(points: ReferencePoints) -> Callable[[], ReferencePoints]:
 def reference_of(
     buildings: Sequence[RoofModel], parts: Sequence[ReferencePoints], bounds: Sequence[Bounds] = ()
 ) -> Reference:
-    return Reference(
-        name="r",
-        kind="truth",
-        buildings=tuple(buildings),
-        has_faces=True,
-        outlines="truth",
-        tiles=tuple(reader(part) for part in parts),
-        bounds=tuple(bounds),
-    )
+    tiles = tuple(reader(part) for part in parts)
+    return dataclasses.replace(by_hand.reference(buildings, extent=None), tiles=tiles, bounds=tuple(bounds))
 
 
 def lattice(model: RoofModel, step: float, noise: float = 0.0, seed: int = 0) -> FloatArray:
@@ -71,6 +65,13 @@ def lattice(model: RoofModel, step: float, noise: float = 0.0, seed: int = 0) ->
     x0, y0, x1, y1 = model.footprint.bounds
     x, y = (a.ravel() for a in np.meshgrid(np.arange(x0 + step / 2, x1, step), np.arange(y0 + step / 2, y1, step)))
     return np.column_stack((x, y, model.top(x, y) + np.random.default_rng(seed).normal(0.0, noise, len(x))))
+
+
+def one_house(step: float) -> Reference:
+    """One house at the origin with its lattice."""
+    truth = house("a", 0, 0)
+    xyz = lattice(truth, step)
+    return reference_of([truth], [tile(xyz, zeros(len(xyz)))])
 
 
 def figures(rows: Sequence[BuildingResiduals], reference: Reference) -> dict[str, Measure]:
@@ -109,13 +110,11 @@ def random_world(seed: int, n: int = 4000) -> tuple[list[RoofModel], Reference, 
     truth = [house(f"b{k}", corner[0] + 10 * k, corner[1] + 3 * (k % 3)) for k in range(6)]
     models = []
     for model in truth:
-        surfaces = tuple(
-            dataclasses.replace(s, origin=(s.origin[0], s.origin[1], rng.normal(0, 0.2))) for s in model.surfaces
-        )
-        turned = tuple(
-            dataclasses.replace(s, polygon=shapely.affinity.rotate(s.polygon, rng.uniform(-9, 9))) for s in surfaces
-        )
-        models.append(dataclasses.replace(model, surfaces=turned))
+        surfaces = []
+        for s in model.surfaces:
+            polygon = shapely.affinity.rotate(s.polygon, rng.uniform(-9, 9))
+            surfaces.append(dataclasses.replace(lifted(s, rng.normal(0, 0.2)), polygon=polygon))
+        models.append(dataclasses.replace(model, surfaces=tuple(surfaces)))
     x, y = corner[0] + rng.uniform(0, 60, n), corner[1] + rng.uniform(-1, 14, n)
     building = np.full(n, -1, np.int32)
     z = np.zeros(n)
@@ -178,46 +177,34 @@ def test_the_truth_against_itself_is_perfect() -> None:
 
 
 def test_footprints_shrunk_by_half_a_metre_lose_the_coverage_of_the_ring() -> None:
-    truth = [house("a", 0, 0)]
-    xyz = lattice(truth[0], 0.1)
-    reference = reference_of(truth, [tile(xyz, zeros(len(xyz)))])
-    inner = truth[0].footprint.buffer(-0.5, join_style="mitre")
-    shrunk = dataclasses.replace(
-        truth[0],
-        footprint=inner,
-        surfaces=tuple(dataclasses.replace(s, polygon=s.polygon.intersection(inner)) for s in truth[0].surfaces),
-    )
-    measured = figures(building_residuals([shrunk], reference), reference)
+    reference = one_house(0.1)
+    measured = figures(building_residuals([shrunk(reference.buildings[0], 0.5)], reference), reference)
     assert measured["coverage"].value == pytest.approx(9 * 7 / 80, abs=1e-9)
     assert measured["within_0_2m"].value == measured["coverage"].value
     assert measured["rmse"].value < 1e-6
 
 
 def test_a_face_moved_by_0_3_m_or_dropped_is_half_of_the_points() -> None:
-    truth = [house("a", 0, 0)]
-    xyz = lattice(truth[0], 0.1)
-    reference = reference_of(truth, [tile(xyz, zeros(len(xyz)))])
-    south, north = truth[0].surfaces
-    moved = dataclasses.replace(truth[0], surfaces=(dataclasses.replace(south, origin=(0.0, 4.0, 0.3)), north))
-    measured = figures(building_residuals([moved], reference), reference)
+    reference = one_house(0.1)
+    (true,) = reference.buildings
+    raised = with_face(true, 0, lifted(true.surfaces[0], 0.3))
+    measured = figures(building_residuals([raised], reference), reference)
     assert measured["within_0_2m"].value == 0.5
     assert measured["rmse"].value == pytest.approx(0.3 / math.sqrt(2.0))
     assert measured["bias"].value == pytest.approx(-0.15)
-    dropped = dataclasses.replace(truth[0], surfaces=(north,))
-    measured = figures(building_residuals([dropped], reference), reference)
+    measured = figures(building_residuals([with_face(true, 0, None)], reference), reference)
     assert (measured["within_0_2m"].value, measured["coverage"].value) == (0.5, 0.5)
 
 
 def test_a_face_turned_by_5_deg_is_off_in_proportion_to_the_distance_from_its_axis() -> None:
-    truth = [house("a", 0, 0)]
-    xyz = lattice(truth[0], 0.05)
-    reference = reference_of(truth, [tile(xyz, zeros(len(xyz)))])
+    reference = one_house(0.05)
+    (true,) = reference.buildings
     tilt = math.tan(math.atan(0.5) + math.radians(5.0)) - 0.5
     turned = tuple(
         dataclasses.replace(s, coefficients=(0.0, (0.5 + tilt) * sign, 10.0))
-        for s, sign in zip(truth[0].surfaces, (1, -1), strict=True)
+        for s, sign in zip(true.surfaces, (1, -1), strict=True)
     )
-    measured = figures(building_residuals([dataclasses.replace(truth[0], surfaces=turned)], reference), reference)
+    measured = figures(building_residuals([dataclasses.replace(true, surfaces=turned)], reference), reference)
     # dz = tilt |y - 4|, evenly spread between 0 and 4 m from the ridge
     assert measured["rmse"].value == pytest.approx(tilt * 4 / math.sqrt(3.0), rel=1e-3)
     assert measured["median"].value == pytest.approx(tilt * 2, abs=0.006)
@@ -226,37 +213,18 @@ def test_a_face_turned_by_5_deg_is_off_in_proportion_to_the_distance_from_its_ax
 
 
 def test_of_several_models_over_a_point_the_highest_counts() -> None:
-    low, high = house("low", 0, 0), house("high", 0, 0)
-    high = dataclasses.replace(
-        high, surfaces=tuple(dataclasses.replace(s, origin=(0.0, 4.0, 2.0)) for s in high.surfaces)
-    )
-    xyz = lattice(low, 0.5)
-    reference = reference_of([low], [tile(xyz, zeros(len(xyz)))])
-    measured = figures(building_residuals([low, high], reference), reference)
+    reference = one_house(0.5)
+    (low,) = reference.buildings
+    measured = figures(building_residuals([low, moved(low, 0.0, 0.0, 2.0)], reference), reference)
     assert measured["bias"].value == pytest.approx(-2.0)
 
 
 def test_moving_the_world_by_whole_metres_changes_nothing() -> None:
     models, reference, xyz, building = random_world(11)
-    shift = np.array([-400_000.0, 300_000.0])
-
-    def moved(model: RoofModel) -> RoofModel:
-        return dataclasses.replace(
-            model,
-            footprint=shapely.affinity.translate(model.footprint, *shift),
-            surfaces=tuple(
-                dataclasses.replace(
-                    s,
-                    polygon=shapely.affinity.translate(s.polygon, *shift),
-                    origin=(s.origin[0] + shift[0], s.origin[1] + shift[1], s.origin[2]),
-                )
-                for s in model.surfaces
-            ),
-        )
-
-    there = reference_of([moved(b) for b in reference.buildings], [tile(xyz + np.array([*shift, 0.0]), building)])
+    shift = (-400_000.0, 300_000.0, 0.0)
+    there = reference_of([moved(b, *shift) for b in reference.buildings], [tile(xyz + np.array(shift), building)])
     before = figures(building_residuals(models, reference), reference)
-    after = figures(building_residuals([moved(m) for m in models], there), there)
+    after = figures(building_residuals([moved(m, *shift) for m in models], there), there)
     for name, measure in before.items():
         assert after[name].value == pytest.approx(measure.value, abs=1e-6), name
 
@@ -288,23 +256,14 @@ def test_buildings_at_the_edge_of_the_data_need_not_be_found() -> None:
 
 
 def test_without_models_all_is_missed_and_without_points_nothing_is_measured() -> None:
-    truth = [house("a", 0, 0)]
-    xyz = lattice(truth[0], 0.5)
-    reference = reference_of(truth, [tile(xyz, zeros(len(xyz)))])
+    reference = one_house(0.5)
     measured = figures(building_residuals([], reference), reference)
     assert (measured["coverage"].value, measured["within_0_2m"].value) == (0.0, 0.0)
     assert math.isnan(measured["rmse"].value)
     assert math.isnan(measured["building_rmse"].value)
-    empty = reference_of(truth, [])
-    assert figures(building_residuals(truth, empty), empty) == {}
-
-
-def test_every_figure_has_its_definition() -> None:
-    truth = [house("a", 0, 0)]
-    xyz = lattice(truth[0], 0.5)
-    reference = reference_of(truth, [tile(xyz, zeros(len(xyz)))])
-    names = [m.name for m in residual_measures(building_residuals(truth, reference), subsets(reference)[0])]
-    assert sorted(names) == sorted(definition.name for definition in DEFINITIONS)
+    assert sorted(f"residuals.{name}" for name in measured) == sorted(definition.name for definition in DEFINITIONS)
+    empty = dataclasses.replace(reference, tiles=())
+    assert figures(building_residuals(empty.buildings, empty), empty) == {}
 
 
 def test_a_model_at_a_wrong_place_in_the_world_changes_no_residual_and_no_index() -> None:
