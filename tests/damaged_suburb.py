@@ -8,8 +8,7 @@ import math
 import numpy as np
 import pyarrow as pa
 import shapely
-from roofs_by_hand import lifted, points_of
-from shapely import affinity
+from roofs_by_hand import lifted, models_of_scene, moved, points_of
 
 from pipeline.model import RoofType, Status
 from pipeline.ruler.evaluation.evaluate import Evaluation
@@ -52,26 +51,23 @@ DEFINITIONS = {
     )
 }
 """Stand for those of the measure modules, so that a test says what it expects."""
+KINDS: tuple[dict[str, bool], ...] = (
+    {},
+    {"points": False},
+    {"has_faces": False},
+    {"has_faces": False, "points": False},
+    {"reference": False},
+)
+"""Truth with points, truth alone, footprints with points, footprints alone, no reference."""
 
 
-def true_models(seed: int = 3, size_m: tuple[float, float] = (160.0, 120.0)) -> list[RoofModel]:
+def true_models() -> list[RoofModel]:
     """The houses of a simulated suburb."""
-    made = []
-    for building in suburb(seed, size_m=size_m).buildings:
-        surfaces = tuple(
-            RoofSurface(polygon=shapely.force_2d(polygon), coefficients=plane.coefficients, plane_id=number)
-            for number, (polygon, plane) in enumerate(zip(building.roof_polygons(), building.planes, strict=True))
-        )
-        made.append(
-            RoofModel(
-                building_id=building.building_id,
-                footprint=building.footprint,
-                roof_type=building.roof_type,
-                surfaces=surfaces,
-                solids=(building_solid(building),),
-            )
-        )
-    return made
+    scene = dataclasses.replace(suburb(3, size_m=(160.0, 120.0)), origin=(0.0, 0.0, 0.0))
+    return [
+        dataclasses.replace(model, solids=(building_solid(building),))
+        for model, building in zip(models_of_scene(scene), scene.buildings, strict=True)
+    ]
 
 
 def damaged(truth: list[RoofModel]) -> list[RoofModel]:
@@ -99,16 +95,8 @@ def damaged(truth: list[RoofModel]) -> list[RoofModel]:
         if number % 7 == 6 and len(model.surfaces) > 1:
             copy = dataclasses.replace(copy, surfaces=model.surfaces[1:], solids=())
         made.append(copy)
-    elsewhere = dataclasses.replace(
-        truth[0],
-        building_id="model-elsewhere",
-        footprint=affinity.translate(truth[0].footprint, -25.0, -20.0),
-        surfaces=tuple(
-            dataclasses.replace(s, polygon=affinity.translate(s.polygon, -25.0, -20.0)) for s in truth[0].surfaces
-        ),
-        solids=(),
-    )
-    return [*made, elsewhere]
+    elsewhere = moved(truth[0], -25.0, -20.0, 0.0)
+    return [*made, dataclasses.replace(elsewhere, building_id="model-elsewhere", solids=())]
 
 
 def roof_points(truth: list[RoofModel], density: float = 3.0) -> ReferencePoints:

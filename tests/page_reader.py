@@ -56,16 +56,21 @@ def count(png: bytes, colour: str) -> int:
     return int(np.sum(near & (picture[:, :, 3] > 0.9)))
 
 
+def assert_links_stay_within(read: Reader) -> None:
+    """Every link and picture of a page is of the page itself."""
+    for _, attributes in read.elements:
+        for name in ("src", "href", "xlink:href", "srcset", "action"):
+            assert (attributes.get(name) or "#").startswith(("#", "data:image/png;base64,"))
+
+
 def assert_loads_nothing(text: str, scripts: int = 0) -> Reader:
     """A page is one file that loads nothing and holds only scripts of its own; the elements of the page."""
     read = Reader(text)
     assert read.open == []
     assert len(read.all("script")) == scripts
     assert not {"link", "iframe", "object", "embed"} & {tag for tag, _ in read.elements}
-    for _, attributes in read.elements:
-        for name in ("src", "href", "xlink:href", "srcset", "action"):
-            assert (attributes.get(name) or "#").startswith(("#", "data:image/png;base64,"))
-        assert not any(name.startswith("on") for name in attributes)
+    assert_links_stay_within(read)
+    assert not any(name.startswith("on") for _, attributes in read.elements for name in attributes)
     assert not re.search(r"https?:|url\(|@import", text)
     return read
 

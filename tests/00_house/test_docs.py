@@ -17,6 +17,7 @@ from pipeline.export.records import SCHEMAS
 from pipeline.io import SpatialReference
 from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import REASONS, Reason, RoofType, Status
+from pipeline.parameters import Parameters
 from pipeline.roof.settings import RoofSettings, RoofTypeSettings
 from pipeline.ruler.epochs.settings import DiffSettings, read_settings
 from pipeline.runtime.overrides.overrides_file import overrides_of
@@ -92,16 +93,13 @@ def test_every_setting_of_every_stage_is_in_the_reference(generator: ModuleType)
     assert missing == []
 
 
-def test_the_method_page_says_every_setting_of_its_recipe() -> None:
-    text = (DOCS / "methods" / "fuzzy_sart.md").read_text()
-    missing = [f.name for f in dataclasses.fields(FuzzySartSettings) if f"`{f.name}" not in text]
-    assert missing == []
-
-
-def test_the_page_of_solids_says_every_setting_of_roof_and_roof_type() -> None:
-    text = (DOCS / "methods" / "solids.md").read_text()
-    fields = [*dataclasses.fields(RoofSettings), *dataclasses.fields(RoofTypeSettings)]
-    assert [field.name for field in fields if f"`{field.name}" not in text] == []
+@pytest.mark.parametrize(
+    ("page", "kind"),
+    [("fuzzy_sart.md", FuzzySartSettings), ("solids.md", RoofSettings), ("solids.md", RoofTypeSettings)],
+)
+def test_a_page_of_methods_says_every_setting(page: str, kind: type[Parameters]) -> None:
+    text = (DOCS / "methods" / page).read_text()
+    assert [field.name for field in dataclasses.fields(kind) if f"`{field.name}" not in text] == []
 
 
 @pytest.mark.parametrize("page", ["fuzzy_sart.md", "solids.md"])
@@ -114,42 +112,24 @@ def test_every_setting_that_a_page_names_exists(generator: ModuleType, page: str
     assert named - known - values == set()
 
 
-def toml_blocks() -> list[tuple[str, str]]:
-    """Every toml block, with its page."""
+def toml_blocks(table: str | None = None) -> list[tuple[str, str]]:
+    """Every toml block with a table, or with settings of a run, and its page."""
     return [
         (page.relative_to(ROOT).as_posix(), block)
         for page in PAGES
         for block in re.findall(r"^```toml\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+        if table == next((one for one in ("[[building]]", "[diff]", "[schedule]") if one in block), None)
     ]
 
 
-def is_overrides(block: str) -> bool:
-    return "[[building]]" in block
-
-
-def is_of_a_comparison(block: str) -> bool:
-    return block.startswith("[diff]")
-
-
-def is_of_a_schedule(block: str) -> bool:
-    return block.startswith("[schedule]")
-
-
-@pytest.mark.parametrize("block", [block for _, block in toml_blocks() if is_of_a_schedule(block)])
+@pytest.mark.parametrize("block", [block for _, block in toml_blocks("[schedule]")])
 def test_times_of_the_docs_are_valid(block: str, tmp_path: Path) -> None:
     file = tmp_path / "city.toml"
     file.write_text(f'[inputs]\npaths = ["tiles"]\n[output]\npath = "models"\n{block}')
     assert read_batch(file).schedule.cron
 
 
-@pytest.mark.parametrize(
-    ("page", "block"),
-    [
-        (page, block)
-        for page, block in toml_blocks()
-        if not is_overrides(block) and not is_of_a_comparison(block) and not is_of_a_schedule(block)
-    ],
-)
+@pytest.mark.parametrize(("page", "block"), toml_blocks())
 def test_a_settings_file_of_the_docs_is_valid(page: str, block: str) -> None:
     settings = RunSettings.from_mapping(tomllib.loads(block)["settings"])
     if page == "docs/methods/fuzzy_sart.md":
@@ -157,9 +137,9 @@ def test_a_settings_file_of_the_docs_is_valid(page: str, block: str) -> None:
 
 
 def test_the_thresholds_of_the_docs_are_valid(tmp_path: Path) -> None:
-    blocks = [block for _, block in toml_blocks() if is_of_a_comparison(block)]
+    blocks = toml_blocks("[diff]")
     assert blocks
-    for block in blocks:
+    for _, block in blocks:
         path = tmp_path / "diff.toml"
         path.write_text(block)
         assert read_settings(str(path), {}) != DiffSettings()
@@ -169,10 +149,9 @@ def test_the_overrides_files_of_the_docs_are_valid() -> None:
     reference = SpatialReference()
     outlines = re.compile(r"footprint = \{[^}]*\}")
     found = []
-    for _, block in toml_blocks():
-        if is_overrides(block):
-            document = tomllib.loads(outlines.sub('footprint = "POLYGON ((0 0, 1 0, 1 1, 0 0))"', block))
-            found += overrides_of(document, reference, RunSettings())
+    for _, block in toml_blocks("[[building]]"):
+        document = tomllib.loads(outlines.sub('footprint = "POLYGON ((0 0, 1 0, 1 1, 0 0))"', block))
+        found += overrides_of(document, reference, RunSettings())
     assert {entry.action for entry in found} == {None, "accept", "reject"}
 
 

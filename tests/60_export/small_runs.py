@@ -14,7 +14,7 @@ from pipeline.model import BuildingResult, Reason, Status
 from pipeline.runtime.manifest import RunManifest, RunStatus, write_manifest
 
 
-def moved(result: BuildingResult, east: float, north: float) -> BuildingResult:
+def moved(result: BuildingResult, east: float, north: float = 0.0) -> BuildingResult:
     """A building elsewhere, by whole metres."""
     x, y, z = result.origin
     return dataclasses.replace(result, origin=(x + east, y + north, z))

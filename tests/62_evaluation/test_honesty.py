@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import roofs_by_hand as by_hand
 import shapely
 
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
@@ -56,25 +57,17 @@ def whole(reference: Reference) -> list[RoofModel]:
     return [building for building in reference.buildings if not building.touches_data_edge]
 
 
-def replaced(truth: ModelSet, building_id: str, model: RoofModel | None) -> ModelSet:
+def replaced(truth: ModelSet, building_id: str, *models: RoofModel) -> ModelSet:
     """The truth with one building replaced, or dropped."""
-    models = [
-        one if one.building_id != building_id else model
-        for one in truth.models
-        if one.building_id != building_id or model is not None
-    ]
-    return dataclasses.replace(truth, models=tuple(models))
+    others = [one for one in truth.models if one.building_id != building_id]
+    return dataclasses.replace(truth, models=(*others, *models))
 
 
 def with_surface(truth: ModelSet, building_id: str, plane_id: int, surface: RoofSurface | None) -> ModelSet:
     """The truth with one roof face replaced, or left out."""
     building = next(one for one in truth.models if one.building_id == building_id)
-    surfaces = [
-        one if one.plane_id != plane_id else surface
-        for one in building.surfaces
-        if one.plane_id != plane_id or surface is not None
-    ]
-    return replaced(truth, building_id, dataclasses.replace(building, surfaces=tuple(surfaces)))
+    place = [one.plane_id for one in building.surfaces].index(plane_id)
+    return replaced(truth, building_id, by_hand.with_face(building, place, surface))
 
 
 def a_large_face(reference: Reference) -> tuple[RoofModel, RoofSurface]:
@@ -160,9 +153,7 @@ def test_a_lifted_face_is_wrong_from_0_3_m_across_the_plane_on(
 ) -> None:
     building, face = a_large_face(reference)
     dz = lift_m / float(face.normal[2])  # moved across the plane by lift_m
-    a, b, c = face.coefficients
-    moved = dataclasses.replace(face, coefficients=(a, b, c + dz))
-    found = evaluate(with_surface(truth, building.building_id, face.plane_id, moved), reference)
+    found = evaluate(with_surface(truth, building.building_id, face.plane_id, by_hand.lifted(face, dz)), reference)
     share = face.polygon.area / roof_plan_m2(reference)
     right = lift_m < 0.3
     assert value(found, "faces.completeness_10m2") == pytest.approx(1.0 - (0 if right else 1 / large_faces(reference)))
@@ -185,12 +176,7 @@ def test_a_turned_face_is_found_up_to_10_degrees(
     slope = math.hypot(a, b)
     steeper = math.tan(math.atan(slope) + math.radians(turn_deg))
     middle = face.polygon.centroid
-    height = float(face.elevation(np.array([middle.x]), np.array([middle.y]))[0])
-    turned = dataclasses.replace(
-        face,
-        coefficients=(a / slope * steeper, b / slope * steeper, height),
-        origin=(middle.x, middle.y, 0.0),
-    )
+    turned = by_hand.turned(face, turn_deg)
     found = evaluate(with_surface(truth, building.building_id, face.plane_id, turned), reference)
     lost = 0.0 if is_found else 1.0 / large_faces(reference)
     assert value(found, "faces.completeness_10m2") == pytest.approx(1.0 - lost)
@@ -207,7 +193,7 @@ def test_a_turned_face_is_found_up_to_10_degrees(
 
 def test_a_dropped_building_is_missed_everywhere(truth: ModelSet, reference: Reference, undamaged: Evaluation) -> None:
     building = whole(reference)[0]
-    found = evaluate(replaced(truth, building.building_id, None), reference)
+    found = evaluate(replaced(truth, building.building_id), reference)
     kept = 1.0 - 1.0 / len(whole(reference))
     for name in ("delivery.lod2", "detection.object_completeness", "footprints.iou_mean", "roof_types.correct"):
         assert value(found, name) == pytest.approx(kept), name
@@ -230,12 +216,8 @@ def test_an_invented_building_costs_correctness_and_no_completeness(truth: Model
         for y in np.arange(low_y + 12, high_y - 22, 2.0)
         if not (place := shapely.box(x, y, x + 10.0, y + 10.0)).intersects(taken)
     )
-    invented = RoofModel(
-        building_id="invented",
-        footprint=box,
-        roof_type=whole(reference)[0].roof_type,
-        surfaces=(RoofSurface(polygon=box, coefficients=(0.0, 0.0, 60.0), plane_id=0),),
-    )
+    roof = RoofSurface(polygon=box, coefficients=(0.0, 0.0, 60.0), plane_id=0)
+    invented = by_hand.model("invented", whole(reference)[0].roof_type, [roof])
     found = evaluate(dataclasses.replace(truth, models=(*truth.models, invented)), reference)
     count, faces = len(whole(reference)), large_faces(reference)
     assert value(found, "delivery.false_models") == 1

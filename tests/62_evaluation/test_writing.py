@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import shapely
-from damaged_suburb import DEFINITIONS, damaged_evaluation
+from damaged_suburb import DEFINITIONS, KINDS, damaged_evaluation
 
 from pipeline.errors import RunError
 from pipeline.ruler.evaluation.chapters import chapters, printed
@@ -20,9 +20,6 @@ from pipeline.ruler.evaluation.counts import breakdowns, count_tables
 from pipeline.ruler.evaluation.definitions import DEFINITIONS as ALL
 from pipeline.ruler.evaluation.measure import Group, Measure
 from pipeline.ruler.evaluation.writing import markdown, measures_table, write_tables
-
-KINDS = ({}, {"points": False}, {"has_faces": False}, {"has_faces": False, "points": False}, {"reference": False})
-"""Truth with points, truth alone, footprints with points, footprints alone, no reference."""
 
 
 def measure(value: float, low: float = math.nan, high: float = math.nan, name: str = "delivery.lod2") -> Measure:

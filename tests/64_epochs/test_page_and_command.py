@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -15,12 +16,13 @@ from typer.testing import CliRunner
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from page_reader import Reader, count
+from page_reader import Reader, assert_links_stay_within, count
 
 from pipeline.cli import app
 from pipeline.console import ExitCode
 from pipeline.report import class_map
-from pipeline.ruler.epochs.diff import DiffRequest, diff
+from pipeline.report.class_map import ClassMap
+from pipeline.ruler.epochs.diff import Diff, DiffRequest, diff
 from pipeline.ruler.epochs.records import SCHEMA, Change
 from pipeline.ruler.report.epochs_map import COLOURS, epochs_map, gathering
 from pipeline.ruler.report.epochs_page import page
@@ -38,6 +40,13 @@ def pair(tmp_path: Path) -> tuple[Path, Path]:
         *(house("x2", 40.0, 80.0, eave=3.0), house("g2", 80.0, 80.0)),
     ]
     return write_epoch(tmp_path / "y2019", old), write_epoch(tmp_path / "y2024", new)
+
+
+def compared_on_a_map(old: Path, new: Path) -> tuple[Diff, ClassMap]:
+    """What a comparison found, and the map of it."""
+    rows = epochs_map()
+    request = DiffRequest(old=str(old), new=str(new), out=str(new.with_name("out")))
+    return diff(request, take_in=(gathering(rows),)), rows
 
 
 def invoke(*words: str | Path) -> Any:
@@ -100,17 +109,13 @@ def test_runs_that_cannot_be_compared_end_with_their_code(pair: tuple[Path, Path
     assert invoke(pair[0], tmp_path / "nowhere", "--out", tmp_path / "out").exit_code == ExitCode.RUN_DIRECTORY
 
 
-def test_the_page_holds_all_that_it_shows(pair: tuple[Path, Path], tmp_path: Path) -> None:
-    rows = epochs_map()
-    made = diff(DiffRequest(old=str(pair[0]), new=str(pair[1]), out=str(tmp_path / "out")), take_in=(gathering(rows),))
+def test_the_page_holds_all_that_it_shows(pair: tuple[Path, Path]) -> None:
+    made, rows = compared_on_a_map(*pair)
     text = page(made, rows)
     read = Reader(text)
     assert read.open == []
     assert "Changes: y2019 to y2024" in read.texts
-    links = [
-        one.get(name) for tag in ("img", "script", "link", "a") for one in read.all(tag) for name in ("src", "href")
-    ]
-    assert all(link is None or link.startswith(("data:image/png;base64,", "#")) for link in links)
+    assert_links_stay_within(read)
     listed = [one["data-change"] for one in read.all("tr") if "data-change" in one]
     assert sorted(listed) == sorted(change.value for change in Change if change is not Change.UNCHANGED)
     pictures = {one["alt"]: one["src"] for one in read.all("img")}
@@ -123,16 +128,9 @@ def test_the_page_holds_all_that_it_shows(pair: tuple[Path, Path], tmp_path: Pat
     assert "min_height_change_m" in read.texts
 
 
-def test_text_of_the_users_is_no_markup(pair: tuple[Path, Path], tmp_path: Path) -> None:
-    import dataclasses
-
+def test_text_of_the_users_is_no_markup(tmp_path: Path) -> None:
     evil = dataclasses.replace(house("e2"), source_id="<script>alert(1)</script>")
-    new = write_epoch(tmp_path / "new", [evil])
-    rows = epochs_map()
-    made = diff(
-        DiffRequest(old=str(write_epoch(tmp_path / "o", [])), new=str(new), out=str(tmp_path / "out")),
-        take_in=(gathering(rows),),
-    )
+    made, rows = compared_on_a_map(write_epoch(tmp_path / "o", []), write_epoch(tmp_path / "new", [evil]))
     assert "<script>alert" not in page(made, rows)
 
 
@@ -142,9 +140,9 @@ def test_a_map_of_very_many_buildings_keeps_its_bounds(monkeypatch: pytest.Monke
     monkeypatch.setattr(class_map, "MAX_DRAWN", 10)
     houses = [house(f"h{k}_1", 30.0 * (k % 10), 30.0 * (k // 10)) for k in range(40)]
     added = [house(f"n{k}_2", 30.0 * (k % 10), 300.0 + 30.0 * (k // 10), length=10.0 + k / 10.0) for k in range(25)]
-    rows = epochs_map()
-    runs = write_epoch(tmp_path / "old", houses), write_epoch(tmp_path / "new", [*houses, *added])
-    made = diff(DiffRequest(old=str(runs[0]), new=str(runs[1]), out=str(tmp_path / "out")), take_in=(gathering(rows),))
+    made, rows = compared_on_a_map(
+        write_epoch(tmp_path / "old", houses), write_epoch(tmp_path / "new", [*houses, *added])
+    )
     assert made.summary.rows == {"new": 25, "unchanged": 40}
     drawn = rows.map(1.0)
     assert drawn is not None
@@ -154,9 +152,7 @@ def test_a_map_of_very_many_buildings_keeps_its_bounds(monkeypatch: pytest.Monke
 
 
 def test_a_comparison_of_nothing_has_a_page_too(tmp_path: Path) -> None:
-    rows = epochs_map()
-    runs = [str(write_epoch(tmp_path / name, [])) for name in ("old", "new")]
-    made = diff(DiffRequest(old=runs[0], new=runs[1], out=str(tmp_path / "out")), take_in=(gathering(rows),))
+    made, rows = compared_on_a_map(*(write_epoch(tmp_path / name, []) for name in ("old", "new")))
     assert rows.map(1.0) is None
     assert Reader(page(made, rows)).all("table") != []
     gathering(rows)(SCHEMA.empty_table())

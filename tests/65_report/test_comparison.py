@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import roofs_by_hand as by_hand
 import shapely
 import small_buildings as small
 from page_reader import Reader, assert_loads_nothing, assert_pictures_have_words_and_ids_are_unique, count, pixels
+from small_runs import moved
 
 from pipeline.errors import RunError, SettingsError
 from pipeline.io import ReadOptions, Source, SourceInfo
@@ -25,7 +27,6 @@ from pipeline.report.render import ROOF_COLOURS
 from pipeline.ruler.evaluation.evaluate import evaluate
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reading import read_models
-from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.report import comparison_page, comparison_points
 from pipeline.ruler.report.comparison import ComparedRun, PointFiles, write_comparison
 from pipeline.ruler.report.comparison_building import ComparedBuilding, Record, difference_of
@@ -38,12 +39,6 @@ from pipeline.runtime.manifest import read_manifest, write_manifest
 
 MakeRun = Callable[..., Path]
 EVIL = '"><script>alert(1)</script>'
-
-
-def moved(result: BuildingResult, east: float) -> BuildingResult:
-    """A building elsewhere, by whole metres."""
-    x, y, z = result.origin
-    return dataclasses.replace(result, origin=(x + east, y, z))
 
 
 def flat(building_id: str, **changes: object) -> BuildingResult:
@@ -84,27 +79,18 @@ def runs(make_run: MakeRun) -> list[ComparedRun]:
 @pytest.fixture
 def points(tmp_path: Path) -> PointFiles:
     """Points on four gables, as text."""
-    steps = np.arange(0.25, 10.0, 0.5)
-    x, y = (axis.ravel() for axis in np.meshgrid(steps, steps[:16]))
-    z = 6.0 - 0.75 * np.abs(y - 4.0)
-    gables = [np.column_stack([x + 40.0 * place, y, z]) for place in range(4)]
-    ground = np.column_stack([x + 25.0, y, 0.0 * x])
+    gable = gable_points()
+    gables = [gable + np.array([40.0 * place, 0.0, 0.0]) for place in range(4)]
+    ground = np.column_stack([gable[:, :2] + np.array([25.0, 0.0]), np.full(len(gable), small.ORIGIN[2])])
     path = tmp_path / "points.xyz"
-    np.savetxt(path, np.vstack([*gables, ground]) + np.array(small.ORIGIN), fmt="%.3f")
+    np.savetxt(path, np.vstack([*gables, ground]), fmt="%.3f")
     return PointFiles(paths=(str(path),))
 
 
 def evaluated(runs: list[ComparedRun]) -> list[ComparedRun]:
     """The runs measured against the first of them."""
     truth = read_models(runs[0].run_dir)
-    reference = Reference(
-        name="the first run",
-        kind="truth",
-        buildings=truth.models,
-        has_faces=True,
-        outlines="truth",
-        tiles=(),
-    )
+    reference = dataclasses.replace(by_hand.reference(truth.models, extent=None), name="the first run")
     return [dataclasses.replace(run, evaluation=evaluate(read_models(run.run_dir), reference)) for run in runs]
 
 
@@ -337,10 +323,7 @@ def gable_points() -> np.ndarray:
 
 def raised(model: RoofModel, up_m: float) -> RoofModel:
     x, y, z = model.solid_origin
-    surfaces = tuple(
-        dataclasses.replace(one, coefficients=(one.coefficients[0], one.coefficients[1], one.coefficients[2] + up_m))
-        for one in model.surfaces
-    )
+    surfaces = tuple(by_hand.lifted(one, up_m) for one in model.surfaces)
     return dataclasses.replace(model, surfaces=surfaces, solid_origin=(x, y, z + up_m))
 
 

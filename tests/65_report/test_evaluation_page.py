@@ -15,7 +15,16 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import shapely
-from damaged_suburb import DEFINITIONS, damaged, damaged_evaluation, model_set, reference_of, roof_points, true_models
+from damaged_suburb import (
+    DEFINITIONS,
+    KINDS,
+    damaged,
+    damaged_evaluation,
+    model_set,
+    reference_of,
+    roof_points,
+    true_models,
+)
 from matplotlib.colors import to_rgb
 from page_reader import Reader, assert_loads_nothing, assert_pictures_have_words_and_ids_are_unique, count, pixels
 from PIL import Image
@@ -33,15 +42,6 @@ from pipeline.ruler.report.histograms import charts
 from pipeline.ruler.report.section import RESIDUAL_CLASSES, UNCOVERED, profile_line, residual_class, section_svg
 from pipeline.ruler.report.svg_chart import rebinned
 from pipeline.ruler.report.worst_cases import MAX_NOT_FOUND, chosen_rows, worst_cases
-
-KINDS: tuple[dict[str, bool], ...] = (
-    {},
-    {"points": False},
-    {"has_faces": False},
-    {"has_faces": False, "points": False},
-    {"reference": False},
-)
-"""Truth with points, truth alone, footprints with points, footprints alone, no reference."""
 
 
 def map_called(evaluation: Evaluation, title: str) -> Map:
