@@ -1,7 +1,5 @@
 """Candidates made of points, as a run makes them: on the millimetre grid and in canonical order."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence

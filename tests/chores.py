@@ -1,7 +1,5 @@
 """Tasks for workers under test; in a module of its own, because tests themselves are not importable there."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import signal

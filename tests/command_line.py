@@ -1,7 +1,5 @@
 """Command lines run within the test's process."""
 
-from __future__ import annotations
-
 from typer.testing import CliRunner
 
 from pipeline.cli import app

@@ -1,7 +1,5 @@
 """An evaluation made by hand: a simulated suburb, copies of its houses with known damage, and points on its roofs."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

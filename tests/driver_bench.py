@@ -1,7 +1,5 @@
 """A driver with a scripted run in place of the science, for tests of what becomes of jobs."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How many examples tests of properties draw."""
 
-from __future__ import annotations
-
 import os
 
 PROFILE = os.environ.get("HYPOTHESIS_PROFILE", "repeatable")

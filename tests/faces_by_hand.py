@@ -1,7 +1,5 @@
 """Planes and roof faces made by hand, and what holds for the rings of every closed solid."""
 
-from __future__ import annotations
-
 import collections
 from collections.abc import Iterable, Sequence
 

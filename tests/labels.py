@@ -1,7 +1,5 @@
 """The labels of a simulated data set."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """LAS and LAZ files of points that a test makes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The application under a real server on a free port, for tests that speak HTTP; and small files to send."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import socket

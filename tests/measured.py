@@ -1,7 +1,5 @@
 """Memory of the test's process, and programs in processes of their own."""
 
-from __future__ import annotations
-
 import contextlib
 import subprocess
 import sys

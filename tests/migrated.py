@@ -4,8 +4,6 @@ The revisions themselves are run by the tests of the store that begin with an em
 every service that runs as a process.
 """
 
-from __future__ import annotations
-
 import functools
 import tempfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An S3 server for tests, and a proxy in front of it that fails as a script says, and counts."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import http.client

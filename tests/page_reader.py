@@ -1,7 +1,5 @@
 """Pages and their pictures as tests look at them."""
 
-from __future__ import annotations
-
 import io
 import re
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """Real programs for tests: found or skipped, each logged in its own process group and ended by id."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os

@@ -1,7 +1,5 @@
 """Small buildings built by hand for the tests of the evaluation, known damage, and simulated scenes as models."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The tables of a run as tests read them, and footprints for one."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a stored schedule does at the clock: the same tests for a batch's file, SQLite and PostgreSQL."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime as dt
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ over the same times, so that all of them see the same slots due. It prints a lin
 for a line on its standard input before every lap of so many ticks.
 """
 
-from __future__ import annotations
-
 import datetime as dt
 import sys
 

@@ -1,7 +1,5 @@
 """What the store does with schedules on every database: the same tests for SQLite and PostgreSQL."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import datetime as dt

@@ -1,7 +1,5 @@
 """Buildings and scenes for several tests of the simulation, and the first hits of many rays in them as arrays."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The join as the science defines it, slowly: all fragments of all tiles at once, each surface judged on its own."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What the store does on every database: the same tests for SQLite and PostgreSQL."""
 
-from __future__ import annotations
-
 import datetime as dt
 import os
 import subprocess

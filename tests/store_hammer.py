@@ -4,8 +4,6 @@
 brought to its end: job id and attempt.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import time

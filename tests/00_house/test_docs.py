@@ -1,7 +1,5 @@
 """The docs say what the code says: settings, options, columns, reasons, commands and links."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.util
 import re

@@ -1,7 +1,5 @@
 """The contracts of pyproject.toml hold, and would catch what they forbid."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """No tracked text holds a word of the ban list in CONTRIBUTING."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 from pathlib import Path

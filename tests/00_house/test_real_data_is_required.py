@@ -1,7 +1,5 @@
 """Where the real data must be there, a test that needs them cannot quietly skip."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """What is imported, and when: start-up counts in every worker process."""
 
-from __future__ import annotations
-
 import resource
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What the repository holds: no hosts, no machine paths, no sprawling files, one version."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import tomllib

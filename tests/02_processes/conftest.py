@@ -1,7 +1,5 @@
 """The programs that tests start."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

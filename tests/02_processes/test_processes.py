@@ -1,7 +1,5 @@
 """What starts and ends the programs of other tests does as it says."""
 
-from __future__ import annotations
-
 import signal
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The list of kernels to compile ahead, its signatures, and compiling them only once."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import NamedTuple

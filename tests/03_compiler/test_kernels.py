@@ -1,7 +1,5 @@
 """Which kernels are compiled and stored, and what makes a stored kernel stale, each in fresh processes."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

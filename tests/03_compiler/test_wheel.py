@@ -1,7 +1,5 @@
 """After kernels were compiled ahead, or come with a wheel, no command compiles anything."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

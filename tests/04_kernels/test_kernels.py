@@ -1,7 +1,5 @@
 """The compiled toolkit against slow scalar twins: sets, sorting, heaps, orientation, normal equations."""
 
-from __future__ import annotations
-
 import heapq
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Facets, planes, rings and neighbourhoods."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

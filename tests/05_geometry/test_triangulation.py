@@ -1,7 +1,5 @@
 """Faces are cut into triangles of their own vertices, exactly, and the same from whatever corner a ring starts."""
 
-from __future__ import annotations
-
 import itertools
 import random
 

@@ -1,7 +1,5 @@
 """Delaunay triangulation: exact, canonical, complete."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

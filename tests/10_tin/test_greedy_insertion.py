@@ -1,7 +1,5 @@
 """Greedy insertion with noise absorption."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Hashing in space: duplicates by value, and slots that spread whatever is packed high in a key."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 import pytest

@@ -1,7 +1,5 @@
 """The lattice: every point has one owner, whatever the sign of its coordinates."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

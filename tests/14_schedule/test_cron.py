@@ -1,7 +1,5 @@
 """Cron times: against a slow scalar twin that looks at every minute, and on the days when clocks are shifted."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import itertools

@@ -1,7 +1,5 @@
 """Which slots have passed, and what becomes of them."""
 
-from __future__ import annotations
-
 import datetime as dt
 import itertools
 

@@ -1,7 +1,5 @@
 """The scanner measures as configured, and the same whatever the chunks."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

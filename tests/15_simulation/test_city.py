@@ -1,7 +1,5 @@
 """A city made tile by tile is the city made at once, and grows at its edges only."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

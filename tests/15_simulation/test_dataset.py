@@ -1,7 +1,5 @@
 """Simulated tiles on disk: read back by others, aligned with their truth, the same bytes again."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

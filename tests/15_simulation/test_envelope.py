@@ -1,7 +1,5 @@
 """The upper envelope against a brute-force maximum, and the drawing that it makes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

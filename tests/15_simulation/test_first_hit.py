@@ -1,7 +1,5 @@
 """What lines hit, against independent and slow ways to find it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

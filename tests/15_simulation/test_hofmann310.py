@@ -1,7 +1,5 @@
 """The 310 buildings have the figures of the paper for every seed: the slow tests draw two more."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections import Counter

@@ -1,7 +1,5 @@
 """What lines hit, against the triangles of the closed solids (Moeller and Trumbore 1997) and steep terrain."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

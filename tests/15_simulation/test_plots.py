@@ -1,7 +1,5 @@
 """Plots lie beside one another, hold their building with its free ground, and cross no border of strips."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import shapely

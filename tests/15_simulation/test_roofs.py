@@ -1,7 +1,5 @@
 """Every shape of roof against slow formulas of its own, and sizes drawn at random."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import cast

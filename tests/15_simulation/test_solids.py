@@ -1,7 +1,5 @@
 """Parametric buildings: exact, closed, valid."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """All suites: seeds that never meet, scenes that are the same for the same seed, buildings that stand apart."""
 
-from __future__ import annotations
-
 import functools
 import json
 from pathlib import Path

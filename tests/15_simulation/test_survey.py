@@ -1,7 +1,5 @@
 """Tiles of a survey give together what the whole gives; wet roofs and survey faults do what they say."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

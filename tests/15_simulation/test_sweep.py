@@ -1,7 +1,5 @@
 """The sweep: the same buildings under every survey, a data set a cell."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from pathlib import Path

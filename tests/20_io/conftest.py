@@ -1,7 +1,5 @@
 """Small files of every format, made where a test needs them."""
 
-from __future__ import annotations
-
 import io
 import struct
 from collections.abc import Callable

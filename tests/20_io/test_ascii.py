@@ -1,7 +1,5 @@
 """ASCII tables of every habit, and rows that hold two echoes."""
 
-from __future__ import annotations
-
 import laspy
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """LAS and LAZ that cannot be used: a clear error each, naming file, value and fix, before memory is asked for."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 import subprocess

@@ -1,7 +1,5 @@
 """COPC: a window is read through the octree and gives what laspy's own query and a plain read give."""
 
-from __future__ import annotations
-
 import struct
 
 import laspy

@@ -1,7 +1,5 @@
 """Coordinate reference systems and units, from headers and from the user."""
 
-from __future__ import annotations
-
 import dataclasses
 import pickle
 import struct

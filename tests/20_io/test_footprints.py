@@ -1,7 +1,5 @@
 """Footprints of three formats, in metres of the run's CRS, with ids and attributes."""
 
-from __future__ import annotations
-
 import json
 
 import geopandas

@@ -1,7 +1,5 @@
 """Formats are recognised by content, and paths, folders and patterns become a sorted list of files."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Footprints out of GeoParquet, written by others and by hand."""
 
-from __future__ import annotations
-
 import datetime as dt
 import decimal
 import json

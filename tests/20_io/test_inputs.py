@@ -1,7 +1,5 @@
 """Which files paths, URLs and tile indexes mean."""
 
-from __future__ import annotations
-
 import json
 from pathlib import PurePath
 

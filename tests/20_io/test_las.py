@@ -1,7 +1,5 @@
 """LAS and LAZ of every version give what laspy wrote, in pieces, in metres."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

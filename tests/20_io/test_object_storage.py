@@ -1,7 +1,5 @@
 """An object store that fails, answers late or not at all, counted request by request."""
 
-from __future__ import annotations
-
 import logging
 import pickle
 import subprocess

@@ -1,7 +1,5 @@
 """PLY in three encodings, and PLY that cannot be used."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from measured import memory_below

@@ -1,7 +1,5 @@
 """The facts of the real files, held against laspy and the data's own description."""
 
-from __future__ import annotations
-
 import laspy
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Files behind URLs: read by ranges or fetched, from servers of every temper."""
 
-from __future__ import annotations
-
 import http.server
 import os
 import re

@@ -1,7 +1,5 @@
 """Which faults are worth another attempt, and when it is made."""
 
-from __future__ import annotations
-
 import errno
 
 import pytest

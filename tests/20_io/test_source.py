@@ -1,7 +1,5 @@
 """Windows, areas of interest and options: what of a file is wanted."""
 
-from __future__ import annotations
-
 import os
 import pickle
 

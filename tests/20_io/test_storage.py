@@ -1,7 +1,5 @@
 """What has a name in storage is complete: one contract for folders and object stores."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 

@@ -1,7 +1,5 @@
 """Decks and roofs between two parallel drops."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

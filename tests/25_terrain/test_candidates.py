@@ -1,7 +1,5 @@
 """Whole surfaces are judged by hand-made sums; levels unite whatever their numbers."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Terrain and surface at the cells of a raster: each kernel against a slow twin or an independent library."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 

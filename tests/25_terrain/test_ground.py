@@ -1,7 +1,5 @@
 """The ground stage: pits, local planes, heights, ground points; nothing depends on where the window ends."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The hierarchical ground filter: what it cuts off, its tests by slow twins, and how far it looks."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

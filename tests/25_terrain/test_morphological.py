@@ -1,7 +1,5 @@
 """The morphological ground filter: openings by octagons, two passes, wide objects, regrowth, and what they tell."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gross outliers: alone in the 27 cubes around them."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 import pytest

@@ -1,7 +1,5 @@
 """The class of every point: each kernel against a slow twin, and what a scene's points become."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Walls cut the TIN: what lies on either side of them, and what is summed of it."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

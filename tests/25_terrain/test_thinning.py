@@ -1,7 +1,5 @@
 """Thinning: one point a cell, whatever the order of the points."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 from examples import examples

@@ -1,7 +1,5 @@
 """Roofs made by hand: where units are split and where not, at any density, turn and order of the points."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Planarity of the surroundings: roofs are planar up to their ridges and eaves, crowns are not."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A small town of points with known truth: rolling terrain, a gable house, a flat block of two levels, and trees."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

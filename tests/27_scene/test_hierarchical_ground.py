@@ -1,7 +1,5 @@
 """The hierarchical ground filter within the scene: the buildings are found, and tiles change nothing."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

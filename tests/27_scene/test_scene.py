@@ -1,7 +1,5 @@
 """A town of points to surfaces: the buildings are found, the trees are not, and tiles change nothing."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Planes found with thresholds that follow noise and density."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Weights, centres, membership and the eliminations of the clusters in three dimensions."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

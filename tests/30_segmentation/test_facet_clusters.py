@@ -1,7 +1,5 @@
 """Connected parts of clusters against scipy, points of facets and samples beside a roof against plain loops."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from candidates_by_hand import same_partition

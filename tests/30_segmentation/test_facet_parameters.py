@@ -1,7 +1,5 @@
 """Slope, orientation and O-distance of facets: what they are of known planes, and what turns and shifts do to them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The clustering against a plain Python twin, and the equations against their words."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The printed Z_avg rule on facets that can be counted by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """K-means of facet normals: against scikit-learn, against a plain twin, and what must not change the outcome."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """Clusters among leftover points: small faces are found, labelled points and clutter are left alone."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.geometry import nearest_neighbours

@@ -1,7 +1,5 @@
 """Coarse clusters in boxes: dense neighbours grow together, layers do not, doubles are merged."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Merging in a queue against merging by brute force, and the lists of pairs against all pairs."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Refinement of rough clusters: what merges, what is dropped, what stays, and what it does not depend on."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Best-fit planes from sums against numpy's least squares."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Assignment of points and dissolution of redundant planes against loops over all points and planes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

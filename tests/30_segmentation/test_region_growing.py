@@ -1,7 +1,5 @@
 """Regions grown from the mean of clusters: they follow the plane, not the cluster's members."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

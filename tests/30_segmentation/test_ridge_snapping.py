@@ -1,7 +1,5 @@
 """Ridges, hips and valleys: where they are found, and that they become straight."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Both decision trees, leaf by leaf, as sections 3.3 and 4.2 print them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Single linkage on the grid against scipy's, the paper's rules about the distance, and the cost on dense roofs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from candidates_by_hand import same_partition

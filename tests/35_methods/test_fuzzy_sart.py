@@ -1,7 +1,5 @@
 """The whole recipe on roofs whose planes are known: the paper's cube, gables, hips, and what must not matter."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

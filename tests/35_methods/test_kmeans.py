@@ -1,7 +1,5 @@
 """The whole recipe of Zeng et al.: exact gables come back, other roofs find their way, and what must not matter."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

@@ -1,7 +1,5 @@
 """Both recipes on roofs whose planes are known: the leaves of the trees, the primitive, and what must not matter."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

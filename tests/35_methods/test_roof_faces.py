@@ -1,7 +1,5 @@
 """Which methods arrange their roof faces, and what that changes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Solids that are valid, and the same broken on purpose, for every test of this layer."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Callable, Sequence

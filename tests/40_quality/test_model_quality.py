@@ -1,7 +1,5 @@
 """How well points support a model: what is unexplained, holes, the ridge's standard deviation, curved roofs."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

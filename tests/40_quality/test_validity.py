@@ -1,7 +1,5 @@
 """Every code has a solid that shows it, and verdicts depend on the geometry alone."""
 
-from __future__ import annotations
-
 import dataclasses
 import random
 from collections.abc import Callable

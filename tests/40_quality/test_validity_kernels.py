@@ -1,7 +1,5 @@
 """The exact tests behind the codes, against slow rational twins, shapely and numpy."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import Counter
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """Exact roofs: bodies with planes over polygons, sampled with their true labels."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

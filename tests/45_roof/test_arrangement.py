@@ -1,7 +1,5 @@
 """The arrangement: labelled points and planes to roof faces that fill an outline."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

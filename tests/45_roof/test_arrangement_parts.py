@@ -1,7 +1,5 @@
 """The steps of the arrangement: minimum cuts, and the subdivision of an outline by chords."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The arrangement on shapes of many faces: mansards, sawtooth halls, set-backs, towers, with noise and turned."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Straight borders: ridges exactly where planes cross, steps along lines, and always a coverage."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Straight eaves: few lines, the true place, and never a broken outline."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """Where an edge is put: without bias for any pattern of points, drawn back by what mixed pulses add, and no more."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

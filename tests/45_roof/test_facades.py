@@ -1,7 +1,5 @@
 """Outlines at the facades: where points beneath the eaves show the walls."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

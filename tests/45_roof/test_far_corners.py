@@ -1,7 +1,5 @@
 """Corners where a plane leaves the points: found, cut off, and given to a plane that does not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import shapely

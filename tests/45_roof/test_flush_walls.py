@@ -1,7 +1,5 @@
 """Flush walls: one wall where two lie in one plane, and nothing else changes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """Given footprints, clipping, and the fallback block over any of them."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 

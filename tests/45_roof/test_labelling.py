@@ -1,7 +1,5 @@
 """Labels for places without points."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from examples import examples

@@ -1,7 +1,5 @@
 """Lines through ragged borders."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

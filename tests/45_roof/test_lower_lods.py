@@ -1,7 +1,5 @@
 """LoD1.2 and LoD1.3 from roof faces: closed, on the same outline, joined where steps are low."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

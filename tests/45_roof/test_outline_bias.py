@@ -1,7 +1,5 @@
 """Outlines of scanned buildings against their exact footprints: of the right size whatever the survey."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

@@ -1,7 +1,5 @@
 """The partition of the plan: a coverage with one polygon a connected region, wherever labels lie."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """The model of ten vertices and its counterparts: exact from exact points, valid as solids, or refused."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

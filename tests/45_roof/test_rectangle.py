@@ -1,7 +1,5 @@
 """Hulls and rectangles in plan: against shapely, and on shapes whose answer is known."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Roof types of exact roofs."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any

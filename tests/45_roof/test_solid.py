@@ -1,7 +1,5 @@
 """Solids over partitions: closed, oriented, valid, and as large as the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

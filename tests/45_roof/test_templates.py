@@ -1,7 +1,5 @@
 """Templates: simple roof shapes over the parts of an outline, for few points."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Outlines of touching units: without slits and overlaps, the border amid the points of both."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import shapely

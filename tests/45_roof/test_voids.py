@@ -1,7 +1,5 @@
 """Places of a given outline without a roof point nearby."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import shapely

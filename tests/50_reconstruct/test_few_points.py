@@ -1,7 +1,5 @@
 """Buildings with few points: templates compete with the arrangement, and stand in where there are no planes."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

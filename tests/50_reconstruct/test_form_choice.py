@@ -1,7 +1,5 @@
 """Which of several sound forms of a roof is delivered."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Levels of detail on request: the finest is the record's, others come with it, a requested block is not a fault."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What every model of the default method keeps, on simulated roofs of every shape with their outlines and without."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterator

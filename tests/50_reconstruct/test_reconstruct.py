@@ -1,7 +1,5 @@
 """One building end to end: models, fallbacks, failures, and that every candidate gives a record."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

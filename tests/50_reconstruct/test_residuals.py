@@ -1,7 +1,5 @@
 """Residuals against a plain search, and what a missing roof costs."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sloping roofs over round outlines: given with edges of decimetres, they are models of LoD2.2 all the same."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

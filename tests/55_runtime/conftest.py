@@ -1,7 +1,5 @@
 """A small simulated suburb for runs that take seconds."""
 
-from __future__ import annotations
-
 import dataclasses
 import random
 from collections.abc import Callable, Generator, Sequence

@@ -1,7 +1,5 @@
 """A run that is cancelled ends soon and leaves nothing; tasks may die half way, run twice, or come too late."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Callable, Generator, Sequence

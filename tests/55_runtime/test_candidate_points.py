@@ -1,7 +1,5 @@
 """The points that a candidate knows besides its own: split returns, and those beside it, whatever the tiles."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Codes of a producer's own: 67 can be a building, wherever classes are believed or looked at."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

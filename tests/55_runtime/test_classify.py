@@ -1,7 +1,5 @@
 """`classify`: every input written back as it was but for its classes, whatever the tiles, the order and the workers."""
 
-from __future__ import annotations
-
 import signal
 import struct
 import subprocess

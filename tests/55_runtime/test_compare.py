@@ -1,7 +1,5 @@
 """Several methods over the same candidates: each as if it had run alone, the scene split once."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

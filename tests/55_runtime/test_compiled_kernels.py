@@ -1,7 +1,5 @@
 """Stored files show whether kernels are compiled; nothing is compiled to find out."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

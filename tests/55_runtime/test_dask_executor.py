@@ -1,7 +1,5 @@
 """Executors: every task gives its result, whatever happens to the workers, or an error says why not."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator

@@ -1,7 +1,5 @@
 """Which engine runs a job, by what is asked for and by what it will cost."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Children forked from a preloaded server have what it loaded; the loss of the server costs only time."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

@@ -1,7 +1,5 @@
 """Given footprints end to end: every fault is reported, none stops a run, ids and attributes come out again."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

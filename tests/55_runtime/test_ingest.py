@@ -1,7 +1,5 @@
 """Ingest: every point lands in its own tile, once, also when a task runs twice."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

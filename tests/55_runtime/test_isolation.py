@@ -1,7 +1,5 @@
 """Supervised children: a building harms only itself, and no child outlives its parent."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

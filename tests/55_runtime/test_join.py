@@ -1,7 +1,5 @@
 """What tiles finish and what they hand on give, joined, what a join of all their fragments gives."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

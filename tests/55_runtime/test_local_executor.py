@@ -1,7 +1,5 @@
 """Small jobs run in children of the command: equal results, and no child's death costs more than its task."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import threading

@@ -1,7 +1,5 @@
 """The CPU time of a task: that of its own thread and of its children, and no other."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

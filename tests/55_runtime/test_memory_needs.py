@@ -1,7 +1,5 @@
 """Memory that tasks declare: what is large goes where it fits, nothing waits for ever, and the small ones pass by."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Runs whose inputs and results lie in an object store."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Keys tell all that an outcome depends on, and nothing else; kept outcomes are whole or not there."""
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import pickle

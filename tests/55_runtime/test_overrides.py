@@ -1,7 +1,5 @@
 """Overrides of single buildings take effect, are reported, and change no other building."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json

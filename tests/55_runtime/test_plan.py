@@ -1,7 +1,5 @@
 """What a plan says of inputs that cannot be used: of all of them, not of the first alone."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

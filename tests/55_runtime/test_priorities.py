@@ -1,7 +1,5 @@
 """Interactive runs overtake batch runs, whatever either of them wishes."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Rasters of classify: right values at the right places, cloud-optimised, whatever the tiles."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from pathlib import Path

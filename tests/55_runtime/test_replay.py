@@ -1,7 +1,5 @@
 """Quarantine bundles: everything that modelling a building needs, safe to open, replayed by one command."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

@@ -1,7 +1,5 @@
 """A run as a user sees it: records for every candidate, clear refusals, nothing lost."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

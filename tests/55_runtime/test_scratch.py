@@ -1,7 +1,5 @@
 """Scratch: arrays come back as they were stored, whole or mapped."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Settings: all faults at once, a hash of what can change geometry and of nothing else."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

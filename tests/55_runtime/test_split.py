@@ -1,7 +1,5 @@
 """The order in which a tile's points are stored."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

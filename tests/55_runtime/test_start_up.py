@@ -1,7 +1,5 @@
 """What processes of ours set for themselves, and what those of others keep."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """The promise of the whole design: the same content whatever the tiles, the order and the workers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

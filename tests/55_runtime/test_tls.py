@@ -1,7 +1,5 @@
 """Certificates: unusable files are refused with name and fix, before any connection."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import ssl

@@ -1,7 +1,5 @@
 """Units over tile borders: a row of houses in one candidate becomes the same candidates whatever the lattice."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Figures, log lines and the page about the workers' time say what happened, with ids, and stay bounded."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging

@@ -1,7 +1,5 @@
 """How far tiles look: no farther than what is known of the points asks for, and the content stays the same."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A work folder: an interrupted run resumes, a later one repeats only what changed, and the results stay the same."""
 
-from __future__ import annotations
-
 import dataclasses
 import fcntl
 import json

@@ -1,7 +1,5 @@
 """The batch file: paths are the file's own, and all faults are reported at once."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The status of a run: its content, and the state dead after the run died."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import json

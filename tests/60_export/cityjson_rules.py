@@ -1,7 +1,5 @@
 """The rules of CityJSON 2.0 for what this program writes, as a JSON schema and as checks that no schema can state."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

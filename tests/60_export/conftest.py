@@ -1,7 +1,5 @@
 """Fixtures of the export tests."""
 
-from __future__ import annotations
-
 import datetime as dt
 import sys
 from pathlib import Path

@@ -4,8 +4,6 @@
 triangle meshes, and gives the nodes with their triangles in the file's own coordinates.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import struct

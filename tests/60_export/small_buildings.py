@@ -1,7 +1,5 @@
 """Small buildings with known dimensions: what the exports are fed in tests."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Finished runs of small buildings, written as a run writes them."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 from pathlib import Path

@@ -1,7 +1,5 @@
 """CityJSONSeq: its rules, the official schema, cjio, and the geometry that comes back."""
 
-from __future__ import annotations
-
 import copy
 import json
 import os

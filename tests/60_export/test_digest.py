@@ -1,7 +1,5 @@
 """The digest of a run: blind to files, order and storage, awake to every millimetre."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import shutil

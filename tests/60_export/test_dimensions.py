@@ -1,7 +1,5 @@
 """Dimensions of delivered solids against textbook figures, a sampled twin and an independent hull."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """GeoParquet files: judged by the validator, read back by three independent readers."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

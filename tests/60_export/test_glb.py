@@ -1,7 +1,5 @@
 """GLB files, read by an independent reader: whole by the rules, closed, oriented, placed to the millimetre."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections import Counter

@@ -1,7 +1,5 @@
 """LAZ 1.4: every dimension of every older format survives, as laspy, an independent reader and writer, has it."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

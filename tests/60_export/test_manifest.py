@@ -1,7 +1,5 @@
 """run.json: written whole, read back as it was, honest about damage."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import json

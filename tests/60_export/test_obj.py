@@ -1,7 +1,5 @@
 """OBJ files, read again by a small reader of their own: closed, grouped, at full coordinates."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import Counter
 

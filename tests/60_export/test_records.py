@@ -1,7 +1,5 @@
 """Records: their columns, their units and what is unknown."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import re

@@ -1,7 +1,5 @@
 """Solids as columns of GeoParquet: read back by other programs, they bound the same solids with the same semantics."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections import Counter

@@ -1,7 +1,5 @@
 """Publishing a tile: the designed paths, whole files only, the same twice."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A published tile with some buildings replaced is the tile that publishing the whole would have written."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from pathlib import Path

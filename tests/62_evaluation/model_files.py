@@ -1,7 +1,5 @@
 """Files of models as this program and others write them, and what they are to be read as."""
 
-from __future__ import annotations
-
 import copy
 import json
 import subprocess

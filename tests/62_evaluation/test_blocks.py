@@ -1,7 +1,5 @@
 """Buildings that touch become blocks; their faces, points and conditions go with them."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Intervals by resampling units."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

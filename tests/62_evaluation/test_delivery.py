@@ -1,7 +1,5 @@
 """Delivery: what buildings got, which models stand where no building is, which split or join."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

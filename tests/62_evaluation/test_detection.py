@@ -1,7 +1,5 @@
 """Detection by area against a plain raster with scipy's morphology, by object by hand, and under known damage."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence

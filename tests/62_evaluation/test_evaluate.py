@@ -1,7 +1,5 @@
 """One evaluation as a whole: the same models in another format, and models that are nowhere."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import roofs_by_hand as by_hand

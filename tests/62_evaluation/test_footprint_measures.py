@@ -1,7 +1,5 @@
 """Footprints: known damage moves overlap and area by what geometry says."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Ground against reference classes: tables by hand, labels of files, and the filter of a run."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence

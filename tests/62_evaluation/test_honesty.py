@@ -3,8 +3,6 @@
 Everything goes through the files and the readers that a user has; damage is done to the models after reading.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Footprints match best first, one to one, as naive loops find it."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """CityJSON that others write: parts, levels, semantics, templates, versions, units, and what is broken."""
 
-from __future__ import annotations
-
 import copy
 import json
 import sys

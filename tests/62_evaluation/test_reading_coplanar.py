@@ -1,7 +1,5 @@
 """Faces that are parts of one plane are found again, whatever they were cut into."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """OBJ that others write: names, groups, materials, indices, and what is broken."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

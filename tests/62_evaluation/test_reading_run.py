@@ -1,7 +1,5 @@
 """Run directories, the truth of simulated scenes, and what is nothing that can be read."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import shutil

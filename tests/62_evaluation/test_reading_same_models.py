@@ -1,7 +1,5 @@
 """The same buildings read from a run's tables, CityJSONSeq, CityJSON and OBJ; polygons and their triangles."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Classified points as a reference: buildings by given footprints, or by what hangs together on the raster."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 

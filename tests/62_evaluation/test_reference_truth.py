@@ -1,7 +1,5 @@
 """A simulated data set read back as a reference: models, labels and points belong together."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections import Counter

@@ -1,7 +1,5 @@
 """Points against models: counted by hand, by a slow twin with shapely, and as damage moves the figures."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Roof types and the paper's outcomes: each damage moves a building into the class that it should."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Vertical differences over the true roofs: integrals, known damage, and a naive lattice."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

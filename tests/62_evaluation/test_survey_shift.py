@@ -1,7 +1,5 @@
 """True buildings moved to where the survey saw them."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

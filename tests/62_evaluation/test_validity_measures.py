@@ -1,7 +1,5 @@
 """Validity of delivered solids of any program."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files of an evaluation: Parquet and Markdown say what was measured, and no more than the figures support."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """Pairs of runs made by hand: exact houses on level ground, written as a run writes them."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import math

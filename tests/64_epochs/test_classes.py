@@ -1,7 +1,5 @@
 """Classes of changes: pairs of houses made by hand, one change each, and differences that are not a change."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A simulated suburb, changed, scanned twice with other noise, reconstructed twice: every change is found, no other."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

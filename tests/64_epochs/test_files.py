@@ -1,7 +1,5 @@
 """What is written, what is refused: GeoParquet, GeoJSON, sums, reference systems, settings."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

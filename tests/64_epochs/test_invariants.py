@@ -1,7 +1,5 @@
 """What must not depend on which epoch comes first, on the order of rows, on tiles, on place and units."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`gablework batch diff` as a user types it, and the page that it writes."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import json

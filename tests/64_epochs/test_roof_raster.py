@@ -1,7 +1,5 @@
 """The raster of two roofs against the exact integral over the pieces in which their faces overlap, and its details."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import shapely

@@ -1,7 +1,5 @@
 """Fixtures of the report tests: a finished run of small buildings."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path

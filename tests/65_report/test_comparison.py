@@ -1,7 +1,5 @@
 """Runs side by side: one table, one page, nothing hidden, and views of one place at one scale."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

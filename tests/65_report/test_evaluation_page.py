@@ -1,7 +1,5 @@
 """The page of an evaluation: one file that shows every figure, its maps, its charts and its worst cases."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import html

@@ -1,7 +1,5 @@
 """The picture of a run: it shows what is there, by its colours, and nothing else."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

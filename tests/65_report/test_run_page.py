@@ -1,7 +1,5 @@
 """The page of a run: it shows the content of the run, at any size, and text is never markup."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import sys

@@ -1,7 +1,5 @@
 """Tables of a run: every candidate is counted once, and nothing is claimed of what is unknown."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """gablework batch: plan, run, status, as a user types them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """`classify` as a user meets it: files, tables, machine output, errors."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The commands as a user meets them: help, usage errors, input errors, machine output, options that they share."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`gablework compare` as a user runs it: one command, one folder, one page."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Progress, errors and exit codes as people, logs and machines see them."""
 
-from __future__ import annotations
-
 import io
 import json
 

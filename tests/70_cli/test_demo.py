@@ -1,7 +1,5 @@
 """The demo of the README, on a smaller suburb."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

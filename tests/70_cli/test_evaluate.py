@@ -1,7 +1,5 @@
 """`gablework evaluate` as a user types it: against truth, against points, alone, and on files of other programs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

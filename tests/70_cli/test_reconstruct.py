@@ -1,7 +1,5 @@
 """The main job on the command line: a simulated tile in, a run directory out."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Commands import what they use and no more: start-up counts."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

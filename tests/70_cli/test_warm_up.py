@@ -1,7 +1,5 @@
 """`gablework warm-up` as a user meets it: which kernels it compiles for which words; nothing is compiled here."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable
 

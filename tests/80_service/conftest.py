@@ -1,7 +1,5 @@
 """A service in this process, on a state folder of its own."""
 
-from __future__ import annotations
-
 import contextlib
 import sys
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Finished runs of several tiles, written by the program's own export, and a service that holds them as jobs."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import dataclasses

@@ -1,7 +1,5 @@
 """Who asks: keys on any address but loopback, scopes, revocation within seconds, and no key in a message or a log."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import logging

@@ -1,7 +1,5 @@
 """Files that are built to harm: refused by their header, within bounded memory and time, by errors that are meant."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import io

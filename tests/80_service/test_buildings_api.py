@@ -1,7 +1,5 @@
 """Buildings by REST: pages by window and words against a slow twin, single buildings in four forms."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The process `compare`: what it takes, what a driver makes of it, and what its results answer."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

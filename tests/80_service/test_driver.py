@@ -1,7 +1,5 @@
 """The driver with a scripted run in place of the science: what becomes of a job, whatever happens."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

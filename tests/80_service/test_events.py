@@ -1,7 +1,5 @@
 """Events of a job, as a stream that can be taken up again and as a list."""
 
-from __future__ import annotations
-
 import datetime as dt
 import json
 import threading

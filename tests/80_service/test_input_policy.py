@@ -1,7 +1,5 @@
 """Which hosts, URLs and CRS a stranger may name: one origin an entry, no parser is led astray, PROJ opens nothing."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The janitor removes what no job needs, and nothing else."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import time

@@ -1,7 +1,5 @@
 """Jobs as records, and what is decided about them: no database, no clock."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import errno

@@ -1,7 +1,5 @@
 """Jobs over HTTP: the one-call form, list and filters, status, dismissal."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from pathlib import Path

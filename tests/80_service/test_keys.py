@@ -1,7 +1,5 @@
 """Keys: random, hashed, with scopes that are steps."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import hashlib

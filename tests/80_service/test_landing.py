@@ -1,7 +1,5 @@
 """The landing page, conformance, health and figures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

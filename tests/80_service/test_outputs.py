@@ -1,7 +1,5 @@
 """Outputs of a finished run: merged over the tiles, judged by other programs, the same twice."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import subprocess

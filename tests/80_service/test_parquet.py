@@ -1,7 +1,5 @@
 """GeoParquet from strangers: taken where it is what it says, refused where its few bytes stand for too much."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """Errors as problem documents, and what stands before the routes."""
 
-from __future__ import annotations
-
 import pytest
 from sqlalchemy import exc as sql
 

@@ -1,7 +1,5 @@
 """The processes: descriptions that hold for the code, and requests of which every fault is reported."""
 
-from __future__ import annotations
-
 import base64
 import json
 

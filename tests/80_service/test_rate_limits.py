@@ -1,7 +1,5 @@
 """Limits of requests: counted for each client by itself, exactly, from any number of threads."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

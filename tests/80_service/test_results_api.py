@@ -1,7 +1,5 @@
 """Results by REST: what is listed, what a file's answer carries, and what a job without results says."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -1,7 +1,5 @@
 """The clock of the schedules in drivers with a scripted run in place of the science."""
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from typing import Any

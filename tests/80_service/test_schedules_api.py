@@ -1,7 +1,5 @@
 """Schedules over HTTP: made, listed, changed, run by hand, removed, and how their jobs tell of them."""
 
-from __future__ import annotations
-
 import base64
 import datetime as dt
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`gablework serve`, `driver` and `keys` as processes: starting, refusing, restarting the driver, ending."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

@@ -1,7 +1,5 @@
 """Uploads: whole or not at all, counted and hashed on the way, under a name that cannot lead anywhere."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import contextlib

@@ -1,7 +1,5 @@
 """The programs that tests start, and a house to model."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

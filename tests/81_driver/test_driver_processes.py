@@ -1,7 +1,5 @@
 """Real drivers with real clusters over real jobs: killed, drained, several at once."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Schedules in a real service over a real tile: by hand, by the clock, with the driver killed on the way."""
 
-from __future__ import annotations
-
 import datetime as dt
 import json
 import re

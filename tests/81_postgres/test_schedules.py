@@ -1,7 +1,5 @@
 """Schedules in the store, on a real PostgreSQL."""
 
-from __future__ import annotations
-
 import pytest
 from processes import PostgresServer
 from schedule_contract import HOUR, NOON

@@ -1,7 +1,5 @@
 """The store on a real PostgreSQL."""
 
-from __future__ import annotations
-
 import pytest
 from processes import PostgresServer
 from store_contract import StoreContract, claim, running, submit

@@ -1,7 +1,5 @@
 """Faults that strike a batch run, the stages at which they do, and what became of it, as rows of a table."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Real schedulers, workers, drivers and APIs on the loopback."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The whole service as real processes on the loopback, which tests kill and restart."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """Faults, the stages in which they strike, and the outcome of the job, as rows of a table."""
 
-from __future__ import annotations
-
 import dataclasses
 import signal
 from collections.abc import Callable, Iterable, Mapping, Sequence

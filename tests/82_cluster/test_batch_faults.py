@@ -3,8 +3,6 @@
 Every row is held against docs/reference/batch_faults.md; what strikes the store is in `test_batch_store_faults.py`.
 """
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """An object store fails while a batch run reads from it or publishes to it: nothing is lost, nothing comes twice."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

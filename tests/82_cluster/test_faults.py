@@ -3,8 +3,6 @@
 Every test adds its rows to a table; the last test compares docs/reference/faults.md with it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """`gablework batch schedule` as a process: ended, killed, started again, and no run is lost or made twice at a time."""
 
-from __future__ import annotations
-
 import datetime as dt
 import os
 import signal

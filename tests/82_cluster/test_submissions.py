@@ -1,7 +1,5 @@
 """The API is killed while clients submit: every acknowledged job exists, complete and once."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 import time

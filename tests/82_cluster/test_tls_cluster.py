@@ -1,7 +1,5 @@
 """A scheduler and workers with TLS: the same content as without, and no one else can connect."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

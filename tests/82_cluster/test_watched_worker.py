@@ -1,7 +1,5 @@
 """A worker's figures and log lines name what it did, and what it lost."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -1,7 +1,5 @@
 """Runs on a real scheduler and real workers: killed, drained, missing, late, of other versions, and interrupted."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The OpenAPI document: valid, of version 3.0 throughout, and complete."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

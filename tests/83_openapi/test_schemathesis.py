@@ -3,8 +3,6 @@
 CI runs some hundred; `GABLEWORK_OPENAPI_CASES=5000 .venv/bin/python -m pytest -m slow tests/83_openapi -s` runs more.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os

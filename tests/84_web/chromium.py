@@ -1,7 +1,5 @@
 """One open page: what it loads, what it complains about, and what is seen of its models."""
 
-from __future__ import annotations
-
 import colorsys
 import io
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A real service and a real Chromium. The page is built if missing; missing programs are named."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import os

@@ -1,7 +1,5 @@
 """The web page in a real Chromium, against a real service: from a dropped tile to a record and its files."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

@@ -1,7 +1,5 @@
 """The files of docker/, read, and the programs that tests start."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

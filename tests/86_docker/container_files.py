@@ -1,7 +1,5 @@
 """Reads a Dockerfile and a compose file far enough to hold them against the sources and to run what they start."""
 
-from __future__ import annotations
-
 import dataclasses
 import fnmatch
 import json

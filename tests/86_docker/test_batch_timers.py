@@ -1,7 +1,5 @@
 """The CronJob and the systemd timer of a batch run, and the page about them and of the service's schedules."""
 
-from __future__ import annotations
-
 import configparser
 import datetime as dt
 import json

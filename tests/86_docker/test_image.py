@@ -1,7 +1,5 @@
 """The Dockerfile, the compose file and the entry point, held against the sources and against each other."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The manifests, held against Kubernetes' own schemas, against the operator's fields, the sources and each other."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Iterator, Mapping

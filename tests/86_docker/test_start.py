@@ -4,8 +4,6 @@ Only names that a container alone has are replaced: folders, host names and port
 user; where that one cannot enter the folders of this environment they run as this user, without capabilities.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import re

@@ -1,7 +1,5 @@
 """The contact sheets: every building of a run is on one, with the share that its points tell."""
 
-from __future__ import annotations
-
 import math
 import sys
 from pathlib import Path

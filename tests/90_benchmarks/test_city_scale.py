@@ -1,7 +1,5 @@
 """The city that the engine is measured on, what is seen of its processes, and the tables of a run."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """What the benchmarks measure, what they find there already, and how they clock."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import time

@@ -1,7 +1,5 @@
 """The benchmark of ground filters: its scenes, its figures, and what the default filter reaches on some of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The printed tables, and what is computed beside them."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What was measured goes between the marks of the page, and nothing else changes."""
 
-from __future__ import annotations
-
 import re
 
 from benchmarks.results_page import PAGE, filled

@@ -1,7 +1,5 @@
 """What is said of the ridge's standard deviation, from errors and figures by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The table beside roofer: how surveys are thinned, what differs between runs, who is valid, and the table itself."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

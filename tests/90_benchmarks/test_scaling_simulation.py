@@ -1,7 +1,5 @@
 """The simulation of the task graph: limits that can be reckoned by hand, and traces that it gives again."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

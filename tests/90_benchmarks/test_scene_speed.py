@@ -1,7 +1,5 @@
 """How the stages are timed, and how the times are reported."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import laspy

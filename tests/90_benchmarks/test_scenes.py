@@ -1,7 +1,5 @@
 """The scores of split scenes: counted by hand, and over a small city."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

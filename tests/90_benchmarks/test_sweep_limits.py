@@ -1,7 +1,5 @@
 """Where a quality holds a level, between the cells of the sweep."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

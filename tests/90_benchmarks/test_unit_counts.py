@@ -1,7 +1,5 @@
 """The counts of candidates against houses, from tables made by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from benchmarks.units import Relations, relations

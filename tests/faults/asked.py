@@ -1,7 +1,5 @@
 """What a test puts into the environment of a process that is to meet faults."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

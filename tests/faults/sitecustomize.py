@@ -29,8 +29,6 @@ split, reconstruct and publish, and outputs in the service's driver. A stage's t
 `environment()` in `tests/faults/asked.py` sets both variables.
 """
 
-from __future__ import annotations
-
 import errno
 import functools
 import importlib.abc
