@@ -84,6 +84,12 @@ def evaluate(
         list[str] | None,
         typer.Option(metavar="FILE", help="The same points, classified by another program: judge its ground."),
     ] = None,
+    wireframes: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE", help="True roof edges in metres, as JSON or OBJ lines: judge edges and corners by them."
+        ),
+    ] = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
     as_surveyed: AsSurveyed = False,
@@ -100,7 +106,7 @@ def evaluate(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Measure models: against simulated truth, against classified points, or alone."""
+    """Measure models: against simulated truth, classified points, true roof edges, or alone."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
         from pipeline.runtime.monitoring.events import Event
@@ -111,6 +117,7 @@ def evaluate(
             points=tuple(points or ()),
             footprints=footprints,
             ground=tuple(ground or ()),
+            wireframes=wireframes,
             crs=crs,
             vertical_unit=vertical_unit,
             as_surveyed=as_surveyed,

@@ -12,6 +12,8 @@ import pytest
 from command_line import invoke
 
 from pipeline.console import ExitCode
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.wireframe_network import network, roof_segments
 from pipeline.ruler.simulation.dataset import Output, ScenePaths, simulate
 
 
@@ -86,6 +88,27 @@ def test_the_ground_of_any_program_is_judged(scene: ScenePaths, tmp_path: Path) 
     measured = figures(evaluated(scene.truth, "--points", scene.laz, "--ground", tmp_path / "classified.laz"))
     assert measured["ground.type_1"] == pytest.approx(0.1, abs=0.01)
     assert measured["ground.type_2"] == 0.0
+
+
+def test_true_roof_edges_can_be_the_reference(scene: ScenePaths, tmp_path: Path) -> None:
+    truth = read_models(scene.truth).models
+    edges = {one.building_id: network(roof_segments([one], [0])).edges.reshape(-1, 3) for one in truth}
+    drawn = {name: {"v": xyz.tolist(), "e": np.arange(len(xyz)).reshape(-1, 2).tolist()} for name, xyz in edges.items()}
+    (tmp_path / "drawn.json").write_text(json.dumps(drawn))
+    document = evaluated(scene.truth, "--wireframes", tmp_path / "drawn.json", "--out", tmp_path / "report")
+    measured = {name: value for name, value in figures(document).items() if name.startswith("wireframes.")}
+    assert len(measured) == 21
+    assert list(measured.values()) == pytest.approx([1.0] * 21)
+    rows = pq.read_table(tmp_path / "report" / "wireframes.parquet").to_pylist()
+    assert {name: row["corner_f1_0_3m"] for name, row in zip(sorted(drawn), rows, strict=True)} == dict.fromkeys(
+        drawn, 1.0
+    )
+    for page in ("report.html", "report.md"):
+        text = (tmp_path / "report" / page).read_text()
+        assert "Roof edges and corners" in text
+        assert f"drawn.json: roof edges of {len(drawn)} buildings" in text
+    (tmp_path / "drawn.json").write_text('{"a": {"v": [[0, 0, 5]], "e": [[0, 1]]}}')
+    assert "edge 0 of building 'a' is [0, 1]" in refused(scene.truth, "--wireframes", tmp_path / "drawn.json")
 
 
 def test_what_does_not_go_together_is_refused(scene: ScenePaths, tmp_path: Path) -> None:

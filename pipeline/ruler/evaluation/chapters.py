@@ -19,6 +19,7 @@ TITLES = {
     Group.RESIDUALS: "Points against the models",
     Group.SURFACE: "Roof surfaces against the truth",
     Group.FACES: "Roof faces",
+    Group.WIREFRAMES: "Roof edges and corners",
     Group.ROOF_TYPES: "Roof types",
     Group.FOOTPRINTS: "Footprints",
     Group.DETECTION: "Detection of buildings",

@@ -16,6 +16,8 @@ from pipeline.ruler.evaluation.measure import Group
 
 OUTCOMES = ("correct", "passable", "false")
 """Outcomes of a roof, best first (Hofmann, Maas, Streilein 2003)."""
+MAX_WIREFRAMES = 20
+"""Buildings in the table of the worst wireframes."""
 AREA_CLASSES_M2 = (0.0, 50.0, 100.0, 200.0, 500.0, math.inf)
 """Borders of the classes of footprints in breakdowns."""
 
@@ -43,6 +45,7 @@ def count_tables(tables: Tables) -> dict[Group, tuple[CountTable, ...]]:
         (Group.FACES, "topology", _topology),
         (Group.VALIDITY, "validity_codes", _validity_codes),
         (Group.GROUND, "ground", _ground),
+        (Group.WIREFRAMES, "wireframes", _wireframes),
     )
     found: dict[Group, tuple[CountTable, ...]] = {}
     for group, name, make in makers:
@@ -112,6 +115,27 @@ def _ground(table: pa.Table) -> list[CountTable]:
     )
     header = ("tile", "type I", "type II", "total", "kappa", "ground points", "object points")
     return [CountTable(title="Ground filter by tile", header=header, rows=rows)]
+
+
+def _wireframes(table: pa.Table) -> list[CountTable]:
+    """One table of edges and one of corners, at 0.5 m; the worst buildings first."""
+    title = "by building at 0.5 m, the worst first"
+    if table.num_rows > MAX_WIREFRAMES:
+        title += f": {MAX_WIREFRAMES} of {table.num_rows:,}"
+    printed = []
+    for kind, amount, sign in (("edge", "edges_m", " (m)"), ("corner", "corners", "")):
+        worst = sorted(table.to_pylist(), key=lambda row: row[f"{kind}_f1_0_5m"] or 0.0)[:MAX_WIREFRAMES]
+        rows = tuple(
+            (
+                str(row["building_id"]),
+                *(_count(row[f"{side}_{amount}"]) for side in ("true", "model")),
+                *(_percent(row[f"{kind}_{share}_0_5m"]) for share in ("recall", "precision", "f1")),
+            )
+            for row in worst
+        )
+        header = ("building", f"true{sign}", f"models{sign}", "recall", "precision", "F1")
+        printed.append(CountTable(title=f"{kind.capitalize()}s {title}", header=header, rows=rows))
+    return printed
 
 
 def breakdowns(tables: Tables) -> tuple[CountTable, ...]:

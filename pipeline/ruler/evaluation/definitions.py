@@ -15,10 +15,11 @@ from pipeline.ruler.evaluation import (
     roof_types,
     surface,
     validity,
+    wireframes,
 )
 from pipeline.ruler.evaluation.measure import Definition
 
-_MODULES = (delivery, residuals, surface, faces, roof_types, footprints, detection, ground, validity)
+_MODULES = (delivery, residuals, surface, faces, wireframes, roof_types, footprints, detection, ground, validity)
 
 DEFINITIONS: Mapping[str, Definition] = MappingProxyType(
     {definition.name: definition for module in _MODULES for definition in module.DEFINITIONS}

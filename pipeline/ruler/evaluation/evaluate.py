@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import pyarrow as pa
 import shapely
@@ -16,9 +16,11 @@ from pipeline.ruler.evaluation.ground import FoundGround, ground_blocks, ground_
 from pipeline.ruler.evaluation.matching import match_footprints
 from pipeline.ruler.evaluation.measure import Measure
 from pipeline.ruler.evaluation.models import ModelSet
+from pipeline.ruler.evaluation.reading.wireframes import WireframeSet
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.residuals import building_residuals, residual_measures
-from pipeline.ruler.evaluation.subsets import Subset, subsets
+from pipeline.ruler.evaluation.subsets import subsets
+from pipeline.ruler.evaluation.wireframes import WireframeScore, score_wireframes, wireframe_measures
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,6 +37,8 @@ class Evaluation:
     """The rows behind the figures by name; see `pipeline.ruler.evaluation.tables`."""
     notes: tuple[str, ...]
     """Assumptions and omissions of the measures."""
+    wireframes: WireframeSet | None = None
+    """The true wireframes; None without any."""
 
     def measure(self, name: str, subset: str = "all") -> Measure:
         """One figure; KeyError if it was not possible here."""
@@ -61,55 +65,60 @@ def evaluate(
     *,
     blocks: bool | None = None,
     ground: FoundGround | None = None,
+    wireframes: WireframeSet | None = None,
     on_step: Callable[[str], None] = lambda _: None,
 ) -> Evaluation:
     """Measure models; without a reference only delivery and validity.
 
     `blocks` joins true buildings that touch; by default as in `needs_blocks`. Without the found ground its measures
-    are left out. `on_step` is called with the name of each step as it begins. The points of the reference are read once
+    are left out. Roof edges and corners are measured against the wireframes, with or without a reference. `on_step` is called with the name of each step as it begins. The points of the reference are read once
     for the residuals, and once each for detection against points and for the ground.
     """
     on_step("solids")
     solids = validity.validity(models)
     valid = validity.measures(solids)
     found: dict[str, pa.Table] = {"validity_codes": tables.validity_table(solids)}
-    if reference is None:
-        found["models"] = tables.model_table(models, solids, None)
-        return Evaluation(
-            models=models,
-            reference=None,
-            measures=(*delivery.record_measures(models), *valid),
-            tables=found,
-            notes=(),
-        )
-    if needs_blocks(models, reference) if blocks is None else blocks:
-        reference = joined_reference(reference)
-    groups = [group for group in subsets(reference) if group.elsewhere or group.size]
     measures: list[Measure] = []
-    if reference.buildings or reference.extent is not None:
-        measures += _buildings(models, reference, groups, solids, found, on_step)
+    notes: list[str] = []
+    if reference is not None:
+        if needs_blocks(models, reference) if blocks is None else blocks:
+            reference = joined_reference(reference)
+        notes += _notes(models, reference)
+    if reference is not None and (reference.buildings or reference.extent is not None):
+        measures += _buildings(models, reference, solids, found, on_step)
     else:
         measures += delivery.record_measures(models)
         found["models"] = tables.model_table(models, solids, None)
-    if ground is not None and reference.has_ground:
+    if reference is not None and ground is not None and reference.has_ground:
         on_step("ground")
         judged = ground_blocks(reference, ground)
-        measures += ground_measures(judged, groups[0])
+        measures += ground_measures(judged, subsets(reference)[0])
         found["ground"] = tables.ground_table(judged)
+    if wireframes is not None:
+        on_step("wireframes")
+        score = score_wireframes(models.models, wireframes.wireframes)
+        measures += wireframe_measures(score)
+        found["wireframes"] = tables.wireframe_table(score)
+        notes += [*wireframes.notes, *_wireframe_notes(models, score)]
     return Evaluation(
-        models=models, reference=reference, measures=(*measures, *valid), tables=found, notes=_notes(models, reference)
+        models=models,
+        reference=reference,
+        measures=(*measures, *valid),
+        tables=found,
+        notes=tuple(notes),
+        wireframes=wireframes,
     )
 
 
 def _buildings(
     models: ModelSet,
     reference: Reference,
-    groups: Sequence[Subset],
     solids: tuple[validity.ModelValidity, ...],
     found: dict[str, pa.Table],
     on_step: Callable[[str], None],
 ) -> list[Measure]:
     """All measures of buildings; adds the tables to `found`."""
+    groups = [group for group in subsets(reference) if group.elsewhere or group.size]
     on_step("footprints")
     matching = match_footprints(models.models, reference)
     delivered = delivery.score_delivery(models.models, reference, matching)
@@ -177,3 +186,12 @@ def _notes(models: ModelSet, reference: Reference) -> tuple[str, ...]:
                 f"{away:,} of the {len(models.models):,} models stand beyond the reference and are not judged."
             )
     return tuple(found)
+
+
+def _wireframe_notes(models: ModelSet, score: WireframeScore) -> list[str]:
+    count = len(models.models)
+    if count and score.elsewhere == count:
+        return ["None of the models stands on a wireframe: another place, another reference system, or not in metres."]
+    if score.elsewhere:
+        return [f"{score.elsewhere:,} of the {count:,} models stand on no wireframe; their edges are not judged."]
+    return []

@@ -12,6 +12,7 @@ from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
 from pipeline.ruler.evaluation.ground import FoundGround, GroundOfFiles, GroundOfRun
 from pipeline.ruler.evaluation.models import ModelSet
 from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reading.wireframes import read_wireframes
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.reference_points import read_points_reference
 from pipeline.ruler.evaluation.reference_truth import read_truth_reference
@@ -38,6 +39,8 @@ class EvaluationRequest:
     """CRS of the point files, if their header has none or a wrong one."""
     vertical_unit: str | None = None
     """Unit of their elevations."""
+    wireframes: str | None = None
+    """True roof edges: JSON, OBJ or a folder of OBJ files."""
     as_surveyed: bool = False
     """Move true buildings to where the survey saw them."""
     blocks: bool | None = None
@@ -75,8 +78,9 @@ def evaluate_files(
 ) -> Evaluation:
     """Read and measure; `reference` is that of the same request, if it serves several models.
 
-    Raises InputError if models or reference cannot be read, and RunError if a run directory is damaged.
+    Raises InputError if models, reference or wireframes cannot be read, and RunError if a run directory is damaged.
     """
+    drawn = None if request.wireframes is None else read_wireframes(request.wireframes)
     on_step("models")
     models = read_models(request.models)
     if reference is None and (request.truth is not None or request.points):
@@ -84,7 +88,7 @@ def evaluate_files(
         reference = read_reference(request)
     options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit)
     ground = None if reference is None else _ground(request.ground, models, reference, options)
-    return evaluate(models, reference, blocks=request.blocks, ground=ground, on_step=on_step)
+    return evaluate(models, reference, blocks=request.blocks, ground=ground, wireframes=drawn, on_step=on_step)
 
 
 def _ground(files: Sequence[str], models: ModelSet, reference: Reference, options: ReadOptions) -> FoundGround | None:

@@ -22,6 +22,7 @@ class Group(StrEnum):
     RESIDUALS = "residuals"
     SURFACE = "surface"
     FACES = "faces"
+    WIREFRAMES = "wireframes"
     ROOF_TYPES = "roof_types"
     FOOTPRINTS = "footprints"
     DETECTION = "detection"

@@ -22,6 +22,7 @@ from pipeline.ruler.evaluation.subsets import Subset
 from pipeline.ruler.evaluation.surface import SurfaceRow
 from pipeline.ruler.evaluation.topology import Topology
 from pipeline.ruler.evaluation.validity import ModelValidity, code_counts
+from pipeline.ruler.evaluation.wireframes import TOLERANCES_M, WireframeScore, recall_precision_f1, tolerance_name
 
 ROLES = {
     Stands.FOR_BUILDING: "matched",
@@ -249,3 +250,27 @@ def ground_table(rows: Sequence[GroundBlock]) -> pa.Table:
             "object": [one.object for one in figures],
         }
     )
+
+
+def wireframe_table(score: WireframeScore) -> pa.Table:
+    """One row per true wireframe."""
+    rows = score.rows
+    columns: Columns = {
+        "building_id": [row.building_id for row in rows],
+        "x": [_known(row.place[0]) for row in rows],
+        "y": [_known(row.place[1]) for row in rows],
+        "model_ids": [list(row.model_ids) for row in rows],
+        "has_model": [row.has_model for row in rows],
+        "true_edges_m": [row.true_edges.total for row in rows],
+        "model_edges_m": [row.model_edges.total for row in rows],
+        "true_corners": [round(row.true_corners.total) for row in rows],
+        "model_corners": [round(row.model_corners.total) for row in rows],
+    }
+    for kind in ("edge", "corner"):
+        for k, tolerance in enumerate(TOLERANCES_M):
+            shares = [
+                recall_precision_f1(getattr(row, f"true_{kind}s"), getattr(row, f"model_{kind}s"), k) for row in rows
+            ]
+            for name, values in zip(("recall", "precision", "f1"), zip(*shares, strict=True), strict=True):
+                columns[f"{kind}_{name}_{tolerance_name(tolerance)}"] = [_known(value) for value in values]
+    return pa.table(columns)

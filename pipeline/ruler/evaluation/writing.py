@@ -24,6 +24,7 @@ from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.ruler.evaluation.evaluate import Evaluation
 from pipeline.ruler.evaluation.markdown import markdown_cell, markdown_table
 from pipeline.ruler.evaluation.measure import Definition
+from pipeline.ruler.evaluation.reading.wireframes import WireframeSet
 
 MEASURES = "measures.parquet"
 """The file of all figures."""
@@ -114,8 +115,9 @@ def subject_sentences(evaluation: Evaluation) -> tuple[str, str]:
     measured = f"{models.name}: {_counted(len(models.models), 'model')} ({kinds[models.kind]})"
     if models.failed:
         measured += f", {_counted(len(models.failed), 'record')} without a model"
+    edges = "" if evaluation.wireframes is None else _drawn(evaluation.wireframes)
     if reference is None:
-        return f"{measured}.", "Nothing: the models alone."
+        return f"{measured}.", f"{edges}." if edges else "Nothing: the models alone."
     against = f"{reference.name}: {_counted(len(reference.buildings), 'building')}"
     if reference.has_faces:
         against += " with true roof faces"
@@ -124,7 +126,12 @@ def subject_sentences(evaluation: Evaluation) -> tuple[str, str]:
         against += f" ({origins.get(reference.outlines, reference.outlines)})"
     points = len(reference.tiles)
     against += f", points of {_counted(points, 'tile')}" if points else ", no points"
+    against += f"; {edges}" if edges else ""
     return f"{measured}.", f"{against}."
+
+
+def _drawn(wireframes: WireframeSet) -> str:
+    return f"{wireframes.name}: roof edges of {_counted(len(wireframes.wireframes), 'building')}"
 
 
 def _counted(number: int, what: str) -> str:

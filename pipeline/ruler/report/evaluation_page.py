@@ -27,6 +27,8 @@ HEADLINE = (
     ("validity.models_valid",),
     ("residuals.within_0_2m_top_visible",),
     ("surface.within_0_2m",),
+    ("wireframes.edge_f1_0_5m",),
+    ("wireframes.corner_f1_0_5m",),
     ("faces.completeness_10m2",),
     ("faces.correctness_10m2",),
     ("roof_types.correct",),
@@ -56,8 +58,9 @@ def page(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINIT
     found = chapters(evaluation, definitions)
     measured, against = subject_sentences(evaluation)
     name = evaluation.models.name
+    truth = evaluation.reference or evaluation.wireframes
     return page_template("evaluation.html", "pipeline.ruler.report").render(
-        title=name if evaluation.reference is None else f"{name} against {evaluation.reference.name}",
+        title=name if truth is None else f"{name} against {truth.name}",
         measured=measured,
         against=against,
         headline=headline(found),
