@@ -7,7 +7,6 @@ where a vertex lies on them, and stretches between two faces of one plane are le
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 
@@ -160,24 +159,26 @@ def _welded(xyz: FloatArray) -> tuple[FloatArray, IntArray]:
 
 def _split(vertices: FloatArray, ends: IntArray) -> tuple[IntArray, IntArray]:
     """Edges (n, 2) cut at the vertices that lie on them: the pieces (p, 2), and the edge of each (p,)."""
-    starts, stops = vertices[ends[:, 0]], vertices[ends[:, 1]]
-    along = stops - starts
+    if not len(ends):
+        return ends, np.zeros(0, np.int64)
+    starts = vertices[ends[:, 0]]
+    along = vertices[ends[:, 1]] - starts
     length = np.linalg.norm(along, axis=1)
-    near: Sequence[list[int]] = ()
-    if len(ends):
-        near = KDTree(vertices).query_ball_point((starts + stops) / 2.0, length / 2.0 + WELD_M, return_sorted=True)
-    pieces: list[tuple[int, int]] = []
-    source: list[int] = []
-    for k, candidates in enumerate(near):
-        between = np.setdiff1d(candidates, ends[k])
-        offset = vertices[between] - starts[k]
-        position = offset @ along[k] / max(length[k] ** 2, WELD_M**2)
-        away = np.linalg.norm(offset - position[:, None] * along[k], axis=1)
-        on = (away <= WELD_M) & (position > 0.0) & (position < 1.0)
-        chain = [int(ends[k, 0]), *between[on][np.argsort(position[on], kind="stable")].tolist(), int(ends[k, 1])]
-        pieces += itertools.pairwise(chain)
-        source += [k] * (len(chain) - 1)
-    return np.array(pieces, np.int64).reshape(-1, 2), np.array(source, np.int64)
+    near = KDTree(vertices).query_ball_point(starts + along / 2.0, length / 2.0 + WELD_M, return_sorted=True)
+    edge = np.repeat(np.arange(len(ends)), [len(found) for found in near])
+    vertex = np.concatenate(near).astype(np.int64)
+    offset = vertices[vertex] - starts[edge]
+    position = (offset * along[edge]).sum(axis=1) / np.maximum(length[edge], WELD_M) ** 2
+    away = np.linalg.norm(offset - position[:, None] * along[edge], axis=1)
+    on = (away <= WELD_M) & (position > 0.0) & (position < 1.0) & (vertex[:, None] != ends[edge]).all(axis=1)
+    # The vertices of each edge in their order along it: its start, those on it, its end.
+    every = np.arange(len(ends))
+    of_edge = np.concatenate([every, edge[on], every])
+    order = np.lexsort((np.concatenate([every * 0.0, position[on], every * 0.0 + 1.0]), of_edge))
+    chain = np.concatenate([ends[:, 0], vertex[on], ends[:, 1]])[order]
+    of_edge = of_edge[order]
+    following = of_edge[1:] == of_edge[:-1]
+    return np.column_stack([chain[:-1], chain[1:]])[following], of_edge[:-1][following]
 
 
 def _is_inner(segments: Segments, sources: IntArray) -> bool:
