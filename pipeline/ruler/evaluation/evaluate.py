@@ -71,8 +71,9 @@ def evaluate(
     """Measure models; without a reference only delivery and validity.
 
     `blocks` joins true buildings that touch; by default as in `needs_blocks`. Without the found ground its measures
-    are left out. Roof edges and corners are measured against the wireframes, with or without a reference. `on_step` is called with the name of each step as it begins. The points of the reference are read once
-    for the residuals, and once each for detection against points and for the ground.
+    are left out. Roof edges and corners are measured against the wireframes, with or without a reference. `on_step` is
+    called with the name of each step as it begins. The points of the reference are read once for the residuals, and
+    once each for detection against points and for the ground.
     """
     on_step("solids")
     solids = validity.validity(models)
