@@ -478,7 +478,7 @@ def test_without_a_heartbeat_for_the_length_of_the_lease_the_work_stops(bench: B
 
 
 def test_a_lease_is_renewed_for_as_long_as_the_run_takes(bench: Bench) -> None:
-    job, _ = bench.under_way(lease_s=1.0)
+    job, _ = bench.under_way(lease_s=5.0)
     first = bench.store.get(job.job_id).lease_until
     end = time.monotonic() + LONG_S
 
