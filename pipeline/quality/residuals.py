@@ -294,7 +294,7 @@ class TopSurface:
     ) -> tuple[int, int, float]:
         """How much of the faces points are near to, by the cells of a raster.
 
-        Points (n, 3) are in metres; residuals (n,) are points minus this surface, nan where there is no face. A point
+        Points (n, 3) are in metres; residuals (n,) are points minus this surface, nan outside all faces. A point
         is on the surface up to `tolerance_m` vertically, and a cell is far from points from `gap_m` in plan on.
 
         Returns the cells with a face at their middle, those of them far from all points on the surface, and the largest

@@ -54,7 +54,7 @@ _STATUSES = {
 def write_run_page(run_dir: str) -> str:
     """Write `run.html` with its images, styles and scripts into a run directory, a path or URL; returns its place.
 
-    Raises RunError if there is no finished run, or the page cannot be written.
+    Raises RunError if the run is not finished or the page cannot be written.
     """
     storage = storage_at(run_dir)
     storage.put(PAGE, run_page(run_dir).encode())
@@ -62,7 +62,7 @@ def write_run_page(run_dir: str) -> str:
 
 
 def run_page(run_dir: str) -> str:
-    """The page as text; RunError if there is no finished run."""
+    """The page as text; raises RunError if the run is not finished."""
     manifest = read_manifest(run_dir)
     if manifest.status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
         raise RunError(f"{run_dir} is {manifest.status.value}: a report needs a run that ended, run it to its end")

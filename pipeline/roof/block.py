@@ -43,7 +43,7 @@ def block_forms(
 
     First on the footprint itself, in valid integer millimetres; then opened by a few centimetres where it pinches,
     drawn back until parts and holes do not touch, more and more simplified, up to `tolerance_m`; at last on its convex
-    hull. Parts below `min_area_m2` are left out unless there is no larger one.
+    hull. Parts below `min_area_m2` are left out if a larger one exists.
 
     Each way draws the blocks, at least one and not yet judged. It raises BuildingError where they cannot be drawn:
     `no_footprint` where no part has an area, `no_partition` where parts overlap or touch; or what GEOS raises.

@@ -91,7 +91,7 @@ class FacadePoints:
     def of(
         cls, single: FloatArray, later: FloatArray, roof: FloatArray, ground: FloatArray, ground_z_m: float
     ) -> FacadePoints:
-        """Take heights above the terrain, `ground_z_m` where there is no cell of it, and index the points.
+        """Take heights above the terrain, `ground_z_m` where the terrain has no cell, and index the points.
 
         Parameters
         ----------

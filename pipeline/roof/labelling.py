@@ -218,7 +218,7 @@ def _pairs_that_cross(
 def continue_crossings(
     x: IntArray, y: IntArray, facets: LabelArray, labels: LabelArray, known: BoolArray, planes: FloatArray
 ) -> LabelArray:
-    """Labels (n,) in which borders of two planes that cross run straight, also where there are no points.
+    """Labels (n,) in which borders of two planes that cross run straight, also across gaps in the points.
 
     A place without points, or with a point that no plane explains, has the label of the nearest labelled point; a ridge
     would leave its line there. The edges between the points of two planes show whether they meet in a ridge (the lower

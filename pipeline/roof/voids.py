@@ -107,7 +107,7 @@ def without_voids(
 ) -> MultiPolygon:
     """An outline in valid integer millimetres without the places that are not roof.
 
-    Roof points (n, 3) of the same frame are in metres. The same object comes back where there is no void, or where
+    Roof points (n, 3) of the same frame are in metres. The same object comes back if it has no void, or where
     nothing would be left.
     """
     far_m = max(settings.void_distance_m, 2.0 * settings.gap_spacings * spacing_m)

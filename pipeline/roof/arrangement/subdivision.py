@@ -209,7 +209,7 @@ def _set_face(graph: IntArray, start: int, face: int) -> None:
 def insert_chord(plan: Subdivision, u: int, v: int, face: int, line: int) -> int:
     """Join two vertices of a cell by an edge, which is the last one then, unless it would touch anything.
 
-    Returns the cells made: 1, or 0 where two loops of the cell became one; -1 where there is no room for the chord.
+    Returns the cells made: 1, or 0 where two loops of the cell became one; -1 if the chord does not fit.
     """
     graph, counts = plan.graph, plan.counts
     at_u, at_v = _corner(plan, u, v, face), _corner(plan, v, u, face)
