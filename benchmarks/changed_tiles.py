@@ -53,7 +53,7 @@ class Again:
     seconds: float
     """Wall clock."""
     digest: str
-    """Of the content."""
+    """Digest of the content."""
 
     @property
     def cells(self) -> list[str]:

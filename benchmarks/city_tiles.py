@@ -43,7 +43,7 @@ class CityTiles:
     density_per_m2: float = 4.5
     """Pulses per square metre; returns are about a quarter more."""
     seed: int = 1
-    """Of layout and scanner."""
+    """Seed of layout and scanner."""
 
     @property
     def size_m(self) -> tuple[float, float]:

@@ -58,7 +58,7 @@ class SimulatedScene:
     suite: str
     """Name of the suite."""
     seed: int
-    """Of the scene."""
+    """Seed of the scene."""
     cell: Cell | None = None
     """Which survey of a suite of several."""
 

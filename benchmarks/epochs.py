@@ -49,7 +49,7 @@ EXPECTED: Mapping[Work | None, Change] = {
 }
 """The change expected for a building, by what was done to it."""
 MISSED = "missed"
-"""Of a building over which no row lies."""
+"""Verdict on a building that no row covers."""
 _MIN_SHARE = 0.5
 
 
@@ -58,7 +58,7 @@ class Case:
     """A scene and its two surveys."""
 
     suite: str
-    """Of the scene."""
+    """Suite of the scene."""
     draw: int
     """Which of the split."""
     earlier: Mapping[str, float] = dataclasses.field(default_factory=dict)

@@ -60,7 +60,7 @@ class Sample:
     """Which houses are looked at."""
 
     draws: int
-    """Of each kind."""
+    """Number of draws of each kind."""
     split: str
     """dev or test."""
     out: Path | None = None

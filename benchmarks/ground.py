@@ -45,7 +45,7 @@ class Scene:
     """Points whose ground is known."""
 
     name: str
-    """Of the sample, or kind and density."""
+    """Name of the sample, or kind and density."""
     x_mm: Ints
     """(n,) easting."""
     y_mm: Ints
@@ -68,7 +68,7 @@ class Figures:
     """The figures of a scene, in percent."""
 
     name: str
-    """Of the scene."""
+    """Name of the scene."""
     type_1: float
     """Ground taken for object."""
     type_2: float
@@ -80,7 +80,7 @@ class Figures:
     points: int
     """Judged points."""
     seconds: float
-    """Of the filter."""
+    """Seconds that the filter took."""
 
 
 def samples(data: Path) -> Iterator[Scene]:

@@ -130,7 +130,7 @@ class Watcher:
                 self.killed.append(pid)
 
     def by_role(self) -> dict[str, tuple[int, float, int]]:
-        """Of every role that was seen: how many processes, CPU seconds of all, and the largest peak in bytes."""
+        """Number of processes, their CPU seconds and the largest peak in bytes, per role."""
         reported = {}
         for role in ROLES:
             own = [seen for seen in self.seen.values() if seen.role == role]

@@ -38,12 +38,12 @@ from pipeline.runtime.scratch.folder import POINT
 
 _SEED = 20
 _HALO_M = 240.0
-"""Of unclassified points; `SceneSettings.support_m`."""
+"""Halo of unclassified points; `SceneSettings.support_m`."""
 STAGES = ("ingest", "split", "join", "outline", "reconstruct", "publish")
 GROUPED = frozenset({"ingest", "join", "outline", "reconstruct"})
 REQUIRED = 0.80
 _LARGE = 5_000_000
-"""Of cities with more buildings only the larger numbers of workers are simulated: a minute each."""
+"""Cities with more buildings are simulated with the larger numbers of workers only: a minute each."""
 _LARGE_WORKERS = 100
 
 
@@ -61,7 +61,7 @@ class Stage:
     scheduler_s: float = 0.0
     """What a task costs the scheduler."""
     result_bytes: float = 0.0
-    """Of a task's result."""
+    """Bytes of a task's result."""
     stored_bytes: float = 0.0
     """What a task reads and writes."""
 
@@ -71,7 +71,7 @@ class Machine:
     """What the stages run on."""
 
     workers: int
-    """Of one thread each."""
+    """Number of workers, each with one thread."""
     byte_s: float = 0.0
     """What a byte of a result costs scheduler and driver, each."""
     worker_s: float = 0.0
@@ -242,23 +242,23 @@ class Engine:
     times: Mapping[str, FloatArray]
     """CPU seconds of tasks, by stage."""
     buildings: int
-    """Of the trace."""
+    """Number of buildings in the trace."""
     files: int
     points: int
     tiles: int
     plan_s: float
-    """Of the driver, a file."""
+    """The driver's seconds per file."""
     join_s: float
     """Driver seconds per building from the end of the splits to the first task of the join. `engine_costs.py` measures
     that it grows no faster than the city."""
     digest_s: float
-    """Of the driver, a building: digest, sums and the removal of scratch at the end."""
+    """The driver's seconds per building: digest, sums and the removal of scratch at the end."""
     driver_s: Mapping[str, float]
-    """Of the driver, a task, by stage."""
+    """The driver's seconds per task, by stage."""
     scheduler_s: float
-    """Of the scheduler, a task."""
+    """The scheduler's seconds per task."""
     byte_s: float
-    """Of either, a byte of a result."""
+    """Seconds per byte of a result, for either."""
     result_bytes: Mapping[str, float]
     """By stage."""
     start_s: float

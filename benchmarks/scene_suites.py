@@ -62,7 +62,7 @@ class SuiteScene:
     """One city."""
 
     slope_deg: float
-    """Of its ground."""
+    """Slope of its ground."""
     density_per_m2: float
     """Pulses."""
 

@@ -19,7 +19,7 @@ HEADER_SIZE = 375
 KEEP = 255
 """In place of a class: the point keeps its own."""
 OVERLAP_CLASS = 12
-"""Of point formats 0 to 5; the newer ones have a flag for it."""
+"""Class of overlap points in point formats 0 to 5; the newer ones have a flag for it."""
 WKT_BIT = 1 << 4
 WAVEFORM_FORMATS = (4, 5, 9, 10)
 

@@ -33,7 +33,7 @@ class GeometryColumn:
     """What a file says of its geometries."""
 
     name: str
-    """Of the column."""
+    """Name of the column."""
     crs: str | None
     """As a code or PROJJSON; None where the file says that it is unknown."""
     encoding: str

@@ -26,7 +26,7 @@ from pipeline.io.urls import filesystem_of, is_url, name_in, shown
 BLOCK_BYTES = 1 << 18
 """Read at least, and kept together."""
 BLOCKS_KEPT = 64
-"""Of one file, 16 MiB."""
+"""Blocks kept per file, 16 MiB."""
 MAX_AHEAD = 32
 """Blocks that are read at once where a file is read on and on: 8 MiB."""
 PIECE_BYTES = 1 << 24

@@ -54,7 +54,7 @@ class TileIndex:
     outlines: npt.NDArray[np.object_] | None = None
     """(n,) shapely geometries, None where a tile has none; None as a whole of text files."""
     crs: str | None = None
-    """Of the outlines, as the index has it; None where it is unknown."""
+    """CRS of the outlines, as the index has it; None if unknown."""
 
     def within(self, area: shapely.Geometry, reference: SpatialReference) -> tuple[str, ...]:
         """The files whose tiles come near an area; of what has no outline all."""

@@ -49,7 +49,7 @@ class Scheme:
     """A URL scheme."""
 
     options: Callable[[], dict[str, Any]]
-    """Of the file system, made when it is used."""
+    """Makes the options of the file system when it is used."""
     module: str
     """What must be installed."""
     extra: str | None = None

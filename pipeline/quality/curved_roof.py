@@ -52,7 +52,7 @@ def is_curved_roof(planes: Sequence[Plane], faces: Sequence[RoofFace], solids: S
 
 
 def _cosine(one: Normal, other: Normal) -> float:
-    """Of the angle between two unit normals."""
+    """Cosine of the angle between two unit normals."""
     return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 

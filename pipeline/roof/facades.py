@@ -83,9 +83,9 @@ class FacadePoints:
     roof: FloatArray
     """(m, 3) float64, the roof points, local metres."""
     tree: shapely.STRtree
-    """Of `xyz` in plan."""
+    """Index of `xyz` in plan."""
     roof_tree: shapely.STRtree
-    """Of `roof` in plan."""
+    """Index of `roof` in plan."""
 
     @classmethod
     def of(

@@ -10,7 +10,7 @@ from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 
 _MAX_CELLS = 4_000_000
-"""Of a raster: bounds the memory for points strewn over a wide area."""
+"""Most cells of a raster: bounds the memory for points strewn over a wide area."""
 _FARTHEST = 2**63 - 1  # no squared distance reaches it
 _CONTINUATIONS = 12
 """Most rounds of `continue_crossings`: labels spread by one vertex per round, over gaps of a few."""

@@ -35,7 +35,7 @@ class Run:
     """The line's point: centroid of the stretch."""
     y: float
     direction: float
-    """Of the line along the border, radians."""
+    """Direction of the line along the border, radians."""
     length: float
     """From the first to the last vertex."""
     exact: bool = False

@@ -57,7 +57,7 @@ class InputFile:
     path: str
     """As the user gave it, or as it was found in a folder."""
     sha256: str
-    """Of the whole file, hexadecimal."""
+    """Digest of the whole file, hexadecimal."""
     size_bytes: int
     """Its size."""
     n_points: int | None = None

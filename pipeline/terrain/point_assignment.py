@@ -122,7 +122,7 @@ def _corner_at(px: int, py: int, f: int, vertices: SceneVertices, facets: LabelA
 
 @kernel(inline="always")
 def _facet_at_edge(f: int, edge: int, vertices: SceneVertices, tin: LabelledTin) -> int:
-    """Of the two facets at an edge the one that is not a gap, else that with the smaller opposite vertex.
+    """The facet at an edge that is not a gap, else the one with the smaller opposite vertex.
 
     It is the same from whichever side a walk came.
     """

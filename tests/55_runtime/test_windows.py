@@ -112,7 +112,7 @@ def test_trusted_ground_looks_as_far_as_terrain_is_drawn(filter_name: str) -> No
 
 @pytest.fixture
 def plan(suburb: Path) -> Plan:
-    """Of a suburb in tiles of 50 m."""
+    """The plan of a suburb in tiles of 50 m."""
     return make_plan([str(suburb)], ReadOptions(), RunSettings.from_mapping({"tile_size_m": 50.0}))
 
 

@@ -24,7 +24,7 @@ from pipeline.ruler.simulation.solids import truth_record
 from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, write_manifest
 
 ORIGIN = (565_000.0, 5_934_000.0, 0.0)
-"""Of all scenes: east and north in metres."""
+"""Origin of all scenes: east and north in metres."""
 EXTENT = (-500.0, -500.0, 500.0, 500.0)
 """Where both epochs have data by default, about the origin."""
 UTM = "EPSG:25832+7837"

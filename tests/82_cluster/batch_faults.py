@@ -128,7 +128,7 @@ class BatchRun:
 
     @property
     def digest(self) -> str:
-        """Of the content of the results."""
+        """Digest of the content of the results."""
         return run_digest(self.out)
 
     def buildings(self) -> dict[str, tuple[str, str | None]]:

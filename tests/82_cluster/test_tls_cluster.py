@@ -47,7 +47,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> TlsFiles:
 
 
 def options(files: TlsFiles) -> list[str]:
-    """Of our commands."""
+    """Options of our commands."""
     return ["--tls-ca", files.ca, "--tls-cert", files.cert, "--tls-key", files.key]
 
 

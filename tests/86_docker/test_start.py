@@ -42,7 +42,7 @@ class Host:
     folder: Path
     """Below it is all that is written."""
     names: Mapping[str, str]
-    """Of the container, and what they are here."""
+    """Names in the container, and what they are here."""
 
     def here(self, text: str) -> str:
         """A word of the container's, on this machine."""

@@ -52,7 +52,7 @@ class _Star(NamedTuple):
     planes: IntArray
     """int64, -1 outside."""
     heights: FloatArray
-    """Of the planes at the vertex, metres; -inf outside."""
+    """Heights of the planes at the vertex, metres; -inf outside."""
     refused: BoolArray
     """(64,), corners that cannot be given to the left and to the right."""
 

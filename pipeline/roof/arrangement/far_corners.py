@@ -46,7 +46,7 @@ class HeightsRaster(NamedTuple):
     west: float
     south: float
     side: float
-    """Of a cell: 0.75 m or a spacing, the larger."""
+    """Side of a cell: 0.75 m or a spacing, the larger."""
 
 
 class HeightsAround(NamedTuple):

@@ -63,7 +63,7 @@ class Templates:
     outline_mm: MultiPolygon
     """Integer millimetres."""
     direction: float
-    """Of the frame's axis u, radians."""
+    """Direction of the frame's axis u, radians."""
     origin_m: FloatArray
     """(2,) float64, of the frame."""
     regions: FloatArray

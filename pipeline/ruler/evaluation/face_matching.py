@@ -67,7 +67,7 @@ class Planes:
         return normals
 
     def elevation(self, index: IntArray, places: FloatArray) -> FloatArray:
-        """Of the planes of an index (k,) at places (k, 2): (k,)."""
+        """Elevation (k,) of the planes of an index (k,) at places (k, 2)."""
         above: FloatArray = ((places - self.place[index, :2]) * self.rise[index]).sum(axis=1)
         elevation: FloatArray = self.place[index, 2] + above
         return elevation

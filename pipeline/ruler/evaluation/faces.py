@@ -102,7 +102,7 @@ class ReferenceFace:
     offset_m: float
     """Model minus true plane, mean over the common area, across the true plane; nan without an overlap."""
     topology: Topology | None
-    """Of the connected component; None below 10 m2 and at the data edge."""
+    """Topology of the connected component; None below 10 m2 and at the data edge."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -128,7 +128,7 @@ class ModelFace:
     verdict: FaceVerdict
     """What it counts as."""
     topology: Topology | None
-    """Of the connected component; None below 10 m2 and where it is left out."""
+    """Topology of the connected component; None below 10 m2 and where it is left out."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -82,7 +82,7 @@ class Survey(NamedTuple):
     range_noise: float
     """Standard deviation along the beam."""
     beam_radius: float
-    """Of the footprint on the ground."""
+    """Radius of the footprint on the ground."""
     range_resolution: float
     """Echoes closer than this melt into one return."""
     drop_out: float
@@ -122,7 +122,7 @@ class _Pulse(NamedTuple):
     ray: Ray
     """Its axis, given by the point on the terrain."""
     tangent: float
-    """Of the scan angle."""
+    """Tangent of the scan angle."""
     line: int
     """Number of the scan line."""
     time: float

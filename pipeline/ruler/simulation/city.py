@@ -20,7 +20,7 @@ Extent = tuple[float, float, float, float]
 TILE_M = 500.0
 """Edge of the tiles in which a city is scanned and written."""
 STEEPEST_DEG = 29.0
-"""Of the hillside; the gentle waves over it add less than a degree."""
+"""Slope of the hillside; the gentle waves over it add less than a degree."""
 _HILL_LENGTH_M, _HILL_MIDDLE_M, _HILL_AZIMUTH_DEG = 3200.0, 1000.0, 80.0
 _BASE_Z_M = 260.0
 _WAVE_M, _WAVE_LENGTH_M = 0.3, 190.0

@@ -43,7 +43,7 @@ class Override:
     entry: int
     """Place in the file, from 1."""
     building_id: str | None = None
-    """Of a building or a rejected object; this, `source_id` or `point_m` is given."""
+    """Id of a building or a rejected object; this, `source_id` or `point_m` is given."""
     source_id: str | None = None
     """A given footprint's own id."""
     point_m: tuple[float, float] | None = None
