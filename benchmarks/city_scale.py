@@ -227,7 +227,7 @@ def report(seen: Mapping[str, Any], trace: Mapping[str, Any] | None, run_dir: Pa
         f"workers killed {seen['killed']}; digest {manifest['content_sha256'][:16]}."
     )
     speed = (
-        f"wall {wall_s:.1f} s, {buildings / wall_s:.1f} buildings a second, "
+        f"wall {wall_s:.1f} s, {buildings / wall_s:.1f} buildings per second, "
         f"CPU of all processes {all_cpu_s:.1f} s ({all_cpu_s / wall_s:.2f} cores)."
     )
     lines = [conditions, "", speed]

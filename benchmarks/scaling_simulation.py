@@ -493,7 +493,7 @@ def curve_table(buildings: int, found: Sequence[Outcome]) -> str:
         slow = ", ".join(f"{name} {seconds / one.wall_s:.0%}" for name, seconds in slowest)
         cells = outcome_cells(one)
         rows.append([str(one.workers), cells[0], f"{buildings / one.wall_s:.0f}", *cells[1:], slow])
-    heads = ["workers", "wall, min", "buildings a second", "efficiency", "driver at work", "scheduler at work"]
+    heads = ["workers", "wall, min", "buildings per second", "efficiency", "driver at work", "scheduler at work"]
     return markdown_table([*heads, "stages that take most"], rows)
 
 

@@ -91,7 +91,7 @@ def _files_of(entry: str | Path, cut: Cut) -> list[str]:
         met = glob.glob(str(entry), recursive=True)  # noqa: PTH207 - pathlib knows no absolute patterns
         files = [name for name in met if Path(name).is_file()]
         if not files:
-            raise UnreadableInputError(str(entry), "the pattern meets no files", "Check the pattern and the folder")
+            raise UnreadableInputError(str(entry), "the pattern matches no file", "Check the pattern and the folder")
         return files
     first_bytes(path)
     return list(cut(read_tile_index(str(path)))) if is_index(path) else [str(path)]
@@ -135,7 +135,7 @@ def _listed(url: str, *, pattern: bool) -> list[str]:
     files = [f"{scheme}://{name}" for name, info in sorted(found.items()) if info["type"] == "file" and info["size"]]
     if pattern:
         if not files:
-            raise UnreadableInputError(shown(url), "the pattern meets no files", "Check the pattern and the bucket")
+            raise UnreadableInputError(shown(url), "the pattern matches no file", "Check the pattern and the bucket")
         return files
     points = [file for file in files if _is_point_file(file)]
     if not points:

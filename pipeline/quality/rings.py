@@ -130,7 +130,7 @@ def _touches_enclose_a_part(ids: IntArray, ring_offsets: IntArray) -> bool:
     return False
 
 
-@kernel
+@kernel(inline="always")
 def _place_of_inner_rings(flat: IntArray, ring_offsets: IntArray) -> int:
     """The fault of inner rings that do not lie within the outer ring, or not outside one another; else 0."""
     rings = len(ring_offsets) - 1

@@ -216,7 +216,7 @@ def _is_folded(corners: IntArray, rings: IntArray, cut: IntArray, min_cosine: fl
     return status != DONE or min_cosine_of_normals(corners, in_plane, min_cosine) < min_cosine
 
 
-@kernel
+@kernel(inline="always")
 def _faces_are_sound(
     corners: IntArray,
     ids: IntArray,

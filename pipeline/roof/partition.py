@@ -89,7 +89,7 @@ def _region_areas(
     return areas
 
 
-@kernel
+@kernel(inline="always")
 def _adjacency(facets: LabelArray, n: int) -> tuple[LabelArray, LabelArray]:
     """The neighbours of n vertices in compressed rows: starts (n + 1,) and vertices; those over inner edges twice."""
     corners = np.empty(6 * len(facets), np.int32)
@@ -103,7 +103,7 @@ def _adjacency(facets: LabelArray, n: int) -> tuple[LabelArray, LabelArray]:
     return starts, adjacent
 
 
-@kernel
+@kernel(inline="always")
 def _best_label(
     x: IntArray,
     y: IntArray,

@@ -25,7 +25,7 @@ def _relative_distance(
     return float(abs(vertical) * cosines[k] / distance_m)
 
 
-@kernel
+@kernel(inline="always")
 def _votes(
     neighbours: LabelArray, labels: LabelArray, usable: BoolArray, i: int, kind: LabelArray, votes: LabelArray
 ) -> int:

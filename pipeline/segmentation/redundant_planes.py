@@ -12,7 +12,7 @@ from pipeline.segmentation.plane_merge import touching_pairs
 from pipeline.segmentation.point_assignment import distance_to_plane
 
 
-@kernel
+@kernel(inline="always")
 def _partners(pairs: IntArray, n: int) -> tuple[LabelArray, LabelArray]:
     """Partners of each of n clusters, ascending, from codes low * n + high: where those of each start, and they."""
     m = pairs.size

@@ -61,7 +61,7 @@ def test_an_empty_folder_and_one_without_points_are_separated(tmp_path):
 def test_a_missing_file_an_empty_pattern_and_no_input_are_reported(tmp_path):
     with pytest.raises(UnreadableInputError, match="no such file"):
         find_inputs([tmp_path / "missing.laz"])
-    with pytest.raises(UnreadableInputError, match="meets no files"):
+    with pytest.raises(UnreadableInputError, match="matches no file"):
         find_inputs([tmp_path / "*.laz"])
     with pytest.raises(UnreadableInputError, match=r"a\.laz: no such file.*1 more input .*b\.laz: no such file"):
         find_inputs([tmp_path / "a.laz", tmp_path / "b.laz"])

@@ -149,7 +149,7 @@ def test_what_is_not_in_a_bucket_is_reported(bucket):
     for entry, reported in (
         (f"{bucket}/t/missing.laz", "there is no such thing"),
         (f"{bucket}/t", "a folder, not a file.*End its name with /"),
-        (f"{bucket}/t/*.laz", "meets no files"),
+        (f"{bucket}/t/*.laz", "matches no file"),
         (f"{bucket}/t/", "none of the 1 files in the folder is a point file"),
         (f"{bucket}/nothing/", "there is no such thing|the folder is empty"),
         ("s3://no-such-bucket/t/", "there is no such bucket"),

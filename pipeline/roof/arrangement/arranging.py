@@ -59,7 +59,7 @@ class _Arranged(NamedTuple):
     support: FloatArray
 
 
-@kernel
+@kernel(inline="always")
 def _outline_edges(outline: _Outline) -> FloatArray:
     """Edges x0, y0, x1, y1 of all rings, (n, 4), metres."""
     edges = np.empty((len(outline.xy), 4))
@@ -73,7 +73,7 @@ def _outline_edges(outline: _Outline) -> FloatArray:
     return edges
 
 
-@kernel
+@kernel(inline="always")
 def _planes_and_lines(
     points: FloatArray, planes: FloatArray, edges: FloatArray, limits: Limits
 ) -> tuple[FloatArray, CandidateLines]:
@@ -90,7 +90,7 @@ def _planes_and_lines(
     return planes, lines
 
 
-@kernel
+@kernel(inline="always")
 def _label_cells(
     plan: Subdivision,
     points: FloatArray,

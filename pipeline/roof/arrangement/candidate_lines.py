@@ -203,7 +203,7 @@ def _parting_shift(
     return best
 
 
-@kernel
+@kernel(inline="always")
 def _take_places(
     places: FloatArray, first: int, last: int, line: FloatArray, near_m: float, line_of: LabelArray, number: int
 ) -> int:

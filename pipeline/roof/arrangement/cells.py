@@ -90,7 +90,7 @@ def cell_areas_m2(plan: Subdivision) -> FloatArray:
     return areas
 
 
-@kernel
+@kernel(inline="always")
 def _heights_of_planes(points: FloatArray, labels: LabelArray, planes: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Lowest and highest point of each plane, (k,) metres; for a level plane without points its own height."""
     k = len(planes)
@@ -197,7 +197,7 @@ def points_per_cell(cells: IntArray, n_cells: int) -> LabelArray:
     return held
 
 
-@kernel
+@kernel(inline="always")
 def _borders_of_faces(faces: LabelArray, count: int, pairs: IntArray, weights: IntArray) -> tuple[IntArray, IntArray]:
     """Borders of faces by keys face * count + neighbour, ascending, and the cost of each of their edges."""
     keys = np.empty(2 * len(pairs), np.int64)

@@ -160,7 +160,7 @@ def _corner_cost(
     return cost
 
 
-@kernel
+@kernel(inline="always")
 def _cheapest_corner(plan: Subdivision, planes: FloatArray, star: _Star, m: int, corner_mm: float) -> int:
     """The corner i of m that costs least to give to its left (2 i) or right neighbour (2 i + 1); -1 for none."""
     faces, plane_of = star.faces, star.planes

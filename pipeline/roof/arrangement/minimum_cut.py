@@ -164,7 +164,7 @@ def _cut(flow: _Flow, n: int) -> None:
             arc = following[arc]
 
 
-@kernel
+@kernel(inline="always")
 def _mark_movable(
     costs: IntArray, nodes: LabelArray, neighbours: Neighbours, labels: LabelArray, alpha: int, moves: _Moves
 ) -> None:
@@ -227,7 +227,7 @@ def _add_arc(flow: _Flow, arc: int, tail: int, head: int, capacity: int) -> None
     flow.first[head] = arc + 1
 
 
-@kernel
+@kernel(inline="always")
 def _build_flow(
     costs: IntArray,
     nodes: LabelArray,

@@ -315,7 +315,7 @@ class _Passages(NamedTuple):
     """int64, the half-edge, or -1."""
 
 
-@kernel
+@kernel(inline="always")
 def _passages(plan: Subdivision, line: FloatArray, snap_mm: float) -> _Passages:
     """Vertices nearer to a line than a distance, and edges that it crosses."""
     xy, graph = plan.xy, plan.graph

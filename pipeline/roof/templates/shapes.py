@@ -217,7 +217,7 @@ def copy_planes(planes: FloatArray, to: FloatArray) -> None:
             to[k, q] = planes[k, q]
 
 
-@kernel
+@kernel(inline="always")
 def _fit_of_least_freedom(
     points: FloatArray, heights: FloatArray, box: FloatArray, trial: int, reach_m: float, planes: FloatArray
 ) -> int:

@@ -273,7 +273,7 @@ def _beam_hits(scene: SceneArrays, cell: int, pulse: _Pulse, radius: float, hits
     return n
 
 
-@kernel
+@kernel(inline="always")
 def _write_returns(
     flight: FlightLine,
     survey: Survey,
