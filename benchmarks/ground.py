@@ -1,7 +1,7 @@
 """Ground filters on the ISPRS samples and on scenes with exact ground: type I, type II, total error, kappa, speed.
 
     python -m benchmarks.ground [--data ../shared/data] [--filter morphological | MODULE:FUNCTION] [--only samp quarry]
-                                [--densities 0.2 1 5] [--draw 0] [--out DIR]
+                                [--densities 0.2 1 5] [--draw 0] [--out DIR] [--kept-aside]
 
 A filter is the name of one in the settings, all other settings default, or a function of this environment that takes
 x, y, z (n,) int64 in mm, `usable` (n,) bool and the window (column0, row0, columns, rows) and gives (n,) bool. Judged
@@ -36,6 +36,8 @@ GroundFilter = Callable[[Ints, Ints, Ints, Bools, Window], Bools]
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
 DENSITIES = (0.2, 1.0, 5.0)
+KEPT_ASIDE = ("samp22", "samp42")
+"""Samples for judging alone: no setting is chosen on them, and they are read only when asked for."""
 MARGIN_M = 130
 """Empty cells around the points: no less than the terrain is drawn beyond them."""
 
@@ -83,9 +85,12 @@ class Figures:
     """Seconds that the filter took."""
 
 
-def samples(data: Path) -> Iterator[Scene]:
-    """The reference samples of the ISPRS filter test that are there."""
-    for path in sorted((data / "isprs").glob("samp*.la[sz]")):
+def samples(data: Path, *, kept_aside: bool = False) -> Iterator[Scene]:
+    """The reference samples of the ISPRS filter test that are there: those for choosing, or those kept aside."""
+    paths = [path for folder in ("isprs", "more/isprs") for path in (data / folder).glob("samp*.la[sz]")]
+    for path in sorted(paths, key=lambda path: path.name):
+        if path.name.startswith(KEPT_ASIDE) != kept_aside:
+            continue
         clouds = list(open_source(path).chunks())
         x, y, z = np.rint(np.concatenate([cloud.xyz for cloud in clouds]).T * 1000).astype(np.int64)
         is_ground = np.concatenate([cloud.classification for cloud in clouds]) == GROUND_CLASS
@@ -206,10 +211,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--densities", type=float, nargs="*", default=DENSITIES)
     parser.add_argument("--draw", type=int, default=0)
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--kept-aside", action="store_true", help="the samples that no setting was chosen on")
     given = parser.parse_args(arguments)
     ground_filter = filter_of(given.filter)
     for scenes, mean in (
-        (list(samples(given.data)), "mean of samples"),
+        (list(samples(given.data, kept_aside=given.kept_aside)), "mean of samples"),
         (list(drawn_scenes(given.densities, given.draw)), "mean of drawn scenes"),
     ):
         wanted = [scene for scene in scenes if not given.only or any(part in scene.name for part in given.only)]

@@ -24,6 +24,9 @@ from pipeline.terrain.wide_objects import wide_objects, with_corners
 _STEEPEST = 1.5
 """Rise over run beyond which a steeper trend does not allow the second openings more: ground is seldom steeper."""
 
+_WALL_MM = 2000
+"""Two neighbours of a cell, 2 m apart, lie on two sides of a wall if they differ by more: steeper than 45 degrees."""
+
 _CLUMP_SHARE = 0.1
 """A clump holds at most this share of the cells around it, or four."""
 
@@ -36,10 +39,12 @@ _FEWEST_BESIDE = 2
 
 @kernel
 def closed_gaps(lowest: Elevations, reach: int) -> Elevations:
-    """The surface of the lowest points with gaps closed up to reach cells from their rims.
+    """The surface of the lowest points with gaps closed up to reach cells from their rims; elevations are in mm.
 
-    Round by round a cell takes the mean of the filled ones around it, then the fill is relaxed as often. Beyond, and
-    beyond the data's edge, there stays NO_DATA.
+    Round by round an empty cell takes the mean of the filled ones around it, from the lowest up to `_WALL_MM` higher.
+    Then the fill is relaxed as often, and a cell takes no neighbour that lies farther than that from it. A wall in a
+    gap thus stays a wall and becomes no ramp, and does not move to its foot. Beyond, and beyond the data's edge, there
+    stays NO_DATA.
     """
     rows, columns = lowest.shape
     out = lowest.copy()
@@ -51,12 +56,19 @@ def closed_gaps(lowest: Elevations, reach: int) -> Elevations:
                 # the first half of the rounds fills, the second smooths what was filled
                 if lowest[r, c] != NO_DATA or (before[r, c] == NO_DATA) != (number < reach):
                     continue
+                level = before[r, c]
+                if number < reach:
+                    for a in range(max(r - 1, 0), min(r + 2, rows)):
+                        for b in range(max(c - 1, 0), min(c + 2, columns)):
+                            level = min(level, before[a, b])
                 n, total = 0, 0
                 for a in range(max(r - 1, 0), min(r + 2, rows)):
                     for b in range(max(c - 1, 0), min(c + 2, columns)):
-                        if before[a, b] != NO_DATA and (number < reach or (a == r) != (b == c)):
-                            n += 1
-                            total += before[a, b]
+                        beside = before[a, b]
+                        if beside != NO_DATA and abs(beside - level) <= _WALL_MM:
+                            if number < reach or (a == r) != (b == c):
+                                n += 1
+                                total += beside
                 if n > 0:
                     out[r, c] = total // n
                     changed = True
