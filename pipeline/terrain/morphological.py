@@ -65,10 +65,11 @@ def closed_gaps(lowest: Elevations, reach: int) -> Elevations:
                 for a in range(max(r - 1, 0), min(r + 2, rows)):
                     for b in range(max(c - 1, 0), min(c + 2, columns)):
                         beside = before[a, b]
-                        if beside != NO_DATA and abs(beside - level) <= _WALL_MM:
-                            if number < reach or (a == r) != (b == c):
-                                n += 1
-                                total += beside
+                        if beside == NO_DATA or (number >= reach and (a == r) == (b == c)):
+                            continue
+                        if abs(beside - level) <= _WALL_MM:
+                            n += 1
+                            total += beside
                 if n > 0:
                     out[r, c] = total // n
                     changed = True
