@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.normal_equations import add_to_sums, solve_plane_moments
-from pipeline.model import FloatArray, IntArray, LabelArray, Tin
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Tin
 from pipeline.terrain.binning import points_by_cell
 from pipeline.terrain.vegetation import smallest_eigenvalue
 
@@ -352,13 +352,26 @@ def border_pieces(
     return pairs[:count].copy(), ends[:count].copy(), area, outline
 
 
-def patches_of(
-    x: IntArray, y: IntArray, z: IntArray, tin: Tin, min_step_m: float
-) -> tuple[Patches, Borders, RoofVertices]:
-    """Planar patches of a roof, the borders between them, and its vertices with their neighbours.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GrownPatches:
+    """Patches of a roof before they are measured; k of them over n vertices."""
 
-    Vertices (n,) are in millimetres from a place near by, sorted by (x, y), under their Delaunay TIN. Planes closer
-    than `min_step_m` in elevation meet.
+    vertices: RoofVertices
+    """The roof's vertices."""
+    tin: Tin
+    """Their Delaunay TIN."""
+    is_sound: BoolArray
+    """(m,) whether a facet bridges no gap."""
+    label: LabelArray
+    """(n,) int32, patch of every vertex."""
+    planes: FloatArray
+    """(k, 3) slopes and level at the origin in mm; nan where a patch has no plane."""
+
+
+def grown_patches(x: IntArray, y: IntArray, z: IntArray, tin: Tin) -> GrownPatches:
+    """Planar patches of a roof.
+
+    Vertices (n,) are in millimetres from a place near by, sorted by (x, y), under their Delaunay TIN.
     """
     radii = circumradii(x, y, tin.facets)
     limit = _TYPICAL_RADII * float(np.median(radii))
@@ -368,32 +381,35 @@ def patches_of(
     local = local_planes(x, y, z)
     label, planes = grow_patches(vertices, local, np.argsort(local[:, 2], kind="stable"))
     count = int(fill_patches(vertices, label, planes))
-    pairs, ends, area, outline = border_pieces(x, y, tin.facets, tin.neighbours, sound, label, count)
-    without = np.full((count - len(planes), 3), np.nan)
-    planes = np.concatenate((planes, without))
+    planes = np.concatenate((planes, np.full((count - len(planes), 3), np.nan)))
+    return GrownPatches(vertices=vertices, tin=tin, is_sound=is_sound, label=label, planes=planes)
+
+
+def measured_patches(grown: GrownPatches, min_step_m: float) -> tuple[Patches, Borders]:
+    """Sizes of the patches and the borders between them. Planes closer than `min_step_m` in elevation meet."""
+    x, y, z, label, planes, count = *grown.vertices[:3], grown.label, grown.planes, len(grown.planes)
+    facets, neighbours = grown.tin.facets, grown.tin.neighbours
+    sound, across = (np.flatnonzero(part).astype(np.int32) for part in (grown.is_sound, ~grown.is_sound))
+    pairs, ends, area, outline = border_pieces(x, y, facets, neighbours, sound, label, count)
     centres = np.zeros((count, 3))
     for k, values in enumerate((x, y, z)):
         np.add.at(centres[:, k], label, values / 1000.0)
     centres /= np.maximum(np.bincount(label, minlength=count), 1)[:, None]
-    across = np.flatnonzero(~is_sound).astype(np.int32)
-    gaps, sights, _, _ = border_pieces(x, y, tin.facets, tin.neighbours, across, label, count)
+    gaps, sights, _, _ = border_pieces(x, y, facets, neighbours, across, label, count)
     borders = _borders(pairs, ends, planes, min_step_m, _longest_first(gaps, sights, count))
     outlines = outline / 1000.0
     np.add.at(outlines, borders.first, borders.length_m)
     np.add.at(outlines, borders.second, borders.length_m)
-    return (
-        Patches(
-            of_vertex=label,
-            slopes=planes[:, :2],
-            levels_mm=planes[:, 2],
-            areas_m2=area / 1e6,
-            centres_m=centres,
-            tops_m=_tops(z, label, count),
-            outlines_m=outlines,
-        ),
-        borders,
-        vertices,
+    patches = Patches(
+        of_vertex=label,
+        slopes=planes[:, :2],
+        levels_mm=planes[:, 2],
+        areas_m2=area / 1e6,
+        centres_m=centres,
+        tops_m=_tops(z, label, count),
+        outlines_m=outlines,
     )
+    return patches, borders
 
 
 def _tops(z: IntArray, label: LabelArray, count: int) -> FloatArray:

@@ -273,7 +273,14 @@ class UnitSettings(Parameters):
         "Where a candidate is split into units: nowhere, at steps, or at steps and at valleys between parallel ridges.",
         choices=("nothing", "steps", "ridges"),
     )
-    min_step_m: float = parameter(0.3, "Least step between the roofs of two units.", unit="m", minimum=0.1, maximum=5.0)
+    min_step_m: float = parameter(0.2, "Least step between the roofs of two units.", unit="m", minimum=0.1, maximum=5.0)
+    min_ridge_step_m: float = parameter(
+        0.12,
+        "Least step between two units of one gable roof; both slopes step there, by the same amount.",
+        unit="m",
+        minimum=0.05,
+        maximum=5.0,
+    )
     min_area_m2: float = parameter(
         25.0, "Least plan area of a unit; smaller ones join a neighbour.", unit="m2", minimum=1.0, maximum=1000.0
     )
@@ -284,7 +291,7 @@ class UnitSettings(Parameters):
         maximum=1.0,
     )
     annex_share: float = parameter(
-        0.5,
+        0.4,
         "A unit below this share of the area of its only neighbour joins it if its top lies below that one's middle.",
         minimum=0.0,
         maximum=1.0,

@@ -23,7 +23,8 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.union_find import root_of, unite, united
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.terrain.roof_patches import MIN_POINTS, Borders, Patches, RoofVertices, patches_of
+from pipeline.terrain.ridge_steps import cut_at_ridge_steps
+from pipeline.terrain.roof_patches import MIN_POINTS, Borders, Patches, RoofVertices, grown_patches, measured_patches
 from pipeline.terrain.settings import UnitSettings
 from pipeline.terrain.thinning import highest_per_cell
 from pipeline.tin.delaunay import MAX_WINDOW_MM, triangulate
@@ -80,29 +81,31 @@ def _facing(patches: Patches, borders: Borders, row: int) -> _Facing | None:
     return _Facing(along, opposite, along and rise_p > 0.0 > rise_q, along and rise_p < 0.0 < rise_q)
 
 
-def units_of_patches(patches: Patches, borders: Borders, settings: UnitSettings) -> LabelArray:
-    """The unit of every patch of a candidate's roof, (k,) int32, numbered by one of its patches."""
+def _clear_borders(patches: Patches, borders: Borders) -> dict[int, _Facing | None]:
+    """Rows of the borders that are long enough, between patches that are large enough, and how these face them."""
+    large = (patches.areas_m2 >= _PART_M2) & ~np.isnan(patches.levels_mm)
+    is_clear = large[borders.first] & large[borders.second] & (borders.length_m >= _SHORTEST_BORDER_M)
+    return {row: _facing(patches, borders, row) for row in np.flatnonzero(is_clear).tolist()}
+
+
+def units_of_patches(patches: Patches, borders: Borders, origin: IntArray, settings: UnitSettings) -> LabelArray:
+    """The unit of every patch of a candidate's roof, (k,) int32, numbered by one of its patches.
+
+    `origin` (k,) is the patch that each was cut from at ridge steps; patches of one origin lie in different houses.
+    """
     count = len(patches.areas_m2)
     unit = np.arange(count)
-    large = (patches.areas_m2 >= _PART_M2) & ~np.isnan(patches.levels_mm)
-    rows = [
-        row
-        for row in range(len(borders.first))
-        if large[borders.first[row]] and large[borders.second[row]] and borders.length_m[row] >= _SHORTEST_BORDER_M
-    ]
     meets = borders.level_m >= _LEVEL_SHARE * borders.length_m
-    facing = {row: _facing(patches, borders, row) for row in rows}
+    facing = _clear_borders(patches, borders)
     has_ridge = set()
-    for row in rows:
-        seen = facing[row]
+    for row, seen in facing.items():
         if seen is not None and seen.ridge and seen.opposite:
             has_ridge |= {int(borders.first[row]), int(borders.second[row])}
     apart: dict[int, set[int]] = {k: set() for k in range(count)}
     joining = []
-    for row in rows:
+    for row, seen in facing.items():
         p, q = int(borders.first[row]), int(borders.second[row])
-        seen = facing[row]
-        if (
+        is_gutter = (
             settings.split == "ridges"
             and seen is not None
             and seen.valley
@@ -110,7 +113,8 @@ def units_of_patches(patches: Patches, borders: Borders, settings: UnitSettings)
             and p in has_ridge
             and q in has_ridge
             and borders.length_m[row] >= _SHORTEST_GUTTER_M
-        ):
+        )
+        if is_gutter or origin[p] == origin[q]:
             apart[p].add(q)
             apart[q].add(p)
         elif meets[row] or (seen is not None and seen.along_contours):
@@ -281,13 +285,18 @@ def units_of(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSetti
     tin = triangulate(np.column_stack((vx, vy)))
     if len(tin) == 0:
         return one
-    patches, borders, vertices = patches_of(vx, vy, vz, tin, settings.min_step_m)
-    unit_of_patch = units_of_patches(patches, borders, settings)
+    grown = grown_patches(vx, vy, vz, tin)
+    patches, borders = measured_patches(grown, settings.min_step_m)
+    ridges = [row for row, seen in _clear_borders(patches, borders).items() if seen and seen.ridge and seen.opposite]
+    grown, origin = cut_at_ridge_steps(grown, borders, np.array(ridges, np.int64), settings.min_ridge_step_m)
+    if len(origin) > len(patches.areas_m2):
+        patches, borders = measured_patches(grown, settings.min_step_m)
+    unit_of_patch = units_of_patches(patches, borders, origin, settings)
     if (unit_of_patch == unit_of_patch[0]).all():
         return one
     planes = np.column_stack((patches.slopes, patches.levels_mm))
     unit = unit_of_patch[patches.of_vertex]
-    label = _unit_of_points(x, y, z, vertices, cell_mm, unit, patches.of_vertex, planes)
+    label = _unit_of_points(x, y, z, grown.vertices, cell_mm, unit, patches.of_vertex, planes)
     first = smallest_points(x, y, z, label)
     present = np.flatnonzero(first >= 0)
     smallest = first[present]
