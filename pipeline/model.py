@@ -52,7 +52,8 @@ class Reason(StrEnum):
 
 REASONS: Mapping[Reason, str] = {
     Reason.TOO_FEW_POINTS: "fewer points than a plane needs; or fewer than `min_points`, of which the model "
-    "explains less than three quarters",
+    "explains less than three quarters; or too few anywhere on an object to show whether it is planar. In "
+    "`buildings` only if a footprint or an override says that there is a building",
     Reason.NO_PLANE: "no plane passed the refinement",
     Reason.NO_PARTITION: "the planes could not be turned into roof faces",
     Reason.INVALID_SOLID: "the solid broke a validity rule; `validity_codes` lists which",

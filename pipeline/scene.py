@@ -27,6 +27,8 @@ from pipeline.tin.delaunay import triangulate
 
 GROUND_CLASS = 2
 BUILDING_CLASS = 6
+VEGETATION_CLASSES = (3, 4, 5)
+"""Low, medium and high vegetation."""
 NEUTRAL_CLASSES = (0, 1, 12, 19)
 """Classes without information on buildings: never classified, unclassified, overlap, overhead structure."""
 
@@ -174,6 +176,8 @@ def split_tile(
     excluded = np.zeros(len(points), np.bool_)
     if classes.building:
         excluded = ~np.isin(points.classification, (*NEUTRAL_CLASSES, GROUND_CLASS, BUILDING_CLASS))
+    elif classes.vegetation:
+        excluded = np.isin(points.classification, VEGETATION_CLASSES)
     vertices = _vertices(points, height, terrain, building, excluded, settings, classes)
     core_index = np.flatnonzero(core.contains(points.x_mm, points.y_mm) & (height != NO_DATA))
     allowed = np.ones(len(core_index), np.int8)

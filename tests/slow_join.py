@@ -83,7 +83,9 @@ def _fault(kind: int, sums: IntArray, settings: CandidateSettings) -> tuple[Reas
     if kind == FacetKind.CROWN:
         rough = "a crown: most of what surrounds its vertices is rough"
         return Reason.VEGETATION, f"{rough}, planar share {f['planar_share']:.2f}"
-    if f["judged"] > 0 and f["planar_share"] < settings.min_planar_share:
+    if f["judged"] == 0:
+        return Reason.TOO_FEW_POINTS, "no vertex has enough neighbours to show whether the surface is planar"
+    if f["planar_share"] < settings.min_planar_share:
         return Reason.VEGETATION, f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}"
     if f["canopy_share"] > settings.max_canopy_share:
         return Reason.VEGETATION, f"canopy share {f['canopy_share']:.2f}, at most {settings.max_canopy_share:g}"

@@ -21,10 +21,8 @@ from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
 from pipeline.runtime.request import RunRequest, input_file
 from pipeline.runtime.run import OVERRIDES
 from pipeline.runtime.stages.ingested import Ingested
+from pipeline.runtime.stages.model_batch import REJECTED
 from pipeline.settings import RunSettings
-
-REJECTED = "rejected"
-"""Status of objects that are not buildings."""
 
 _AGAIN = "Run the whole again"
 

@@ -27,7 +27,6 @@ from pipeline.model import Reason
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.earlier import (
-    REJECTED,
     Earlier,
     Record,
     check_outlines,
@@ -55,9 +54,9 @@ from pipeline.runtime.stages.given_footprints import GivenFootprints, given_foot
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested, points_by_tile
 from pipeline.runtime.stages.join import join
-from pipeline.runtime.stages.model_batch import Modelled, StoredResult
+from pipeline.runtime.stages.model_batch import REJECTED, Modelled, StoredResult
 from pipeline.runtime.stages.outline import outline
-from pipeline.runtime.stages.publish import record_context, rejected_object
+from pipeline.runtime.stages.publish import buildings_and_rejected, record_context, rejected_object
 from pipeline.runtime.stages.reconstruct import QUARANTINE, Models, reconstruct
 from pipeline.runtime.stages.sites import CandidateSite, Joined, RejectedSite
 from pipeline.runtime.stages.split import Splits, split
@@ -183,7 +182,7 @@ def _rerun(
         prepared = _prepared(search, found, models, new)
         context.scratch.check_cancelled()
         digest = _written(search, found, modelled, prepared, new, began)
-    status = {**{m.building_id: m.status for m in modelled}, **{s.object_id: "rejected" for s in found.again.rejected}}
+    status = {**{m.building_id: m.status for m in modelled}, **{s.object_id: REJECTED for s in found.again.rejected}}
     seconds = time.perf_counter() - began
     progress.tell("finished", "", f"{len(found.changed)} buildings in {seconds:.1f} s")
     return RerunSummary(
@@ -347,12 +346,13 @@ def _prepared(search: _Search, found: _Found, models: Models, new: LocalStorage)
     without = ((tile, list[StoredResult]()) for tile in sorted(rejected.keys() - owners))
 
     def prepare(tile: Tile, stored: Sequence[StoredResult]) -> _Prepared:
+        buildings, unmodelled = buildings_and_rejected(stored)
         update = updated_tile(
             earlier.run_dir,
             tile.key,
             found.changed,
-            [entry.result for entry in stored],
-            [rejected_object(site) for site in rejected.get(tile, ())],
+            buildings,
+            [*(rejected_object(site) for site in rejected.get(tile, ())), *unmodelled],
             dataclasses.replace(records, facts={entry.result.building_id: entry.facts for entry in stored}),
             request.meshes,
         )
@@ -437,7 +437,7 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
     for status in ("ok", "fallback", "failed"):
         counts[status] += after[status] - before[status]
         counts["candidates"] += after[status] - before[status]
-    counts[REJECTED] += len(found.again.rejected) - before[REJECTED]
+    counts[REJECTED] += len(found.again.rejected) + after[REJECTED] - before[REJECTED]
     counts["roof_faces"] += sum(m.faces for m in modelled) - earlier.faces(found.changed)
     old = earlier.manifest.request["overrides"]
     inputs = [entry for entry in earlier.manifest.inputs if entry.n_points is not None or entry.path != old]

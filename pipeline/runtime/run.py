@@ -388,7 +388,7 @@ class _VariantRun:
             digest=digest,
             statuses=dict(self.counted.statuses),
             reasons=dict(self.counted.reasons),
-            rejected=dict(Counter(site.verdict.reason.value for site in found.joined.rejected)),
+            rejected=dict(self.counted.rejected + Counter(site.verdict.reason.value for site in found.joined.rejected)),
             roof_types=dict(self.counted.roof_types),
             counts=counts,
             timings_s=timings,

@@ -61,7 +61,9 @@ class Fault(IntEnum):
     TOO_NARROW = 6
     NO_WALLS = 7
     BELOW_Z_AVG = 8
-    NOT_JUDGED = 9
+    TOO_SPARSE = 9
+    """No vertex has enough neighbours to show whether the surface is planar."""
+    NOT_JUDGED = 10
     """Ground, a step between levels, or a surface without points."""
 
 
@@ -74,6 +76,7 @@ REASON_OF_FAULT = {
     Fault.TOO_NARROW: Reason.TOO_NARROW,
     Fault.NO_WALLS: Reason.NO_WALLS,
     Fault.BELOW_Z_AVG: Reason.BELOW_Z_AVG,
+    Fault.TOO_SPARSE: Reason.TOO_FEW_POINTS,
 }
 """The reason in the records for each fault."""
 
@@ -138,7 +141,8 @@ def _faults(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> Kin
         (kind == FacetKind.BUILDING, Fault.NONE),
         (f["top_m"] < settings.min_height_m, Fault.TOO_LOW),
         (kind == FacetKind.CROWN, Fault.CROWN),
-        ((f["judged"] > 0) & (f["planar_share"] < settings.min_planar_share), Fault.ROUGH),
+        (f["judged"] == 0, Fault.TOO_SPARSE),
+        (f["planar_share"] < settings.min_planar_share, Fault.ROUGH),
         (f["canopy_share"] > settings.max_canopy_share, Fault.COVERED),
         (f["width_m"] < width_m, Fault.TOO_NARROW),
         (f["wall_share"] < settings.min_wall_share, Fault.NO_WALLS),
@@ -199,6 +203,8 @@ def _verdict(fault: Fault, f: Mapping[str, float], settings: CandidateSettings) 
             detail = f"a crown: most of what surrounds its vertices is rough, planar share {share:.2f}"
         case Fault.ROUGH:
             detail = f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}"
+        case Fault.TOO_SPARSE:
+            detail = "no vertex has enough neighbours to show whether the surface is planar"
         case Fault.COVERED:
             detail = f"canopy share {f['canopy_share']:.2f}, at most {settings.max_canopy_share:g}"
         case Fault.TOO_NARROW:

@@ -25,6 +25,8 @@ class ClassesInUse:
     """Class 2 is the ground; no filter runs."""
     building: bool = False
     """Class 6 is building, classes that exclude buildings are believed, the rest is judged by its own evidence."""
+    vegetation: bool = False
+    """Classes 3 to 5 are vegetation, which is never part of a building."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,13 @@ class OutlierSettings(Parameters):
     min_neighbours: int = parameter(
         4, "Fewest other points in the 27 cubes around a point that is kept.", minimum=0, maximum=100
     )
+    min_share: float = parameter(
+        0.1,
+        "Fewer other points suffice if they are this share of those in the cubes above and below, too: in a sparse "
+        "survey few points lie anywhere.",
+        minimum=0.0,
+        maximum=1.0,
+    )
 
     @property
     def support_m(self) -> float:

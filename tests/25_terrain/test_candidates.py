@@ -140,8 +140,10 @@ def test_a_crown_is_vegetation_whatever_its_figures() -> None:
     assert verdict.detail == "a crown: most of what surrounds its vertices is rough, planar share 0.95"
 
 
-def test_surfaces_of_unknown_planarity_are_not_called_vegetation() -> None:
-    assert judged({Sum.PLANAR: 0, Sum.ROUGH: 0}) is None
+def test_a_surface_of_unknown_planarity_is_not_taken_for_a_roof() -> None:
+    verdict = judged({Sum.PLANAR: 0, Sum.ROUGH: 0})
+    assert verdict is not None
+    assert verdict.reason == Reason.TOO_FEW_POINTS
 
 
 def test_building_by_trusted_classes_needs_only_its_area() -> None:

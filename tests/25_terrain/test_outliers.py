@@ -22,13 +22,15 @@ def kept_of(points: Points, outliers: OutlierSettings | None = None) -> BoolArra
     return dense_enough(x, y, z, outliers or OutlierSettings())
 
 
-def slow_twin(points: Points, cube_mm: int, min_neighbours: int) -> list[bool]:
+def slow_twin(points: Points, cube_mm: int, min_neighbours: int, min_share: float) -> list[bool]:
     """Each point against each other one, by Python's whole numbers."""
     cubes = [tuple(int(v) // cube_mm for v in p) for p in points]
     kept = []
     for a in cubes:
-        near = sum(all(abs(u - v) <= 1 for u, v in zip(a, b, strict=True)) for b in cubes)
-        kept.append(near - 1 >= min_neighbours)
+        column = [b for b in cubes if all(abs(u - v) <= 1 for u, v in zip(a[:2], b[:2], strict=True))]
+        others = sum(abs(a[2] - b[2]) <= 1 for b in column) - 1
+        fair = len(column) > min_neighbours and others >= max(1, min_share * (len(column) - 1))
+        kept.append(others >= min_neighbours or fair)
     return kept
 
 
@@ -42,13 +44,18 @@ point_lists = st.lists(st.tuples(*[st.integers(-12_000, 12_000)] * 3), min_size=
 
 
 @settings(deadline=None)
-@given(points=point_lists, cube_m=st.sampled_from([1.0, 2.5, 5.0]), min_neighbours=st.integers(0, 5))
+@given(
+    points=point_lists,
+    cube_m=st.sampled_from([1.0, 2.5, 5.0]),
+    min_neighbours=st.integers(0, 5),
+    min_share=st.sampled_from([0.0, 0.1, 0.5, 1.0]),
+)
 def test_it_agrees_with_each_point_against_each_other(
-    points: list[tuple[int, int, int]], cube_m: float, min_neighbours: int
+    points: list[tuple[int, int, int]], cube_m: float, min_neighbours: int, min_share: float
 ) -> None:
     cloud = np.array(points, np.int64).reshape(-1, 3)
-    kept = kept_of(cloud, OutlierSettings(cube_m=cube_m, min_neighbours=min_neighbours))
-    assert kept.tolist() == slow_twin(cloud, round(cube_m * 1000), min_neighbours)
+    kept = kept_of(cloud, OutlierSettings(cube_m=cube_m, min_neighbours=min_neighbours, min_share=min_share))
+    assert kept.tolist() == slow_twin(cloud, round(cube_m * 1000), min_neighbours, min_share)
 
 
 @pytest.mark.parametrize(("n", "low_mm", "cube_m", "few"), [(6000, -60_000, 5.0, 12), (60_000, 0, 2.0, 8)])
@@ -63,7 +70,8 @@ def test_it_agrees_with_a_convolution_of_the_counts_also_where_a_table_of_many_c
     around = convolve(counts, np.ones((3, 3, 3), np.int64), mode="constant")
     expected = around[tuple(cubes.T)] - 1 >= few
     assert 0.1 < expected.mean() < 0.9
-    np.testing.assert_array_equal(kept_of(cloud, OutlierSettings(cube_m=cube_m, min_neighbours=few)), expected)
+    strict = OutlierSettings(cube_m=cube_m, min_neighbours=few, min_share=1.0)
+    np.testing.assert_array_equal(kept_of(cloud, strict), expected)
 
 
 def test_points_far_below_above_and_away_are_dropped_without_memory_for_the_cubes_between_and_the_town_stays() -> None:
@@ -82,6 +90,15 @@ def test_up_to_four_close_points_are_dropped_and_five_stay() -> None:
     for count in (1, 2, 4):
         assert not kept_of(five[:count]).any()
     assert kept_of(five[:1], OutlierSettings(min_neighbours=0)).all()
+
+
+def test_three_points_in_a_sparse_tree_top_stay_where_one_above_it_is_dropped() -> None:
+    ground = np.column_stack((np.arange(12) * 900, np.arange(12) * 700 % 5000, np.zeros(12))).astype(np.int64)
+    top = np.array([[5000, 4000, 20_000], [6000, 5000, 21_000], [5000, 5000, 22_000]])
+    bird = np.array([[5500, 4500, 60_000]])
+    kept = kept_of(np.concatenate((ground, top, bird)))
+    assert kept.tolist() == [True] * 15 + [False]
+    assert not kept_of(np.concatenate((ground, top)), OutlierSettings(min_share=1.0))[12:].any()
 
 
 @settings(deadline=None, max_examples=examples(25))
@@ -136,9 +153,10 @@ def test_borders_of_cubes_are_the_same_in_an_array_and_in_a_table(
     low, high = cubes.min(axis=0) - 1, cubes.max(axis=0) + 1
     shape = tuple((high - low + 1).tolist())
     for few in (3, 60, 90):
-        array = outliers_module._by_grid(x, y, z, cube_mm, few, tuple(low.tolist()), shape)
-        table = outliers_module._by_table(x, y, z, cube_mm, few, tuple(low.tolist()))
+        array = outliers_module._by_grid(x, y, z, cube_mm, (few, 1.0), tuple(low.tolist()), shape)
+        table = outliers_module._by_table(x, y, z, cube_mm, (few, 1.0), tuple(low.tolist()))
         np.testing.assert_array_equal(array, table)
-        np.testing.assert_array_equal(dense_enough(x, y, z, OutlierSettings(cube_m=cube_m, min_neighbours=few)), table)
+        strict = OutlierSettings(cube_m=cube_m, min_neighbours=few, min_share=1.0)
+        np.testing.assert_array_equal(dense_enough(x, y, z, strict), table)
     assert not table.all()
     assert table.any()

@@ -248,6 +248,19 @@ def test_trusted_ground_alone_replaces_the_filter(town: Any) -> None:
     assert found.terrain.elevation_mm[27, 70] == pytest.approx(9000, abs=100)
 
 
+@pytest.mark.parametrize("building", [True, False])
+def test_trusted_vegetation_is_never_part_of_a_surface(town: Any, building: bool) -> None:
+    classification = town.points.classification.copy()
+    classification[town.house] = TREE
+    if not building:
+        classification[classification == BUILDING] = 1
+    classes = ClassesInUse(ground=True, building=building, vegetation=True)
+    found = split_whole(changed(town.points, classification=classification), classes)
+    candidate = candidate_of_points(found)
+    assert (candidate[classification[: len(candidate)] == TREE] == -1).all()
+    assert (candidate >= 0).any()
+
+
 # -- invariants --------------------------------------------------------------------------------------------------------
 
 

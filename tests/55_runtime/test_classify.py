@@ -242,6 +242,7 @@ def test_the_classes_of_the_file_stand_where_they_are_trusted(true_suburb: Path,
     found = classes_in(run_classify(true_suburb, settings={"classes": "trust"}))
     assert ((found == 2) == (truth == 2)).all()
     assert (found[truth == 6] == 6).all()
+    assert not (found[(truth >= 3) & (truth <= 5)] == 6).any()
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,8 @@ from run_tables import rows, write_footprints
 
 import pipeline.export.tile
 import pipeline.reconstruct
-from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, RunError
+from pipeline.errors import BuildingError, EmptyInputError, InconsistentInputError, InputError, RunError
+from pipeline.model import Reason
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.request import RunRequest
@@ -64,6 +65,33 @@ def test_one_broken_building_costs_only_itself(suburb: Path, reconstruct: Any, m
     assert "on purpose" in hurt[victim]["reason_detail"]
     assert sum(row["status"] == "failed" for row in hurt.values()) == 1
     assert len(hurt) == whole.counts["candidates"]
+
+
+def test_a_candidate_with_too_few_points_for_a_model_is_rejected_unless_a_user_overrides_it(
+    suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    whole = reconstruct(suburb)
+    victim = min(row["building_id"] for row in rows(whole.run_dir))
+    real = pipeline.reconstruct.roof_points
+
+    def sparse(cloud: Any, settings: Any) -> Any:
+        if cloud.candidate.building_id == victim:
+            raise BuildingError(Reason.TOO_FEW_POINTS, "on purpose")
+        return real(cloud, settings)
+
+    monkeypatch.setattr(pipeline.reconstruct, "roof_points", sparse)
+    summary = reconstruct(suburb, out=str(tmp_path / "run"))
+    (lost,) = [row for row in rows(summary.run_dir, "rejected") if row["object_id"] == victim]
+    assert (lost["reason"], lost["reason_detail"]) == ("too_few_points", "on purpose")
+    assert lost["area_m2"] > 10
+    assert summary.rejected["too_few_points"] == whole.rejected.get("too_few_points", 0) + 1
+    assert len(rows(summary.run_dir)) == summary.counts["candidates"] == whole.counts["candidates"] - 1
+    assert summary.counts["failed"] == 0
+    assert len(rows(summary.run_dir, "rejected")) == summary.counts["rejected"]
+    overrides = tmp_path / "overrides.toml"
+    overrides.write_text(f'[[building]]\nbuilding_id = "{victim}"\nmethod = "kmeans"\n')
+    known = reconstruct(suburb, out=str(tmp_path / "known"), overrides=str(overrides))
+    assert {row["building_id"]: row["status"] for row in rows(known.run_dir)}[victim] == "failed"
 
 
 def test_given_footprints_are_the_candidates_also_where_there_are_no_points(

@@ -104,7 +104,7 @@ def _redrawn(
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
     if _accepts(layer[0]):
         # the user overrules the classes, which say that there is no building
-        classes = dataclasses.replace(classes, building=False)
+        classes = dataclasses.replace(classes, building=False, vegetation=False)
     polygons, grid = [polygon for _, polygon in named], context.plan.grid
     met = numbers_by_tile(points_by_tile(ingested), grid, polygons)
     numbers = {tile: found for tile, found in met.items() if found}

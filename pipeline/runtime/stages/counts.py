@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pipeline.runtime.manifest import SLOWEST, SlowBuilding
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.stages.ingested import Ingested
+from pipeline.runtime.stages.model_batch import REJECTED
 from pipeline.runtime.stages.reconstruct import Models
 from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import Splits
@@ -23,6 +24,8 @@ class Counted:
     """Candidates by status."""
     reasons: Counter[str]
     """Candidates that are not ok, by reason."""
+    rejected: Counter[str]
+    """Candidates that became rejected objects, by reason; the other counts of candidates are without them."""
     roof_types: Counter[str]
     """Candidates by roof type."""
     faces: int
@@ -37,16 +40,19 @@ class Counted:
     @classmethod
     def of(cls, models: Models, *, each: bool) -> Counted:
         """Count the models; `each` stores the seconds of every one."""
-        statuses, reasons, roof_types = Counter[str](), Counter[str](), Counter[str]()
+        statuses, reasons, rejected, roof_types = Counter[str](), Counter[str](), Counter[str](), Counter[str]()
         seconds: dict[str, float] = {}
         slowest: list[tuple[float, str]] = []
         faces = 0
         for model in models.each():
-            statuses[model.status] += 1
-            if model.reason is not None:
-                reasons[model.reason] += 1
-            roof_types[model.roof_type] += 1
-            faces += model.faces
+            if model.status == REJECTED:
+                rejected[model.reason or ""] += 1
+            else:
+                statuses[model.status] += 1
+                if model.reason is not None:
+                    reasons[model.reason] += 1
+                roof_types[model.roof_type] += 1
+                faces += model.faces
             if each:
                 seconds[model.building_id] = model.seconds
             slowest.append((round(model.seconds, 3), model.building_id))
@@ -55,6 +61,7 @@ class Counted:
         return cls(
             statuses=statuses,
             reasons=reasons,
+            rejected=rejected,
             roof_types=roof_types,
             faces=faces,
             made=models.made,
@@ -78,12 +85,12 @@ def run_counts(
         "duplicates": sum(s.duplicates for s in splits.figures),
         "outliers": sum(s.outliers for s in splits.figures),
         "tiles": len(splits.figures),
-        "candidates": sum(by_status.values()),
+        "candidates": by_status.total(),
         "ok": by_status["ok"],
         "fallback": by_status["fallback"],
         "failed": by_status["failed"],
-        "rejected": len(joined.rejected),
-        "reused": sum(by_status.values()) - found.made,
+        "rejected": len(joined.rejected) + found.rejected.total(),
+        "reused": by_status.total() + found.rejected.total() - found.made,
         "small_surfaces": joined.small_fragments,
         "roof_faces": found.faces,
         "class_6_in_candidates": sum(s.audit[0] for s in splits.figures),

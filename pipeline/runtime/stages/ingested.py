@@ -68,8 +68,8 @@ def content_by_tile(ingested: Sequence[Ingested]) -> dict[Tile, ZoneSums]:
 def classes_in_use(ingested: Sequence[Ingested], *, trust: bool) -> tuple[ClassesInUse, str]:
     """Which classes are believed, and a sentence on why; empty where there is nothing to explain.
 
-    Ground and buildings are believed only where every input is classified: at least 5 % of its points are ground. A
-    file with stray codes, or one that was never classified, is not taken at its word.
+    Ground, buildings and vegetation are believed only where every input is classified: at least 5 % of its points are
+    ground. A file with stray codes, or one that was never classified, is not taken at its word.
     """
     if not trust:
         return ClassesInUse(), ""
@@ -85,7 +85,7 @@ def classes_in_use(ingested: Sequence[Ingested], *, trust: bool) -> tuple[Classe
         why = "the inputs have no classes" if not some else f"{len(bare)} of {len(ingested)} inputs are not classified"
         return ClassesInUse(), f"{why}: ground and buildings are found in the points alone"
     buildings = any(found.classes.get(BUILDING_CLASS, 0) for found in ingested)
-    return ClassesInUse(ground=True, building=buildings), ""
+    return ClassesInUse(ground=True, building=buildings, vegetation=True), ""
 
 
 def spread_m(results: Sequence[Ingested]) -> float:

@@ -20,7 +20,7 @@ from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.gather import Surroundings, surroundings_of
 from pipeline.runtime.stages.sites import PointRange
 from pipeline.runtime.stages.window_points import bucket_paths, load_window
-from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints
+from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, VEGETATION_CLASSES, WindowPoints
 from pipeline.terrain.ground import Terrain, ground_points, slopes_of
 from pipeline.terrain.lattice import NO_DATA, height_above
 from pipeline.terrain.outliers import dense_enough
@@ -174,4 +174,6 @@ def _believed(found: ByteArray, own: ByteArray, classes: ClassesInUse) -> ByteAr
         labels[own == GROUND_CLASS] = PointClass.GROUND
     if classes.building:
         labels[own == BUILDING_CLASS] = PointClass.BUILDING
+    if classes.vegetation:
+        labels[np.isin(own, VEGETATION_CLASSES) & (labels == PointClass.BUILDING)] = PointClass.VEGETATION
     return labels

@@ -33,6 +33,8 @@ from pipeline.tiling import Tile, TileGrid
 _BUNDLE_TIMEOUT_S = 60.0
 _LOST = frozenset({Reason.CRASHED, Reason.TIMED_OUT, Reason.OUT_OF_MEMORY, Reason.INTERNAL_ERROR})
 """Reasons caused by processes or by gablework, not by the building's points: each deserves a log line."""
+REJECTED = "rejected"
+"""The status, in the figures of a run, of a candidate that becomes a rejected object."""
 _NO_BUNDLE = "there is no bundle, since its points cannot be put together"
 
 
@@ -87,6 +89,7 @@ class Modelled:
     building_id: str
     owner: Tile
     status: str
+    """As in the records, or `REJECTED`."""
     reason: str | None
     roof_type: str
     faces: int
@@ -102,6 +105,8 @@ class StoredResult:
 
     result: BuildingResult
     facts: CandidateFacts
+    is_rejected: bool = False
+    """Whether it has too few points for a model and nothing else says that it is a building."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -164,10 +169,11 @@ def _packed(
     *,
     reused: bool = False,
 ) -> Packed:
+    is_rejected = _is_rejected(task, site, result)
     modelled = Modelled(
         building_id=result.building_id,
         owner=site.owner,
-        status=result.status.value,
+        status=REJECTED if is_rejected else result.status.value,
         reason=None if result.reason is None else result.reason.value,
         roof_type=result.roof_type.value,
         faces=len(result.faces),
@@ -182,9 +188,18 @@ def _packed(
         overridden=None if site.override is None else site.override.effects,
         settings_hash=None if own is None else own.settings_hash,
     )
-    stored = StoredResult(result=result, facts=facts)
+    stored = StoredResult(result=result, facts=facts, is_rejected=is_rejected)
     packed = pickle.dumps(stored, protocol=pickle.HIGHEST_PROTOCOL)
     return Packed(modelled=modelled, stored=packed, made_from=made_from)
+
+
+def _is_rejected(task: BatchTask, site: CandidateSite, result: BuildingResult) -> bool:
+    """Whether a candidate has too few points for a model, and neither a footprint nor a user says it is a building.
+
+    A comparison keeps it, so that each method has a record of each candidate.
+    """
+    known = site.footprint is not None or site.override is not None
+    return result.reason is Reason.TOO_FEW_POINTS and not known and not task.compared
 
 
 def _here(task: BatchTask) -> Iterator[tuple[int, Packed]]:

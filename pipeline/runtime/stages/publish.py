@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import shapely
@@ -15,7 +17,7 @@ from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.putting import Put
 from pipeline.io import Storage, storage_at
 from pipeline.io.storage import Puts
-from pipeline.model import Status
+from pipeline.model import BuildingResult, Reason, Status
 from pipeline.runtime.isolation.replay_bundle import SUFFIX
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.run_context import ProgressUnits, RunContext
@@ -78,6 +80,27 @@ def rejected_object(site: RejectedSite) -> RejectedObject:
         area_m2=site.area_m2,
         height_m=site.height_m,
         n_points=site.points,
+    )
+
+
+def buildings_and_rejected(stored: Sequence[StoredResult]) -> tuple[list[BuildingResult], list[RejectedObject]]:
+    """The buildings among some results, and the objects that have too few points to be shown as one."""
+    buildings = [entry.result for entry in stored if not entry.is_rejected]
+    return buildings, [_unmodelled(entry.result) for entry in stored if entry.is_rejected]
+
+
+def _unmodelled(result: BuildingResult) -> RejectedObject:
+    """The record of an object with too few points for a model."""
+    outline = result.footprint
+    return RejectedObject(
+        object_id=result.building_id,
+        origin=result.origin,
+        reason=Reason.TOO_FEW_POINTS,
+        reason_detail=result.reason_detail,
+        outline=None if outline is None else shapely.box(*outline.bounds),
+        area_m2=math.nan if outline is None else outline.area,
+        height_m=math.nan,
+        n_points=result.n_points,
     )
 
 
@@ -218,11 +241,12 @@ def _write(task: PublishTask, put: Put) -> dict[str, str]:
     for place in task.batches:
         stored.extend(stored_results(task.scratch, place))
     context = dataclasses.replace(task.context, facts={entry.result.building_id: entry.facts for entry in stored})
+    buildings, unmodelled = buildings_and_rejected(stored)
     files = write_tile(
         task.run_dir,
         task.tile.key,
-        [entry.result for entry in stored],
-        [rejected_object(site) for site in task.rejected],
+        buildings,
+        [*(rejected_object(site) for site in task.rejected), *unmodelled],
         context,
         meshes=task.meshes,
         put=put,

@@ -16,7 +16,16 @@ from pipeline.model import BoolArray, IntArray
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.open_fragments import TileSurfaces, open_fragments
 from pipeline.runtime.stages.window_points import load_window
-from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, SplitTile, WindowPoints, lattice_of, split_tile, terrain_of
+from pipeline.scene import (
+    BUILDING_CLASS,
+    GROUND_CLASS,
+    VEGETATION_CLASSES,
+    SplitTile,
+    WindowPoints,
+    lattice_of,
+    split_tile,
+    terrain_of,
+)
 from pipeline.terrain.ground import Terrain, ground_points
 from pipeline.terrain.scene_settings import APRON_M, ClassesInUse, SceneSettings
 from pipeline.terrain.settings import GroundSettings
@@ -210,7 +219,7 @@ def _above_ground(
 ) -> BoolArray:
     """Whether each of the points at `index` counts inside a footprint.
 
-    Where class 6 is believed its points count, else all points above the ground.
+    Where class 6 is believed its points count, else all points above the ground that are not vegetation by their class.
     """
     if classes.building:
         is_building: BoolArray = points.classification[index] == BUILDING_CLASS
@@ -218,6 +227,8 @@ def _above_ground(
     above = ~ground_points(points.x_mm[index], points.y_mm[index], points.z_mm[index], terrain, settings)
     if classes.ground:
         above &= points.classification[index] != GROUND_CLASS
+    if classes.vegetation:
+        above &= ~np.isin(points.classification[index], VEGETATION_CLASSES)
     return above
 
 
