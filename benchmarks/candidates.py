@@ -56,8 +56,7 @@ def found_scene(
         joined = outline(context, settings.building.roof, join(context, settings.scene, splits, given))
         return FoundScene(
             candidates=tuple(
-                gather(scratch, plan.grid, site, plan.gps_kind, beside=settings.building.roof.at_walls)[0]
-                for site in joined.candidates
+                gather(scratch, plan.grid, site, plan.gps_kind, settings.building.roof)[0] for site in joined.candidates
             ),
             rejected=joined.rejected,
             small_fragments=joined.small_fragments,

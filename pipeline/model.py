@@ -355,6 +355,18 @@ class ModelQuality:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class WallOutline:
+    """The walls beneath a footprint that was drawn at the eaves."""
+
+    outline: MultiPolygon
+    """2D outline of the walls in local metres."""
+    overhang_m: float
+    """Mean overhang of the eaves along the walls that points show, metres."""
+    overhang_sigma_m: float
+    """Its standard error, metres."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class LodModel:
     """A building's model at a coarser level of detail than that of its record."""
 
@@ -417,5 +429,7 @@ class BuildingResult:
     """How well the points support the model."""
     touches_data_edge: bool
     """As the candidate's."""
+    walls: WallOutline | None = None
+    """The walls beneath the footprint; None where it was given, or where no wall is asked for or seen."""
     coarser: tuple[LodModel, ...] = ()
     """Models at the coarser requested levels of detail, the finest first; none beside a fallback block."""

@@ -31,6 +31,7 @@ from pipeline.model import (
     Segmentation,
     Solid,
     Status,
+    WallOutline,
 )
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, model_quality
@@ -42,7 +43,7 @@ from pipeline.roof.footprint import hull_of_points, outline
 from pipeline.roof.forms import UNDRAWABLE, FaceForm, arranged_forms, template_forms, traced_forms
 from pipeline.roof.lower_lods import LodParts, lower_lods
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.plan import RoofPlan, RoofPoints, level_unsupported_faces, partition_roof, roof_points
+from pipeline.roof.plan import RoofPlan, RoofPoints, level_unsupported_faces, partition_roof, roof_points, walls_of
 from pipeline.roof.primitives import primitive_partition
 from pipeline.roof.roof_type import roof_type
 from pipeline.roof.solid import SolidPart, solid_parts
@@ -383,7 +384,17 @@ def _record(
         coverage=residuals.coverage,
         quality=dataclasses.replace(quality, bic_margin=model.bic_margin),
         touches_data_edge=candidate.touches_data_edge,
+        walls=_wall_outline(footprint, building),
     )
+
+
+def _wall_outline(footprint: Polygon | MultiPolygon, building: _Building) -> WallOutline | None:
+    """The walls beneath a footprint at the eaves; None where they are not asked for or none is seen."""
+    walls = walls_of(footprint, building.roof, building.settings.roof)
+    if walls is None:
+        return None
+    outline = shapely.transform(walls.outline_mm, lambda xy: xy * 1e-3)
+    return WallOutline(outline=outline, overhang_m=walls.overhang_m, overhang_sigma_m=walls.overhang_sigma_m)
 
 
 def _lod_model(model: LodParts) -> LodModel:

@@ -15,13 +15,13 @@ import numpy as np
 
 from pipeline.export.coordinates import SpatialReference, crs_coordinates, decimals, epsg_code
 from pipeline.export.obj import part_id
-from pipeline.export.solid_geometry import SOLID_COLUMNS, SURFACES
+from pipeline.export.solid_geometry import SHAPE_COLUMNS, SURFACES
 from pipeline.model import BuildingResult, FaceKind, Plane, Solid
 
 VERSION = "2.0"
 """Version of CityJSON."""
 
-_NOT_ATTRIBUTES = ("building_id", "geometry", *SOLID_COLUMNS)
+_NOT_ATTRIBUTES = ("building_id", "geometry", *SHAPE_COLUMNS)
 
 
 def cityjson_lines(

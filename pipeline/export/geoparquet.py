@@ -19,7 +19,7 @@ import shapely
 
 from pipeline.errors import RunError
 from pipeline.export.records import KEYS, SCHEMAS
-from pipeline.export.solid_geometry import SOLIDS
+from pipeline.export.solid_geometry import SOLIDS, WALL_OUTLINE
 
 if TYPE_CHECKING:
     import pyarrow.dataset as pads
@@ -38,24 +38,25 @@ def stored_schema(table_name: str) -> pa.Schema:
     return SCHEMAS[table_name].append(pa.field("bbox", _BBOX))
 
 
-def solid_names(table_name: str) -> tuple[str, ...]:
-    """The columns of geometry of a table beside the primary one: faces of solids, a MultiPolygon Z each."""
-    return tuple(name for name in SOLIDS if name in SCHEMAS[table_name].names)
+def shape_names(table_name: str) -> tuple[str, ...]:
+    """The columns of geometry of a table beside the primary one: faces of solids, a MultiPolygon Z each, and walls."""
+    return tuple(name for name in (*SOLIDS, WALL_OUTLINE) if name in SCHEMAS[table_name].names)
 
 
 def geo_metadata(
-    geometries: Any, projjson: Mapping[str, Any] | None, solids: Mapping[str, Any] | None = None
+    geometries: Any, projjson: Mapping[str, Any] | None, shapes: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """The `geo` entry of the file metadata. Null geometries are left out of types and bounds; an unknown CRS is None.
 
-    `solids` are the geometries of the columns of solids by their names. Their rings run outward round the solid, not
-    counter-clockwise in plan, so no orientation is stated. The footprint is the outline of the solids, so the `bbox`
-    column covers both. Coarser solids are listed if there are any; rows may lack them, so `bbox` does not cover them.
+    `shapes` are the geometries of the columns of solids and of walls by their names. Rings of solids run outward round
+    the solid, not counter-clockwise in plan, so no orientation is stated. The footprint is the outline of the solids,
+    so the `bbox` column covers both. Coarser solids and walls are listed if there are any; rows may lack them, so
+    `bbox` does not cover them.
     """
     column = _column_metadata(geometries, projjson)
     column["orientation"] = "counterclockwise"
     columns = {"geometry": column}
-    for name, faces in (solids or {}).items():
+    for name, faces in (shapes or {}).items():
         metadata = _column_metadata(faces, projjson)
         if name == SOLIDS[0]:
             columns[name] = metadata
@@ -106,8 +107,8 @@ def geo_table(table_name: str, rows: Sequence[Mapping[str, Any]], projjson: Mapp
         mask=pa.array(missing, pa.bool_()),
     )
     table = table.append_column(pa.field("bbox", _BBOX), bbox)
-    solids = {name: _from_wkb(ordered, name) for name in solid_names(table_name)}
-    geo = json.dumps(geo_metadata(geometries, projjson, solids), sort_keys=True, separators=(",", ":"))
+    shapes = {name: _from_wkb(ordered, name) for name in shape_names(table_name)}
+    geo = json.dumps(geo_metadata(geometries, projjson, shapes), sort_keys=True, separators=(",", ":"))
     return table.replace_schema_metadata({"geo": geo})
 
 

@@ -14,7 +14,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.export.coordinates import SpatialReference, crs_coordinates, crs_elevation, crs_geometry, decimals
 from pipeline.export.dimensions import Dimensions, dimensions
 from pipeline.export.facts import CandidateFacts, RecordContext, RejectedObject
-from pipeline.export.solid_geometry import solid_columns
+from pipeline.export.solid_geometry import WALL_OUTLINE, solid_columns
 from pipeline.model import BuildingResult, ModelQuality, Plane
 
 _TIME = pa.timestamp("us", tz="UTC")
@@ -71,6 +71,9 @@ BUILDINGS = pa.schema(
         pa.field("valid", pa.bool_(), nullable=False),
         pa.field("validity_codes", pa.list_(pa.int32()), nullable=False),
         pa.field("touches_data_edge", pa.bool_(), nullable=False),
+        pa.field(WALL_OUTLINE, pa.binary()),
+        pa.field("overhang_m", pa.float64()),
+        pa.field("overhang_sigma_m", pa.float64()),
         pa.field("acquired_from", _TIME),
         pa.field("acquired_to", _TIME),
         pa.field("mesh_path", pa.string()),
@@ -185,6 +188,7 @@ def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: s
         "valid": modelled,
         "validity_codes": list(result.validity_codes),
         "touches_data_edge": result.touches_data_edge,
+        **_walls(result, context.reference),
         "acquired_from": facts.acquired_from,
         "acquired_to": facts.acquired_to,
         "mesh_path": mesh_path,
@@ -205,6 +209,16 @@ def _quality(quality: ModelQuality) -> dict[str, float | bool | None]:
         "ridge_z_sigma_m": _or_none(quality.ridge_z_sigma_m),
         "bic_margin": _or_none(quality.bic_margin),
         "is_curved": quality.is_curved,
+    }
+
+
+def _walls(result: BuildingResult, reference: SpatialReference) -> dict[str, bytes | float | None]:
+    """The walls beneath the footprint; None where they are not known."""
+    walls = result.walls
+    return {
+        WALL_OUTLINE: None if walls is None else _geometry(walls.outline, result.origin, reference),
+        "overhang_m": None if walls is None else _or_none(walls.overhang_m),
+        "overhang_sigma_m": None if walls is None else _or_none(walls.overhang_sigma_m),
     }
 
 

@@ -41,6 +41,10 @@ SOLID_COLUMNS = (
     *(name for names in _COARSER_COLUMNS.values() for name in names),
 )
 """The columns that tell a building's solids."""
+WALL_OUTLINE = "wall_outline"
+"""The column of the walls beneath a footprint at the eaves."""
+SHAPE_COLUMNS = (*SOLID_COLUMNS, WALL_OUTLINE)
+"""The columns that hold a building's shape beside its footprint."""
 SURFACES = {FaceKind.ROOF: "RoofSurface", FaceKind.WALL: "WallSurface", FaceKind.GROUND: "GroundSurface"}
 """CityGML's names of the kinds of faces."""
 

@@ -199,19 +199,37 @@ def _overhang_of_sheet(off: FloatArray, strip: IntArray, z: FloatArray, strips: 
     return min(overhang, _WIDEST_M) if overhang >= -_SLACK_M else None
 
 
-def mean_overhang_m(eaves: Sequence[Eave], usual_m: float) -> float:
-    """The mean overhang of the lines whose wall is known, by their lengths, never negative; else the usual one."""
+def mean_overhang(eaves: Sequence[Eave]) -> tuple[float, float]:
+    """Mean overhang of the lines whose wall is known, by their lengths, never negative, and its standard error, metres.
+
+    Each line has its own error, as great as its sheet is thick, and the lines differ; nan where no wall is known.
+    """
     known = [(eave.length_m, eave.overhang_m) for eave in eaves if eave.overhang_m is not None]
     if not known:
-        return usual_m
-    return max(0.0, math.fsum(length * over for length, over in known) / math.fsum(length for length, _ in known))
+        return math.nan, math.nan
+    whole = math.fsum(length for length, _ in known)
+    mean = math.fsum(length * over for length, over in known) / whole
+    own = _SHEET_M**2 / 12.0  # the variance of a uniform distribution
+    variance = math.fsum(length**2 * (own + (over - mean) ** 2) for length, over in known) / whole**2
+    return max(0.0, mean), math.sqrt(variance)
 
 
-def at_walls(outline_mm: MultiPolygon, points: FacadePoints, reach_m: float, usual_m: float) -> MultiPolygon:
-    """Draw an outline at the facades; it is at the eaves, with straight lines, in integer millimetres, and stays valid.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Walls:
+    """The walls beneath an outline at the eaves."""
 
-    `usual_m` is the overhang where no wall of the whole outline is known; see `mixed_pulse_reach_mm` for the reach. A
-    ring that would break stays at the eaves.
+    outline_mm: MultiPolygon
+    """At the walls, integer millimetres; at the eaves where a ring would break."""
+    overhang_m: float
+    """Mean overhang of the lines whose wall is known; nan where no wall is."""
+    overhang_sigma_m: float
+    """Its standard error."""
+
+
+def walls_beneath(outline_mm: MultiPolygon, points: FacadePoints, reach_m: float, usual_m: float) -> Walls:
+    """Find the walls beneath an outline at the eaves, with straight lines, in integer millimetres; it stays valid.
+
+    `usual_m` is the overhang where no wall of the whole outline is known; see `mixed_pulse_reach_mm` for the reach.
     """
     polygons = [orient(polygon) for polygon in outline_mm.geoms]
     rings = [
@@ -220,13 +238,14 @@ def at_walls(outline_mm: MultiPolygon, points: FacadePoints, reach_m: float, usu
         for ring in (polygon.exterior, *polygon.interiors)
     ]
     eaves_of = [_eaves(ring, points, reach_m) for _, ring in rings]
-    mean_m = mean_overhang_m([eave for eaves in eaves_of for eave in eaves], usual_m)
+    known_m, sigma_m = mean_overhang([eave for eaves in eaves_of for eave in eaves])
+    mean_m = usual_m if math.isnan(known_m) else known_m
     moved: list[list[FloatArray]] = [[] for _ in polygons]
     for (k, ring), eaves in zip(rings, eaves_of, strict=True):
         ways_m = [e.overhang_m if e.overhang_m is not None else mean_m if e.is_open else 0.0 for e in eaves]
         moved[k].append(_moved(ring, ways_m))
     drawn = MultiPolygon([Polygon(outer, holes) for outer, *holes in moved])
-    return drawn if drawn.is_valid else outline_mm
+    return Walls(outline_mm=drawn if drawn.is_valid else outline_mm, overhang_m=known_m, overhang_sigma_m=sigma_m)
 
 
 def _eaves(ring: FloatArray, points: FacadePoints, reach_m: float) -> list[Eave]:

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 import shapely
-from shapely import MultiPolygon
+from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import BuildingError
 from pipeline.geometry import spacing_over_area_m
@@ -18,7 +18,7 @@ from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.borders import straighten_borders
 from pipeline.roof.eaves import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
-from pipeline.roof.facades import FacadePoints, at_walls
+from pipeline.roof.facades import FacadePoints, Walls, walls_beneath
 from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, outline, polygons_of
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
 from pipeline.roof.partition import (
@@ -61,7 +61,7 @@ class RoofPoints:
     outline_mm: MultiPolygon | None = None
     """The outline that was drawn together with touching units; integer millimetres."""
     facades: FacadePoints | None = None
-    """Points that show the walls beneath; None where the outline is drawn at the eaves."""
+    """Points that show the walls beneath; None where no wall is asked for."""
 
 
 def roof_points(cloud: PreparedCloud, settings: RoofSettings) -> RoofPoints:
@@ -92,7 +92,7 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings) -> RoofPoints:
         facades=FacadePoints.of(
             candidate.beside, candidate.beside_later, points, candidate.ground, candidate.ground_z_m
         )
-        if settings.at_walls
+        if settings.at_walls or settings.finds_walls
         else None,
     )
 
@@ -179,9 +179,9 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     if drawn is None:
         edge_points = EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m)
         drawn = straighten(around, roof.spacing_m, settings, edge_points)
-        if roof.facades is not None:
+        if roof.facades is not None and settings.at_walls:
             reach_m = 1e-3 * mixed_pulse_reach_mm(around, edge_points)
-            drawn = at_walls(drawn, roof.facades, reach_m, settings.usual_overhang_m)
+            drawn = walls_beneath(drawn, roof.facades, reach_m, settings.usual_overhang_m).outline_mm
     return RoofPlan(planes=tuple(planes), faces=continued_faces, outline_mm=drawn, raw=partition)
 
 
@@ -199,6 +199,16 @@ def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:
     level = Plane(a=0.0, b=0.0, c=float(z[len(z) // 2]), n_points=len(z), rmse_m=0.0)
     unlabelled = dataclasses.replace(roof, labels=np.zeros(len(roof.points), np.int32))
     return partition_roof(unlabelled, [level], settings).outline_mm
+
+
+def walls_of(footprint: Polygon | MultiPolygon, roof: RoofPoints, settings: RoofSettings) -> Walls | None:
+    """The walls beneath a footprint at the eaves, local metres; None where they are not asked for or none is seen."""
+    if roof.facades is None or roof.footprint_mm is not None or not settings.finds_walls:
+        return None
+    eaves_mm = footprint_in_mm(footprint)
+    reach_mm = mixed_pulse_reach_mm(eaves_mm, EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m))
+    walls = walls_beneath(eaves_mm, roof.facades, 1e-3 * reach_mm, settings.usual_overhang_m)
+    return None if math.isnan(walls.overhang_m) else walls
 
 
 def _require_extent(extent_m: float) -> None:

@@ -53,6 +53,10 @@ class RoofSettings(Parameters):
         minimum=0.0,
         maximum=1.0,
     )
+    wall_outline: bool = parameter(
+        False,
+        "With outline = eaves: find the walls beneath as well, for the columns wall_outline and overhang_m.",
+    )
     templates_spacing_m: float = parameter(
         0.6,
         "Arranged faces compete with simple roof shapes where points lie at least this far apart.",
@@ -146,6 +150,15 @@ class RoofSettings(Parameters):
     def at_walls(self) -> bool:
         """Whether outlines are drawn back to the walls; that takes straight lines."""
         return self.outline == "walls" and self.straight_eaves
+
+    @property
+    def finds_walls(self) -> bool:
+        """Whether the walls beneath outlines at the eaves are found for the records."""
+        return self.wall_outline and self.straight_eaves and not self.at_walls
+
+    def needs_facades(self, *, is_drawn: bool) -> bool:
+        """Whether a candidate needs the points around and beneath it; `is_drawn` if it has an outline already."""
+        return self.finds_walls or (self.at_walls and not is_drawn)
 
 
 class ArrangementSettings(Parameters):

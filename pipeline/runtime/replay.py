@@ -14,14 +14,14 @@ from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.facts import RecordContext
 from pipeline.export.obj import obj_text
 from pipeline.export.records import building_row
-from pipeline.export.solid_geometry import SOLID_COLUMNS
+from pipeline.export.solid_geometry import SHAPE_COLUMNS
 from pipeline.model import BuildingResult, Reason
 from pipeline.reconstruct import failed_building
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
 from pipeline.runtime.isolation.replay_bundle import Bundle
 from pipeline.runtime.stages.model_batch import model_bundle
 
-_OF_THE_RUN = ("geometry", "acquired_from", "acquired_to", "mesh_path", "input_hash", "settings_hash", *SOLID_COLUMNS)
+_OF_THE_RUN = ("geometry", "acquired_from", "acquired_to", "mesh_path", "input_hash", "settings_hash", *SHAPE_COLUMNS)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

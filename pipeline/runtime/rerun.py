@@ -320,8 +320,8 @@ class _Search:
         if record.input_hash is None:
             # the outline of a unit depends on all units of its block, which may reach beyond the split tiles
             return site.block is None
-        plan, at_walls = self.context.plan, self.request.settings.building.roof.at_walls
-        _, facts = gather(self.context.scratch, plan.grid, site, plan.gps_kind, beside=at_walls)
+        plan, roof = self.context.plan, self.request.settings.building.roof
+        _, facts = gather(self.context.scratch, plan.grid, site, plan.gps_kind, roof)
         return facts.input_hash == record.input_hash
 
 

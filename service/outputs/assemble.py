@@ -211,7 +211,7 @@ class _Sinks:
 
     def add(self, tile: RunTile) -> None:
         """Write one tile to all files."""
-        from pipeline.export.solid_geometry import SOLID_COLUMNS
+        from pipeline.export.solid_geometry import SHAPE_COLUMNS
         from service.outputs.footprints import feature_texts
         from service.outputs.merged_table import read_tile
         from service.outputs.meshes import zip_files
@@ -227,7 +227,7 @@ class _Sinks:
             planes.setdefault(plane.pop("building_id"), []).append(plane)
             self.tally.planes += 1
         self.tally.count_rejected(tables["rejected"].column("reason").to_pylist())
-        rows = [{**row, "tile": tile.key} for row in tables["buildings"].drop_columns(list(SOLID_COLUMNS)).to_pylist()]
+        rows = [{**row, "tile": tile.key} for row in tables["buildings"].drop_columns(list(SHAPE_COLUMNS)).to_pylist()]
         for feature in feature_texts(rows, self._to_wgs84):
             start = self._features.add(feature)
             self._index.add(

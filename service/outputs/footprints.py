@@ -13,13 +13,13 @@ import numpy.typing as npt
 import pyproj
 import shapely
 
-from pipeline.export.solid_geometry import SOLID_COLUMNS
+from pipeline.export.solid_geometry import SHAPE_COLUMNS
 from service.outputs.catalogue import ResultsCrs
 
 DECIMALS = 9
 """Decimals of degrees: a tenth of a millimetre."""
 
-_NOT_PROPERTIES = frozenset({"geometry", "bbox", *SOLID_COLUMNS})
+_NOT_PROPERTIES = frozenset({"geometry", "bbox", *SHAPE_COLUMNS})
 _UNKNOWN = (
     "The coordinate reference system of the tiles is unknown: these coordinates are theirs, not WGS 84. "
     "Give `crs` with the job to get degrees."

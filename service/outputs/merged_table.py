@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.errors import RunError
-from pipeline.export.geoparquet import geo_metadata, solid_names, stored_schema
+from pipeline.export.geoparquet import geo_metadata, shape_names, stored_schema
 
 ROWS_PER_GROUP = 5_000
 """Rows in one row group: a reader with a window skips the groups whose `bbox` is elsewhere."""
@@ -38,7 +38,7 @@ class MergedTable:
         self, path: Path, table_name: str, sources: Sequence[Path], projjson: Mapping[str, Any] | None
     ) -> None:
         no_geometry = np.empty(0, dtype=object)
-        nothing = geo_metadata(no_geometry, projjson, dict.fromkeys(solid_names(table_name), no_geometry))
+        nothing = geo_metadata(no_geometry, projjson, dict.fromkeys(shape_names(table_name), no_geometry))
         geo = united_metadata(_metadata(source) for source in sources) if sources else nothing
         plain = stored_schema(table_name).append(pa.field("tile", pa.string(), nullable=False))
         self._schema = plain.with_metadata({"geo": json.dumps(geo, sort_keys=True, separators=(",", ":"))})

@@ -10,8 +10,9 @@ from candidates_by_hand import candidate
 
 from pipeline.model import FloatArray
 from pipeline.prepared_cloud import prepare_cloud
+from pipeline.reconstruct import ReconstructSettings, reconstruct_building
 from pipeline.roof.block import block_plane
-from pipeline.roof.facades import Eave, FacadePoints, at_walls, eave_of, mean_overhang_m
+from pipeline.roof.facades import Eave, FacadePoints, eave_of, mean_overhang, walls_beneath
 from pipeline.roof.plan import partition_roof, roof_points
 from pipeline.roof.settings import RoofSettings
 from pipeline.ruler.simulation.als import scan_all
@@ -60,7 +61,8 @@ def south(points: FacadePoints, reach_m: float = 0.0) -> Eave:
 
 def drawn(points: FacadePoints, usual_m: float = 0.0) -> shapely.MultiPolygon:
     """The outline at the walls, in metres."""
-    outline_mm = at_walls(shapely.MultiPolygon([shapely.transform(EAVES, lambda xy: xy * 1e3)]), points, 0.0, usual_m)
+    eaves_mm = shapely.MultiPolygon([shapely.transform(EAVES, lambda xy: xy * 1e3)])
+    outline_mm = walls_beneath(eaves_mm, points, 0.0, usual_m).outline_mm
     assert outline_mm.is_valid
     return shapely.transform(outline_mm, lambda xy: xy / 1e3)
 
@@ -109,7 +111,7 @@ def test_a_courtyard_grows_to_its_walls() -> None:
     outside = ~shapely.contains_xy(hole, base.roof[:, 0], base.roof[:, 1])
     points = FacadePoints.of(base.xyz, NONE, base.roof[outside], NONE, 0.0)
     outline = shapely.MultiPolygon([shapely.transform(EAVES.difference(hole), lambda xy: xy * 1e3)])
-    result = shapely.transform(at_walls(outline, points, 0.0, 0.0), lambda xy: xy / 1e3)
+    result = shapely.transform(walls_beneath(outline, points, 0.0, 0.0).outline_mm, lambda xy: xy / 1e3)
     (yard,) = result.geoms[0].interiors
     assert np.allclose(yard.bounds, (3.6, 1.6, 8.4, 6.4), atol=0.03)
     assert np.allclose(result.bounds, (0.4, 0.4, 11.6, 7.6), atol=0.03)
@@ -139,7 +141,8 @@ def test_a_turned_and_moved_building_gives_the_turned_outline() -> None:
 
     there = FacadePoints.of(moved(points.xyz), NONE, moved(points.roof), NONE, 0.0)
     eaves = shapely.affinity.translate(shapely.affinity.rotate(EAVES, 27.0, origin=(0, 0)), 31.0, -12.0)
-    result = at_walls(shapely.MultiPolygon([shapely.transform(eaves, lambda xy: np.rint(xy * 1e3))]), there, 0.0, 0.0)
+    eaves_mm = shapely.MultiPolygon([shapely.transform(eaves, lambda xy: np.rint(xy * 1e3))])
+    result = walls_beneath(eaves_mm, there, 0.0, 0.0).outline_mm
     here = shapely.affinity.translate(shapely.affinity.rotate(drawn(points), 27.0, origin=(0, 0)), 31.0, -12.0)
     assert shapely.hausdorff_distance(shapely.transform(result, lambda xy: xy / 1e3), here) < 0.02
 
@@ -150,13 +153,41 @@ def test_a_ring_narrower_than_its_overhangs_stays_at_the_eaves() -> None:
     for width_m, stays in ((1.2, True), (2.0, False)):
         narrow = shapely.MultiPolygon([shapely.box(0.0, 0.0, 12e3, width_m * 1e3)])
         above = behind + np.array([0.0, width_m - 1.2, 0.0])
-        result = at_walls(narrow, facades(street(), above, wall(0, 0.7)), 0.0, 0.0)
+        result = walls_beneath(narrow, facades(street(), above, wall(0, 0.7)), 0.0, 0.0).outline_mm
         assert result.is_valid
         assert result.equals(narrow) == stays
 
 
 def test_the_mean_overhang_is_never_negative() -> None:
-    assert mean_overhang_m([Eave(length_m=3.0, is_open=True, overhang_m=-0.05)], 0.3) == 0.0
+    assert mean_overhang([Eave(length_m=3.0, is_open=True, overhang_m=-0.05)])[0] == 0.0
+
+
+def test_the_mean_overhang_is_the_surer_the_more_walls_are_seen_and_the_more_they_agree() -> None:
+    def sigma_of(*overhangs_m: float) -> float:
+        return mean_overhang([Eave(length_m=8.0, is_open=True, overhang_m=one) for one in overhangs_m])[1]
+
+    assert sigma_of(0.3, 0.3, 0.3, 0.3) == pytest.approx(sigma_of(0.3) / 2.0)
+    assert sigma_of(0.1, 0.5) > sigma_of(0.25, 0.35)
+    assert all(math.isnan(value) for value in mean_overhang([Eave(length_m=8.0, is_open=True, overhang_m=None)]))
+
+
+def test_walls_beneath_a_roof_are_in_the_record_and_its_solid_stays_at_the_eaves() -> None:
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0.2, 12.0, 0.4), np.arange(0.2, 8.0, 0.4)))
+    roof = np.column_stack((x, y, np.full(len(x), EAVE_Z)))
+    house = dataclasses.replace(
+        candidate(roof), ground_z_m=0.0, beside=np.concatenate((street(), wall(0, 0.4), wall(1, 0.4)))
+    )
+    results = [
+        reconstruct_building(house, "arrangement", ReconstructSettings(roof=RoofSettings(wall_outline=asked)))
+        for asked in (True, False)
+    ]
+    with_walls, without = results
+    assert without.walls is None
+    assert with_walls.footprint == without.footprint
+    assert with_walls.walls is not None
+    assert with_walls.walls.overhang_m == pytest.approx(0.4, abs=0.05)
+    assert 0.0 < with_walls.walls.overhang_sigma_m < 0.1
+    assert np.allclose(with_walls.walls.outline.bounds, (0.4, 0.4, 11.6, 7.6), atol=0.06)
 
 
 def test_the_usual_overhang_is_for_buildings_without_visible_walls() -> None:

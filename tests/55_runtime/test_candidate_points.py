@@ -2,14 +2,17 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
+import pytest
 
 from pipeline.model import Candidate
 from pipeline.runtime.run import RunSummary
 
 WALLS = {"outline": "walls"}
+WALLS_BENEATH = {"wall_outline": True}
 
 
 # --- split returns: the pulses that went on below the roof
@@ -53,10 +56,11 @@ def absolute_mm(candidate: Candidate, xyz: np.ndarray) -> set[tuple[int, ...]]:
     return {tuple(row) for row in np.rint((xyz + np.array(candidate.origin)) * 1e3).astype(np.int64).tolist()}
 
 
+@pytest.mark.parametrize("roof", [WALLS, WALLS_BENEATH], ids=["at the walls", "walls beneath"])
 def test_points_beside_are_those_of_the_file_that_are_near_and_no_points_of_the_candidate(
-    suburb: Path, reconstruct: Callable[..., RunSummary], candidates: list[Candidate]
+    suburb: Path, reconstruct: Callable[..., RunSummary], candidates: list[Candidate], roof: dict[str, Any]
 ) -> None:
-    reconstruct(suburb, settings={"roof": WALLS})
+    reconstruct(suburb, settings={"roof": roof})
     las = laspy.read(suburb)
     mm = np.rint(np.column_stack((las.x, las.y, las.z)) * 1e3).astype(np.int64)
     of, order = np.array(las.number_of_returns), np.array(las.return_number)

@@ -20,7 +20,7 @@ from small_buildings import Builder, Contexts
 
 from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.records import RecordContext, building_row
-from pipeline.export.solid_geometry import SOLID_COLUMNS
+from pipeline.export.solid_geometry import SHAPE_COLUMNS
 
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
 BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent, small.levelled)
@@ -147,7 +147,7 @@ def test_attributes_are_the_record_without_what_is_unknown(contexts: Contexts) -
     first = contexts["compound"]
     by_id = {feature["id"]: feature["CityObjects"][feature["id"]]["attributes"] for feature in sequence(first)[1:]}
     row = building_row(small.courtyard(), first, mesh_path="meshes/t/a.obj")
-    wanted = {n: v for n, v in row.items() if v is not None and n not in {"geometry", "building_id", *SOLID_COLUMNS}}
+    wanted = {n: v for n, v in row.items() if v is not None and n not in {"geometry", "building_id", *SHAPE_COLUMNS}}
     reported = {name: value for name, value in wanted.items() if not name.startswith("acquired")}
     assert {n: v for n, v in by_id["courtyard"].items() if not n.startswith("acquired")} == reported
     assert by_id["courtyard"]["acquired_from"] == "2014-03-01T10:00:00.000125+00:00"

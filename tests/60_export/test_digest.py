@@ -96,6 +96,8 @@ def test_every_column_of_content_counts(run_dir: Path, tmp_path: Path, name: str
     def change(table: pa.Table) -> pa.Table:
         row = next((i for i, value in enumerate(table[name].to_pylist()) if value is not None), 0)
         value = table[name][row].as_py()
+        if value is None and pa.types.is_floating(table.schema.field(name).type):
+            value = 0.0
         kinds = {
             bool: lambda: not value,
             int: lambda: value + 1,

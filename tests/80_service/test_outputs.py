@@ -24,7 +24,7 @@ import small_buildings as small
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
-from pipeline.export.solid_geometry import SOLID_COLUMNS
+from pipeline.export.solid_geometry import SHAPE_COLUMNS
 from pipeline.runtime.manifest import RunStatus
 from service.errors import NoSuchOutputError
 from service.outputs import OUTPUTS, merged_table, output_file, read_catalogue, write_outputs
@@ -290,7 +290,7 @@ def test_the_footprints_are_rfc_7946_with_all_columns_and_all_buildings(out_dir:
     assert found["type"] == "FeatureCollection"
     assert "coordRefSys" not in found
     assert sorted(feature["id"] for feature in found["features"]) == sorted(table["building_id"].to_pylist())
-    columns = set(table.schema.names) - {"geometry", "bbox", *SOLID_COLUMNS}
+    columns = set(table.schema.names) - {"geometry", "bbox", *SHAPE_COLUMNS}
     for feature in found["features"]:
         assert set(feature["properties"]) == columns
         if feature["geometry"] is None:

@@ -17,6 +17,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.export.facts import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.model import BoolArray, Candidate, IntArray
+from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.sites import CandidateSite
 from pipeline.runtime.stages.window_points import bucket_paths
@@ -138,13 +139,11 @@ def gather(
     grid: TileGrid,
     site: CandidateSite,
     gps_kind: GpsTimeKind,
-    *,
-    beside: bool = False,
+    roof: RoofSettings | None = None,
 ) -> tuple[Candidate, CandidateFacts]:
     """One candidate with the terrain around it.
 
-    `gps_kind` says whether GPS times can be converted to dates, `beside` whether to add the points around and beneath
-    it; a candidate with a known outline has none.
+    `gps_kind` says whether GPS times can be converted to dates, `roof` whether to add the points around and beneath it.
     """
     points = points_of(scratch, site)
     footprint = site.footprint
@@ -161,14 +160,14 @@ def gather(
     margin = _VIEW_MARGIN_M * MM
     view = Window(x0_mm=int(low[0]), y0_mm=int(low[1]), x1_mm=int(high[0]) + 1, y1_mm=int(high[1]) + 1).grown(margin)
     around = surroundings_of(scratch, grid, view)
-    roof = np.zeros(around.occupied.shape, np.bool_)
-    roof[columns_mm[1] // CELL_MM - around.row0, columns_mm[0] // CELL_MM - around.column0] = True
+    own = np.zeros(around.occupied.shape, np.bool_)
+    own[columns_mm[1] // CELL_MM - around.row0, columns_mm[0] // CELL_MM - around.column0] = True
     # terrain far from all points may lie in a tile without points, which is never made
     points_near = _grown(around.occupied, _EMPTY_CELLS)
     known = (around.elevation_mm != NO_DATA) & points_near
-    outline = _grown(roof, _OUTLINE_CELLS) & ~roof & known
-    sampled = known & _grown(roof, _GROUND_MARGIN_M)
-    if not roof.any():
+    outline = _grown(own, _OUTLINE_CELLS) & ~own & known
+    sampled = known & _grown(own, _GROUND_MARGIN_M)
+    if not own.any():
         sampled = known
     rows, columns = np.nonzero(sampled)
     ground_mm = np.column_stack(
@@ -182,8 +181,8 @@ def gather(
     digest = hashlib.sha256(points.tobytes())
     digest.update(np.ascontiguousarray(ground_mm).tobytes())
     beside_mm = later_mm = np.empty((0, 3), np.int64)
-    if beside and footprint is None and site.outline is None:
-        beside_mm, later_mm = _beside(scratch, grid, xyz, _grown(roof, _BESIDE_CELLS), around)
+    if roof is not None and footprint is None and roof.needs_facades(is_drawn=site.outline is not None):
+        beside_mm, later_mm = _beside(scratch, grid, xyz, _grown(own, _BESIDE_CELLS), around)
         digest.update(beside_mm.tobytes())
         digest.update(later_mm.tobytes())
     if site.outline is not None:
@@ -200,7 +199,7 @@ def gather(
         outline=None if site.outline is None else _moved(site.outline, origin_mm),
         beside=(beside_mm - origin_mm) / MM,
         beside_later=(later_mm - origin_mm) / MM,
-        touches_data_edge=_touches_data_edge(roof, ~points_near),
+        touches_data_edge=_touches_data_edge(own, ~points_near),
     )
     first, last = _acquired(points, gps_kind)
     return candidate, CandidateFacts(input_hash=digest.hexdigest(), acquired_from=first, acquired_to=last)

@@ -259,7 +259,7 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     made_from = ""
     reused = False
     try:
-        candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, beside=task.settings.roof.at_walls)
+        candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, task.settings.roof)
         made_from = key_of(candidate, task.method, _settings_key(task.settings))
         earlier = _modelled_before(task, site.building_id, made_from)
         reused = earlier is not None
@@ -322,7 +322,7 @@ def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
     from pipeline.reconstruct import failed_building  # as above
 
     task = task.way_of(site)
-    candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, beside=task.settings.roof.at_walls)
+    candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, task.settings.roof)
     result = failed_building(candidate, task.method, loss.reason, loss.detail)
     incident = Incident(
         reason=loss.reason.value,

@@ -136,7 +136,8 @@ def _drawn(task: OutlineTask, units: Sequence[CandidateSite]) -> dict[str, Multi
         ranges=tuple(part for site in units for part in site.ranges),
         points=len(points),
     )
-    candidate, _ = gather(task.scratch, task.grid, whole, GpsTimeKind.NONE, beside=task.settings.at_walls)
+    facades = task.settings if task.settings.at_walls else None
+    candidate, _ = gather(task.scratch, task.grid, whole, GpsTimeKind.NONE, facades)
     outlines = unit_outlines(candidate, unit[canonical_order(points)], task.settings)
     return {
         site.building_id: translate(outline, candidate.origin[0], candidate.origin[1])
