@@ -194,6 +194,7 @@ def split_tile(
             z_mm=points.z_mm[core_index],
             height_mm=height[core_index],
             last=_is_last(points)[core_index],
+            several=points.return_count[core_index] > 1,
             allowed=allowed,
         ),
         (core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm),

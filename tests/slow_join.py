@@ -41,6 +41,7 @@ def _figures(sums: IntArray) -> dict[str, float]:
     grown_outline_mm = outline_mm + 2.0 * math.pi * half_mm
     judged = max(1, int(sums[Sum.PLANAR] + sums[Sum.ROUGH]))
     vertices = max(1, int(sums[Sum.VERTICES]))
+    points = max(1, int(sums[Sum.POINTS]))
     mean_mm = float(sums[Sum.HEIGHT]) / vertices
     # heights over a slope are uniform between eave and ridge: the ridge lies sqrt(3) standard deviations above the mean
     spread_mm = math.sqrt(max(0.0, 3.0 * (float(sums[Sum.HEIGHT2]) / vertices - mean_mm * mean_mm)))
@@ -52,6 +53,9 @@ def _figures(sums: IntArray) -> dict[str, float]:
         "planar_share": float(sums[Sum.PLANAR]) / judged,
         "judged": float(sums[Sum.PLANAR] + sums[Sum.ROUGH]),
         "canopy_share": float(sums[Sum.CANOPY]) / max(1, int(sums[Sum.CANOPY] + sums[Sum.POINTS])),
+        "points": float(points),
+        "several_share": float(sums[Sum.SEVERAL]) / points,
+        "through_share": float(sums[Sum.THROUGH]) / points,
         "wall_share": float(sums[Sum.WALL]) / outline_mm,
         "top_share": float(sums[Sum.WALL_TOP]) / max(1, int(sums[Sum.WALL])),
         "step_share": float(sums[Sum.STEP]) / outline_mm,
@@ -68,9 +72,13 @@ def _fault(kind: int, sums: IntArray, settings: CandidateSettings) -> tuple[Reas
     """The reason and its detail."""
     f = _figures(sums)
     sure = f["judged"] > 0 and f["planar_share"] >= settings.sure_planar_share
-    sure = sure and f["canopy_share"] <= settings.max_canopy_share
     slender = f["height_m"] > settings.max_slenderness * f["width_m"]
     sure = sure and (f["area_m2"] >= settings.doubtful_area_m2 or not slender)
+    p = settings.max_through_share
+    scatter = math.sqrt(p * (1.0 - p) / f["points"])
+    is_intact = f["several_share"] > 0.0 and f["several_share"] + scatter <= p
+    sure = sure or (is_intact and f["area_m2"] >= settings.doubtful_area_m2)
+    sure = sure and f["canopy_share"] <= settings.max_canopy_share
     min_m2 = settings.min_area_m2
     if kind != FacetKind.BUILDING and not sure:
         min_m2 = max(min_m2, settings.doubtful_area_m2)
@@ -83,10 +91,14 @@ def _fault(kind: int, sums: IntArray, settings: CandidateSettings) -> tuple[Reas
     if kind == FacetKind.CROWN:
         rough = "a crown: most of what surrounds its vertices is rough"
         return Reason.VEGETATION, f"{rough}, planar share {f['planar_share']:.2f}"
-    if f["judged"] == 0:
+    if f["judged"] == 0 and not is_intact:
         return Reason.TOO_FEW_POINTS, "no vertex has enough neighbours to show whether the surface is planar"
-    if f["planar_share"] < settings.min_planar_share:
+    if f["planar_share"] < settings.min_planar_share and not is_intact:
         return Reason.VEGETATION, f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}"
+    most = p + settings.beam_m / max(1.0, f["width_m"]) + scatter
+    if f["through_share"] > most:
+        share = f"pulses of {f['through_share']:.2f} of its points go on below"
+        return Reason.VEGETATION, f"{share}, at most {most:.2f}"
     if f["canopy_share"] > settings.max_canopy_share:
         return Reason.VEGETATION, f"canopy share {f['canopy_share']:.2f}, at most {settings.max_canopy_share:g}"
     width_m = settings.min_width_m * (0.5 if sure else 1.0)

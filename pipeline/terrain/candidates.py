@@ -25,6 +25,8 @@ NOWHERE = 2**62
 """Coordinate of the smallest point of a surface that has none."""
 SOLID = (FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.CROWN)
 """Kinds of the surfaces that are judged."""
+_NARROW_M = 1.0
+"""Narrower surfaces count as this wide: their width is known no better."""
 _BLOCK = 65_536
 """Surfaces judged at once: it limits the memory to 20 MB."""
 
@@ -63,7 +65,9 @@ class Fault(IntEnum):
     BELOW_Z_AVG = 8
     TOO_SPARSE = 9
     """No vertex has enough neighbours to show whether the surface is planar."""
-    NOT_JUDGED = 10
+    PIERCED = 10
+    """Too many pulses go on below it."""
+    NOT_JUDGED = 11
     """Ground, a step between levels, or a surface without points."""
 
 
@@ -77,6 +81,7 @@ REASON_OF_FAULT = {
     Fault.NO_WALLS: Reason.NO_WALLS,
     Fault.BELOW_Z_AVG: Reason.BELOW_Z_AVG,
     Fault.TOO_SPARSE: Reason.TOO_FEW_POINTS,
+    Fault.PIERCED: Reason.VEGETATION,
 }
 """The reason in the records for each fault."""
 
@@ -103,6 +108,7 @@ def _figures(sums: IntArray) -> dict[str, FloatArray]:
     vertices = np.maximum(1, sums[:, Sum.VERTICES])
     mean_mm = sums[:, Sum.HEIGHT] / vertices
     # heights over a slope are uniform between eave and ridge: the ridge lies sqrt(3) standard deviations above the mean
+    points = np.maximum(1, sums[:, Sum.POINTS])
     spread_mm = np.sqrt(np.maximum(0.0, 3.0 * (sums[:, Sum.HEIGHT2] / vertices - mean_mm * mean_mm)))
     return {
         "area_m2": area_mm2 / 1e6,
@@ -112,10 +118,26 @@ def _figures(sums: IntArray) -> dict[str, FloatArray]:
         "planar_share": sums[:, Sum.PLANAR] / np.maximum(1, known),
         "judged": known.astype(np.float64),
         "canopy_share": sums[:, Sum.CANOPY] / np.maximum(1, sums[:, Sum.CANOPY] + sums[:, Sum.POINTS]),
+        "points": points.astype(np.float64),
+        "several_share": sums[:, Sum.SEVERAL] / points,
+        "through_share": sums[:, Sum.THROUGH] / points,
         "wall_share": sums[:, Sum.WALL] / outline_mm,
         "top_share": sums[:, Sum.WALL_TOP] / np.maximum(1, sums[:, Sum.WALL]),
         "step_share": sums[:, Sum.STEP] / outline_mm,
     }
+
+
+def _penetration(f: dict[str, FloatArray], settings: CandidateSettings) -> tuple[BoolArray, FloatArray]:
+    """Which surfaces surely let few pulses through, and the largest share that may go on below each.
+
+    At the edge of a roof pulses go on, too: the narrower a surface, the larger the part of it that is edge. Shares of
+    few points scatter by the standard deviation of a binomial distribution. A surface without any pulse of several
+    returns shows nothing: the scanner may record one return each.
+    """
+    p = settings.max_through_share
+    scatter = np.sqrt(p * (1.0 - p) / f["points"])
+    is_intact = (f["several_share"] > 0.0) & (f["several_share"] + scatter <= p)
+    return is_intact, p + settings.beam_m / np.maximum(_NARROW_M, f["width_m"]) + scatter
 
 
 def _limits(
@@ -123,9 +145,11 @@ def _limits(
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Which surfaces are surely roofs, and the least area (m2) and width (m) of each."""
     sure = (f["judged"] > 0) & (f["planar_share"] >= settings.sure_planar_share)
-    sure &= f["canopy_share"] <= settings.max_canopy_share
     slender = f["height_m"] > settings.max_slenderness * f["width_m"]
     sure &= (f["area_m2"] >= settings.doubtful_area_m2) | ~slender
+    is_intact, _ = _penetration(f, settings)
+    sure |= is_intact & (f["area_m2"] >= settings.doubtful_area_m2)
+    sure &= f["canopy_share"] <= settings.max_canopy_share
     doubtful = (kind != FacetKind.BUILDING) & ~sure
     min_m2 = np.where(doubtful, max(settings.min_area_m2, settings.doubtful_area_m2), settings.min_area_m2)
     return sure, min_m2, settings.min_width_m * np.where(sure, 0.5, 1.0)
@@ -135,14 +159,16 @@ def _faults(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> Kin
     """The first fault of each of some surfaces, by their kind and sums alone."""
     f = _figures(sums)
     sure, min_m2, width_m = _limits(kind, f, settings)
+    is_intact, max_through = _penetration(f, settings)
     # the first rule that holds decides
     rules = [
         (f["area_m2"] < min_m2, Fault.TOO_SMALL),
         (kind == FacetKind.BUILDING, Fault.NONE),
         (f["top_m"] < settings.min_height_m, Fault.TOO_LOW),
         (kind == FacetKind.CROWN, Fault.CROWN),
-        (f["judged"] == 0, Fault.TOO_SPARSE),
-        (f["planar_share"] < settings.min_planar_share, Fault.ROUGH),
+        (~is_intact & (f["judged"] == 0), Fault.TOO_SPARSE),
+        (~is_intact & (f["planar_share"] < settings.min_planar_share), Fault.ROUGH),
+        (f["through_share"] > max_through, Fault.PIERCED),
         (f["canopy_share"] > settings.max_canopy_share, Fault.COVERED),
         (f["width_m"] < width_m, Fault.TOO_NARROW),
         (f["wall_share"] < settings.min_wall_share, Fault.NO_WALLS),
@@ -181,6 +207,7 @@ def verdicts(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> It
         faults, figures = _faults(kind[own], sums[own], settings), _figures(sums[own])
         _, min_m2, width_m = _limits(kind[own], figures, settings)
         figures |= {"min_m2": min_m2, "least_width_m": width_m}
+        figures |= {"max_through": _penetration(figures, settings)[1]}
         walls = np.maximum(1, sums[own, Sum.WALLS])
         figures |= {"z_avg": sums[own, Sum.WALLS_Z_MX] / walls / 1000.0}
         figures |= {"own": sums[own, Sum.WALLS_OWN_Z] / walls / 1000.0}
@@ -205,6 +232,9 @@ def _verdict(fault: Fault, f: Mapping[str, float], settings: CandidateSettings) 
             detail = f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}"
         case Fault.TOO_SPARSE:
             detail = "no vertex has enough neighbours to show whether the surface is planar"
+        case Fault.PIERCED:
+            share = f["through_share"]
+            detail = f"pulses of {share:.2f} of its points go on below, at most {f['max_through']:.2f}"
         case Fault.COVERED:
             detail = f"canopy share {f['canopy_share']:.2f}, at most {settings.max_canopy_share:g}"
         case Fault.TOO_NARROW:

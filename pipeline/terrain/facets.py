@@ -66,7 +66,9 @@ class FacetLimits(NamedTuple):
 
     max_circumradius_mm: float
     wall_mm: int
-    """MX_zdiff from which a facet is a wall."""
+    """MX_zdiff from which a facet is a wall, unless it is flatter than `wall_slope`."""
+    wall_slope: float
+    """Least rise over run of a wall."""
     steep_slope: float
     """Rise over run from which a facet cuts too, if it is `steep_mm` high."""
     steep_mm: int
@@ -136,12 +138,12 @@ def classify_facets(vertices: SceneVertices, facets: LabelArray, limits: FacetLi
         if ground > 0 or excluded:
             out[f] = FacetKind.BORDER
             continue
-        cuts = z_difference >= limits.wall_mm
-        if not cuts and z_difference >= limits.steep_mm:
+        cuts = False
+        if z_difference >= limits.steep_mm:
             # slope by integer cross products: the facet's normal is (nx, ny, area2)
             uz, vz = z[b] - z[a], z[c] - z[a]
             nx, ny = uy * vz - uz * vy, uz * vx - ux * vz
-            steep = float(area2) * limits.steep_slope
+            steep = float(area2) * (limits.wall_slope if z_difference >= limits.wall_mm else limits.steep_slope)
             cuts = float(nx) * nx + float(ny) * ny > steep * steep
         if cuts:
             high = min(height[a], height[b], height[c]) >= limits.step_height_mm

@@ -44,6 +44,10 @@ class Sum(IntEnum):
     """Earlier returns well above the fragment."""
     HEIGHT2 = 15
     """Squared heights of the vertices above the terrain, mm2."""
+    SEVERAL = 16
+    """Points from pulses with several returns."""
+    THROUGH = 17
+    """Points whose pulse went on to a later return."""
 
 
 N_SUMS = len(Sum)

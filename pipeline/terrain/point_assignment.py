@@ -75,6 +75,8 @@ class ScenePoints(NamedTuple):
     """Height above the terrain."""
     last: BoolArray
     """Last return of its pulse."""
+    several: BoolArray
+    """The pulse has more than one return."""
     allowed: KindArray
     """By the trusted classes: 0 may not belong to a building, 2 is building, 1 anything else."""
 
@@ -183,7 +185,7 @@ def assign_points(
     sums: IntArray,
     lowest_point: IntArray,
 ) -> LabelArray:
-    """Fragment of every point of the core, int32 (n,), -1 where none; fills the columns POINTS and CANOPY of sums.
+    """Fragment of every point of the core, int32 (n,), -1 where none; fills the columns of sums that count points.
 
     A point belongs to the surface of the facet around it, or at walls and borders to that of the vertex nearest in
     elevation. `lowest_point` (f, 3) int64 gets the smallest point of each fragment. All in mm.
@@ -229,6 +231,8 @@ def assign_points(
             continue
         out[i] = fragment
         sums[fragment, Sum.POINTS] += 1
+        sums[fragment, Sum.SEVERAL] += points.several[i]
+        sums[fragment, Sum.THROUGH] += not points.last[i]
         p = lowest_point[fragment]
         if px < p[0] or (px == p[0] and (py < p[1] or (py == p[1] and pz < p[2]))):
             p[0], p[1], p[2] = px, py, pz

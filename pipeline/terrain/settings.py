@@ -178,6 +178,13 @@ class SurfaceSettings(Parameters):
         6.0, "Facets with a wider circumcircle bridge a gap in the data.", unit="m", minimum=1.0, maximum=30.0
     )
     wall_m: float = parameter(2.0, "MX_zdiff from which a facet is a wall.", unit="m", minimum=0.5, maximum=10.0)
+    wall_deg: float = parameter(
+        55.0,
+        "Flatter facets are not walls: where points lie metres apart, a pitched roof rises that far between them.",
+        unit="deg",
+        minimum=0.0,
+        maximum=90.0,
+    )
     steep_deg: float = parameter(
         70.0, "Facets steeper than this cut too, from steep_m on.", unit="deg", minimum=45.0, maximum=90.0
     )
@@ -253,6 +260,20 @@ class CandidateSettings(Parameters):
     )
     max_canopy_share: float = parameter(
         0.35, "Largest share of earlier returns above the surface.", minimum=0.0, maximum=1.0
+    )
+    max_through_share: float = parameter(
+        0.15,
+        "Largest share of points whose pulses go on to a later return; more for narrow surfaces and for few points. A "
+        "surface surely below it need not be planar.",
+        minimum=0.01,
+        maximum=1.0,
+    )
+    beam_m: float = parameter(
+        0.1,
+        "Added to that share per metre of mean width: the width of a pulse, half of which goes on at an edge.",
+        unit="m",
+        minimum=0.0,
+        maximum=2.0,
     )
     min_wall_share: float = parameter(0.15, "Least share of the outline that touches walls.", minimum=0.0, maximum=1.0)
     min_top_share: float = parameter(

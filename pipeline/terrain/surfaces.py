@@ -77,6 +77,7 @@ def fragments_of(
     limits = FacetLimits(
         max_circumradius_mm=settings.max_circumradius_m * 1000.0,
         wall_mm=wall_mm,
+        wall_slope=math.tan(math.radians(min(settings.wall_deg, settings.steep_deg, 89.99))),
         steep_slope=math.tan(math.radians(min(settings.steep_deg, 89.99))),
         steep_mm=round(settings.steep_m * 1000),
         step_height_mm=round(settings.step_height_m * 1000),

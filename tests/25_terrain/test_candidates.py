@@ -86,6 +86,11 @@ def test_a_roof_with_walls_around_it_is_a_candidate() -> None:
         ),
         ({Sum.HEIGHT: 400 * 1500}, Reason.TOO_LOW, "top 1.50 m above the terrain, at least 2"),
         ({Sum.PLANAR: 40, Sum.ROUGH: 60}, Reason.VEGETATION, "planar share 0.40, at least 0.5"),
+        (
+            {Sum.SEVERAL: 800, Sum.THROUGH: 320},
+            Reason.VEGETATION,
+            "pulses of 0.20 of its points go on below, at most 0.18",
+        ),
         ({Sum.CANOPY: 1600}, Reason.VEGETATION, "canopy share 0.50, at most 0.35"),
         (
             {**DOUBTFUL, Sum.BOUNDARY: 200_000, Sum.WALL: 200_000},
@@ -121,6 +126,14 @@ def test_each_reason_names_its_figure_and_threshold(changes: dict[Sum, int], rea
         ),
         ({Sum.PLANAR: 50, Sum.ROUGH: 50}, {Sum.PLANAR: 49, Sum.ROUGH: 51}),
         ({Sum.POINTS: 65, Sum.CANOPY: 35}, {Sum.POINTS: 64, Sum.CANOPY: 36}),
+        # the few points of a small surface show less
+        (
+            {Sum.POINTS: 20, Sum.SEVERAL: 8, Sum.THROUGH: 4},
+            {Sum.POINTS: 1600, Sum.SEVERAL: 640, Sum.THROUGH: 320},
+        ),
+        # a rough roof that hardly any pulse pierces; a scanner of single returns shows nothing of the kind
+        ({Sum.PLANAR: 0, Sum.ROUGH: 380, Sum.SEVERAL: 160}, {Sum.PLANAR: 0, Sum.ROUGH: 380}),
+        ({Sum.PLANAR: 0, Sum.ROUGH: 0, Sum.SEVERAL: 160}, {Sum.PLANAR: 0, Sum.ROUGH: 0, Sum.SEVERAL: 240}),
         ({Sum.WALL: 6000, Sum.WALL_TOP: 6000}, {Sum.WALL: 5999, Sum.WALL_TOP: 5999}),
         ({**DOUBTFUL, Sum.WALL_TOP: 12_000}, {**DOUBTFUL, Sum.WALL_TOP: 11_999}),
     ],
@@ -195,6 +208,8 @@ some_sums = st.fixed_dictionaries(
         Sum.WALLS_OWN_Z: st.integers(-(10**6), 10**6),
         Sum.POINTS: st.integers(0, 5000),
         Sum.CANOPY: st.integers(0, 2000),
+        Sum.SEVERAL: st.integers(0, 1000),
+        Sum.THROUGH: st.integers(0, 1000),
     }
 )
 """Anything, and more often than by chance what lies at a threshold or passes most of them."""

@@ -56,8 +56,8 @@ class Scene:
 
     def facet_kinds(self) -> KindArray:
         """Kinds of the facets."""
-        slope = math.tan(math.radians(SETTINGS.steep_deg))
-        return classify_facets(self.vertices, self.tin.facets, FacetLimits(6000.0, 2000, slope, 1000, 2000))
+        wall, steep = (math.tan(math.radians(deg)) for deg in (SETTINGS.wall_deg, SETTINGS.steep_deg))
+        return classify_facets(self.vertices, self.tin.facets, FacetLimits(6000.0, 2000, wall, steep, 1000, 2000))
 
 
 def built(
@@ -93,6 +93,7 @@ def built(
             z_mm=pz,
             height_mm=pz,
             last=np.ones(len(px), np.bool_),
+            several=np.zeros(len(px), np.bool_),
             allowed=np.ones(len(px), np.int8),
         ),
     )
@@ -155,7 +156,7 @@ def slow_kind(scene: Scene, facet: npt.NDArray[np.int32]) -> FacetKind:
         return FacetKind.BORDER
     normal = np.cross(p[1] - p[0], p[2] - p[0])
     slope_deg = math.degrees(math.acos(normal[2] / np.linalg.norm(normal)))
-    if difference >= 2.0 or (difference >= 1.0 and slope_deg > 70.0):
+    if (difference >= 2.0 and slope_deg > 55.0) or (difference >= 1.0 and slope_deg > 70.0):
         return FacetKind.STEP if v.height_mm[facet].min() >= 2000 else FacetKind.BORDER
     if (kinds == VertexKind.OBJECT).all():
         return FacetKind.OBJECT

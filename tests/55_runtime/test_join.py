@@ -134,6 +134,7 @@ def patchwork(seed: int, *, side_m: int, block_m: float, ground: float) -> Patch
             z_mm=z,
             height_mm=z,
             last=np.ones(x.size, np.bool_),
+            several=random.random(x.size) < 0.2,
             # what may belong to no building leaves surfaces without points
             allowed=np.where(random.random((blocks, blocks)) < 0.1, 0, 1)[at][keep].astype(np.int8),
         ),
@@ -245,6 +246,9 @@ def any_fragments(seed: int, most: int, facets: int) -> list[WholeSplit]:
         sums[:, Sum.HEIGHT] = sums[:, Sum.VERTICES] * random.choice([1500, 4000], count, p=[0.2, 0.8])
         sums[:, Sum.PLANAR], sums[:, Sum.ROUGH] = random.choice([0, 5, 20], count), random.choice([0, 5], count)
         sums[:, Sum.BOUNDARY] = 12_000
+        sums[:, Sum.POINTS] = random.choice([1, 20, 200], count)
+        sums[:, Sum.SEVERAL] = sums[:, Sum.POINTS] * random.choice([0, 0.1, 0.5], count)
+        sums[:, Sum.THROUGH] = sums[:, Sum.SEVERAL] // 2
         for column in (Sum.WALL, Sum.WALL_TOP, Sum.STEP):
             sums[:, column] = random.choice(SHARES, count)
         low = random.integers(-9000, 9000, (count, 2))
