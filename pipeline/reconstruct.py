@@ -38,6 +38,7 @@ from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, model_quality
 from pipeline.quality.residuals import vertical_residuals
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_forms, block_plane
+from pipeline.roof.floor_cut import cut_at_floor
 from pipeline.roof.flush_walls import unite_flush_walls
 from pipeline.roof.footprint import hull_of_points, outline
 from pipeline.roof.forms import UNDRAWABLE, FaceForm, arranged_forms, template_forms, traced_forms
@@ -233,10 +234,11 @@ def _own_model(building: _Building, segmentation: Segmentation, roof: RoofPoints
             bic_margin=margin,
         )
     level, extended = level_unsupported_faces(drawn, roof, planes, ground_z_m, settings)
+    cut, cut_planes = cut_at_floor(level, extended, ground_z_m + settings.min_clearance_m)
     return _Model(
         lod="2.2",
-        parts=large_parts(solid_parts(level, extended, ground_z_m), settings.min_part_area_m2),
-        planes=extended,
+        parts=large_parts(solid_parts(cut, cut_planes, ground_z_m), settings.min_part_area_m2),
+        planes=cut_planes,
         roof_type=segmentation.roof_type,
         bic_margin=margin,
         is_levelled=_is_much_changed(drawn, level),

@@ -21,7 +21,10 @@ from pipeline.console import Console
 def simulate(
     suite: Annotated[
         str,
-        typer.Argument(metavar="SUITE", help="suburb, town, cube, hofmann310, sweep, city or one of the roof shapes."),
+        typer.Argument(
+            metavar="SUITE",
+            help="suburb, town, cube, hofmann310, sweep, city, low_buildings or one of the roof shapes.",
+        ),
     ],
     out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: LAZ tiles and the truth beside them.")],
     seed: Annotated[

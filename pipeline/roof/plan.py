@@ -71,7 +71,8 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings) -> RoofPoints:
     """
     candidate = cloud.candidate
     highest = candidate.points[cloud.highest]
-    is_above = highest[:, 2] >= candidate.ground_z_m + settings.min_roof_height_m
+    least_z_m = candidate.ground_z_m + settings.min_roof_height_m if candidate.footprint is None else -math.inf
+    is_above = highest[:, 2] >= least_z_m
     index, points = cloud.highest[is_above], highest[is_above]
     name, fewest = "min_points", settings.min_points
     if candidate.footprint is not None and settings.min_points_in_footprint < fewest:
@@ -324,8 +325,9 @@ def level_unsupported_faces(
 ) -> tuple[RoofPartition, list[Plane]]:
     """Replace the plane of every face that leaves its data by a horizontal one at the median of the face's own points.
 
-    Steep planes that are continued a little too far dip (nearly) under the floor, or rise far above all points. Returns
-    the partition with the labels of the new planes, which follow the old ones in the list.
+    Steep planes that are continued too far rise far above all points, or dip far below them. A face that only comes
+    down to the floor keeps its plane: `cut_at_floor` ends it there. Returns the partition with the labels of the new
+    planes, which follow the old ones in the list.
     """
     labels = partition.labels.copy()
     extended = list(planes)
@@ -343,7 +345,8 @@ def level_unsupported_faces(
     starts = np.searchsorted(face, np.arange(len(labels)))
     bottoms, tops = np.minimum.reduceat(z, starts), np.maximum.reduceat(z, starts)
     tolerance = settings.max_overshoot_m
-    fits = (bottoms >= np.maximum(floor, lowest[labels] - tolerance)) & (tops <= highest[labels] + tolerance)
+    ends = np.maximum(bottoms, floor)
+    fits = (ends >= lowest[labels] - tolerance) & (tops <= highest[labels] + tolerance) & (tops > floor)
     for k in np.flatnonzero(~fits).tolist():
         polygon, label = partition.polygons[k], int(labels[k])
         middle = 0.5 * (float(bottoms[k]) + float(tops[k]))

@@ -19,7 +19,11 @@ class RoofSettings(Parameters):
     )
     max_points: int = parameter(4_000_000, "A candidate with more points is refused as too complex.", minimum=1000)
     min_roof_height_m: float = parameter(
-        1.5, "Points lower than this above the floor are not roof points.", unit="m", minimum=0.2, maximum=10.0
+        1.5,
+        "Points lower than this above the floor are not roof points, except in a given footprint.",
+        unit="m",
+        minimum=0.2,
+        maximum=10.0,
     )
     gap_spacings: float = parameter(
         1.5,
@@ -118,8 +122,8 @@ class RoofSettings(Parameters):
         maximum=3.0,
     )
     min_clearance_m: float = parameter(
-        0.4,
-        "A roof face that comes nearer to the floor than this becomes horizontal.",
+        0.1,
+        "A roof face is level where it would come nearer to the floor than this.",
         unit="m",
         minimum=0.05,
         maximum=5.0,

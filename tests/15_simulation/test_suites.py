@@ -44,9 +44,8 @@ def test_an_unknown_split_and_an_impossible_draw_are_both_reported() -> None:
 
 
 def test_every_roof_shape_is_a_suite_beside_the_scenes() -> None:
-    assert {"suburb", "town", "cube", "hofmann310", "sweep", "city"} | {str(shape) for shape in RoofShape} == set(
-        SUITES
-    )
+    scenes = {"suburb", "town", "cube", "hofmann310", "sweep", "city", "low_buildings"}
+    assert scenes | {str(shape) for shape in RoofShape} == set(SUITES)
 
 
 @pytest.mark.slow
@@ -64,7 +63,7 @@ def test_the_same_seed_gives_the_same_scene_and_another_one_another(name: str) -
         )
 
 
-@pytest.mark.parametrize("name", ["hofmann310", "sweep", "city"])
+@pytest.mark.parametrize("name", ["hofmann310", "sweep", "city", "low_buildings"])
 def test_buildings_have_names_of_their_own_and_never_overlap(name: str) -> None:
     scene = scene_of(name, 1003)
     assert len({one.building_id for one in scene.buildings}) == len(scene.buildings)

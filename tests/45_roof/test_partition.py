@@ -17,6 +17,7 @@ from pipeline.errors import BuildingError
 from pipeline.model import IntArray, LabelArray, Plane, Reason, Solid, Tin
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.validity import check_solid
+from pipeline.roof.floor_cut import cut_at_floor
 from pipeline.roof.partition import MinAreas, RoofPartition, absorb_small_regions, connected_regions, march
 from pipeline.roof.plan import level_unsupported_faces, partition_roof, plan_forms, roof_points
 from pipeline.roof.settings import RoofSettings
@@ -245,6 +246,7 @@ def test_random_labels_and_planes_always_give_some_valid_form(seed: int, with_fo
     for form in plan_forms(plan, roof, roof_settings):
         try:
             drawn, all_planes = level_unsupported_faces(form(), roof, planes, 0.0, roof_settings)
+            drawn, all_planes = cut_at_floor(drawn, all_planes, roof_settings.min_clearance_m)
             parts = solid_parts(drawn, all_planes, 0.0)
         except BuildingError:
             continue

@@ -12,6 +12,9 @@ from pipeline.ruler.simulation.als import ScannerSettings
 from pipeline.ruler.simulation.city import CITY_SCANNER, TILE_M, CityPlan, Extent, city, hillside
 from pipeline.ruler.simulation.hofmann310 import SCANNER as HOFMANN_SCANNER
 from pipeline.ruler.simulation.hofmann310 import hofmann310
+from pipeline.ruler.simulation.low_buildings import CELLS as LOW_CELLS
+from pipeline.ruler.simulation.low_buildings import SCANNER as LOW_SCANNER
+from pipeline.ruler.simulation.low_buildings import low_buildings
 from pipeline.ruler.simulation.roofs import FlatPart, RoofDimensions, RoofShape
 from pipeline.ruler.simulation.scene import Scene, Terrain, place_building, undulating_terrain
 from pipeline.ruler.simulation.suburb import suburb, tree_at
@@ -218,6 +221,16 @@ SUITES: dict[str, Suite] = {
             part=lambda seed, size_m, settings: CityPlan(seed, size_m, settings).part,
             tile_m=TILE_M,
             on_slope=_city_on_slope,
+        ),
+        Suite(
+            name="low_buildings",
+            summary="sheds of 7 to 25 m2 with roofs 0.5 to 2.5 m above ground, some at houses, for given outlines",
+            make=lambda seed, _: low_buildings(seed),
+            scanner=LOW_SCANNER,
+            size_m=(100.0, 300.0),
+            seed=1,
+            is_sized=False,
+            cells=LOW_CELLS,
         ),
         *(_single_suite(shape) for shape in RoofShape),
     )
