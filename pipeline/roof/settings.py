@@ -199,6 +199,25 @@ class ArrangementSettings(Parameters):
         minimum=0.0,
         maximum=10_000.0,
     )
+    corner_share: float = parameter(
+        0.17,
+        "Misfitting points that a corner of the borders must save, as a share of those of a roof face; 0 keeps all.",
+        minimum=0.0,
+        maximum=10.0,
+    )
+    corner_gap_m: float = parameter(
+        0.2, "Roof planes whose heights differ by less make one corner together.", unit="m", minimum=0.0, maximum=2.0
+    )
+    corner_reach_m: float = parameter(
+        0.6, "How far a corner of three or more borders moves to join another.", unit="m", minimum=0.0, maximum=5.0
+    )
+    plane_shift_m: float = parameter(
+        0.05,
+        "How far a plane may move to meet its neighbours in their corners, root mean square over its points.",
+        unit="m",
+        minimum=0.0,
+        maximum=1.0,
+    )
     raster_cell_m: float = parameter(
         0.35,
         "Cell of the coarse labels, at least one point spacing; for dense points 1.2 spacings, at least 0.25 m.",

@@ -23,7 +23,9 @@ from pipeline.roof.arrangement.far_corners import (
     heights_raster,
     with_level_planes,
 )
+from pipeline.roof.arrangement.joined_planes import joined_planes
 from pipeline.roof.arrangement.limits import Limits, limits_at
+from pipeline.roof.arrangement.merged_vertices import Borders, edges_of_rings, merge_vertices, rings_with_merged
 from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, neighbour_lists
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
 from pipeline.roof.arrangement.raster_labels import raster_labels
@@ -154,13 +156,20 @@ def _arranged(
         found = cut_off_far_corners(plan, points, cells, planes, chosen, around, limits, line)
         if found == 0 or (attempt > 0 and counts[CELLS] == n_cells and len(planes) == k):
             break
-    support = support_of_planes(points, label_of_point, planes, limits.cap_m)
 
     faces, n_faces = part_crossings(plan, cell_labels, planes, limits.clearance)
     plane_of_face = np.empty(n_faces, np.int32)
     for i in range(counts[CELLS]):
         plane_of_face[faces[i]] = cell_labels[i]
     vertices, ring_starts, owner = trace_faces(plan, faces, corners_of_borders(plan, len(outline.xy), faces))
+    if n_faces > 1 and limits.clearance == 1.0:
+        edges = edges_of_rings(plan.xy, vertices, ring_starts, owner)
+        borders = Borders(plan.xy, edges, plane_of_face, np.arange(len(plan.xy)) < len(outline.xy))
+        into = merge_vertices(borders, points, planes, limits)
+        vertices, ring_starts = rings_with_merged(vertices, ring_starts, into)
+        planes = refitted_planes(points, label_of_point, planes, limits.cap_m)
+        planes = joined_planes(points, label_of_point, planes, borders, limits)
+    support = support_of_planes(points, label_of_point, planes, limits.cap_m)
     rings = rings_of_faces(plan.xy, vertices, ring_starts, owner, n_faces)
     used = Subdivision(plan.xy[: counts[VERTICES]].copy(), plan.graph[: counts[EDGES]].copy(), counts)
     return _Arranged(used, rings, plane_of_face, faces, planes, support)

@@ -23,6 +23,11 @@ class Limits(NamedTuple):
     """Cost of a face that half of its points misfit, thousandths of a point."""
     line_length_m: float
     line_reach_m: float
+    corner_cost: float
+    """Points that a corner must save."""
+    corner_gap_m: float
+    corner_reach_m: float
+    plane_shift_m: float
     overshoot_m: float
     """How far a plane may go above or below the points."""
     clearance: float
@@ -42,6 +47,10 @@ def limits_at(spacing_m: float, settings: ArrangementSettings, clearance: float 
         doubtful_cost=round(doubtful_cost * COST_SCALE),
         line_length_m=settings.line_length_m,
         line_reach_m=max(settings.line_reach_m, spacing_m),
+        corner_cost=settings.corner_share * face_cost,
+        corner_gap_m=settings.corner_gap_m,
+        corner_reach_m=settings.corner_reach_m,
+        plane_shift_m=settings.plane_shift_m,
         overshoot_m=max(settings.overshoot_m, spacing_m),
         clearance=clearance,
     )
