@@ -47,6 +47,7 @@ from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPlan, RoofPoints, level_unsupported_faces, partition_roof, roof_points, walls_of
 from pipeline.roof.primitives import primitive_partition
 from pipeline.roof.roof_type import roof_type
+from pipeline.roof.shaded_points import with_shaded_points
 from pipeline.roof.solid import SolidPart, solid_parts
 from pipeline.roof.templates.fitting import RankedFaces
 
@@ -139,6 +140,7 @@ def _reconstruct(
         elif segmentation.faces is not None:
             forms = iter([partial(primitive_partition, segmentation.faces)])
         elif is_arranged:
+            roof = with_shaded_points(roof, cloud, segmentation.planes)
             forms = arranged_forms(roof, segmentation.planes, settings.roof, settings.plan)
         else:
             plan = partition_roof(roof, segmentation.planes, settings.roof)

@@ -9,6 +9,8 @@ import numpy as np
 
 from pipeline.errors import SettingsError
 from pipeline.ruler.simulation.als import ScannerSettings
+from pipeline.ruler.simulation.bridges_and_vans import SCANNER as STREET_SCANNER
+from pipeline.ruler.simulation.bridges_and_vans import bridges_and_vans
 from pipeline.ruler.simulation.city import CITY_SCANNER, TILE_M, CityPlan, Extent, city, hillside
 from pipeline.ruler.simulation.hofmann310 import SCANNER as HOFMANN_SCANNER
 from pipeline.ruler.simulation.hofmann310 import hofmann310
@@ -21,6 +23,9 @@ from pipeline.ruler.simulation.suburb import suburb, tree_at
 from pipeline.ruler.simulation.sweep import CELLS, Cell, sweep
 from pipeline.ruler.simulation.sweep import SCANNER as SWEEP_SCANNER
 from pipeline.ruler.simulation.town import town
+from pipeline.ruler.simulation.wide_halls import SCANNER as HALL_SCANNER
+from pipeline.ruler.simulation.wide_halls import SIZE_M as HALLS_SIZE_M
+from pipeline.ruler.simulation.wide_halls import wide_halls
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -231,6 +236,24 @@ SUITES: dict[str, Suite] = {
             seed=1,
             is_sized=False,
             cells=LOW_CELLS,
+        ),
+        Suite(
+            name="bridges_and_vans",
+            summary="bridges over cuttings, vans, trucks and containers at the kerb, and no building",
+            make=lambda seed, _: bridges_and_vans(seed),
+            scanner=STREET_SCANNER,
+            size_m=(168.0, 200.0),
+            seed=1,
+            is_sized=False,
+        ),
+        Suite(
+            name="wide_halls",
+            summary="halls 40 to 90 m wide that the edge of the data cuts",
+            make=lambda seed, _: wide_halls(seed),
+            scanner=HALL_SCANNER,
+            size_m=(HALLS_SIZE_M, HALLS_SIZE_M),
+            seed=1,
+            is_sized=False,
         ),
         *(_single_suite(shape) for shape in RoofShape),
     )

@@ -1,0 +1,82 @@
+"""Hidden points on the plane of a lower roof belong to it; facades and points far from the roof stay out."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import shapely
+from candidates_by_hand import candidate
+
+from pipeline.methods import ReconstructSettings
+from pipeline.model import Candidate, Plane, PreparedCloud
+from pipeline.prepared_cloud import prepare_cloud
+from pipeline.quality.residuals import vertical_residuals
+from pipeline.reconstruct import reconstruct_building
+from pipeline.roof.plan import RoofPoints, roof_points
+from pipeline.roof.settings import RoofSettings
+from pipeline.roof.shaded_points import with_shaded_points
+
+LOW_M, HIGH_M = 3.0, 7.0
+PLANES = tuple(Plane(a=0.0, b=0.0, c=height, n_points=100, rmse_m=0.02) for height in (LOW_M, HIGH_M))
+
+
+def house(strip_m: float, *, facade: int = 0, seed: int = 0) -> Candidate:
+    """A flat house of 10 m by 8 m with a lower strip along one end, 10 points per m2, and points on the wall."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 10, 800), rng.uniform(0, 8, 800)
+    z = np.where(x < strip_m, LOW_M, HIGH_M) + rng.normal(0, 0.02, 800)
+    wall = np.column_stack(
+        (np.full(facade, strip_m - 0.02), rng.uniform(0, 8, facade), rng.uniform(LOW_M + 0.5, HIGH_M - 0.5, facade))
+    )
+    return candidate(np.vstack((np.column_stack((x, y, z)), wall)), footprint=shapely.box(0, 0, 10, 8))
+
+
+def labelled(one: Candidate) -> tuple[PreparedCloud, RoofPoints]:
+    cloud = prepare_cloud(one)
+    roof = roof_points(cloud, RoofSettings())
+    nearest = np.abs(roof.points[:, 2, None] - [LOW_M, HIGH_M]).argmin(axis=1).astype(np.int32)
+    on_plane = np.abs(roof.points[:, 2, None] - [LOW_M, HIGH_M]).min(axis=1) < 0.1
+    return cloud, dataclasses.replace(roof, labels=np.where(on_plane, nearest, -1).astype(np.int32))
+
+
+def test_a_low_strip_gets_its_points_at_the_wall() -> None:
+    cloud, roof = labelled(house(1.0))
+    more = with_shaded_points(roof, cloud, PLANES)
+    low = cloud.candidate.points[:, 2] < 0.5 * (LOW_M + HIGH_M)
+    positions = len(np.unique(cloud.candidate.points[low, :2], axis=0))
+    assert (roof.labels == 0).sum() < 0.7 * positions
+    assert (more.labels == 0).sum() == positions
+    assert (more.labels == 1).sum() == (roof.labels == 1).sum()
+    assert np.array_equal(more.points, cloud.candidate.points[more.index])
+    assert len(np.unique(more.xy_mm, axis=0)) == len(more.xy_mm)
+
+
+def test_points_of_a_facade_stay_out() -> None:
+    cloud, roof = labelled(house(1.0, facade=100))
+    more = with_shaded_points(roof, cloud, PLANES)
+    z = more.points[more.labels >= 0, 2]
+    assert np.abs(z[:, None] - [LOW_M, HIGH_M]).min(axis=1).max() < 0.21
+
+
+def test_hidden_points_far_from_the_roof_on_their_plane_stay_out() -> None:
+    cloud, roof = labelled(house(1.0))
+    beyond = dataclasses.replace(roof, labels=np.where(roof.points[:, 1] < 4.0, roof.labels, -1).astype(np.int32))
+    more = with_shaded_points(beyond, cloud, PLANES)
+    added = np.setdiff1d(more.index, beyond.index)
+    assert len(added) > 5
+    assert cloud.candidate.points[added, 1].max() < 5.1
+
+
+def test_without_hidden_points_the_roof_stays_as_it_is() -> None:
+    cloud, roof = labelled(house(0.0))
+    assert with_shaded_points(roof, cloud, PLANES) is roof
+
+
+@pytest.mark.parametrize("strip_m", [0.7, 1.0, 1.5])
+def test_a_narrow_lower_level_is_modelled_up_to_the_wall(strip_m: float) -> None:
+    one = house(strip_m)
+    result = reconstruct_building(one, "arrangement", ReconstructSettings())
+    low = one.points[:, 2] < 0.5 * (LOW_M + HIGH_M)
+    near = np.abs(vertical_residuals(one.points, result.faces, result.planes)) < 0.2
+    assert near[low].mean() > 0.9
+    assert near[~low].mean() > 0.98
