@@ -39,6 +39,12 @@ WALL_REACH_MM = 1000
 """A point this near to a building in plan, and no higher than it there, is its wall unless it is leafy."""
 UNDER_ROOF_MM = 500
 """This near, it is always wall or lies under the roof: eaves scatter pulses as leaves do."""
+MATE_REACH_MM = 3000
+"""Where points lie farther apart than `UNDER_ROOF_MM`, a roof goes on this far: a spacing and a half at 0.3 points/m2."""
+MATE_LEVEL_MM = 500
+"""Largest difference in elevation of points of such a roof that lie beside each other."""
+MATES = 2
+"""Fewest building points within both that make a point building: one is beside many things."""
 ON_ROOF_MM = 2500
 """Largest height of chimneys, antennas and parapets above the roof."""
 TALL_MM = 2000
@@ -104,6 +110,29 @@ def tops_nearby(x: IntArray, y: IntArray, z: IntArray, used: BoolArray, wanted: 
                         top = z[j]
         if top > -(2**62):
             out[i] = top
+    return out
+
+
+@kernel
+def mates_nearby(
+    x: IntArray, y: IntArray, z: IntArray, used: BoolArray, wanted: BoolArray, reach: int, level: int
+) -> IntArray:
+    """How many used points lie within a distance in plan and in elevation of each wanted one, int64 (n,); all in mm."""
+    n = x.size
+    out = np.zeros(n, np.int64)
+    if n == 0:
+        return out
+    start, members, column0, row0, columns, rows = points_by_cell(x, y, used, reach)
+    for i in range(n):
+        if not wanted[i]:
+            continue
+        c, r = x[i] // reach - column0, y[i] // reach - row0
+        for rr in range(max(r - 1, 0), min(r + 2, rows)):
+            for cc in range(max(c - 1, 0), min(c + 2, columns)):
+                for m in range(start[rr * columns + cc], start[rr * columns + cc + 1]):
+                    j = members[m]
+                    near = (x[j] - x[i]) ** 2 + (y[j] - y[i]) ** 2 <= reach * reach
+                    out[i] += near and abs(z[j] - z[i]) <= level
     return out
 
 
@@ -207,6 +236,7 @@ def classes_of(evidence: PointEvidence, wanted: BoolArray, vegetation: Vegetatio
     # where points lie farther apart than that, the roof's edge is known no better than to their spacing
     crowd = sums_around(x, y, np.ones(len(x), np.bool_), np.ones((len(x), 1), np.int64), AROUND_MM)[:, 0]
     sparse = crowd * UNDER_ROOF_MM**2 < 9 * AROUND_MM**2
+    mates = mates_nearby(x, y, z, building, open_ & wanted & sparse, MATE_REACH_MM, MATE_LEVEL_MM)
     under = beside & (sparse | ((close != NO_DATA) & (z <= close)))
     over = (top != NO_DATA) & ~beside & (z <= top + ON_ROOF_MM)
     tall = ~known | (e.height_mm >= TALL_MM)
@@ -215,7 +245,7 @@ def classes_of(evidence: PointEvidence, wanted: BoolArray, vegetation: Vegetatio
     unknown = leafy == UNKNOWN
     out = np.full(len(x), PointClass.OTHER, np.uint8)
     out[open_ & ((leafy == LEAFY) | (unknown & tall))] = PointClass.VEGETATION
-    out[open_ & (under | ((beside | over) & (leafy != LEAFY)))] = PointClass.BUILDING
+    out[open_ & ((mates >= MATES) | under | ((beside | over) & (leafy != LEAFY)))] = PointClass.BUILDING
     out[building] = PointClass.BUILDING
     out[ground] = PointClass.GROUND
     out[noise] = PointClass.NOISE
