@@ -96,7 +96,7 @@ def _fault(kind: int, sums: IntArray, settings: CandidateSettings) -> tuple[Reas
     if f["planar_share"] < settings.min_planar_share and not is_intact:
         return Reason.VEGETATION, f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}"
     most = p + settings.beam_m / max(1.0, f["width_m"]) + scatter
-    if f["through_share"] > most:
+    if f["several_share"] < 1.0 and f["through_share"] > most:
         share = f"pulses of {f['through_share']:.2f} of its points go on below"
         return Reason.VEGETATION, f"{share}, at most {most:.2f}"
     if f["canopy_share"] > settings.max_canopy_share:

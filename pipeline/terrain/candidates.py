@@ -132,12 +132,14 @@ def _penetration(f: dict[str, FloatArray], settings: CandidateSettings) -> tuple
 
     At the edge of a roof pulses go on, too: the narrower a surface, the larger the part of it that is edge. Shares of
     few points scatter by the standard deviation of a binomial distribution. A surface without any pulse of several
-    returns shows nothing: the scanner may record one return each.
+    returns shows nothing, and so does one without any of a single return: the scanner may record one echo of each
+    pulse, or a first and a last one of each.
     """
     p = settings.max_through_share
     scatter = np.sqrt(p * (1.0 - p) / f["points"])
     is_intact = (f["several_share"] > 0.0) & (f["several_share"] + scatter <= p)
-    return is_intact, p + settings.beam_m / np.maximum(_NARROW_M, f["width_m"]) + scatter
+    most = p + settings.beam_m / np.maximum(_NARROW_M, f["width_m"]) + scatter
+    return is_intact, np.where(f["several_share"] < 1.0, most, 1.0)
 
 
 def _limits(

@@ -40,7 +40,7 @@ WALL_REACH_MM = 1000
 UNDER_ROOF_MM = 500
 """This near, it is always wall or lies under the roof: eaves scatter pulses as leaves do."""
 MATE_REACH_MM = 3000
-"""Where points lie farther apart than `UNDER_ROOF_MM`, a roof goes on this far: a spacing and a half at 0.3 points/m2."""
+"""Where points lie farther apart than `UNDER_ROOF_MM`, a roof goes on this far: 1.5 spacings at 0.3 points/m2."""
 MATE_LEVEL_MM = 500
 """Largest difference in elevation of points of such a roof that lie beside each other."""
 MATES = 2

@@ -131,6 +131,8 @@ def test_each_reason_names_its_figure_and_threshold(changes: dict[Sum, int], rea
             {Sum.POINTS: 20, Sum.SEVERAL: 8, Sum.THROUGH: 4},
             {Sum.POINTS: 1600, Sum.SEVERAL: 640, Sum.THROUGH: 320},
         ),
+        # a scanner that records a first and a last echo of each pulse shows nothing
+        ({Sum.SEVERAL: 1600, Sum.THROUGH: 800}, {Sum.SEVERAL: 1599, Sum.THROUGH: 800}),
         # a rough roof that hardly any pulse pierces; a scanner of single returns shows nothing of the kind
         ({Sum.PLANAR: 0, Sum.ROUGH: 380, Sum.SEVERAL: 160}, {Sum.PLANAR: 0, Sum.ROUGH: 380}),
         ({Sum.PLANAR: 0, Sum.ROUGH: 0, Sum.SEVERAL: 160}, {Sum.PLANAR: 0, Sum.ROUGH: 0, Sum.SEVERAL: 240}),
