@@ -23,6 +23,8 @@ from pipeline.roof.settings import RoofSettings
 
 _FACTORS = (1.0, 0.6, 0.35)
 """Multiples of the tolerance: a ring that cannot be drawn with few lines is tried with more."""
+_FINEST_M = 0.2
+"""Smallest tolerance with those factors: no survey shows finer details of an eave."""
 _FIRST_SHARE = 0.4
 _OTHER_SHARE = 0.2
 """Least share of the squared lengths for a dominant direction: see `dominant_directions`."""
@@ -83,7 +85,8 @@ def _straight_rings(
     rings: list[FloatArray | None] = [None] * len(borders)
     within = math.radians(settings.square_within_deg)
     for factor in _FACTORS:
-        tolerance = max(factor * settings.eave_tolerance_spacings * spacing_m, 0.2) * 1e3
+        tolerance_m = max(settings.eave_tolerance_spacings * spacing_m, settings.min_eave_tolerance_m)
+        tolerance = max(factor * tolerance_m, _FINEST_M) * 1e3
         runs_of = [merge(ring, split(ring, tolerance, closed=True), tolerance, closed=True) for ring in borders]
         dominant = dominant_directions([run for runs in runs_of for run in runs], within)
         for k, (ring, runs) in enumerate(zip(borders, runs_of, strict=True)):

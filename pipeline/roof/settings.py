@@ -78,6 +78,13 @@ class RoofSettings(Parameters):
         minimum=0.2,
         maximum=5.0,
     )
+    min_eave_tolerance_m: float = parameter(
+        0.4,
+        "The same at least, where points are dense: gutters, plants and lost pulses make an eave as ragged.",
+        unit="m",
+        minimum=0.0,
+        maximum=5.0,
+    )
     straight_borders: bool = parameter(True, "Whether borders between roof faces are drawn with straight lines.")
     border_tolerance_spacings: float = parameter(
         0.65,
