@@ -246,6 +246,115 @@ def gaps(random: np.random.Generator, density: float) -> Drawn:
     return _noisy(random, x[~gone], y[~gone], z[~gone], ground[~gone])
 
 
+def embankment_with_bridges(random: np.random.Generator, density: float) -> Drawn:
+    """A railway dam of 7 m with slopes of 1 in 1.5; roads pass below it under decks, and one crosses it on a bridge."""
+    x, y = _places(random, density)
+    away = np.abs(y - 160.0 - 10.0 * np.sin(x / 80.0))
+    z = 7.0 - np.clip((away - 6.0) / 1.5, 0.0, 7.0)
+    ground = np.ones(len(x), np.bool_)
+    for middle, width in ((60.0, 12.0), (170.0, 8.0)):
+        road = np.abs(x - middle) < width / 2
+        deck = road & (away < 6.0)
+        z = np.where(road, np.where(deck, 7.0, 0.0), z)
+        ground &= ~deck
+    # ramps of 1 in 12 lead up to a bridge 6 m over the rails, with walls beside it
+    along = np.abs(x - 260.0) < 6.0
+    ramp = along & (away >= 14.0)
+    z = np.where(ramp, np.maximum(z, 13.0 - (away - 14.0) / 8.0), z)
+    over = along & (away < 14.0)
+    z = np.where(over, 13.0, z)
+    return _noisy(random, x, y, z, ground & ~over)
+
+
+def deep_cutting(random: np.random.Generator, density: float) -> Drawn:
+    """A railway 14 m wide in a cutting 8 m deep, one side a wall and one of 50 deg, crossed by two roads; houses."""
+    x, y = _places(random, density)
+
+    def terrain(px: Floats, py: Floats) -> Floats:
+        off = px - 160.0 - 25.0 * np.sin(py / 110.0)
+        depth = np.where(off < 0.0, np.where(off > -7.0, 8.0, 0.0), np.clip(8.0 - (off - 7.0) * 1.2, 0.0, 8.0))
+        whole: Floats = 0.03 * px - depth
+        return whole
+
+    z, ground = terrain(x, y), np.ones(len(x), np.bool_)
+    for at in ((60.0, 60.0), (60.0, 100.0), (90.0, 200.0), (250.0, 60.0), (240.0, 250.0), (280.0, 150.0)):
+        inside, roof = _house(x, y, terrain, at, 10.0)
+        z, ground = np.where(inside, roof, z), ground & ~inside
+    for middle in (110.0, 220.0):
+        deck = (np.abs(y - middle) < 6.0) & (z < 0.03 * x - 0.5) & ground
+        z, ground = np.where(deck, 0.03 * x, z), ground & ~deck
+    return _noisy(random, x, y, z, ground)
+
+
+def vineyard(random: np.random.Generator, density: float) -> Drawn:
+    """Terraces 7 m wide with walls of 1.5 m up a slope of 25 deg; vines of 1.6 m stop a third of the pulses in rows."""
+    x, y = _places(random, density)
+    across = x + 15.0 * np.sin(y / 60.0)
+    z = 1.5 * np.floor(across / 7.0) + 0.25 * across
+    vine = (across % 2.0 < 0.7) & (random.random(len(x)) < 0.33)
+    z = np.where(vine, z + random.uniform(0.8, 1.6, len(x)), z)
+    return _noisy(random, x, y, z, ~vine)
+
+
+def castle_on_a_rock(random: np.random.Generator, density: float) -> Drawn:
+    """A rock of 90 x 60 m and 14 m with cliffs of 70 deg and a ramp on one side; on it a keep, a range and a yard."""
+    x, y = _places(random, density)
+    u, v = _turned(x, y, (160.0, 160.0), 25.0)
+    rim = 1.0 - np.hypot(u / 45.0, v / 30.0) + 0.04 * np.sin(7.0 * np.arctan2(v, u))
+    rock = np.clip(rim * 30.0 / 0.36, 0.0, 14.0)
+    ramp = np.where((np.abs(v) < 5.0) & (u > 0.0), np.clip(14.0 - (u - 40.0) / 5.0, 0.0, 14.0), 0.0)
+    z = 0.05 * y + np.maximum(rock, ramp)
+    ground = np.ones(len(x), np.bool_)
+    for at, size, height in (((-22.0, 0.0), (14.0, 14.0), 18.0), ((5.0, 16.0), (36.0, 9.0), 9.0)):
+        inside = (np.abs(u - at[0]) < size[0] / 2) & (np.abs(v - at[1]) < size[1] / 2)
+        z, ground = np.where(inside, 0.05 * 160.0 + 14.0 + height, z), ground & ~inside
+    z, ground = _trees(random, x, y, z, ground, 0.05, 0.7)
+    return _noisy(random, x, y, z, ground)
+
+
+def dyke(random: np.random.Generator, density: float) -> Drawn:
+    """A sea dyke of 8 m with slopes of 1 in 3 and a berm, ditches 1.5 m deep in the polder, farms with barns."""
+    x, y = _places(random, density)
+
+    def terrain(px: Floats, py: Floats) -> Floats:
+        off = np.abs(py - 90.0 - 15.0 * np.sin(px / 100.0))
+        crest = np.clip(8.0 - (off - 3.0) / 3.0, 0.0, 8.0)
+        berm = np.where(off < 36.0, np.maximum(crest, 2.0), crest)
+        ditch = np.where((px % 40.0 < 3.0) & (py > 150.0), -1.5, 0.0)
+        whole: Floats = berm + ditch
+        return whole
+
+    z, ground = terrain(x, y), np.ones(len(x), np.bool_)
+    for cx, cy in ((60.0, 200.0), (180.0, 230.0), (260.0, 190.0)):
+        inside, roof = _house(x, y, terrain, (cx, cy), 0.0)
+        z, ground = np.where(inside, roof, z), ground & ~inside
+        barn = _box(x, y, (cx, cy + 35.0), (30.0, 18.0), 0.0)
+        z, ground = np.where(barn, 4.0 + 0.35 * (9.0 - np.abs(y - cy - 35.0)), z), ground & ~barn
+    return _noisy(random, x, y, z, ground)
+
+
+def harbour(random: np.random.Generator, density: float) -> Drawn:
+    """A quay 3 m above water of few returns, a pier 30 m wide, sheds of 80 x 25 and 60 x 20 m, barges, containers."""
+    x, y = _places(random, density)
+    pier = (np.abs(x - 200.0) < 15.0) & (y > 60.0)
+    land = (y > 170.0) | pier
+    z = np.where(land, 3.0, 0.0)
+    ground = np.ones(len(x), np.bool_)
+    wet = ~land & (random.random(len(x)) < 0.9)
+    for at, size, height in (
+        ((90.0, 210.0), (80.0, 25.0), 8.0),
+        ((250.0, 260.0), (60.0, 20.0), 6.0),
+        ((100.0, 270.0), (12.0, 2.5), 2.6),
+        ((120.0, 275.0), (12.0, 7.5), 5.2),
+        ((203.0, 120.0), (40.0, 12.0), 5.0),
+        ((80.0, 160.0), (60.0, 9.0), -0.5),
+        ((235.0, 110.0), (9.0, 50.0), 1.0),
+    ):
+        inside = _box(x, y, at, size, 0.0)
+        z, ground, wet = np.where(inside, 3.0 + height, z), ground & ~inside, wet & ~inside
+    return _noisy(random, x[~wet], y[~wet], z[~wet], ground[~wet])
+
+
 KINDS: dict[str, Callable[[np.random.Generator, float], Drawn]] = {
     scene.__name__: scene
     for scene in (
@@ -260,6 +369,12 @@ KINDS: dict[str, Callable[[np.random.Generator, float], Drawn]] = {
         low_outliers,
         terraces,
         gaps,
+        embankment_with_bridges,
+        deep_cutting,
+        vineyard,
+        castle_on_a_rock,
+        dyke,
+        harbour,
     )
 }
 """The scenes by name."""

@@ -97,13 +97,16 @@ def computed_once() -> Generator[None]:
 
     filtered = ground.morphological_ground
     command = functools.cache(typer.testing._get_command)
-    masks: dict[object, BoolArray] = {}
+    masks: dict[object, tuple[BoolArray, BoolArray]] = {}
 
-    def kept(lowest: Elevations, corner: tuple[int, int], settings: MorphologicalFilterSettings) -> BoolArray:
+    def kept(
+        lowest: Elevations, corner: tuple[int, int], settings: MorphologicalFilterSettings
+    ) -> tuple[BoolArray, BoolArray]:
         key = (lowest.shape, lowest.tobytes(), corner, settings)
         if key not in masks:
             masks[key] = filtered(lowest, corner, settings)
-        return masks[key].copy()
+        ground, steady = masks[key]
+        return ground.copy(), steady.copy()
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ground, "morphological_ground", kept)

@@ -19,6 +19,13 @@ class MorphologicalFilterSettings(Parameters):
         minimum=2,
         maximum=60,
     )
+    residual_window_m: int = parameter(
+        12,
+        "Largest radius of the second openings; wider objects are those that the first openings see.",
+        unit="m",
+        minimum=2,
+        maximum=60,
+    )
     window_slope: float = parameter(
         0.15,
         "Height that a step of the first openings may remove, per metre of radius.",
@@ -35,7 +42,7 @@ class MorphologicalFilterSettings(Parameters):
         0.15, "Height that a step of the second openings may always remove.", unit="m", minimum=0.0, maximum=3.0
     )
     residual_steepness_m: float = parameter(
-        0.3,
+        0.6,
         "Additional height where the trend rises by 45 degrees, in proportion elsewhere: steep ground is rough.",
         unit="m",
         minimum=0.0,
@@ -77,7 +84,7 @@ class MorphologicalFilterSettings(Parameters):
         maximum=20.0,
     )
     regrowth_passes: int = parameter(
-        3, "Number of passes in which cells level with the ground beside them join it.", minimum=0, maximum=10
+        2, "Number of passes in which cells level with the ground beside them join it.", minimum=0, maximum=10
     )
     regrowth_m: int = parameter(3, "Half side of the square that counts as beside.", unit="m", minimum=1, maximum=10)
     regrowth_step_m: float = parameter(
@@ -89,21 +96,38 @@ class MorphologicalFilterSettings(Parameters):
         minimum=0.0,
         maximum=1.0,
     )
-    terrace_passes: int = parameter(
-        2, "Number of further passes in which wide objects may join the ground, as terraces do.", minimum=0, maximum=10
+    rejoin_passes: int = parameter(
+        6,
+        "Number of further passes in which cells, wide objects too, join the ground if its planes meet them from two "
+        "sides, as on brows, benches and terraces.",
+        minimum=0,
+        maximum=10,
     )
-    terrace_share: float = parameter(
-        0.7, "The share that replaces regrowth_share in these passes.", minimum=0.0, maximum=1.0
+    rejoin_m: int = parameter(
+        4, "Half side of the eight squares of those planes, which touch the cell.", unit="m", minimum=2, maximum=10
+    )
+    rejoin_step_m: float = parameter(
+        0.25, "Farthest that such a plane may pass above or below the cell.", unit="m", minimum=0.0, maximum=3.0
     )
 
     @property
     def morphological_support_m(self) -> float:
-        """How far the filter looks: the sum of its chain, or the wide objects beside it."""
-        chain = 4 * GAP_CELLS + 4 * self.max_window_m + 2 * self.trend_m + CLUMP_CELLS
+        """How far the ground looks that terrain is drawn from at any distance: the longest chain, and regrowth."""
+        openings = 2 * self.max_window_m + 2 * self.second_window_m
+        chain = 4 * GAP_CELLS + openings + 2 * self.trend_m + CLUMP_CELLS
         wide = wide_support_m(self.widest_m // 2) if self.looks_for_wide else 0.0
         walls = between_walls_support_m(self.deck_m)
-        grown = (self.regrowth_passes + self.terrace_passes) * self.regrowth_m
-        return PIT_CELLS + max(float(chain), wide, walls) + grown
+        return PIT_CELLS + max(float(chain), wide, walls) + self.regrowth_passes * self.regrowth_m
+
+    @property
+    def rejoined_support_m(self) -> float:
+        """How far the ground looks that rejoined by planes; terrain is drawn from it up to `NEAR_CELLS` away."""
+        return self.morphological_support_m + 2 * self.rejoin_passes * self.rejoin_m
+
+    @property
+    def second_window_m(self) -> int:
+        """Largest radius of the second openings: no larger than that of the first."""
+        return min(self.residual_window_m, self.max_window_m)
 
     @property
     def looks_for_wide(self) -> bool:

@@ -19,29 +19,39 @@ from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, lowest_per_ce
 from pipeline.terrain.morphological import morphological_ground
 from pipeline.terrain.planar_fitting import MIN_CELLS, plane_around, plane_sums
 from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.support import NEAR_CELLS
 
 
 @kernel
-def _terrain(
-    lowest: Elevations, is_ground: BoolArray, bridge: int, max_slope: float, drawn: tuple[int, int, int, int]
-) -> Elevations:
-    """Terrain in mm (rows, columns): local least-squares planes through the ground of the smallest sufficient box.
+def _draw(
+    terrain: Elevations,
+    lowest: Elevations,
+    ground: BoolArray,
+    halves: tuple[int, int, bool],
+    max_slope: float,
+    drawn: tuple[int, int, int, int],
+) -> None:
+    """Terrain in mm where there is none yet: the plane through the ground of the smallest square that determines one.
 
-    Only the cells of `drawn`, first and one past the last column and row, get an elevation.
+    `halves` are the half sides of the first and the last square in cells, and whether the last one must suffice. Only
+    the cells of `drawn`, first and one past the last column and row, get an elevation.
     """
+    first, last, is_final = halves
     rows, columns = lowest.shape
-    sums = plane_sums(lowest, is_ground)
-    terrain = np.full((rows, columns), NO_DATA, np.int32)
+    sums = plane_sums(lowest, ground)
     for r in range(max(drawn[1], 0), min(drawn[3], rows)):
         for c in range(max(drawn[0], 0), min(drawn[2], columns)):
-            half = 1
+            if terrain[r, c] != NO_DATA:
+                continue
+            half = first
             while True:
                 n, level, _, _, carries = plane_around(sums, r, c, half)
-                # cells in a row carry no plane: under an object a wider box is needed
-                if carries or half == bridge or (n >= MIN_CELLS and is_ground[r, c]):
+                # cells in a row carry no plane: under an object a wider square is needed
+                found = carries or (n >= MIN_CELLS and ground[r, c])
+                if found or half == last:
                     break
-                half = min(2 * half, bridge)
-            if n == 0:
+                half = min(2 * half, last)
+            if n == 0 or not (found or is_final):
                 continue
             if carries:
                 # a plane is trusted no steeper from the middle of its cells than terrain may be
@@ -54,6 +64,24 @@ def _terrain(
                 slack = max_slope * CELL_MM * math.sqrt(east * east + north * north)
                 level = min(max(level, mean - slack), mean + slack)
             terrain[r, c] = np.int32(round(level))
+
+
+def _terrain(
+    lowest: Elevations,
+    grounds: tuple[BoolArray, BoolArray],
+    reach: int,
+    max_slope: float,
+    drawn: tuple[int, int, int, int],
+) -> Elevations:
+    """Terrain in mm (rows, columns) through two masks of ground: that of squares up to `NEAR_CELLS`, and of wider ones.
+
+    No square reaches farther than `reach` cells; `drawn` as in `_draw`.
+    """
+    near = min(NEAR_CELLS, reach)
+    terrain = np.full(lowest.shape, NO_DATA, np.int32)
+    _draw(terrain, lowest, grounds[0], (1, near, near == reach), max_slope, drawn)
+    if near < reach:
+        _draw(terrain, lowest, grounds[1], (min(2 * near, reach), reach, True), max_slope, drawn)
     return terrain
 
 
@@ -134,20 +162,20 @@ def ground_of(
     seen = _part_with_data(lowest, settings.reach_m + 1)
     part = np.ascontiguousarray(lowest[seen])
     if part.size:
-        is_ground = part != NO_DATA
+        is_ground = steady = part != NO_DATA
         if not trusted:
             pit_depth_mm = round(settings.pit_depth_m * 1000)
             part = without_pits(part, pit_depth_mm)
             corner = (column0 + seen[1].start, row0 + seen[0].start)
             if settings.filter == "hierarchical":
-                is_ground = hierarchical_ground(part, corner, settings, pit_depth_mm)
+                is_ground = steady = hierarchical_ground(part, corner, settings, pit_depth_mm)
             else:
-                is_ground = morphological_ground(part, corner, settings)
+                is_ground, steady = morphological_ground(part, corner, settings)
         # one cell more for heights between the middles of cells, one for the slope there
         west, south, width, depth = window if wanted is None else wanted
         west, south = west - column0 - seen[1].start - 2, south - row0 - seen[0].start - 2
         drawn = (west, south, west + width + 4, south + depth + 4)
-        elevation[seen] = _terrain(part, is_ground, settings.reach_m, settings.max_slope, drawn)
+        elevation[seen] = _terrain(part, (is_ground, steady), settings.reach_m, settings.max_slope, drawn)
         slope[seen] = slopes_of(elevation[seen])
         measured[seen] = is_ground
     return Terrain(elevation_mm=elevation, slope_mm=slope, measured=measured, column0=column0, row0=row0)

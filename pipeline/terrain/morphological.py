@@ -4,7 +4,7 @@ One step of a growing opening cuts off an object (Zhang et al. 2003). A step may
 and gaps in the surface are closed first (SMRF: Pingel, Clarke and McBride 2013). On a slope an opening cannot see an
 object that is lower than the slope rises between two points. Therefore openings run twice: the first give a provisional
 ground, the second work on heights above its trend, without slopes. Wide objects and decks between two walls are found
-separately. Brows, crests and terraces that were lost rejoin the ground beside them on the same level.
+separately. Brows, crests and terraces that were lost rejoin the ground beside them on the same level or plane.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pipeline.terrain.filter_settings import MorphologicalFilterSettings
 from pipeline.terrain.lattice import NO_DATA, Elevations
 from pipeline.terrain.openings import cut_off
 from pipeline.terrain.planar_fitting import leaning_planes
+from pipeline.terrain.rejoining import rejoined
 from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS
 from pipeline.terrain.wide_objects import wide_objects, with_corners
 
@@ -166,11 +167,12 @@ def regrown(
 
 def morphological_ground(
     lowest: Elevations, corner: tuple[int, int], settings: MorphologicalFilterSettings
-) -> BoolArray:
-    """Mask of the cells that hold ground; none where there is no data.
+) -> tuple[BoolArray, BoolArray]:
+    """Masks of the cells that hold ground, and of those among them that did not rejoin it by planes.
 
-    `lowest` is the elevation in mm of the lowest point of each cell, single pits cleared, NO_DATA where there is none.
-    `corner` is the absolute column and row of the first cell: coarse cells are anchored at the CRS's origin.
+    Neither holds where there is no data. `lowest` is the elevation in mm of the lowest point of each cell, single pits
+    cleared, NO_DATA where there is none. `corner` is the absolute column and row of the first cell: coarse cells are
+    anchored at the CRS's origin.
     """
     radius = settings.max_window_m
     elevation = closed_gaps(lowest, GAP_CELLS)
@@ -187,11 +189,11 @@ def morphological_ground(
     lowest = without_clumps(lowest, level, slope_mm, round(settings.clump_depth_m * 1000))
     limits = (round(settings.residual_step_m * 1000), settings.residual_steepness_m * 1000.0)
     height, base = _heights(lowest, level, slope_mm, limits)
-    second = cut_off(closed_gaps(height, GAP_CELLS), base, settings.residual_slope * 1000.0, radius)
-    ground = (lowest != NO_DATA) & (second == 0) & ~wide & ~decks
-    step_mm = round(settings.regrowth_step_m * 1000)
-    beside = (settings.regrowth_m, step_mm, settings.regrowth_share)
+    narrow = settings.second_window_m
+    second = cut_off(closed_gaps(height, GAP_CELLS), base, settings.residual_slope * 1000.0, narrow)
+    # what only a wider opening sees is too wide for the second ones; on a slope it is high enough for the first
+    ground = (lowest != NO_DATA) & (second == 0) & (first <= narrow) & ~wide & ~decks
+    beside = (settings.regrowth_m, round(settings.regrowth_step_m * 1000), settings.regrowth_share)
     ground = regrown(lowest, ground, wide | decks, settings.regrowth_passes, beside)
-    beside = (settings.regrowth_m, step_mm, settings.terrace_share)
-    found: BoolArray = regrown(lowest, ground, decks, settings.terrace_passes, beside)
-    return found
+    limits_of_planes = (settings.rejoin_m, settings.rejoin_step_m * 1000.0)
+    return rejoined(lowest, ground, decks, settings.rejoin_passes, limits_of_planes), ground

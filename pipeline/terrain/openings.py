@@ -94,7 +94,7 @@ def dilate_back(surface: Elevations, eroded: Elevations, opened: Elevations, scr
 
 @kernel
 def cut_off(surface: Elevations, base_mm: Elevations, rise_mm: float, largest: int) -> ByteArray:
-    """The first radius of a growing opening that removes more from a cell than it may, (rows, columns) uint8.
+    """The last radius at which a growing opening removes more from a cell than it may, (rows, columns) uint8.
 
     0 where no step removes more, and in holes. A planar slope loses nothing to an opening. A hilltop, crest or brow
     loses by each cell of radius no more than its slope rises over a cell; an object loses all of its height at once
@@ -120,7 +120,7 @@ def cut_off(surface: Elevations, base_mm: Elevations, rise_mm: float, largest: i
         dilate_back(surface, eroded, after, low, radius)
         for r in range(rows):
             for c in range(columns):
-                if surface[r, c] != NO_DATA and found[r, c] == 0:
+                if surface[r, c] != NO_DATA:
                     taken = before[r + 1, c + 1] - after[r + 1, c + 1]
                     if taken > base_mm[r, c] + rise_mm * radius:
                         found[r, c] = radius

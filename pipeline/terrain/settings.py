@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.filter_settings import HierarchicalFilterSettings, MorphologicalFilterSettings
-from pipeline.terrain.support import PLANARITY_SCALES
+from pipeline.terrain.support import NEAR_CELLS, PLANARITY_SCALES
 
 _MAX_SUPPORT_M = 500
 """A filter that looks farther makes a tile nearly all halo."""
@@ -80,12 +80,12 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
             cause = f"seed_cell_m {self.seed_cell_m}, level_ratio {self.level_ratio}, passes {self.passes}"
             fix = "use fewer passes or smaller cells"
         else:
-            counts = [self.max_window_m, self.trend_m, self.widest_m, self.regrowth_m]
-            counts += [self.regrowth_passes, self.terrace_passes]
+            counts = [self.max_window_m, self.residual_window_m, self.trend_m, self.widest_m, self.regrowth_m]
+            counts += [self.regrowth_passes, self.rejoin_passes, self.rejoin_m]
             cause = (
-                f"max_window_m {self.max_window_m}, trend_m {self.trend_m}, widest_m {self.widest_m}, regrowth_m "
-                f"{self.regrowth_m} in {self.regrowth_passes} and {self.terrace_passes} passes, "
-                f"bridge_m {self.bridge_m}"
+                f"max_window_m {self.max_window_m}, residual_window_m {self.residual_window_m}, trend_m {self.trend_m},"
+                f" widest_m {self.widest_m}, regrowth_m {self.regrowth_m} in {self.regrowth_passes} passes, "
+                f"rejoin_m {self.rejoin_m} in {self.rejoin_passes} passes, bridge_m {self.bridge_m}"
             )
             fix = "use smaller ones"
         whole = all(isinstance(n, int) for n in (*counts, self.bridge_m))
@@ -105,7 +105,8 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
         """How far a terrain elevation looks: the pit tests, the filter, the local planes, cell sizes, slopes."""
         if self.filter == "hierarchical":
             return self.hierarchical_support_m + self.reach_m + 4
-        return self.morphological_support_m + self.reach_m + 4
+        near = self.rejoined_support_m + min(self.reach_m, NEAR_CELLS)
+        return max(self.morphological_support_m + self.reach_m, near) + 4
 
     @property
     def trusted_support_m(self) -> float:

@@ -29,6 +29,11 @@ NARROW = 2
 RIM_CELLS = 3
 """Corners this near to a wide object belong to it."""
 
+NEAR_CELLS = 16
+"""Half side of the widest square in which ground that rejoined by planes carries the terrain.
+
+Wider squares lie under wide objects, where the ground around them decides. The other ground looks less far."""
+
 PLANARITY_SCALES = 3
 """Planarity is judged in windows of one, two and four radii."""
 

@@ -118,7 +118,7 @@ def with_corners(lowest: Elevations, wide: BoolArray, first: ByteArray) -> BoolA
     """Wide objects with the corners into which no octagon fits.
 
     A narrower opening removed the corner of a hall in smaller steps. The corner is level with the hall, and the first
-    openings cut it off at the radius `first`, 0 where they did not. Elevations are in mm.
+    openings cut it off: `first` is their last radius that did, 0 where none did. Elevations are in mm.
     """
     rows, columns = lowest.shape
     out = wide.copy()

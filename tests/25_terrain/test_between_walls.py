@@ -52,10 +52,10 @@ def test_a_deck_that_meets_the_road_on_its_level_is_found_to_near_its_ends(turn_
 def test_the_ground_of_a_valley_loses_its_bridge_to_near_the_ends() -> None:
     z, deck = valley_with_bridge(30.0)
     lowest = millimetres(z)
-    with_walls = morphological_ground(lowest, (0, 0), GroundSettings())
-    without = morphological_ground(lowest, (0, 0), GroundSettings(wall_drop_m=20.0))
+    with_walls = morphological_ground(lowest, (0, 0), GroundSettings())[0]
+    without = morphological_ground(lowest, (0, 0), GroundSettings(wall_drop_m=20.0))[0]
     assert with_walls[deck].mean() < 0.2
-    assert without[deck].mean() > 0.35
+    assert without[deck].mean() > 0.25
     assert with_walls[~deck].mean() > 0.99
 
 

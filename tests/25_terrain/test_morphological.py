@@ -14,6 +14,7 @@ from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.morphological import closed_gaps, morphological_ground, regrown, without_clumps
 from pipeline.terrain.openings import cut_off, dilate_back, erode_once, framed
 from pipeline.terrain.planar_fitting import leaning_planes
+from pipeline.terrain.rejoining import rejoined
 from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.wide_objects import wide_objects, with_corners
 
@@ -49,7 +50,7 @@ def millimetres(z_m: npt.NDArray[np.float64], noise_mm: float = 0.0, seed: int =
 
 
 def ground_cells(lowest: Grid, chosen: GroundSettings | None = None) -> Mask:
-    found: Mask = morphological_ground(lowest, (0, 0), chosen or GroundSettings())
+    found: Mask = morphological_ground(lowest, (0, 0), chosen or GroundSettings())[0]
     return found
 
 
@@ -119,7 +120,7 @@ def test_an_opening_lies_below_its_data_and_opening_again_changes_nothing(grid: 
     np.testing.assert_array_equal(opened_by(once, radius), once)
 
 
-def test_what_is_cut_off_is_what_a_step_takes_more_than_its_limit() -> None:
+def test_what_is_cut_off_is_what_a_step_takes_more_than_its_limit_and_the_last_such_step_is_given() -> None:
     random = np.random.default_rng(7)
     values = random.integers(0, 500, (60, 50)).astype(np.int32)
     values[20:32, 10:30] += 6000
@@ -129,7 +130,7 @@ def test_what_is_cut_off_is_what_a_step_takes_more_than_its_limit() -> None:
     before = values
     for radius in range(1, 10):
         after = opened_by(values, radius)
-        expected[(expected == 0) & (before - after > base + 100.0 * radius)] = radius
+        expected[before - after > base + 100.0 * radius] = radius
         before = after
     found = cut_off(values, base, 100.0, 9)
     np.testing.assert_array_equal(found, expected)
@@ -209,6 +210,33 @@ def test_what_lies_level_with_ground_beside_it_joins_pass_by_pass() -> None:
         np.testing.assert_array_equal(found[10:], np.broadcast_to(expected, (10, 30)))
         assert not found[5, 10]
         assert not found[:, 25:].any()
+
+
+@pytest.mark.parametrize("turns", [0, 1])
+def test_a_brow_joins_the_plateau_behind_it_and_a_roof_over_the_slope_joins_nothing(turns: int) -> None:
+    c, r = coordinates(60, 80)
+    slope = np.where(c < 40, 0.3 * c, 12.0 - 0.8 * (c - 40))
+    roof = (np.abs(r - 30) < 6) & (np.abs(c - 20) < 5)
+    lowest = np.rot90(millimetres(np.where(roof, 11.0, slope)), turns).copy()
+    lost = np.rot90(roof | (np.abs(c - 40) < 6), turns)
+    brow = np.rot90(~roof & (np.abs(c - 40) < 6), turns)
+    nothing = np.zeros(lowest.shape, np.bool_)
+    found = rejoined(lowest, ~lost, nothing, 3, (3, 250.0))
+    assert found[brow].all()
+    assert not found[np.rot90(roof, turns)].any()
+    assert not rejoined(lowest, ~lost, lost, 3, (3, 250.0))[lost].any()
+
+
+def test_a_pass_of_rejoining_looks_two_half_sides_far() -> None:
+    lowest = np.zeros((30, 60), np.int32)
+    ground = np.zeros(lowest.shape, np.bool_)
+    ground[:, :20] = True
+    nothing = np.zeros_like(ground)
+    seen = rejoined(lowest, ground, nothing, 1, (3, 250.0))
+    assert seen.any(axis=0).argmin() - 20 in range(1, 7)
+    cropped = rejoined(lowest[:, 14:].copy(), ground[:, 14:].copy(), nothing[:, 14:].copy(), 1, (3, 250.0))
+    np.testing.assert_array_equal(cropped[:, 6:], seen[:, 20:])
+    assert rejoined(lowest, nothing, nothing, 3, (3, 250.0)).sum() == 0
 
 
 # -- wide objects ------------------------------------------------------------------------------------------------------
@@ -310,8 +338,11 @@ def test_a_spur_of_a_plateau_that_narrows_grows_back_from_the_plateau() -> None:
     c, r = coordinates(220, 260)
     spur = (c > 80) & (np.abs(r - 110) < 10 + 0.6 * (c - 80))
     lowest = millimetres(np.where(spur, 7.0, 0.0), 20.0)
-    kept = [ground_cells(lowest, GroundSettings(terrace_passes=passes))[spur].mean() for passes in (0, 2, 6)]
+    kept = [ground_cells(lowest, GroundSettings(rejoin_passes=passes))[spur].mean() for passes in (0, 1, 2)]
     assert kept[0] < kept[1] < kept[2]
+    found, steady = morphological_ground(lowest, (0, 0), GroundSettings())
+    np.testing.assert_array_equal(steady, ground_cells(lowest, GroundSettings(rejoin_passes=0)))
+    assert found[steady].all()
 
 
 def test_low_outliers_and_clumps_of_them_change_nothing_but_their_own_cells() -> None:

@@ -38,7 +38,9 @@ WHOLE = Window(x0_mm=0, y0_mm=0, x1_mm=110_000, y1_mm=110_000)
 
 NARROW = SceneSettings(
     outliers=OutlierSettings(cube_m=1.0),
-    ground=GroundSettings(max_window_m=4, trend_m=4, widest_m=10, regrowth_passes=1, regrowth_m=1, bridge_m=6),
+    ground=GroundSettings(
+        max_window_m=4, trend_m=4, widest_m=10, regrowth_passes=1, regrowth_m=1, rejoin_passes=1, rejoin_m=2, bridge_m=6
+    ),
     vegetation=VegetationSettings(radius_m=0.5),
     surfaces=SurfaceSettings(max_circumradius_m=4.0),
 )
@@ -336,10 +338,11 @@ def test_every_stage_widens_the_support() -> None:
     base = SceneSettings()
     wider = [
         SceneSettings(outliers=OutlierSettings(cube_m=6.0)),
-        SceneSettings(ground=GroundSettings(max_window_m=21)),
-        SceneSettings(ground=GroundSettings(bridge_m=60)),
-        SceneSettings(ground=GroundSettings(trend_m=13)),
+        SceneSettings(ground=GroundSettings(max_window_m=30)),
+        SceneSettings(ground=GroundSettings(bridge_m=80)),
+        SceneSettings(ground=GroundSettings(trend_m=20)),
         SceneSettings(ground=GroundSettings(widest_m=120)),
+        SceneSettings(ground=GroundSettings(rejoin_m=5, rejoin_passes=5)),
         SceneSettings(surfaces=SurfaceSettings(max_circumradius_m=7.0)),
         SceneSettings(vegetation=VegetationSettings(radius_m=1.2)),
     ]

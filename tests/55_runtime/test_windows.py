@@ -23,7 +23,16 @@ from pipeline.tiling import MM, Tile, TileGrid
 TRUSTED = ClassesInUse(ground=True, building=True)
 NARROW: dict[str, Any] = {
     "outliers": {"cube_m": 1.0},
-    "ground": {"max_window_m": 4, "trend_m": 4, "widest_m": 10, "regrowth_passes": 1, "regrowth_m": 1, "bridge_m": 6},
+    "ground": {
+        "max_window_m": 4,
+        "trend_m": 4,
+        "widest_m": 10,
+        "regrowth_passes": 1,
+        "regrowth_m": 1,
+        "rejoin_passes": 1,
+        "rejoin_m": 2,
+        "bridge_m": 6,
+    },
     "surfaces": {"max_circumradius_m": 2.0},
     "vegetation": {"radius_m": 0.3, "company_m": 0.5},
 }
