@@ -133,7 +133,7 @@ class Watcher:
         """Number of processes, their CPU seconds and the largest peak in bytes, per role."""
         reported = {}
         for role in ROLES:
-            own = [seen for seen in self.seen.values() if seen.role == role]
+            own = [seen for seen in tuple(self.seen.values()) if seen.role == role]
             if own:
                 reported[role] = (len(own), sum(seen.cpu_s for seen in own), max(seen.peak_bytes for seen in own))
         return reported

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import logging
 import os
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -126,6 +127,18 @@ def name_in(location: str) -> str:
     return unquote(urlsplit(location).path).rpartition("/")[2]
 
 
+class _LostConnections(logging.Filter):
+    """Drops asyncio's report that a task of aiohttp lost its connection: the request fails, too, and is tried again."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a record is shown."""
+        error = record.exc_info[1] if record.exc_info else None
+        return not isinstance(error, ConnectionError)
+
+
+_LOST_CONNECTIONS = _LostConnections()
+
+
 def filesystem_of(url: str) -> Any:
     """The fsspec file system of a URL; one instance serves a whole process.
 
@@ -141,4 +154,5 @@ def filesystem_of(url: str) -> Any:
         fix = f"Install gablework[{scheme.extra}]" if scheme.extra else f"Install {scheme.module}"
         raise RunError(f"{shown(url)}: {name}:// needs {scheme.module}, which is not installed. {fix}") from error
     filesystem.retries = 1  # s3fs has a loop of its own around each request
+    logging.getLogger("asyncio").addFilter(_LOST_CONNECTIONS)  # adds it once
     return filesystem

@@ -1,6 +1,7 @@
 """Which files paths, URLs and tile indexes mean."""
 
 import json
+import logging
 from pathlib import PurePath
 
 import geopandas
@@ -187,3 +188,10 @@ def test_a_broken_index_is_reported_by_its_name(folder):
     (folder / "index.geojson").write_text(json.dumps({"type": "FeatureCollection"})[:-4])
     with pytest.raises(UnreadableInputError, match=r"index\.geojson: cannot be read as vector data"):
         find_inputs([folder / "index.geojson"])
+
+
+def test_only_a_lost_connection_of_a_task_goes_unreported(caplog: pytest.LogCaptureFixture) -> None:
+    filesystem_of("https://example.org/a.laz")
+    for error in (ConnectionResetError("cut off"), ValueError("a fault")):
+        logging.getLogger("asyncio").error("Task exception was never retrieved", exc_info=error)
+    assert [str(record.exc_info[1]) for record in caplog.records if record.exc_info] == ["a fault"]
