@@ -31,7 +31,6 @@ from pipeline.model import (
     Segmentation,
     Solid,
     Status,
-    WallOutline,
 )
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, model_quality
@@ -388,17 +387,8 @@ def _record(
         coverage=residuals.coverage,
         quality=dataclasses.replace(quality, bic_margin=model.bic_margin),
         touches_data_edge=candidate.touches_data_edge,
-        walls=_wall_outline(footprint, building),
+        walls=walls_of(footprint, roof, building.settings.roof),
     )
-
-
-def _wall_outline(footprint: Polygon | MultiPolygon, building: _Building) -> WallOutline | None:
-    """The walls beneath a footprint at the eaves; None where they are not asked for or none is seen."""
-    walls = walls_of(footprint, building.roof, building.settings.roof)
-    if walls is None:
-        return None
-    outline = shapely.transform(walls.outline_mm, lambda xy: xy * 1e-3)
-    return WallOutline(outline=outline, overhang_m=walls.overhang_m, overhang_sigma_m=walls.overhang_sigma_m)
 
 
 def _lod_model(model: LodParts) -> LodModel:

@@ -170,8 +170,8 @@ def morphological_ground(
 ) -> tuple[BoolArray, BoolArray]:
     """Masks of the cells that hold ground, and of those among them that did not rejoin it by planes.
 
-    Neither holds where there is no data. `lowest` is the elevation in mm of the lowest point of each cell, single pits
-    cleared, NO_DATA where there is none. `corner` is the absolute column and row of the first cell: coarse cells are
+    Both are False in cells without data. `lowest` is the elevation in mm of the lowest point of each cell, with single
+    pits cleared and NO_DATA in empty cells. `corner` is the absolute column and row of the first cell: coarse cells are
     anchored at the CRS's origin.
     """
     radius = settings.max_window_m
