@@ -23,3 +23,17 @@ def printed(program: str, *arguments: object) -> list[str]:
     """The words that a Python program prints."""
     command = [sys.executable, "-c", program, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+
+
+_PRINT_PEAK = """
+from pathlib import Path
+print(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
+"""
+
+
+def printed_with_peak(program: str, *arguments: object) -> list[str]:
+    """The words that a Python program prints, then the largest resident size of its process in kB.
+
+    `getrusage` will not do: it starts from the peak of the process that started the program.
+    """
+    return printed(program + _PRINT_PEAK, *arguments)

@@ -21,6 +21,7 @@ import pyproj
 import pytest
 import shapely
 import small_buildings as small
+from measured import printed_with_peak
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
@@ -428,12 +429,11 @@ def test_no_output_names_a_folder_of_the_server(run_dir: Path, out_dir: Path) ->
 
 # --- memory ----------------------------------------------------------------------------------------------------------
 
-_PEAK = """
-import resource, sys
+_WRITE_OUTPUTS = """
+import sys
 from pathlib import Path
 from service.outputs import write_outputs
 write_outputs(Path(sys.argv[1]), Path(sys.argv[2]))
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
 
 
@@ -446,9 +446,8 @@ def test_ten_times_the_tiles_need_hardly_more_memory(tmp_path: Path) -> None:
             for n in range(count)
         }
         run_dir = runs.write_run(tmp_path / f"run {count}", tiles)
-        command = [sys.executable, "-c", _PEAK, str(run_dir), str(tmp_path / f"out {count}")]
-        result = subprocess.run(command, capture_output=True, text=True, check=True)
-        peaks.append(int(result.stdout) * 1024)
+        (peak_kb,) = printed_with_peak(_WRITE_OUTPUTS, run_dir, tmp_path / f"out {count}")
+        peaks.append(int(peak_kb) * 1024)
     assert read_catalogue(tmp_path / "out 60").n_buildings == 3600
     assert peaks[1] - peaks[0] < 30 * 2**20
 
