@@ -213,20 +213,10 @@ def test_ids_that_are_none_are_warned_of_with_the_nearest(plain: Any, overridden
 
 
 def test_what_changes_nothing_is_reported(plain: Any, overridden: Any) -> None:
-    building, thing = min(rows_by_id(plain.run_dir)), min(rows_by_id(plain.run_dir, "rejected"))
-    text = f"""
-        [[building]]
-        building_id = "{building}"
-        action = "accept"
-        [[building]]
-        building_id = "{thing}"
-        action = "reject"
-    """
-    summary = overridden(text)
+    thing = min(rows_by_id(plain.run_dir, "rejected"))
+    summary = overridden(f'[[building]]\nbuilding_id = "{thing}"\naction = "reject"')
     assert summary.digest == plain.digest
-    found = " ".join(summary.warnings)
-    assert f"{building} is a building already" in found
-    assert f"{thing} is rejected already" in found
+    assert any(f"{thing} is rejected already" in warning for warning in summary.warnings)
     summary = overridden(f'[[building]]\nbuilding_id = "{thing}"\nmethod = "kmeans"')
     assert any('give action = "accept", too' in warning for warning in summary.warnings)
 

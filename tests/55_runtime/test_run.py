@@ -89,9 +89,11 @@ def test_a_candidate_with_too_few_points_for_a_model_is_rejected_unless_a_user_o
     assert summary.counts["failed"] == 0
     assert len(rows(summary.run_dir, "rejected")) == summary.counts["rejected"]
     overrides = tmp_path / "overrides.toml"
-    overrides.write_text(f'[[building]]\nbuilding_id = "{victim}"\nmethod = "kmeans"\n')
-    known = reconstruct(suburb, out=str(tmp_path / "known"), overrides=str(overrides))
-    assert {row["building_id"]: row["status"] for row in rows(known.run_dir)}[victim] == "failed"
+    for entry in ('method = "kmeans"', 'action = "accept"'):
+        overrides.write_text(f'[[building]]\nbuilding_id = "{victim}"\n{entry}\n')
+        known = reconstruct(suburb, out=str(tmp_path / entry), overrides=str(overrides))
+        assert {row["building_id"]: row["status"] for row in rows(known.run_dir)}[victim] == "failed"
+        assert known.warnings == summary.warnings
 
 
 def test_given_footprints_are_the_candidates_also_where_there_are_no_points(

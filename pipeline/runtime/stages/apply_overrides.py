@@ -159,10 +159,7 @@ def _judged(override: Override, name: str, candidates: Sites, rejected: Sites) -
     """Which part of an entry takes effect on its building."""
     effective: Override | None = override
     fault = ""
-    if name in candidates and override.action == "accept":
-        fault = f"{name} is a building already: there is nothing to accept"
-        effective = dataclasses.replace(override, action=None)
-    elif name not in candidates and override.action != "accept":
+    if name not in candidates and override.action != "accept":
         site = rejected[name]
         assert isinstance(site, RejectedSite)
         done = f"{name} is rejected already ({site.verdict.reason})"
