@@ -1,0 +1,263 @@
+"""Scores on real data that settings were chosen on, and on data that no setting was chosen on.
+
+    python -m benchmarks.unseen --out DIR [--data ../shared/data] [--only ground classes forest wireframes]
+                                [--kept-aside] [--page docs/results/unseen.md]
+
+Kept aside are the ISPRS samples 22 and 42, the eastern half of `sparse_0382`, and the Tallinn buildings at odd
+positions in the sorted list of their ids. Without `--kept-aside` they are cut off before anything is computed; with it
+only they are measured. The commands run as a user runs them, with the default settings, classes ignored.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import dataclasses
+import json
+import statistics
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import shapely
+
+from benchmarks.entries import markdown_table
+from benchmarks.ground import DATA, measured, product_filter, samples
+from benchmarks.results_page import filled
+from benchmarks.scenes import DELFT_CRS, SCENES
+from benchmarks.thinned_surveys import thinned, write_changed
+from pipeline.export.geoparquet import read_table
+from pipeline.model import BoolArray
+from pipeline.ruler.evaluation.evaluate import evaluate
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reading.wireframes import read_wireframes
+from pipeline.runtime.classify import ClassifyRequest, classify
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run import run
+from pipeline.scene import BUILDING_CLASS
+from pipeline.settings import RunSettings
+from pipeline.terrain.settings import GroundSettings
+
+PARTS = ("ground", "classes", "forest", "wireframes")
+IGN_CRS = "EPSG:2154"
+THINNED_PER_M2 = (0.3, 0.5)
+SPARSE = "more/ign/sparse_0382_6565.laz"
+FOREST = "more/ign/forest_0906_6665.laz"
+TALLINN = "more/building3d"
+TALLINN_CRS = "EPSG:3301"
+TOLERANCES = ("0_3m", "0_5m", "1m")
+"""Of edges and corners, as the names of the measures have them."""
+SERIAL = Resources(workers=0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tile:
+    """A tile with class 6 of its own."""
+
+    name: str
+    file: str
+    """Below the data folder."""
+    crs: str
+    thinned: bool = True
+    """Whether it is also measured thinned to the densities of sparse surveys."""
+
+
+TILES = (
+    Tile(name="hd_770550", file="more/ign/hd_770550_6277600.laz", crs=IGN_CRS),
+    Tile(name="hd_770500", file="ign/hd_770500_6277500.laz", crs=IGN_CRS),
+    Tile(name="hdf", file="ign/hdf_870000_6617100.laz", crs=IGN_CRS),
+    Tile(name="delft_west", file="ahn3/delft_west.laz", crs=DELFT_CRS),
+    Tile(name="delft_east", file="ahn3/delft_east.laz", crs=DELFT_CRS),
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ClassScore:
+    """Class 6 of a result beside class 6 of the file, in points."""
+
+    right: int
+    said: int
+    true: int
+
+    @property
+    def shares(self) -> tuple[float, float, float]:
+        """Intersection over union, recall, precision."""
+        union = self.said + self.true - self.right
+        return self.right / max(union, 1), self.right / max(self.true, 1), self.right / max(self.said, 1)
+
+    def row(self, name: str) -> list[str]:
+        """A row of the table."""
+        return [name, str(self.true), *(f"{share:.3f}" for share in self.shares)]
+
+
+def half_of(las: laspy.LasData, *, eastern: bool) -> laspy.LasData:
+    """The points east, or west, of the middle of the extent."""
+    x = np.asarray(las.x)
+    las.points = las.points[(x >= 0.5 * (x.min() + x.max())) == eastern]
+    return las
+
+
+def judged_points(name: str, las: laspy.LasData) -> BoolArray:
+    """The points to compare: all except those in a building that the file leaves unclassified."""
+    place = next((scene.unjudged for scene in SCENES if scene.name == name), None)
+    if place is None:
+        return np.ones(len(las.x), np.bool_)
+    inside: BoolArray = shapely.contains_xy(shapely.box(*place), np.asarray(las.x), np.asarray(las.y))
+    return ~inside
+
+
+def class_score(name: str, tile: Path, crs: str, out: Path) -> ClassScore:
+    """Classify one tile without its classes, and compare."""
+    settings = RunSettings.from_mapping({"classes": "ignore"})
+    classify(
+        ClassifyRequest(inputs=(str(tile),), out=str(out), settings=settings, crs=crs, resources=SERIAL, overwrite=True)
+    )
+    before, after = laspy.read(tile), laspy.read(out / tile.name)
+    judged = judged_points(name, before)
+    true = (np.asarray(before.classification) == BUILDING_CLASS)[judged]
+    said = (np.asarray(after.classification) == BUILDING_CLASS)[judged]
+    return ClassScore(right=int((true & said).sum()), said=int(said.sum()), true=int(true.sum()))
+
+
+def thinned_to(per_m2: float) -> Callable[[laspy.LasData], laspy.LasData]:
+    """The change that leaves about so many points per square metre of the extent."""
+
+    def change(las: laspy.LasData) -> laspy.LasData:
+        area = float(np.ptp(las.x) * np.ptp(las.y))
+        return thinned(per_m2 * area / len(las.x))(las)
+
+    return change
+
+
+def class_tables(data: Path, out: Path, *, kept_aside: bool) -> str:
+    """Class 6 per point."""
+    work = out / "classes"
+    side = "eastern" if kept_aside else "western"
+    (half,) = write_changed([data / SPARSE], work / "half", lambda las: half_of(las, eastern=kept_aside))
+    rows = [class_score("", half, IGN_CRS, work / "found").row(f"sparse_0382, {side} half")]
+    if not kept_aside:
+        rows = [class_score(t.name, data / t.file, t.crs, work / "found").row(t.name) for t in TILES] + rows
+        sparse: list[ClassScore] = []
+        for per_m2 in THINNED_PER_M2:
+            for tile in TILES:
+                (path,) = write_changed([data / tile.file], work / f"{per_m2:g}", thinned_to(per_m2))
+                sparse.append(class_score(tile.name, path, tile.crs, work / "found"))
+                rows.append(sparse[-1].row(f"{tile.name}, {per_m2:g} per m2"))
+        means = [statistics.fmean(column) for column in zip(*(score.shares for score in sparse), strict=True)]
+        rows.append(["**mean of the thinned**", "", *(f"**{mean:.3f}**" for mean in means)])
+    return markdown_table(["tile", "points of class 6", "IoU", "recall", "precision"], rows)
+
+
+def ground_table(data: Path, *, kept_aside: bool) -> str:
+    """The ISPRS filter test."""
+    figures = measured(list(samples(data, kept_aside=kept_aside)), product_filter(GroundSettings()))
+    rows = [[f.name, *(f"{v:.2f}" for v in (f.type_1, f.type_2, f.total)), f"{f.kappa:.1f}"] for f in figures]
+    total, kappa = (statistics.fmean(getattr(f, name) for f in figures) for name in ("total", "kappa"))
+    rows.append(["**mean**", "", "", f"**{total:.2f}**", f"**{kappa:.1f}**"])
+    return markdown_table(["sample", "type I, %", "type II, %", "total error, %", "kappa, %"], rows)
+
+
+def forest_table(data: Path, out: Path) -> str:
+    """What a forest without buildings becomes."""
+    rows = []
+    for classes in ("ignore", "trust"):
+        settings = RunSettings.from_mapping({"classes": classes})
+        place = out / "forest" / classes
+        run(
+            RunRequest(
+                inputs=(str(data / FOREST),), out=str(place), settings=settings, crs=IGN_CRS, resources=SERIAL,
+                overwrite=True,
+            )
+        )  # fmt: skip
+        status = collections.Counter(read_table(str(place), "buildings").column("status").to_pylist())
+        rejected = read_table(str(place), "rejected").num_rows
+        rows.append([classes, *(str(n) for n in (status["ok"], status["fallback"], status["failed"], rejected))])
+    return markdown_table(["classes", "models", "blocks", "failed", "rejected"], rows)
+
+
+def tallinn_half(data: Path, out: Path, *, kept_aside: bool) -> Path:
+    """Points, outlines and wireframes of every second building; a point belongs to the nearest outline."""
+    source = data / TALLINN
+    drawn: dict[str, Any] = json.loads((source / "wireframes.json").read_text(encoding="utf-8"))
+    outlines: dict[str, Any] = json.loads((source / "outlines.geojson").read_text(encoding="utf-8"))
+    chosen = set(sorted(drawn)[int(kept_aside) :: 2])
+    place = out / "tallinn"
+    place.mkdir(parents=True, exist_ok=True)
+    features = outlines["features"]
+    owners = np.array([str(feature["properties"]["id"]) for feature in features])
+    tree = shapely.STRtree([shapely.geometry.shape(feature["geometry"]) for feature in features])
+    las = laspy.read(source / "tallinn.laz")
+    nearest = tree.nearest(shapely.points(np.asarray(las.x), np.asarray(las.y)))
+    las.points = las.points[np.isin(owners[nearest], sorted(chosen))]
+    las.write(place / "tallinn.laz")
+    outlines["features"] = [f for f, owner in zip(features, owners, strict=True) if owner in chosen]
+    (place / "outlines.geojson").write_text(json.dumps(outlines), encoding="utf-8")
+    (place / "wireframes.json").write_text(json.dumps({k: drawn[k] for k in sorted(chosen)}), encoding="utf-8")
+    return place
+
+
+def wireframe_rows(place: Path) -> Iterator[list[str]]:
+    """Edges and corners with outlines and without."""
+    wireframes = read_wireframes(place / "wireframes.json")
+    for name, footprints in (("given", str(place / "outlines.geojson")), ("found", None)):
+        models = place / f"models-{name}"
+        run(
+            RunRequest(
+                inputs=(str(place / "tallinn.laz"),), out=str(models), footprints=footprints, crs=TALLINN_CRS,
+                resources=SERIAL, overwrite=True,
+            )
+        )  # fmt: skip
+        measures = {m.name: m for m in evaluate(read_models(models), wireframes=wireframes).measures}
+        for what in ("edge", "corner"):
+            values = []
+            for tolerance in TOLERANCES:
+                found = measures[f"wireframes.{what}_f1_{tolerance}"]
+                values.append(f"{found.value:.3f} ({found.low:.2f} to {found.high:.2f})")
+            yield [name, f"{what}s, F1", *values]
+
+
+def wireframe_table(data: Path, out: Path, *, kept_aside: bool) -> str:
+    """Roof edges and corners beside those that people drew."""
+    rows = list(wireframe_rows(tallinn_half(data, out, kept_aside=kept_aside)))
+    return markdown_table(["outlines", "", "within 0.3 m", "0.5 m", "1 m"], rows)
+
+
+def tables(data: Path, out: Path, only: Sequence[str], *, kept_aside: bool) -> Iterator[tuple[str, str]]:
+    """Names and text of the tables."""
+    made: dict[str, Callable[[], str]] = {
+        "ground": lambda: ground_table(data, kept_aside=kept_aside),
+        "classes": lambda: class_tables(data, out, kept_aside=kept_aside),
+        "forest": lambda: forest_table(data, out),
+        "wireframes": lambda: wireframe_table(data, out, kept_aside=kept_aside),
+    }
+    if kept_aside:
+        del made["forest"]
+    for name, make in made.items():
+        if name in only:
+            yield f"{name}-{'unseen' if kept_aside else 'chosen'}.md", make()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, print, and fill in the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=PARTS)
+    parser.add_argument("--kept-aside", action="store_true", help="the data that no setting was chosen on")
+    parser.add_argument("--page", type=Path, help="fill in this page of results")
+    given = parser.parse_args(arguments)
+    given.out.mkdir(parents=True, exist_ok=True)
+    for name, text in tables(given.data, given.out, given.only, kept_aside=given.kept_aside):
+        (given.out / name).write_text(text, encoding="utf-8")
+        print(f"{name}\n\n{text}", flush=True)
+    if given.page is not None:
+        given.page.write_text(filled(given.page.read_text(encoding="utf-8"), given.out)[0], encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
