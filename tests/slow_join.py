@@ -52,6 +52,7 @@ def _figures(sums: IntArray) -> dict[str, float]:
         "width_m": 2.0 * area_mm2 / grown_outline_mm / 1000.0,
         "planar_share": float(sums[Sum.PLANAR]) / judged,
         "judged": float(sums[Sum.PLANAR] + sums[Sum.ROUGH]),
+        "smooth_share": float(sums[Sum.SMOOTH]) / max(1, int(sums[Sum.PLANAR] + sums[Sum.ROUGH])),
         "canopy_share": float(sums[Sum.CANOPY]) / max(1, int(sums[Sum.CANOPY] + sums[Sum.POINTS])),
         "points": float(points),
         "several_share": float(sums[Sum.SEVERAL]) / points,
@@ -96,7 +97,9 @@ def _fault(kind: int, sums: IntArray, settings: CandidateSettings) -> tuple[Reas
     if f["planar_share"] < settings.min_planar_share and not is_intact:
         return Reason.VEGETATION, f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}"
     most = p + settings.beam_m / max(1.0, f["width_m"]) + scatter
-    if f["several_share"] < 1.0 and f["through_share"] > most:
+    q = settings.min_smooth_share
+    is_smooth = f["smooth_share"] >= q + math.sqrt(q * (1.0 - q) / max(1.0, f["judged"]))
+    if f["several_share"] < 1.0 and not is_smooth and f["through_share"] > most:
         share = f"pulses of {f['through_share']:.2f} of its points go on below"
         return Reason.VEGETATION, f"{share}, at most {most:.2f}"
     if f["canopy_share"] > settings.max_canopy_share:

@@ -117,6 +117,7 @@ def _figures(sums: IntArray) -> dict[str, FloatArray]:
         "width_m": 2.0 * area_mm2 / grown_outline_mm / 1000.0,
         "planar_share": sums[:, Sum.PLANAR] / np.maximum(1, known),
         "judged": known.astype(np.float64),
+        "smooth_share": sums[:, Sum.SMOOTH] / np.maximum(1, known),
         "canopy_share": sums[:, Sum.CANOPY] / np.maximum(1, sums[:, Sum.CANOPY] + sums[:, Sum.POINTS]),
         "points": points.astype(np.float64),
         "several_share": sums[:, Sum.SEVERAL] / points,
@@ -133,13 +134,16 @@ def _penetration(f: dict[str, FloatArray], settings: CandidateSettings) -> tuple
     At the edge of a roof pulses go on, too: the narrower a surface, the larger the part of it that is edge. Shares of
     few points scatter by the standard deviation of a binomial distribution. A surface without any pulse of several
     returns shows nothing, and so does one without any of a single return: the scanner may record one echo of each
-    pulse, or a first and a last one of each.
+    pulse, or a first and a last one of each. A surface of which a part is as smooth as the scanner measures is a roof,
+    however many pulses meet its edges.
     """
     p = settings.max_through_share
     scatter = np.sqrt(p * (1.0 - p) / f["points"])
     is_intact = (f["several_share"] > 0.0) & (f["several_share"] + scatter <= p)
     most = p + settings.beam_m / np.maximum(_NARROW_M, f["width_m"]) + scatter
-    return is_intact, np.where(f["several_share"] < 1.0, most, 1.0)
+    q = settings.min_smooth_share
+    is_smooth = f["smooth_share"] >= q + np.sqrt(q * (1.0 - q) / np.maximum(1.0, f["judged"]))
+    return is_intact, np.where(is_smooth | (f["several_share"] >= 1.0), np.inf, most)
 
 
 def _limits(

@@ -48,6 +48,8 @@ class Sum(IntEnum):
     """Points from pulses with several returns."""
     THROUGH = 17
     """Points whose pulse went on to a later return."""
+    SMOOTH = 18
+    """Vertices with smooth surroundings."""
 
 
 N_SUMS = len(Sum)
@@ -66,8 +68,9 @@ def _sum_vertices(sums: IntArray, vertices: SceneVertices, vertex_label: LabelAr
             sums[fragment, Sum.VERTICES] += 1
             sums[fragment, Sum.HEIGHT] += height[v]
             sums[fragment, Sum.HEIGHT2] += np.int64(height[v]) * height[v]
-            if planar[v] == 1:
+            if planar[v] > 0:
                 sums[fragment, Sum.PLANAR] += 1
+                sums[fragment, Sum.SMOOTH] += planar[v] == 2
             elif planar[v] == 0:
                 sums[fragment, Sum.ROUGH] += 1
 

@@ -136,6 +136,13 @@ class VegetationSettings(Parameters):
         minimum=0.02,
         maximum=1.0,
     )
+    smooth_m: float = parameter(
+        0.03,
+        "The same of a smooth window: a roof is as smooth as the scanner measures, and the top of a hedge is not.",
+        unit="m",
+        minimum=0.0,
+        maximum=1.0,
+    )
     level_m: float = parameter(
         2.0,
         "Points this far above or below a vertex lie across a wall and do not count for it.",
@@ -275,6 +282,13 @@ class CandidateSettings(Parameters):
         unit="m",
         minimum=0.0,
         maximum=2.0,
+    )
+    min_smooth_share: float = parameter(
+        0.2,
+        "From this share of vertices with smooth surroundings on, a surface is a roof in spite of such pulses; more "
+        "for few vertices.",
+        minimum=0.01,
+        maximum=1.0,
     )
     min_wall_share: float = parameter(0.15, "Least share of the outline that touches walls.", minimum=0.0, maximum=1.0)
     min_top_share: float = parameter(

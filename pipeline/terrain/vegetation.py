@@ -141,6 +141,8 @@ class _Windows(NamedTuple):
     min_points: int
     roughness_mm: float
     """Largest orthogonal standard deviation of a planar window."""
+    smooth_mm: float
+    """The same of a smooth one."""
     level_mm: int
     """Points farther above or below a vertex do not count."""
 
@@ -149,8 +151,8 @@ class _Windows(NamedTuple):
 def _planar(
     x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, wanted: BoolArray, windows: _Windows, out: KindArray
 ) -> None:
-    """Kernel for one scale: fills the wanted entries of out that are still -1 with 1 (planar) or 0 (rough)."""
-    radius_mm, min_points, roughness_mm, level_mm = windows
+    """Kernel for one scale: fills the wanted entries of out that are still -1 with the verdicts of `planarity`."""
+    radius_mm, min_points, roughness_mm, smooth_mm, level_mm = windows
     n = x_mm.size
     if n == 0:
         return
@@ -164,7 +166,7 @@ def _planar(
     # copies in the order of the cells: neighbouring cells of a row are one run of memory
     points = _in_order(x_mm, y_mm, z_mm, members)
     block, wide, near = np.empty((3, 256)), np.empty((3, 256)), np.empty((3, 256))
-    planar_mm2 = roughness_mm * roughness_mm
+    planar_mm2, smooth_mm2 = roughness_mm * roughness_mm, smooth_mm * smooth_mm
     for cell in range(rows * columns):
         place = (cell // columns, cell % columns)
         count, around = -1, -1
@@ -179,8 +181,9 @@ def _planar(
             s = _moments(block, count, at, (0.0, 0.0), limit, level_mm)
             if s[0] < min_points:
                 continue
-            out[i] = _spread_mm2(s) <= planar_mm2
-            if out[i] == 1:
+            spread_mm2 = _spread_mm2(s)
+            out[i] = 2 if spread_mm2 <= smooth_mm2 else 1 if spread_mm2 <= planar_mm2 else 0
+            if out[i] > 0:
                 continue
             if around < 0:
                 wide, around = _block_around(points, start, place, (rows, columns), 2, wide)
@@ -197,8 +200,9 @@ def _planar(
 def planarity(
     x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, wanted: BoolArray, settings: VegetationSettings
 ) -> KindArray:
-    """Whether the surroundings of each wanted vertex are planar: 1 planar, 0 rough, -1 not wanted or few neighbours.
+    """How planar the surroundings of each wanted vertex are.
 
+    2 smooth, 1 planar, 0 rough, -1 not wanted or few neighbours. Only the window in the middle can be smooth.
     A vertex is judged by the most planar of nine windows: one around it and eight shifted by 0.8 of the radius, as
     edge-preserving filters do (Nagao and Matsuyama 1979), since every point near a ridge or an eave has a planar side.
     Vertices are thinned points in millimetres; all within `level_m` in elevation are neighbours.
@@ -209,6 +213,7 @@ def planarity(
             radius_mm=round(settings.radius_m * 1000) * 2**scale,
             min_points=settings.min_neighbours,
             roughness_mm=settings.roughness_m * 1000.0 * 1.5**scale,
+            smooth_mm=settings.smooth_m * 1000.0 * 1.5**scale,
             level_mm=round(settings.level_m * 1000),
         )
         _planar(x_mm, y_mm, z_mm, wanted, windows, verdict)

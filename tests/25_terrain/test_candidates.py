@@ -131,6 +131,11 @@ def test_each_reason_names_its_figure_and_threshold(changes: dict[Sum, int], rea
             {Sum.POINTS: 20, Sum.SEVERAL: 8, Sum.THROUGH: 4},
             {Sum.POINTS: 1600, Sum.SEVERAL: 640, Sum.THROUGH: 320},
         ),
+        # a surface as smooth as the scanner measures is a roof whose edges many pulses meet
+        (
+            {Sum.SMOOTH: 88, Sum.SEVERAL: 800, Sum.THROUGH: 640},
+            {Sum.SMOOTH: 87, Sum.SEVERAL: 800, Sum.THROUGH: 640},
+        ),
         # a scanner that records a first and a last echo of each pulse shows nothing
         ({Sum.SEVERAL: 1600, Sum.THROUGH: 800}, {Sum.SEVERAL: 1599, Sum.THROUGH: 800}),
         # a rough roof that hardly any pulse pierces; a scanner of single returns shows nothing of the kind
@@ -212,6 +217,7 @@ some_sums = st.fixed_dictionaries(
         Sum.CANOPY: st.integers(0, 2000),
         Sum.SEVERAL: st.integers(0, 1000),
         Sum.THROUGH: st.integers(0, 1000),
+        Sum.SMOOTH: st.integers(0, 400),
     }
 )
 """Anything, and more often than by chance what lies at a threshold or passes most of them."""
