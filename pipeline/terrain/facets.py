@@ -58,7 +58,7 @@ class SceneVertices(NamedTuple):
     kind: KindArray
     """VertexKind."""
     planar: KindArray
-    """1 planar surroundings, 0 rough, -1 unknown."""
+    """2 smooth surroundings, 1 planar, 0 rough, -1 unknown."""
 
 
 class FacetLimits(NamedTuple):

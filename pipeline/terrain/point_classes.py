@@ -281,7 +281,7 @@ def leafiness(evidence: PointEvidence, among: BoolArray, tall: BoolArray, vegeta
     values = np.zeros((len(index), 4), np.int64)
     values[:, 0] = 1
     values[:, 1] = evidence.echoes[index]
-    values[chosen, 2] = flat == 1
+    values[chosen, 2] = flat > 0
     values[chosen, 3] = flat == 0
     points, echoes, smooth, rough = sums_around(x, y, all_of_them, values, AROUND_MM).T
     often, uneven = 2 * echoes >= points, rough >= smooth
