@@ -152,7 +152,8 @@ class VegetationSettings(Parameters):
     )
     company_m: float = parameter(
         2.0,
-        "Radius of the sphere around a vertex; the verdicts in it decide together whether the vertex is roof or crown.",
+        "Radius of the sphere around a vertex; the verdicts in it decide together whether the vertex is roof or crown. "
+        "Doubled up to twice where it holds fewer than min_neighbours of them.",
         unit="m",
         minimum=0.5,
         maximum=5.0,
@@ -173,7 +174,7 @@ class VegetationSettings(Parameters):
     @property
     def support_m(self) -> float:
         """How far the judgement looks: the shifted windows of the widest scale, around the vertices of a sphere."""
-        return 2.0 * self.radius_m * 2.0 ** (PLANARITY_SCALES - 1) + self.company_m
+        return (2.0 * self.radius_m + self.company_m) * 2.0 ** (PLANARITY_SCALES - 1)
 
 
 class SurfaceSettings(Parameters):

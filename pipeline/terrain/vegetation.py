@@ -228,8 +228,8 @@ def _crowns(
     planar: KindArray,
     several: BoolArray,
     radius_mm: int,
-    crown_share: float,
-    pierced_share: float,
+    min_judged: int,
+    shares: tuple[float, float],
 ) -> BoolArray:
     """Kernel of `crowns`."""
     n = x_mm.size
@@ -243,16 +243,21 @@ def _crowns(
     marks = 1 + ((planar[members] == 0).astype(np.int64) << 20) + (several[members].astype(np.int64) << 40)
     for cell in range(rows * columns):
         r, c = cell // columns, cell % columns
-        west, east = max(c - 2, 0), min(c + 2, columns - 1)
         for m in range(start[cell], start[cell + 1]):
             x, y, z = points[0, m], points[1, m], points[2, m]
-            counts = 0
-            for rr in range(max(r - 2, 0), min(r + 3, rows)):
-                for k in range(start[rr * columns + west], start[rr * columns + east + 1]):
-                    dx, dy, dz = points[0, k] - x, points[1, k] - y, points[2, k] - z
-                    counts += marks[k] if dx * dx + dy * dy + dz * dz <= limit else 0
+            counts, reach, farthest = 0, 2, limit
+            for _ in range(PLANARITY_SCALES):
+                counts = 0
+                west, east = max(c - reach, 0), min(c + reach, columns - 1)
+                for rr in range(max(r - reach, 0), min(r + reach + 1, rows)):
+                    for k in range(start[rr * columns + west], start[rr * columns + east + 1]):
+                        dx, dy, dz = points[0, k] - x, points[1, k] - y, points[2, k] - z
+                        counts += marks[k] if dx * dx + dy * dy + dz * dz <= farthest else 0
+                if counts & _COUNT >= min_judged:
+                    break
+                reach, farthest = 2 * reach, 4.0 * farthest
             judged, rough, pierced = counts & _COUNT, (counts >> 20) & _COUNT, counts >> 40
-            out[members[m]] = rough > crown_share * judged and pierced > pierced_share * judged
+            out[members[m]] = rough > shares[0] * judged and pierced > shares[1] * judged
     return out
 
 
@@ -267,15 +272,15 @@ def crowns(
     """Which vertices belong to crowns: most of the judged vertices near them in space are rough, and some are pierced.
 
     A chimney is rough and stays with its roof; a flat patch in a crown is planar and stays with the crown; a crown that
-    leans on a roof is cut from it. The sphere counts only neighbours on the level of the vertex. Rough roofs with
-    superstructures return most pulses once, crowns do not. In a file of single returns nothing is a crown, and whole
-    surfaces are judged by their shape alone.
+    leans on a roof is cut from it. The sphere counts only neighbours on the level of the vertex, and doubles up to
+    twice until it holds `min_neighbours` judged ones: two or three vertices of a sparse survey show no crown. Rough
+    roofs with superstructures return most pulses once, crowns do not. In a file of single returns nothing is a crown,
+    and whole surfaces are judged by their shape alone.
 
     Vertices are thinned points in millimetres, `planar` their verdicts by `planarity`; without one a vertex is not in a
     crown. `several` marks those from a pulse of several returns.
     """
     radius_mm = round(settings.company_m * 1000)
-    mask: BoolArray = _crowns(
-        x_mm, y_mm, z_mm, planar, several, radius_mm, settings.crown_share, settings.pierced_share
-    )
+    shares = (settings.crown_share, settings.pierced_share)
+    mask: BoolArray = _crowns(x_mm, y_mm, z_mm, planar, several, radius_mm, settings.min_neighbours, shares)
     return mask

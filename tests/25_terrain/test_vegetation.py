@@ -185,14 +185,19 @@ def test_the_judgement_looks_no_further_than_its_support() -> None:
 
 def test_crowns_are_those_of_a_slow_twin() -> None:
     random = np.random.default_rng(11)
-    points = np.concatenate((flat(random, 3.0), crown(random, 250)))
+    sparse = flat(random, 0.2) + np.array([100_000, 0, 0])
+    points = np.concatenate((flat(random, 3.0), crown(random, 250), sparse))
     planar = random.choice(np.array([-1, 0, 0, 1, 1], np.int8), len(points))
     several = random.random(len(points)) < 0.12
     settings = VegetationSettings()
     found = crowns(*points.T.copy(), planar, several, settings)
     expected = []
     for k, point in enumerate(points):
-        near = (((points - point) ** 2).sum(axis=1) <= 2000**2) & (planar >= 0)
+        distance_mm = np.sqrt(((points - point) ** 2).sum(axis=1))
+        for radius_mm in (2000, 4000, 8000):
+            near = (distance_mm <= radius_mm) & (planar >= 0)
+            if near.sum() >= settings.min_neighbours:
+                break
         rough, pierced = (planar[near] == 0).sum(), several[near].sum()
         expected.append(planar[k] >= 0 and rough > 0.5 * near.sum() and pierced > 0.1 * near.sum())
     assert found.tolist() == expected
