@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
+import math
 from collections.abc import Mapping
 
 from shapely import MultiPolygon, Polygon
@@ -22,6 +23,8 @@ class CandidateFacts:
     """Time of the candidate's earliest point, with a time zone; None if the file has no absolute time."""
     acquired_to: dt.datetime | None = None
     """Time of the candidate's latest point."""
+    through_share: float = math.nan
+    """Share of the candidate's points whose pulse went on to a later return; nan if it is not known."""
     source_attributes: str | None = None
     """The given footprint's columns as the text of a JSON object; None without one."""
     overridden: str | None = None

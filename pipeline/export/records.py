@@ -16,8 +16,11 @@ from pipeline.export.dimensions import Dimensions, dimensions
 from pipeline.export.facts import CandidateFacts, RecordContext, RejectedObject
 from pipeline.export.solid_geometry import WALL_OUTLINE, solid_columns
 from pipeline.model import BuildingResult, ModelQuality, Plane
+from pipeline.quality.detection import detection_confidence
 
 _TIME = pa.timestamp("us", tz="UTC")
+_SAYS_BUILDING = frozenset({"accept", "footprint"})
+"""Overrides by which a user says that an object is a building."""
 
 BUILDINGS = pa.schema(
     [
@@ -56,6 +59,8 @@ BUILDINGS = pa.schema(
         pa.field("volume_m3", pa.float64()),
         pa.field("n_points", pa.int64(), nullable=False),
         pa.field("density_per_m2", pa.float64()),
+        pa.field("through_share", pa.float64()),
+        pa.field("detection_confidence", pa.float64()),
         pa.field("n_planes", pa.int32(), nullable=False),
         pa.field("rmse_m", pa.float64()),
         pa.field("p95_m", pa.float64()),
@@ -180,6 +185,8 @@ def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: s
         "volume_m3": _or_none(measured.volume_m3) if modelled else None,
         "n_points": result.n_points,
         "density_per_m2": _or_none(result.density_per_m2),
+        "through_share": _or_none(facts.through_share, 4),
+        "detection_confidence": _confidence(result, facts),
         "n_planes": len(result.planes),
         "rmse_m": _or_none(result.rmse_m),
         "p95_m": _or_none(result.p95_m),
@@ -196,6 +203,13 @@ def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: s
         "settings_hash": facts.settings_hash or context.settings_hash,
         "engine_version": context.engine_version,
     }
+
+
+def _confidence(result: BuildingResult, facts: CandidateFacts) -> float | None:
+    """How probably it is a building; None without a model, and where a footprint or the user says that it is one."""
+    if result.source_id is not None or _SAYS_BUILDING & set((facts.overridden or "").split(", ")):
+        return None
+    return _or_none(detection_confidence(result.n_points, result.quality.share_within, facts.through_share))
 
 
 def _quality(quality: ModelQuality) -> dict[str, float | bool | None]:

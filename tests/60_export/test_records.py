@@ -21,12 +21,14 @@ from pipeline.export.records import (
     rejected_row,
 )
 from pipeline.model import Plane
+from pipeline.quality.detection import detection_confidence
 
 DESIGNED = """building_id, source_id, source_attributes, status, reason, reason_detail, overridden, method, roof_type,
 geometry, lod, solid, solid_parts, solid_surfaces, solid_planes, solid_lod12, solid_lod12_parts, solid_lod12_surfaces,
 solid_lod13, solid_lod13_parts, solid_lod13_surfaces, ground_z, eave_z, ridge_z, h_min, h_50p, h_70p, h_max, height_m,
-footprint_area_m2, footprint_share, roof_area_m2, volume_m3, n_points, density_per_m2, n_planes, rmse_m, p95_m,
-coverage, point_spacing_m, noise_m, share_within_0_2m, unexplained_m2, largest_hole_m, ridge_z_sigma_m, bic_margin,
+footprint_area_m2, footprint_share, roof_area_m2, volume_m3, n_points, density_per_m2, through_share,
+detection_confidence, n_planes, rmse_m, p95_m, coverage, point_spacing_m, noise_m, share_within_0_2m, unexplained_m2,
+largest_hole_m, ridge_z_sigma_m, bic_margin,
 is_curved, valid, validity_codes, touches_data_edge, wall_outline, overhang_m, overhang_sigma_m, acquired_from,
 acquired_to, mesh_path, input_hash, settings_hash, engine_version"""
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
@@ -94,7 +96,7 @@ def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts: Contexts) 
         *("source_id", "geometry", "lod", "eave_z", "ridge_z", "h_min", "h_50p", "h_70p", "h_max", "height_m"),
         *("footprint_area_m2", "footprint_share", "roof_area_m2", "volume_m3", "density_per_m2", "rmse_m", "p95_m"),
         *("point_spacing_m", "noise_m", "share_within_0_2m", "unexplained_m2", "largest_hole_m", "ridge_z_sigma_m"),
-        *("wall_outline", "overhang_m", "overhang_sigma_m"),
+        *("wall_outline", "overhang_m", "overhang_sigma_m", "through_share", "detection_confidence"),
         *("bic_margin", "source_attributes", "overridden", "mesh_path", "input_hash"),
         *("solid", "solid_parts", "solid_surfaces", "solid_planes"),
         *("solid_lod12", "solid_lod12_parts", "solid_lod12_surfaces"),
@@ -110,6 +112,20 @@ def test_facts_of_a_candidate_stand_above_those_of_the_run(contexts: Contexts) -
     own, other = building_row(small.gable(), context), building_row(small.pent(), context)
     assert (own["input_hash"], own["acquired_from"]) == ("ab", moment)
     assert (other["input_hash"], other["acquired_from"]) == (None, contexts["compound"].acquired_from)
+
+
+def test_only_a_building_found_in_the_points_alone_has_a_confidence(contexts: Contexts) -> None:
+    def confidence(overridden: str | None = None, **changes: str) -> float | None:
+        facts = {"gable": CandidateFacts(through_share=0.1, overridden=overridden)}
+        row = building_row(small.gable(**changes), dataclasses.replace(contexts["compound"], facts=facts))
+        assert row["through_share"] == 0.1
+        found: float | None = row["detection_confidence"]
+        return found
+
+    expected = detection_confidence(small.gable().n_points, small.QUALITY.share_within, 0.1)
+    assert confidence() == confidence("method") == pytest.approx(expected, abs=5e-4)
+    assert confidence("accept, method") is confidence("footprint") is None
+    assert confidence(source_id="parcel 7") is None
 
 
 @pytest.mark.parametrize("crs", CRSES)

@@ -202,7 +202,14 @@ def gather(
         touches_data_edge=_touches_data_edge(own, ~points_near),
     )
     first, last = _acquired(points, gps_kind)
-    return candidate, CandidateFacts(input_hash=digest.hexdigest(), acquired_from=first, acquired_to=last)
+    goes_on = int((points["return_number"] < points["return_count"]).sum())
+    facts = CandidateFacts(
+        input_hash=digest.hexdigest(),
+        acquired_from=first,
+        acquired_to=last,
+        through_share=goes_on / len(points) if len(points) else math.nan,
+    )
+    return candidate, facts
 
 
 def _ground_mm(outline_mm: IntArray, terrain_mm: IntArray, points_mm: IntArray) -> int | None:
