@@ -207,7 +207,7 @@ class ArrangementSettings(Parameters):
         maximum=10_000.0,
     )
     corner_share: float = parameter(
-        0.17,
+        0.4,
         "Misfitting points that a corner of the borders must save, as a share of those of a roof face; 0 keeps all.",
         minimum=0.0,
         maximum=10.0,
@@ -216,14 +216,21 @@ class ArrangementSettings(Parameters):
         0.2, "Roof planes whose heights differ by less make one corner together.", unit="m", minimum=0.0, maximum=2.0
     )
     corner_reach_m: float = parameter(
-        0.6, "How far a corner of three or more borders moves to join another.", unit="m", minimum=0.0, maximum=5.0
+        0.7, "How far a corner of three or more borders moves to join another.", unit="m", minimum=0.0, maximum=5.0
     )
     plane_shift_m: float = parameter(
-        0.05,
+        0.08,
         "How far a plane may move to meet its neighbours in their corners, root mean square over its points.",
         unit="m",
         minimum=0.0,
         maximum=1.0,
+    )
+    strip_width_m: float = parameter(
+        0.5,
+        "A narrower strip is not a roof face: parapets, gutters, the edge of a wall.",
+        unit="m",
+        minimum=0.0,
+        maximum=2.0,
     )
     raster_cell_m: float = parameter(
         0.35,

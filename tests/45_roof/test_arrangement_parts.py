@@ -10,12 +10,14 @@ from pipeline.model import IntArray, LabelArray
 from pipeline.roof.arrangement.candidate_lines import CandidateLines
 from pipeline.roof.arrangement.cells import (
     cell_areas_m2,
+    cell_borders,
     cells_of_points,
     connected_faces,
     points_per_cell,
     unite_faces,
 )
 from pipeline.roof.arrangement.faces import rings_of_faces
+from pipeline.roof.arrangement.limits import Limits, limits_at
 from pipeline.roof.arrangement.minimum_cut import Allowed, every_label, expand_labels, neighbour_lists
 from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, Raster, _settle
 from pipeline.roof.arrangement.subdivision import (
@@ -30,6 +32,7 @@ from pipeline.roof.arrangement.subdivision import (
     subdivide,
     subdivision_of,
 )
+from pipeline.roof.settings import ArrangementSettings
 
 
 def random_graph(seed: int, n: int, k: int) -> tuple[IntArray, LabelArray, IntArray]:
@@ -136,28 +139,6 @@ def test_rings_come_by_faces_the_outer_one_first() -> None:
     assert not rings_of_faces(xy, hole_first[:8], starts[:3], np.array([1, 0], np.int32), 2)[3]
 
 
-def test_a_face_that_explains_too_little_joins_its_neighbour_and_another_stays() -> None:
-    costs = np.array([[0, 900], [900, 600], [90_000, 0]])
-    pairs, weights = np.array([[0, 1], [1, 2]], np.int32), np.array([100, 100])
-    labels = np.array([0, 1, 1], np.int32)
-    held = np.array([10, 10, 100], np.int32)
-    unite_faces(costs, held, pairs, weights, labels, 500, 500)
-    assert connected_faces(labels, pairs)[1] == 2
-    strict = labels.copy()
-    unite_faces(costs, held, pairs, weights, strict, 1_000_000, 1_000_000)
-    assert connected_faces(strict, pairs)[1] == 1
-
-
-@pytest.mark.parametrize(("own_misfit", "faces"), [(0, 2), (4_000, 2), (20_000, 1)])
-def test_a_face_costs_the_more_the_more_of_its_own_points_misfit_it(own_misfit: int, faces: int) -> None:
-    # beside a large face forty points, that save thirty; half of them or more would make the face cost sixty
-    costs = np.array([[0, 200_000], [30_000 + own_misfit, own_misfit]])
-    pairs, weights = np.array([[0, 1]]), np.array([100])
-    labels = np.array([0, 1], np.int32)
-    unite_faces(costs, np.array([200, 40], np.int32), pairs, weights, labels, 16_000, 60_000)
-    assert connected_faces(labels, pairs)[1] == faces
-
-
 def test_points_are_counted_by_cell_and_those_outside_not_at_all() -> None:
     assert points_per_cell(np.array([2, 0, -1, 2]), 4).tolist() == [1, 0, 2, 0]
 
@@ -170,6 +151,71 @@ def square(holes: int = 0) -> Subdivision:
         rings.append(np.array([(x, x), (x, x + 1000), (x + 1000, x + 1000), (x + 1000, x)]))
     starts = np.arange(0, 4 * len(rings) + 1, 4)
     return subdivision_of(np.concatenate(rings), starts, np.zeros(len(rings), np.int64), 400)
+
+
+def cut(*east_mm: int) -> Subdivision:
+    """A square of 10 m cut from south to north."""
+    plan = square()
+    for x in east_mm:
+        for y in (0, 10_000):
+            assert insert_vertex(plan, edge_through(plan, x, y), x, y)
+        north = int(plan.counts[0]) - 1
+        assert insert_chord(plan, north - 1, north, cell_at(plan, x + 1.0, 5000.0), 0) == 1
+    return plan
+
+
+def edge_through(plan: Subdivision, x: int, y: int) -> int:
+    """The half-edge with a cell to its left that runs from west to east or back through a place."""
+    for h in range(plan.counts[1]):
+        (x0, y0), (x1, y1) = plan.xy[plan.graph[h, ORIGIN]], plan.xy[plan.graph[h ^ 1, ORIGIN]]
+        if plan.graph[h, FACE] >= 0 and y0 == y == y1 and min(x0, x1) < x < max(x0, x1):
+            return h
+    raise AssertionError((x, y))
+
+
+def united(plan: Subdivision, misfits: IntArray, labels: LabelArray, limits: Limits) -> int:
+    """The number of faces that stay, of one cell each with a hundred points."""
+    pairs, weights = cell_borders(plan, 0.01)
+    unite_faces(plan, misfits, np.full(len(labels), 100, np.int32), pairs, weights, labels, limits)
+    return connected_faces(labels, pairs)[1]
+
+
+def face_limits(face_cost: int, doubtful_cost: int, strip_width_m: float = 0.0) -> Limits:
+    usual = limits_at(0.3, ArrangementSettings())
+    return usual._replace(face_cost=face_cost, doubtful_cost=doubtful_cost, strip_width_m=strip_width_m)
+
+
+def test_a_face_that_explains_too_little_joins_its_neighbour_and_another_stays() -> None:
+    costs = np.array([[0, 900], [90_000, 0]])
+    labels = np.array([0, 1], np.int32)
+    assert united(cut(5000), costs, labels, face_limits(500, 500)) == 2
+    assert united(cut(5000), costs, labels, face_limits(1_000_000, 1_000_000)) == 1
+
+
+@pytest.mark.parametrize(("own_misfit", "faces"), [(0, 2), (4_000, 2), (50_000, 1)])
+def test_a_face_costs_the_more_the_more_of_its_own_points_misfit_it(own_misfit: int, faces: int) -> None:
+    # beside a large face a hundred points, that save thirty; half of them or more would make the face cost sixty
+    costs = np.array([[0, 200_000], [30_000 + own_misfit, own_misfit]])
+    assert united(cut(5000), costs, np.array([0, 1], np.int32), face_limits(16_000, 60_000)) == faces
+
+
+@pytest.mark.parametrize(("width_mm", "faces"), [(300, 1), (450, 1), (550, 2), (1500, 2)])
+@pytest.mark.parametrize("at_border", [True, False])
+def test_a_strip_narrower_than_a_roof_joins_a_neighbour_whatever_its_points_say(
+    width_mm: int, faces: int, at_border: bool
+) -> None:
+    plan = cut(width_mm) if at_border else cut(4000, 4000 + width_mm)
+    is_strip = cell_areas_m2(plan) < 20.0
+    labels = is_strip.astype(np.int32)
+    misfits = np.where(is_strip[:, None] == np.array([False, True]), 0, 90_000)
+    assert united(plan, misfits, labels, face_limits(1000, 1000, 0.5)) == (faces if at_border or faces == 1 else 3)
+    assert labels[np.argmax(cell_areas_m2(plan))] == 0
+
+
+def test_a_strip_without_a_neighbour_stays() -> None:
+    xy = np.array([(0, 0), (400, 0), (400, 9000), (0, 9000), (2000, 0), (8000, 0), (8000, 9000), (2000, 9000)])
+    apart = subdivision_of(xy, np.array([0, 4, 8]), np.array([0, 1]), 400)
+    assert united(apart, np.zeros((2, 2), np.int64), np.array([0, 1], np.int32), face_limits(1000, 1000, 0.5)) == 2
 
 
 def loops(plan: Subdivision) -> list[list[int]]:

@@ -119,7 +119,7 @@ def _label_cells(
     neighbours = neighbour_lists(n_cells, borders, weights)
     expand_labels(costs, every_label(n_cells, len(planes)), neighbours, chosen, _ROUNDS)
     held = points_per_cell(cells, n_cells)
-    unite_faces(misfits, held, borders, weights, chosen, limits.face_cost, limits.doubtful_cost)
+    unite_faces(plan, misfits, held, borders, weights, chosen, limits)
     return cells
 
 

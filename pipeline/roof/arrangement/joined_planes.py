@@ -21,8 +21,8 @@ from pipeline.roof.arrangement.raster_labels import vertical_distance_m
 
 _FEWEST_POINTS = 6
 """Planes with fewer points keep their coefficients: twice as many as there are coefficients."""
-_MAX_GAP_M = 0.5
-"""Wider gaps are steps. Not a setting: how far planes may move decides long before."""
+_MAX_GAP_M = 0.25
+"""Wider gaps are steps. Not a setting: hardly more than what planes that share a corner miss it by (`corner_gap_m`)."""
 _EXACT_M2 = 1e-12
 """Variance per squared noise below which earlier conditions hold a gap as it is; numerical guard."""
 _LEAST_MOMENT = (1e-2, 1e-2, 1e-3)

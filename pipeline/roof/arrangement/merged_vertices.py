@@ -43,6 +43,15 @@ class Borders(NamedTuple):
     """(v,), the vertices of the outline."""
 
 
+class _Ends(NamedTuple):
+    """The ends of the edges by vertex, in lists; end 2 e + side is that of edge e."""
+
+    first: IntArray
+    """(v,), an end at each vertex; -1 for none."""
+    following: IntArray
+    """(2 e,), the next end at the same vertex; -1 after the last."""
+
+
 class _Buckets(NamedTuple):
     """Points by squares of a raster."""
 
@@ -127,16 +136,38 @@ def edges_of_rings(xy: IntArray, vertices: IntArray, starts: IntArray, owner: La
     return edges[:m].copy()
 
 
+@kernel(inline="always")
+def _ends_at_vertices(borders: Borders) -> _Ends:
+    """List the ends of the edges by vertex."""
+    edges = borders.edges
+    first = np.full(len(borders.xy), -1, np.int64)
+    following = np.full(2 * len(edges), -1, np.int64)
+    for end in range(2 * len(edges) - 1, -1, -1):
+        v = edges[end // 2, end % 2]
+        if v >= 0:
+            following[end] = first[v]
+            first[v] = end
+    return _Ends(first, following)
+
+
 @kernel
-def _edges_at(edges: IntArray, v: int, found: IntArray) -> int:
-    """Fill in the edges at a vertex; their number, or more than there is room for."""
+def _edges_at(edges: IntArray, ends: _Ends, v: int, found: IntArray) -> int:
+    """Fill in the edges at a vertex, ascending; their number, or more than there is room for."""
     m = 0
-    for e in range(len(edges)):
-        if edges[e, 0] >= 0 and (edges[e, 0] == v or edges[e, 1] == v):
-            if m == len(found):
-                return m + 1
-            found[m] = e
-            m += 1
+    end = ends.first[v]
+    while end >= 0:
+        e = end // 2
+        end = ends.following[end]
+        if edges[e, 0] < 0:
+            continue
+        if m == len(found):
+            return m + 1
+        place = m
+        while place > 0 and found[place - 1] > e:
+            found[place] = found[place - 1]
+            place -= 1
+        found[place] = e
+        m += 1
     return m
 
 
@@ -278,15 +309,15 @@ def _may_move(borders: Borders, edge: int, found: IntArray, m: int, reach_m: flo
 
 @kernel(inline="always")
 def _gain_of_merging(
-    borders: Borders, buckets: _Buckets, planes: FloatArray, edge: int, u: int, v: int, limits: Limits
+    borders: Borders, ends: _Ends, buckets: _Buckets, planes: FloatArray, edge: int, u: int, v: int, limits: Limits
 ) -> float:
     """Points that merging vertex u of an edge into its other end v gains; not positive where it cannot be done."""
     xy, edges = borders.xy, borders.edges
     found = np.empty(2 * _MAX_DEGREE, np.int64)
-    m = _edges_at(edges, u, found[:_MAX_DEGREE])
+    m = _edges_at(edges, ends, u, found[:_MAX_DEGREE])
     if borders.is_fixed[u] or m > _MAX_DEGREE or not _may_move(borders, edge, found, m, limits.corner_reach_m):
         return 0.0
-    m_v = _edges_at(edges, v, found[m : m + _MAX_DEGREE])
+    m_v = _edges_at(edges, ends, v, found[m : m + _MAX_DEGREE])
     if m_v > _MAX_DEGREE:
         return 0.0
     gain = limits.corner_cost * _corners_saved(borders, planes, u, v, found, m, m_v, limits.corner_gap_m)
@@ -324,14 +355,17 @@ def _shortest_first(borders: Borders) -> IntArray:
 
 
 @kernel(inline="always")
-def _merge(borders: Borders, edge: int, u: int, v: int, into: IntArray) -> None:
+def _merge(edges: IntArray, ends: _Ends, edge: int, u: int, v: int, into: IntArray) -> None:
     """Replace vertex u of an edge by its other end v, in place."""
-    edges = borders.edges
     edges[edge, 0] = edges[edge, 1] = -1
-    for f in range(len(edges)):
-        for side in range(2):
-            if edges[f, side] == u:
-                edges[f, side] = v
+    end, last = ends.first[u], -1
+    while end >= 0:
+        if edges[end // 2, 0] >= 0:
+            edges[end // 2, end % 2] = v
+        last, end = end, ends.following[end]
+    ends.following[last] = ends.first[v]
+    ends.first[v] = ends.first[u]
+    ends.first[u] = -1
     for w in range(len(into)):
         if into[w] == u:
             into[w] = v
@@ -348,17 +382,18 @@ def merge_vertices(borders: Borders, points: FloatArray, planes: FloatArray, lim
     if len(points) == 0 or limits.corner_cost == 0.0:
         return into
     buckets = _buckets_of(points)
+    ends = _ends_at_vertices(borders)
     for _ in range(_ROUNDS):
         changed = False
         for e in _shortest_first(borders):
             best, u, v = 0.0, -1, -1
             for side in range(2):
                 one, other = edges[e, side], edges[e, 1 - side]
-                gain = _gain_of_merging(borders, buckets, planes, e, one, other, limits) if one >= 0 else 0.0
+                gain = _gain_of_merging(borders, ends, buckets, planes, e, one, other, limits) if one >= 0 else 0.0
                 if gain > best:
                     best, u, v = gain, one, other
             if u >= 0:
-                _merge(borders, e, u, v, into)
+                _merge(edges, ends, e, u, v, into)
                 changed = True
         if not changed:
             break
