@@ -221,6 +221,8 @@ class Candidate:
     """(i, 3) float64, the same of pulses with several returns, the last of each."""
     touches_data_edge: bool = False
     """True where the data end at the candidate: it may be cut."""
+    strip_offset_m: float = math.nan
+    """Largest offset between two flight strips that was taken out of the points, metres; nan where none was."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -428,6 +430,8 @@ class BuildingResult:
     quality: ModelQuality = ModelQuality()
     """How well the points support the model."""
     touches_data_edge: bool
+    """As the candidate's."""
+    strip_offset_m: float = math.nan
     """As the candidate's."""
     walls: WallOutline | None = None
     """The walls beneath the footprint; None where it was given, or where no wall is asked for or seen."""

@@ -387,6 +387,7 @@ def _record(
         coverage=residuals.coverage,
         quality=dataclasses.replace(quality, bic_margin=model.bic_margin),
         touches_data_edge=candidate.touches_data_edge,
+        strip_offset_m=candidate.strip_offset_m,
         walls=walls_of(footprint, roof, building.settings.roof),
     )
 
@@ -431,4 +432,5 @@ def failed_building(candidate: Candidate, method: str, reason: Reason, detail: s
         n_points=len(candidate.points),
         density_per_m2=len(candidate.points) / area if area > 0.0 else math.nan,
         touches_data_edge=candidate.touches_data_edge,
+        strip_offset_m=candidate.strip_offset_m,
     )

@@ -18,6 +18,14 @@ class RoofSettings(Parameters):
         4, "The same where the footprint is given: a few points then show a simple roof.", minimum=3, maximum=1000
     )
     max_points: int = parameter(4_000_000, "A candidate with more points is refused as too complex.", minimum=1000)
+    min_strip_offset_m: float = parameter(
+        0.1,
+        "Flight strips that disagree by more at a building are aligned there; the elevations over the roofs that both"
+        " saw, root mean square.",
+        unit="m",
+        minimum=0.03,
+        maximum=10.0,
+    )
     min_roof_height_m: float = parameter(
         1.5,
         "Points lower than this above the floor are not roof points, except in a given footprint.",

@@ -166,7 +166,9 @@ def classify(
     ) as context:
         ingested = ingest(context, paths)
         splits = split(context, request.settings, ingested, footprints)
-        joined = join(context, request.settings.scene, splits, footprints)
+        joined = join(
+            context, request.settings.scene, request.settings.building.roof.min_strip_offset_m, splits, footprints
+        )
         tiles = sorted(splits.places)
         _label_all(context, request.settings, tiles, joined, ingested)
         files = _write_all(context, paths, ingested, out)

@@ -251,8 +251,9 @@ def _find_candidates(
     """The stages up to the candidates."""
     ingested = ingest(context, paths)
     splits = split(context, settings, ingested, footprints)
-    joined = join(context, settings.scene, splits, footprints)
-    return _Candidates(ingested=ingested, splits=splits, joined=outline(context, settings.building.roof, joined))
+    roof = settings.building.roof
+    joined = join(context, settings.scene, roof.min_strip_offset_m, splits, footprints)
+    return _Candidates(ingested=ingested, splits=splits, joined=outline(context, roof, joined))
 
 
 def _override(

@@ -10,7 +10,7 @@ from pipeline.model import BoolArray, FloatArray
 from pipeline.ruler.simulation.als import ScanBlock, ScannerSettings, joined, reach_m, scan, scan_all, strip_count
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
 from pipeline.ruler.simulation.scene import FaultKind, Scene, SurveyFault, Terrain, WetSpot, undulating_terrain
-from pipeline.ruler.simulation.strips import flight_lines, lines_over
+from pipeline.ruler.simulation.strips import flight_lines, lines_over, strip_shifts_m
 from pipeline.ruler.simulation.town import town
 
 WHOLE = (0.0, 0.0, 220.0, 160.0)
@@ -182,6 +182,26 @@ def test_a_shift_of_strips_moves_what_lies_right_of_its_border() -> None:
     assert wrong.sum() > 5000
     near = np.abs((x - 50) - (y - 50)) < 0.01
     assert np.abs(after - before - wrong[:, None] * np.array(shift))[~near].max() < 0.0011
+
+
+def test_returns_of_another_strip_carry_its_number_and_its_shift_is_known() -> None:
+    shift = (0.5, -0.25, 0.3)
+    fault = SurveyFault(extent=(5, 30, 35, 70), kind=FaultKind.STRIP_SHIFT, shift=shift, azimuth_deg=45.0)
+    named = dataclasses.replace(FIELD, survey_faults=(dataclasses.replace(fault, other_strip=0),))
+    survey = dataclasses.replace(QUIET, strip_spacing_m=60.0, strip_overlap=0.0, strip_shift_m=0.2, strip_lift_m=0.1)
+    before = scan_all(FIELD, survey, 1).points
+    unnamed = scan_all(dataclasses.replace(FIELD, survey_faults=(fault,)), survey, 1).points
+    after = scan_all(named, survey, 1).points
+    assert np.array_equal(after.xyz, unnamed.xyz)
+    assert np.array_equal(unnamed.source_id, before.source_id)
+    flown = strip_count(FIELD, survey)
+    moved = (after.xyz != before.xyz).any(axis=1)
+    assert np.array_equal(after.source_id == flown + 1, moved)
+    assert np.array_equal(after.source_id[~moved], before.source_id[~moved])
+    shifts = np.array(strip_shifts_m(named, survey, 1))
+    assert len(shifts) == flown + 1
+    over = np.bincount(before.source_id[moved]).argmax() - 1
+    assert shifts[flown] == pytest.approx(shifts[over] + shift)
 
 
 def test_wrong_rows_are_whole_rows_and_as_many_as_asked_for() -> None:

@@ -49,6 +49,7 @@ def bundle() -> Bundle:
         source_id="house 7",
         outline=shapely.MultiPolygon([shapely.box(0.0, 0.0, 10.0, 9.9)]),
         touches_data_edge=True,
+        strip_offset_m=0.25,
     )
     return Bundle(
         candidate=candidate,

@@ -71,7 +71,7 @@ def stored(points: npt.NDArray[np.void], grid: TileGrid, root: Path, fragments: 
 
 
 def divided(site: CandidateSite, grid: TileGrid, scratch: Scratch, own: UnitSettings) -> list[CandidateSite]:
-    units = [unit for task in unit_tasks([site], own, grid, scratch, CRS) for unit in divide(task)]
+    units = [unit for task in unit_tasks([site], own, 0.1, grid, scratch, CRS) for unit in divide(task)]
     drawn: dict[str, MultiPolygon] = {}
     for task in outline_tasks(units, RoofSettings(), grid, scratch):
         drawn |= draw_outlines(task).outlines
@@ -195,6 +195,56 @@ def test_large_candidates_get_tasks_of_their_own() -> None:
         return CandidateSite(building_id=str(points), owner=ONE_TILE.tile_of(0, 0), ranges=(), points=points)
 
     sites = [site(n) for n in (900_000, 40_000, 9_000, 5_000, 5)]
-    tasks = unit_tasks(sites, UnitSettings(), ONE_TILE, Scratch("nowhere"), CRS)
+    tasks = unit_tasks(sites, UnitSettings(), 0.1, ONE_TILE, Scratch("nowhere"), CRS)
     assert [[s.points for s in task.sites] for task in tasks] == [[900_000], [40_000, 9_000], [5_000, 5]]
-    assert unit_tasks([], UnitSettings(), ONE_TILE, Scratch("nowhere"), CRS) == []
+    assert unit_tasks([], UnitSettings(), 0.1, ONE_TILE, Scratch("nowhere"), CRS) == []
+
+
+# --- strips that do not fit
+
+
+def of_two_strips(points: npt.NDArray[np.void], up_mm: int) -> npt.NDArray[np.void]:
+    """The first house of the row, whose southern half a second strip saw, that lies higher."""
+    c, s = math.cos(math.radians(23.0)), math.sin(math.radians(23.0))
+    east, north = points["x"] / 1000 - 85_000, points["y"] / 1000 - 447_500
+    along = c * east + s * north
+    house = points[along < 8].copy()
+    house["source"] = 7 + (along[along < 8] < 4)
+    house["z"] += up_mm * (house["source"] == 8)
+    return house
+
+
+def test_strips_that_do_not_fit_are_aligned_and_do_not_divide_a_house(
+    row: npt.NDArray[np.void], tmp_path: Path
+) -> None:
+    points = of_two_strips(row, 400)
+    site, scratch = stored(points, ONE_TILE, tmp_path, 1)
+    (unit,) = divided(site, ONE_TILE, scratch, UnitSettings())
+    candidate, _ = gather(scratch, ONE_TILE, unit, GpsTimeKind.NONE, RoofSettings())
+    assert candidate.strip_offset_m == pytest.approx(0.4, abs=0.04)
+    result = reconstruct_building(candidate, "arrangement", ReconstructSettings())
+    assert len(result.planes) == 2
+    assert result.rmse_m < 0.05
+    assert result.strip_offset_m == candidate.strip_offset_m
+
+
+def test_a_step_within_one_strip_is_a_step(row: npt.NDArray[np.void], tmp_path: Path) -> None:
+    points = of_two_strips(row, 400)
+    points["source"] = 7
+    site, scratch = stored(points, ONE_TILE, tmp_path, 1)
+    assert len(divided(site, ONE_TILE, scratch, UnitSettings())) == 2
+    candidate, _ = gather(scratch, ONE_TILE, site, GpsTimeKind.NONE, RoofSettings())
+    assert math.isnan(candidate.strip_offset_m)
+    assert np.ptp(candidate.points[:, 2]) == pytest.approx(np.ptp(points["z"]) / 1e3)
+
+
+def test_aligned_strips_do_not_depend_on_tiles_and_fragments(row: npt.NDArray[np.void], tmp_path: Path) -> None:
+    found = []
+    for number, (grid, fragments) in enumerate(((ONE_TILE, 1), (ONE_TILE, 3), (TileGrid(size_mm=7_000, halo_mm=0), 2))):
+        site, scratch = stored(of_two_strips(row, 400), grid, tmp_path / str(number), fragments)
+        (unit,) = divided(site, grid, scratch, UnitSettings())
+        found.append(gather(scratch, grid, unit, GpsTimeKind.NONE, RoofSettings())[0])
+    for other in found[1:]:
+        assert other.building_id == found[0].building_id
+        assert np.array_equal(other.points, found[0].points)
+        assert other.strip_offset_m == found[0].strip_offset_m

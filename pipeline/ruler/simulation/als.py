@@ -60,7 +60,7 @@ class ScanBlock:
 
 
 def strip_count(scene: Scene, settings: ScannerSettings) -> int:
-    """Number of strips over the scene, or over the survey of which it is a tile."""
+    """Number of strips flown over the scene, or over the survey of which it is a tile."""
     return len(flight_lines(scene, settings, 0))
 
 
@@ -80,9 +80,10 @@ def scan(
     margin_m = settings.beam_radius_m + settings.pulse_spacing_m
     arrays = scene_arrays(scene, settings.max_lean, margin_m, settings.beam_radius_m)
     survey = _survey(scene, settings, seed)
+    strips = strip_count(scene, settings)
     jobs = _jobs(scene, settings, seed, min(_PULSES_PER_BLOCK, chunk_points) // survey.pulses_per_line)
     pending: list[ScanBlock] = []
-    for block in _in_order(jobs, functools.partial(_block, scene, arrays, survey), threads):
+    for block in _in_order(jobs, functools.partial(_block, scene, arrays, survey, strips), threads):
         if len(block):
             pending.append(block)
         if sum(len(one) for one in pending) >= chunk_points:
@@ -155,20 +156,23 @@ def _in_order(jobs: Iterator[_Job], block_of: Callable[[_Job], ScanBlock], threa
             yield running.popleft().result()
 
 
-def _block(scene: Scene, arrays: SceneArrays, survey: Survey, job: _Job) -> ScanBlock:
-    """Scan some lines of a strip."""
+def _block(scene: Scene, arrays: SceneArrays, survey: Survey, strips: int, job: _Job) -> ScanBlock:
+    """Scan some lines of one of the strips."""
     flight, lines = job
     capacity = len(lines) * survey.pulses_per_line * MAX_RETURNS
     floats, integers = np.empty((capacity, 5)), np.empty((capacity, COLUMNS), np.int32)
     count = scan_lines(arrays, flight, survey, lines.start, lines.stop, floats, integers)
     floats, integers = floats[:count], integers[:count]
     faults = fault_rows(scene.survey_faults, floats)
+    strip = np.full(count, flight.number, np.int32)
     if len(faults):
-        move_faulty(floats, np.ascontiguousarray(integers[:, 7]), faults, survey.seed, flight.number)
-    return _as_block(floats, integers, scene, flight.number)
+        lines_of = np.ascontiguousarray(integers[:, 7])
+        others = move_faulty(floats, lines_of, faults, survey.seed, flight.number)
+        strip = np.where(others >= 0, strips + others, strip)
+    return _as_block(floats, integers, scene, strip)
 
 
-def _as_block(floats: FloatArray, integers: LabelArray, scene: Scene, strip: int) -> ScanBlock:
+def _as_block(floats: FloatArray, integers: LabelArray, scene: Scene, strip: LabelArray) -> ScanBlock:
     def byte(column: int) -> ByteArray:
         return integers[:, column].astype(np.uint8)
 
@@ -178,7 +182,7 @@ def _as_block(floats: FloatArray, integers: LabelArray, scene: Scene, strip: int
         return_count=byte(1),
         classification=byte(2),
         gps_time=floats[:, 3].copy(),
-        source_id=np.full(len(floats), strip + 1, np.uint16),
+        source_id=(strip + 1).astype(np.uint16),
     )
     return ScanBlock(
         points=points,

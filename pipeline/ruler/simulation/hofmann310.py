@@ -113,9 +113,7 @@ def hofmann310(seed: int) -> Scene:
         terrain=terrain,
         buildings=tuple(buildings),
         trees=tuple(_trees(buildings, size, terrain, random)),
-        survey_faults=tuple(
-            fault for one, plot in zip(buildings, plots, strict=True) for fault in _faults(one, plot, random)
-        ),
+        survey_faults=_all_faults(buildings, plots, random),
     )
 
 
@@ -237,6 +235,20 @@ def _wet_spots(building: Building, random: np.random.Generator) -> tuple[WetSpot
             area = largest.area * float(random.uniform(0.1, 0.33)) / count
             spots.append(WetSpot(x=x, y=y, radius_m=math.sqrt(area / math.pi)))
     return tuple(spots)
+
+
+def _all_faults(buildings: list[Building], plots: list[Plot], random: np.random.Generator) -> tuple[SurveyFault, ...]:
+    """The errors of the survey over all plots; each pair of strips that do not fit has a second strip of its own."""
+    found: list[SurveyFault] = []
+    others = 0
+    for building, plot in zip(buildings, plots, strict=True):
+        for fault in _faults(building, plot, random):
+            if Defect.STRIP_SHIFT in building.defects:
+                found.append(dataclasses.replace(fault, other_strip=others))
+                others += 1
+            else:
+                found.append(fault)
+    return tuple(found)
 
 
 def _faults(building: Building, plot: Plot, random: np.random.Generator) -> list[SurveyFault]:

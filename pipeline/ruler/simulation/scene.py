@@ -205,6 +205,9 @@ class SurveyFault:
     """strip_shift: direction of the border, clockwise from north; the returns to the right of it are moved."""
     share: float = 0.0
     """wrong_rows: share of the scan rows that are moved."""
+    other_strip: int | None = None
+    """Number of the other strip that the moved returns belong to, counted from 0 behind the strips of the survey; None
+    if they stay returns of their own strip. The same in all tiles of a scene."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -128,6 +128,26 @@ def flight_lines(scene: Scene, settings: ScannerSettings, seed: int) -> list[Fli
     return lines
 
 
+def strip_shifts_m(scene: Scene, settings: ScannerSettings, seed: int) -> list[tuple[float, float, float]]:
+    """The shift of every strip by its number, east, north and up in metres: those flown, then the others of faults.
+
+    The return of another strip has the shift of the fault on top of that of the strip flown over it.
+    """
+    lines = flight_lines(scene, settings, seed)
+    shifts = [(line.shift_x, line.shift_y, line.shift_z) for line in lines]
+    others = {fault.other_strip: fault for fault in scene.survey_faults if fault.other_strip is not None}
+    for number in range(max(others, default=-1) + 1):
+        if number not in others:
+            shifts.append((0.0, 0.0, 0.0))
+            continue
+        x0, y0, x1, y1 = others[number].extent
+        x, y = (x0 + x1) / 2, (y0 + y1) / 2
+        over = min(lines, key=lambda line: abs((x - line.x) * line.along_y - (y - line.y) * line.along_x))
+        east, north, up = others[number].shift
+        shifts.append((over.shift_x + east, over.shift_y + north, over.shift_z + up))
+    return shifts
+
+
 def reached(places: FloatArray, scene: Scene, settings: ScannerSettings) -> BoolArray:
     """Which places (n, 3) of the scene frame some strip can hit: n flags.
 

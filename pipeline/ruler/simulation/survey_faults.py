@@ -11,11 +11,11 @@ from pipeline.model import FloatArray, LabelArray
 from pipeline.ruler.simulation.beam import line_state, row_chance
 from pipeline.ruler.simulation.scene import FaultKind, SurveyFault
 
-_X0, _Y0, _X1, _Y1, _IS_SHIFT, _DX, _DY, _DZ, _SIN, _COS, _SHARE = range(11)
+_X0, _Y0, _X1, _Y1, _IS_SHIFT, _DX, _DY, _DZ, _SIN, _COS, _SHARE, _OTHER = range(12)
 
 
 def fault_rows(faults: tuple[SurveyFault, ...], places: FloatArray) -> FloatArray:
-    """The faults whose rectangles come near places (n, >= 2), as an array (k, 11) for `move_faulty`."""
+    """The faults whose rectangles come near places (n, >= 2), as an array (k, 12) for `move_faulty`."""
     rows = []
     if faults and len(places):
         low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
@@ -24,17 +24,21 @@ def fault_rows(faults: tuple[SurveyFault, ...], places: FloatArray) -> FloatArra
             if x0 <= high[0] and y0 <= high[1] and x1 >= low[0] and y1 >= low[1]:
                 azimuth = math.radians(fault.azimuth_deg)
                 is_shift = float(fault.kind is FaultKind.STRIP_SHIFT)
-                rows.append((*fault.extent, is_shift, *fault.shift, math.sin(azimuth), math.cos(azimuth), fault.share))
-    return np.array(rows, dtype=np.float64).reshape(-1, 11)
+                border = math.sin(azimuth), math.cos(azimuth)
+                other = -1.0 if fault.other_strip is None else float(fault.other_strip)
+                rows.append((*fault.extent, is_shift, *fault.shift, *border, fault.share, other))
+    return np.array(rows, dtype=np.float64).reshape(-1, 12)
 
 
 @kernel
-def move_faulty(places: FloatArray, lines: LabelArray, faults: FloatArray, seed: int, strip: int) -> None:
-    """Move the returns at places (n, >= 3) of the scene frame that faults (k, 11) affect, in place.
+def move_faulty(places: FloatArray, lines: LabelArray, faults: FloatArray, seed: int, strip: int) -> LabelArray:
+    """Move the returns at places (n, >= 3) of the scene frame that faults (k, 12) affect, in place.
 
     The place without any fault decides whether a return is affected; seed, strip and the scan line of each return (n,)
-    decide which rows are wrong.
+    decide which rows are wrong. Returns the number of the other strip that each return belongs to, (n,) int32; -1 where
+    it stays in its own.
     """
+    others = np.full(len(places), -1, np.int32)
     for k in range(len(places)):
         x, y = places[k, 0], places[k, 1]
         for fault in range(len(faults)):
@@ -51,3 +55,6 @@ def move_faulty(places: FloatArray, lines: LabelArray, faults: FloatArray, seed:
                 places[k, 0] += faults[fault, _DX]
                 places[k, 1] += faults[fault, _DY]
                 places[k, 2] += faults[fault, _DZ]
+                if faults[fault, _OTHER] >= 0.0:
+                    others[k] = np.int32(faults[fault, _OTHER])
+    return others

@@ -19,7 +19,7 @@ from pipeline.ruler.simulation.conditions import condition_row
 from pipeline.ruler.simulation.scene import Building, Scene
 from pipeline.ruler.simulation.seeds import split_of
 from pipeline.ruler.simulation.solids import truth_record
-from pipeline.ruler.simulation.strips import ScannerSettings, flight_lines, reached
+from pipeline.ruler.simulation.strips import ScannerSettings, reached, strip_shifts_m
 from pipeline.ruler.simulation.survey_files import TileFiles, spatial_reference
 
 
@@ -83,10 +83,7 @@ def write_manifest(
         "points": sum(tile.points for tile in listed),
         **counts,
         "scanner": dataclasses.asdict(settings),
-        "strip_shifts_m": [
-            [round(line.shift_x, 6), round(line.shift_y, 6), round(line.shift_z, 6)]
-            for line in flight_lines(scene, settings, seed)
-        ],
+        "strip_shifts_m": [[round(part, 6) for part in shift] for shift in strip_shifts_m(scene, settings, seed)],
         "tiles": [
             {
                 "laz": Path(os.path.relpath(tile.laz, truth)).as_posix(),

@@ -91,6 +91,7 @@ def write_bundle(folder: str, bundle: Bundle) -> str:
         "footprint": None if footprint is None else shapely.to_wkb(footprint, hex=True),
         "outline": None if candidate.outline is None else shapely.to_wkb(candidate.outline, hex=True),
         "touches_data_edge": candidate.touches_data_edge,
+        "strip_offset_m": None if math.isnan(candidate.strip_offset_m) else candidate.strip_offset_m,
         "method": bundle.method,
         "settings": {
             "lods": ",".join(bundle.settings.lods),
@@ -205,6 +206,7 @@ def _bundle(
         source_id=None if source_id is None else str(source_id),
         outline=outline,
         touches_data_edge=bool(document["touches_data_edge"]),
+        strip_offset_m=math.nan if document.get("strip_offset_m") is None else float(document["strip_offset_m"]),
     )
     return Bundle(
         candidate=candidate,

@@ -21,6 +21,7 @@ from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.sites import CandidateSite
 from pipeline.runtime.stages.window_points import bucket_paths
+from pipeline.strip_alignment import aligned_mm
 from pipeline.terrain.lattice import CELL_MM, NO_DATA
 from pipeline.tiling import MM, TileGrid, Window
 
@@ -143,7 +144,8 @@ def gather(
 ) -> tuple[Candidate, CandidateFacts]:
     """One candidate with the terrain around it.
 
-    `gps_kind` says whether GPS times can be converted to dates, `roof` whether to add the points around and beneath it.
+    `gps_kind` says whether GPS times can be converted to dates, `roof` whether to align strips and whether to add the
+    points around and beneath it.
     """
     points = points_of(scratch, site)
     footprint = site.footprint
@@ -187,12 +189,16 @@ def gather(
         digest.update(later_mm.tobytes())
     if site.outline is not None:
         digest.update(np.rint(shapely.get_coordinates(site.outline) * MM).astype(np.int64).tobytes())
+    is_split = (points["return_number"] == 1) & (points["return_count"] > 1)
+    strip_offset_m = math.nan
+    if roof is not None:
+        xyz, is_split, strip_offset_m = aligned_mm(xyz, points["source"], is_split, roof.min_strip_offset_m)
     candidate = Candidate(
         building_id=site.building_id,
         origin=(float(origin_mm[0] // MM), float(origin_mm[1] // MM), float(origin_mm[2] // MM)),
         points=(xyz - origin_mm) / MM,
         ground=(ground_mm - origin_mm) / MM,
-        split_returns=(xyz[(points["return_number"] == 1) & (points["return_count"] > 1)] - origin_mm) / MM,
+        split_returns=(xyz[is_split] - origin_mm) / MM,
         ground_z_m=math.nan if ground_z is None else (ground_z - int(origin_mm[2])) / MM,
         footprint=None if footprint is None else _moved(footprint, origin_mm),
         source_id=site.source_id,
@@ -200,6 +206,7 @@ def gather(
         beside=(beside_mm - origin_mm) / MM,
         beside_later=(later_mm - origin_mm) / MM,
         touches_data_edge=_touches_data_edge(own, ~points_near),
+        strip_offset_m=strip_offset_m,
     )
     first, last = _acquired(points, gps_kind)
     goes_on = int((points["return_number"] < points["return_count"]).sum())

@@ -177,8 +177,17 @@ class JoinTask:
     """Goes into the ids."""
 
 
-def join(context: RunContext, settings: SceneSettings, splits: Splits, footprints: GivenFootprints | None) -> Joined:
-    """The candidates of all tiles, divided into units, and the rejected objects; one per footprint where given."""
+def join(
+    context: RunContext,
+    settings: SceneSettings,
+    min_strip_offset_m: float,
+    splits: Splits,
+    footprints: GivenFootprints | None,
+) -> Joined:
+    """The candidates of all tiles, divided into units, and the rejected objects; one per footprint where given.
+
+    Strips that disagree by more than `min_strip_offset_m` are aligned before units are separated.
+    """
     plan, progress = context.plan, context.progress
     started = time.perf_counter()
     progress.tell("stage", "join", total=1)
@@ -187,7 +196,8 @@ def join(context: RunContext, settings: SceneSettings, splits: Splits, footprint
         task = JoinTask(splits=splits, scratch=context.scratch, grid=plan.grid, crs_name=crs_name)
         function = functools.partial(_joined, settings=settings.candidates)
         joined = context.executor.run_step("join", function, task, progress.watch)
-        joined = divide_units(context, settings.units, dataclasses.replace(joined, keys=splits.keys), crs_name)
+        joined = dataclasses.replace(joined, keys=splits.keys)
+        joined = divide_units(context, settings.units, min_strip_offset_m, joined, crs_name)
     else:
         joined = join_footprints(
             splits.stored(context.scratch),

@@ -10,6 +10,7 @@ import tempfile
 import numpy as np
 import shapely
 
+from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.join import join_tiles
 from pipeline.runtime.stages.split_window import SplitTask, split_window
@@ -22,6 +23,8 @@ from pipeline.tiling import MM, Tile, TileGrid
 _SIDE_M = 24
 _HOUSES = ((4, 10), (14, 20))
 """Their extent in both directions, metres."""
+_STRIP_LIFT_MM = 200
+"""Every second row belongs to a strip that lies this much higher: strips are aligned, too."""
 
 
 def rehearse_scene(outlines: str = "") -> None:
@@ -35,6 +38,8 @@ def rehearse_scene(outlines: str = "") -> None:
     for low, high in _HOUSES:
         inside = (x > low * MM) & (x < high * MM) & (y > low * MM) & (y < high * MM)
         points["z"][inside], points["classification"][inside] = 6 * MM, BUILDING_CLASS
+    points["source"] = y // MM % 2
+    points["z"][(points["source"] == 1) & (points["z"] > 0)] += _STRIP_LIFT_MM
     settings, tile = SceneSettings(), Tile(0, 0)
     grid = TileGrid(size_mm=_SIDE_M * MM, halo_mm=MM, origin_x_mm=0, origin_y_mm=0)
     core = grid.core(tile)
@@ -54,5 +59,7 @@ def rehearse_scene(outlines: str = "") -> None:
         if footprints is not None:
             return
         joined = join_tiles([found], grid, settings.candidates, "")
-        for units in unit_tasks(joined.candidates, settings.units, grid, scratch, ""):
+        for units in unit_tasks(
+            joined.candidates, settings.units, RoofSettings().min_strip_offset_m, grid, scratch, ""
+        ):
             divide(units)

@@ -13,14 +13,17 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.model import IntArray
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, whole
+from pipeline.runtime.stages.gather import canonical_order
 from pipeline.runtime.stages.grouping import in_groups
 from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, by_owner, largest_first, object_id
+from pipeline.strip_alignment import strip_offsets_m
 from pipeline.terrain.settings import UnitSettings
 from pipeline.terrain.units import smallest_points, units_of
-from pipeline.tiling import Tile, TileGrid
+from pipeline.tiling import MM, Tile, TileGrid
 
 _POINTS_PER_TASK = 50_000
 
@@ -33,6 +36,8 @@ class UnitTask:
     """The candidates."""
     settings: UnitSettings
     """What separates units."""
+    min_strip_offset_m: float
+    """Strips of a candidate that disagree by more are aligned first."""
     grid: TileGrid
     """The lattice, for the owners."""
     scratch: Scratch
@@ -41,15 +46,17 @@ class UnitTask:
     """Goes into the ids."""
 
 
-def divide_units(context: RunContext, settings: UnitSettings, joined: Joined, crs_name: str) -> Joined:
+def divide_units(
+    context: RunContext, settings: UnitSettings, min_strip_offset_m: float, joined: Joined, crs_name: str
+) -> Joined:
     """The candidates, divided into units; part of the join and not a stage of its own."""
     if settings.split == "nothing":
         return joined
     scratch, grid = context.scratch, context.plan.grid
     tasks = {}
     for tile, candidates in by_owner(joined.candidates).items():
-        for task in unit_tasks(candidates, settings, grid, scratch, crs_name):
-            key = key_of(settings, crs_name, task.sites, joined.around(task.sites, grid))
+        for task in unit_tasks(candidates, settings, min_strip_offset_m, grid, scratch, crs_name):
+            key = key_of(settings, min_strip_offset_m, crs_name, task.sites, joined.around(task.sites, grid))
             tasks[Place("units", tile.key, key)] = task
     drop_outcomes(scratch, "units", tasks)
     divided = context.map_stored("join", divide, tasks, whole, quiet=True)
@@ -57,12 +64,24 @@ def divide_units(context: RunContext, settings: UnitSettings, joined: Joined, cr
 
 
 def unit_tasks(
-    sites: Sequence[CandidateSite], settings: UnitSettings, grid: TileGrid, scratch: Scratch, crs_name: str
+    sites: Sequence[CandidateSite],
+    settings: UnitSettings,
+    min_strip_offset_m: float,
+    grid: TileGrid,
+    scratch: Scratch,
+    crs_name: str,
 ) -> list[UnitTask]:
     """Group candidates to tasks of some tenths of a second each."""
     groups = in_groups(((site, site.points) for site in sites), _POINTS_PER_TASK)
     return [
-        UnitTask(sites=tuple(group), settings=settings, grid=grid, scratch=scratch, crs_name=crs_name)
+        UnitTask(
+            sites=tuple(group),
+            settings=settings,
+            min_strip_offset_m=min_strip_offset_m,
+            grid=grid,
+            scratch=scratch,
+            crs_name=crs_name,
+        )
         for group in groups
     ]
 
@@ -76,6 +95,22 @@ def divide(task: UnitTask) -> tuple[CandidateSite, ...]:
     return tuple(found)
 
 
+def _aligned_mm(
+    points: npt.NDArray[np.void], xyz_mm: tuple[IntArray, IntArray, IntArray], min_offset_m: float
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Coordinates of the points with their strips aligned: a step between two strips does not separate units."""
+    source = points["source"]
+    if len(points) == 0 or (source == source[0]).all():
+        return xyz_mm
+    order = canonical_order(points)
+    places = np.column_stack([values[order] - values[order[0]] for values in xyz_mm]) / MM
+    offsets = np.empty_like(places)
+    offsets[order] = strip_offsets_m(places, source[order], min_offset_m)
+    moved = np.rint(offsets * MM).astype(np.int64)
+    x, y, z = (values - moved[:, k] for k, values in enumerate(xyz_mm))
+    return x, y, z
+
+
 def _units_of_site(site: CandidateSite, task: UnitTask) -> list[CandidateSite]:
     by_tile: dict[Tile, list[npt.NDArray[np.void]]] = {}
     for part in site.ranges:
@@ -87,7 +122,7 @@ def _units_of_site(site: CandidateSite, task: UnitTask) -> list[CandidateSite]:
         return [site]
     points = np.concatenate(pieces)
     x, y, z = points["x"].astype(np.int64), points["y"].astype(np.int64), points["z"].astype(np.int64)
-    unit = units_of(x, y, z, task.settings)
+    unit = units_of(*_aligned_mm(points, (x, y, z), task.min_strip_offset_m), task.settings)
     count = int(unit.max(initial=0)) + 1
     if count == 1:
         return [site]
