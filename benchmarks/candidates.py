@@ -53,7 +53,8 @@ def found_scene(
         scratch.create()
         context = RunContext(plan=plan, progress=progress, executor=SerialExecutor(), scratch=scratch)
         splits = split(context, settings, ingest(context, tiles), given)
-        joined = outline(context, settings.building.roof, join(context, settings.scene, splits, given))
+        roof = settings.building.roof
+        joined = outline(context, roof, join(context, settings.scene, roof.min_strip_offset_m, splits, given))
         return FoundScene(
             candidates=tuple(
                 gather(scratch, plan.grid, site, plan.gps_kind, settings.building.roof)[0] for site in joined.candidates

@@ -152,7 +152,7 @@ def splits_of(folder: Path, tile_size_m: float) -> tuple[Plan, list[Split], int]
         context = RunContext(plan=plan, progress=Progress(ignore), executor=executor, scratch=scratch)
         found = split(context, settings, ingest(context, tiles), None)
         splits = list(found.stored(scratch))
-        joined = join(context, settings.scene, found, None)
+        joined = join(context, settings.scene, settings.building.roof.min_strip_offset_m, found, None)
     return plan, splits, len(joined.candidates)
 
 

@@ -91,7 +91,7 @@ def one_lap(tiles: Sequence[str], plan: Plan, settings: RunSettings, executor: E
         context = RunContext(plan=plan, progress=progress, executor=executor, scratch=scratch)
         began = time.process_time()
         splits = split(context, settings, ingest(context, tiles), None)
-        joined = join(context, settings.scene, splits, None)
+        joined = join(context, settings.scene, settings.building.roof.min_strip_offset_m, splits, None)
         cpu_s = time.process_time() - began
         held = sum(path.stat().st_size for path in Path(place).rglob("*") if path.is_file())
     return Lap(

@@ -249,7 +249,9 @@ class _Search:
         """The candidates of some tiles; of all tiles for None."""
         context, settings = self.context, self.request.settings
         splits = split(context, settings, self.ingested, self.footprints, tiles)
-        judged = outline(context, settings.building.roof, join(context, settings.scene, splits, self.footprints))
+        roof = settings.building.roof
+        found = join(context, settings.scene, roof.min_strip_offset_m, splits, self.footprints)
+        judged = outline(context, roof, found)
         joined, outcomes = apply_overrides(context, settings, judged, self.overrides, self.ingested)
         now = {o.building_id: o.effective.fingerprint for o in outcomes if o.building_id and o.effective is not None}
         before = self.earlier.fingerprints
