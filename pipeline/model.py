@@ -47,6 +47,8 @@ class Reason(StrEnum):
     NO_WALLS = "no_walls"
     VEGETATION = "vegetation"
     TOO_NARROW = "too_narrow"
+    BRIDGE = "bridge"
+    VEHICLE = "vehicle"
     OVERRIDDEN = "overridden"
 
 
@@ -72,6 +74,8 @@ REASONS: Mapping[Reason, str] = {
     Reason.NO_WALLS: "too little of its outline is wall: a mound, a bank",
     Reason.VEGETATION: "rough, many returns, ground seen beneath",
     Reason.TOO_NARROW: "narrower than a building: a wall, a hedge, a wire",
+    Reason.BRIDGE: "level with the ground along two opposite ends and free along its sides: the deck of a bridge",
+    Reason.VEHICLE: "narrow, low and free all around: a van, a truck, a row of them, a container",
     Reason.OVERRIDDEN: "the user's overrides reject it; the detail is their note",
 }
 """Meanings of the reasons, as in the records' reference."""

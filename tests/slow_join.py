@@ -60,7 +60,53 @@ def _figures(sums: IntArray) -> dict[str, float]:
         "wall_share": float(sums[Sum.WALL]) / outline_mm,
         "top_share": float(sums[Sum.WALL_TOP]) / max(1, int(sums[Sum.WALL])),
         "step_share": float(sums[Sum.STEP]) / outline_mm,
+        "open_share": float(sums[Sum.OPEN]) / outline_mm,
+        **_shape(sums, facets_mm2 / 1e6, half_mm / 500.0),
     }
+
+
+def _moments(sums: IntArray, columns: Sequence[Sum], x: int, y: int) -> tuple[float, ...]:
+    """Moments of one or two outlines, or of an area, about a place in dm; wrapped sums become exact again."""
+    w, sx, sy, sxx, sxy, syy = (sum(int(sums[first + k]) for first in columns) for k in range(6))
+    exact = (w, sx - w * x, sy - w * y, sxx - 2 * x * sx + w * x * x, sxy - x * sy - y * sx + w * x * y)
+    exact = (*exact, syy - 2 * y * sy + w * y * y)
+    _, *rest = ((value + 2**63) % 2**64 - 2**63 for value in exact)
+    return tuple(value / float(max(1, w)) / unit for value, unit in zip(rest, (10, 10, 100, 100, 100), strict=True))
+
+
+def _shape(sums: IntArray, facets_m2: float, spacing_m: float) -> dict[str, float]:
+    """The measures that show decks and vehicles."""
+    weight = max(1, int(sums[Sum.AREA_W]))
+    x, y = int(sums[Sum.AREA_X]) // weight, int(sums[Sum.AREA_Y]) // weight
+    dx, dy, xx, xy, yy = _moments(sums, (Sum.AREA_W,), x, y)
+    a, b, d = xx - dx * dx, xy - dx * dy, yy - dy * dy
+    middle = (a + d) / 2.0
+    half = math.sqrt(max(0.0, middle * middle - (a * d - b * b)))
+    found = {
+        "end_share": 0.0,
+        "apart_m": 0.0,
+        "across_m": math.sqrt(12.0 * max(0.0, middle - half)) + spacing_m,
+        "along_m": math.sqrt(12.0 * max(0.0, middle + half)) + spacing_m,
+        "spacing_m": spacing_m,
+    }
+    for outlines, ends in (((Sum.LEVEL_W, Sum.GAP_W), 1.0), ((Sum.LEVEL_W,), 2.0)):
+        mx, my, lxx, lxy, lyy = _moments(sums, outlines, x, y)
+        inverse = max(1e-12, a * d - b * b)
+        m = ((d * lxx - b * lxy) / inverse, (d * lxy - b * lyy) / inverse)
+        n = ((a * lxy - b * lxx) / inverse, (a * lyy - b * lxy) / inverse)
+        mean = (m[0] + n[1]) / 2.0
+        root = math.sqrt(max(0.0, mean * mean - (m[0] * n[1] - m[1] * n[0])))
+        if mean + root < 2.45 or mean - root > 1.5:
+            continue
+        if (d * mx * mx - 2.0 * b * mx * my + a * my * my) / inverse > 1.0:
+            continue
+        forms = ((mean + root - n[1], n[0]), (m[1], mean + root - m[0]))
+        p, q = max(forms, key=lambda form: form[0] * form[0] + form[1] * form[1])
+        u, v = a * p + b * q, b * p + d * q
+        apart = math.sqrt(12.0 * max(0.0, (u * u + v * v) / max(1e-12, p * u + q * v)))
+        found["apart_m"] = apart
+        found["end_share"] = int(sums[Sum.LEVEL_W]) / 100.0 / max(1e-6, ends * facets_m2 / max(1e-6, apart))
+    return found
 
 
 def slowly_judged(kind: int, sums: IntArray, settings: CandidateSettings) -> Verdict | None:
@@ -115,6 +161,18 @@ def _fault(kind: int, sums: IntArray, settings: CandidateSettings) -> tuple[Reas
         own = float(sums[Sum.WALLS_OWN_Z]) / max(1, int(sums[Sum.WALLS])) / 1000.0
         detail = f"at the top of {f['top_share']:.2f} of its walls, at least {settings.min_top_share:g}"
         return Reason.BELOW_Z_AVG, f"{detail} (own {own:.2f} m, Z_avg {z_avg:.2f} m)"
+    if f["end_share"] >= settings.min_deck_end_share:
+        ends = f"level with the ground along {f['end_share']:.2f} of two opposite ends, {f['apart_m']:.1f} m apart"
+        return Reason.BRIDGE, f"{ends}, at least {settings.min_deck_end_share:g}"
+    if (
+        f["across_m"] <= settings.max_vehicle_width_m
+        and f["spacing_m"] <= 0.25 * settings.max_vehicle_width_m
+        and f["along_m"] >= settings.min_vehicle_length_m
+        and f["top_m"] <= settings.max_vehicle_height_m
+        and f["open_share"] >= settings.min_vehicle_open_share
+    ):
+        size = f"{f['across_m']:.2f} m wide, at most {settings.max_vehicle_width_m:g}, {f['along_m']:.1f} m long"
+        return Reason.VEHICLE, f"{size}, {f['top_m']:.2f} m high, free along {f['open_share']:.2f} of the outline"
     return None
 
 

@@ -6,13 +6,14 @@ import contextlib
 import dataclasses
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from uuid import uuid4
 
 from pipeline.errors import InputError, RunError, SettingsError
 from pipeline.export.raster import RasterLattice
 from pipeline.io import is_url, shown
+from pipeline.model import Reason
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.preloading import loads_of
@@ -38,7 +39,7 @@ from pipeline.runtime.stages.rasters import (
     with_neighbours,
     write_mosaic,
 )
-from pipeline.runtime.stages.sites import Joined, PointRange
+from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, RejectedSite
 from pipeline.runtime.stages.split import split
 from pipeline.runtime.stages.write_classified import (
     ClassifiedFile,
@@ -214,10 +215,8 @@ def _label_all(
     """The classes of all tiles' points, in scratch."""
     grid = context.plan.grid
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
-    ranges: dict[Tile, list[PointRange]] = {}
-    for site in joined.candidates:
-        for part in site.ranges:
-            ranges.setdefault(part.tile, []).append(part)
+    buildings = _by_tile(joined.candidates)
+    decks = _by_tile([site for site in joined.rejected if site.verdict.reason is Reason.BRIDGE])
     tasks = [
         LabelTask(
             tile=tile,
@@ -225,15 +224,22 @@ def _label_all(
             settings=settings.scene,
             classes=classes,
             scratch=context.scratch,
-            buildings=tuple(
-                part
-                for other in grid.tiles_over(neighbourhood(tile, grid, settings.scene))
-                for part in ranges.get(other, ())
-            ),
+            buildings=tuple(part for other in near for part in buildings.get(other, ())),
+            decks=tuple(part for other in near for part in decks.get(other, ())),
         )
         for tile in tiles
+        for near in [tuple(grid.tiles_over(neighbourhood(tile, grid, settings.scene)))]
     ]
     context.map("classify", label, tasks)
+
+
+def _by_tile(sites: Iterable[CandidateSite | RejectedSite]) -> dict[Tile, list[PointRange]]:
+    """The ranges of the points of sites, by their tiles."""
+    ranges: dict[Tile, list[PointRange]] = {}
+    for site in sites:
+        for part in site.ranges:
+            ranges.setdefault(part.tile, []).append(part)
+    return ranges
 
 
 def _write_all(

@@ -17,6 +17,13 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray, Reason
+from pipeline.terrain.decks_and_vehicles import (
+    are_decks,
+    are_vehicles,
+    deck_detail,
+    shape_figures,
+    vehicle_detail,
+)
 from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.fragment_sums import Sum
 from pipeline.terrain.settings import CandidateSettings
@@ -67,7 +74,10 @@ class Fault(IntEnum):
     """No vertex has enough neighbours to show whether the surface is planar."""
     PIERCED = 10
     """Too many pulses go on below it."""
-    NOT_JUDGED = 11
+    DECK = 11
+    """A bridge."""
+    VEHICLE = 12
+    NOT_JUDGED = 13
     """Ground, a step between levels, or a surface without points."""
 
 
@@ -82,6 +92,8 @@ REASON_OF_FAULT = {
     Fault.BELOW_Z_AVG: Reason.BELOW_Z_AVG,
     Fault.TOO_SPARSE: Reason.TOO_FEW_POINTS,
     Fault.PIERCED: Reason.VEGETATION,
+    Fault.DECK: Reason.BRIDGE,
+    Fault.VEHICLE: Reason.VEHICLE,
 }
 """The reason in the records for each fault."""
 
@@ -125,6 +137,7 @@ def _figures(sums: IntArray) -> dict[str, FloatArray]:
         "wall_share": sums[:, Sum.WALL] / outline_mm,
         "top_share": sums[:, Sum.WALL_TOP] / np.maximum(1, sums[:, Sum.WALL]),
         "step_share": sums[:, Sum.STEP] / outline_mm,
+        **shape_figures(sums),
     }
 
 
@@ -179,6 +192,8 @@ def _faults(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> Kin
         (f["width_m"] < width_m, Fault.TOO_NARROW),
         (f["wall_share"] < settings.min_wall_share, Fault.NO_WALLS),
         (~sure & (f["top_share"] < settings.min_top_share), Fault.BELOW_Z_AVG),
+        (are_decks(f, settings), Fault.DECK),
+        (are_vehicles(f, settings), Fault.VEHICLE),
     ]
     found = np.select([held for held, _ in rules], [np.int8(fault) for _, fault in rules], np.int8(Fault.NONE))
     return found.astype(np.int8)
@@ -250,6 +265,10 @@ def _verdict(fault: Fault, f: Mapping[str, float], settings: CandidateSettings) 
         case Fault.BELOW_Z_AVG:
             detail = f"at the top of {f['top_share']:.2f} of its walls, at least {settings.min_top_share:g} "
             detail += f"(own {f['own']:.2f} m, Z_avg {f['z_avg']:.2f} m)"
+        case Fault.DECK:
+            detail = deck_detail(f, settings)
+        case Fault.VEHICLE:
+            detail = vehicle_detail(f, settings)
         case _:
             assert_never(fault)
     return Verdict(reason=REASON_OF_FAULT[fault], detail=detail)

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import IntArray, LabelArray
-from pipeline.terrain.facets import FacetKind, LabelledTin, SceneVertices, first_corner
+from pipeline.terrain.facets import FacetKind, LabelledTin, SceneVertices, VertexKind, first_corner, stands_up
 
 
 class Sum(IntEnum):
@@ -50,9 +50,40 @@ class Sum(IntEnum):
     """Points whose pulse went on to a later return."""
     SMOOTH = 18
     """Vertices with smooth surroundings."""
+    OPEN = 19
+    """Length of the outline of objects that stands free: what is beside it is less than two thirds as high, mm."""
+    AREA_W = 20
+    """Plan area of objects, in 1000 mm2, then its first and second moments with places in dm."""
+    AREA_X = 21
+    AREA_Y = 22
+    AREA_XX = 23
+    AREA_XY = 24
+    AREA_YY = 25
+    LEVEL_W = 26
+    """Length of the outline of objects where the ground goes on without a step, in cm, then its moments."""
+    LEVEL_X = 27
+    LEVEL_Y = 28
+    LEVEL_XX = 29
+    LEVEL_XY = 30
+    LEVEL_YY = 31
+    GAP_W = 32
+    """Length of the outline of objects at gaps in the data, in cm, then its moments."""
+    GAP_X = 33
+    GAP_Y = 34
+    GAP_XX = 35
+    GAP_XY = 36
+    GAP_YY = 37
 
 
 N_SUMS = len(Sum)
+MOMENTS = 6
+"""Columns of a weight and its moments: sums of w, w x, w y, w x x, w x y and w y y."""
+LEVEL_MM = 300
+"""Outline beside ground is level where the facet there spans less.
+
+Not a setting: objects are at least `GroundSettings.tolerance_m`, 0.5 m, high; and a ramp of 1 in 7 rises this far
+between points 2 m apart.
+"""
 Core = tuple[int, int, int, int]
 """x0, y0, x1, y1 of a tile in mm, half-open."""
 
@@ -86,6 +117,41 @@ def _with_room(rows: IntArray, used: int) -> IntArray:
     return grown
 
 
+@kernel(inline="always")
+def _add_moments(row: IntArray, first: int, weight: int, x_mm: int, y_mm: int) -> None:
+    """Add a weight at a place to the six moments from column `first` on.
+
+    Products of coordinates may pass 2^63 and wrap; moments about a place nearby are exact again, since they fit.
+    """
+    x, y = x_mm // 100, y_mm // 100
+    row[first] += weight
+    row[first + 1] += weight * x
+    row[first + 2] += weight * y
+    row[first + 3] += weight * x * x
+    row[first + 4] += weight * x * y
+    row[first + 5] += weight * y * y
+
+
+@kernel(inline="always")
+def _add_free_outline(
+    row: IntArray, vertices: SceneVertices, tin: LabelledTin, g: int, edge: tuple[int, int], length: int
+) -> None:
+    """Add an edge (v, w) of an object's outline, with facet g beyond it, to the sums of open, level and cut outline."""
+    v, w = edge
+    x, y = (vertices.x_mm[v] + vertices.x_mm[w]) // 2, (vertices.y_mm[v] + vertices.y_mm[w]) // 2
+    if g < 0 or tin.kinds[g] == FacetKind.VOID:
+        _add_moments(row, Sum.GAP_W, length // 10, x, y)
+    elif tin.kinds[g] == FacetKind.BORDER:
+        beyond = tin.facets[g, 0] + tin.facets[g, 1] + tin.facets[g, 2] - v - w
+        height, z = vertices.height_mm, vertices.z_mm
+        # below two thirds of the mean height of the edge
+        if 3 * height[beyond] < height[v] + height[w]:
+            row[Sum.OPEN] += length
+        span = max(z[v], z[w], z[beyond]) - min(z[v], z[w], z[beyond])
+        if vertices.kind[beyond] == VertexKind.GROUND and span < LEVEL_MM:
+            _add_moments(row, Sum.LEVEL_W, length // 10, x, y)
+
+
 @kernel
 def sum_fragments(
     vertices: SceneVertices, tin: LabelledTin, core: Core, wall_mm: int
@@ -113,6 +179,12 @@ def sum_fragments(
         a, b, c = facets[f, 0], facets[f, 1], facets[f, 2]
         sums[fragment, Sum.FACETS] += 1
         sums[fragment, Sum.AREA2] += (x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a])
+        is_object = stands_up(kinds[f])
+        for q in range(3 if is_object else 0):
+            # the mean over the middles of the edges is exact for squares of coordinates
+            v, w = facets[f, q], facets[f, (q + 1) % 3]
+            third = ((x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a])) // 6000
+            _add_moments(sums[fragment], Sum.AREA_W, third, (x[v] + x[w]) // 2, (y[v] + y[w]) // 2)
         boxes[fragment, 0] = min(boxes[fragment, 0], x[a], x[b], x[c])
         boxes[fragment, 1] = min(boxes[fragment, 1], y[a], y[b], y[c])
         boxes[fragment, 2] = max(boxes[fragment, 2], x[a], x[b], x[c])
@@ -125,6 +197,8 @@ def sum_fragments(
             dx, dy = x[v] - x[w], y[v] - y[w]
             length = np.int64(round(math.sqrt(float(dx * dx + dy * dy))))
             sums[fragment, Sum.BOUNDARY] += length
+            if is_object:
+                _add_free_outline(sums[fragment], vertices, tin, g, (v, w), int(length))
             if g < 0 or kinds[g] == FacetKind.VOID:
                 continue
             ga, gb, gc = facets[g, 0], facets[g, 1], facets[g, 2]

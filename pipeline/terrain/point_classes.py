@@ -25,13 +25,15 @@ class PointClass(IntEnum):
     """The classes in the output."""
 
     OTHER = 1
-    """None of the others: cars, poles, wires, garden walls, bridges."""
+    """None of the others: cars, poles, wires, garden walls."""
     GROUND = 2
     VEGETATION = 5
     BUILDING = 6
     """Roofs, walls and objects on roofs."""
     NOISE = 7
     """Points nearly alone in space, and a few far below the terrain."""
+    BRIDGE_DECK = 17
+    """Points of rejected objects that are decks of bridges; the label stage gives this class."""
 
 
 # Not settings: dimensions of common objects on and beside buildings.

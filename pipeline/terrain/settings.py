@@ -298,6 +298,38 @@ class CandidateSettings(Parameters):
         minimum=0.0,
         maximum=1.0,
     )
+    min_deck_end_share: float = parameter(
+        0.6,
+        "A surface that is level with the ground along two opposite ends, over this share of them, is the deck of a "
+        "bridge; 2 rejects none.",
+        minimum=0.1,
+        maximum=2.0,
+    )
+    max_vehicle_width_m: float = parameter(
+        2.55,
+        "Largest width of vehicles, by law in the EU; 0 rejects none. Where points lie more than a quarter of it "
+        "apart, widths are not known well enough.",
+        unit="m",
+        minimum=0.0,
+        maximum=5.0,
+    )
+    min_vehicle_length_m: float = parameter(
+        4.0, "Least length of vehicles that are as high as buildings.", unit="m", minimum=1.0, maximum=20.0
+    )
+    max_vehicle_height_m: float = parameter(
+        4.2,
+        "Largest height of vehicles: 4 m by law in the EU, and the error of the terrain.",
+        unit="m",
+        minimum=1.0,
+        maximum=10.0,
+    )
+    min_vehicle_open_share: float = parameter(
+        0.9,
+        "Least share of the outline of vehicles that stands free: what is beside it reaches less than two thirds of "
+        "its height.",
+        minimum=0.0,
+        maximum=1.0,
+    )
     unite_share: float = parameter(
         0.5,
         "A surface with at least this share of its outline along steps joins the largest roof beside them.",

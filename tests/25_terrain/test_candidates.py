@@ -23,7 +23,7 @@ from pipeline.terrain.candidates import (
     unite_levels,
 )
 from pipeline.terrain.facets import FacetKind
-from pipeline.terrain.fragment_sums import N_SUMS, Sum
+from pipeline.terrain.fragment_sums import MOMENTS, N_SUMS, Sum
 from pipeline.terrain.settings import CandidateSettings
 
 SETTINGS = CandidateSettings()
@@ -197,7 +197,7 @@ def test_a_share_beyond_one_is_refused() -> None:
 
 
 columns = st.integers(0, 10**9)
-some_sums = st.fixed_dictionaries(
+figures = st.fixed_dictionaries(
     {
         Sum.FACETS: st.integers(0, 5000),
         Sum.AREA2: st.one_of(columns, st.sampled_from([8_000_000, 6_100_000, 36_000_000, 60_000_000])),
@@ -218,8 +218,27 @@ some_sums = st.fixed_dictionaries(
         Sum.SEVERAL: st.integers(0, 1000),
         Sum.THROUGH: st.integers(0, 1000),
         Sum.SMOOTH: st.integers(0, 400),
+        Sum.OPEN: st.integers(0, 200_000),
     }
 )
+weights = st.lists(st.tuples(st.integers(1, 10**6), st.integers(0, 400), st.integers(0, 400)), max_size=6)
+
+
+def moments_of(first: Sum, weighted: list[tuple[int, int, int]]) -> dict[Sum, int]:
+    """The six moments of weights and places in dm, far from the origin; they wrap at 2^63."""
+    far = [(w, x + 59_380_000, y + 59_380_000) for w, x, y in weighted]
+    rows = [(w, w * x, w * y, w * x * x, w * x * y, w * y * y) for w, x, y in far]
+    return {Sum(first + k): (sum(row[k] for row in rows) + 2**63) % 2**64 - 2**63 for k in range(MOMENTS)}
+
+
+some_shapes = st.tuples(weights, weights, weights).map(
+    lambda drawn: {
+        **moments_of(Sum.AREA_W, drawn[0]),
+        **moments_of(Sum.LEVEL_W, drawn[1]),
+        **moments_of(Sum.GAP_W, drawn[2]),
+    }
+)
+some_sums = st.tuples(figures, some_shapes).map(lambda drawn: {**drawn[0], **drawn[1]})
 """Anything, and more often than by chance what lies at a threshold or passes most of them."""
 nearly_roofs = st.tuples(some_sums, st.sets(st.sampled_from(list(Sum)), max_size=4)).map(
     lambda drawn: {column: drawn[0][column] for column in drawn[1]}

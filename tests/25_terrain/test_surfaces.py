@@ -13,6 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.model import FloatArray, IntArray, KindArray, LabelArray, Tin
+from pipeline.terrain.decks_and_vehicles import shape_figures
 from pipeline.terrain.facets import (
     FacetKind,
     FacetLimits,
@@ -297,7 +298,18 @@ def test_a_step_between_two_levels_links_them() -> None:
     assert fragments.sums[step, Sum.BOUNDARY] == fragments.sums[[lower, upper], Sum.STEP].sum()
 
 
-@pytest.mark.parametrize("heights", [box, two_levels, canyon, town])
+def slab(x: FloatArray, y: FloatArray) -> FloatArray:
+    """A slab that rises from the ground in the west to 2 m at the edge of the data in the east."""
+    return np.where(in_box(x, y, 10, 12, 40, 26), (x - 10) / 15, 0.0)
+
+
+def add_moments(row: IntArray, first: Sum, weight: int, x_dm: int, y_dm: int) -> None:
+    """Add a weight and its moments."""
+    for k, value in enumerate((1, x_dm, y_dm, x_dm * x_dm, x_dm * y_dm, y_dm * y_dm)):
+        row[first + k] += weight * value
+
+
+@pytest.mark.parametrize("heights", [box, two_levels, canyon, town, slab])
 def test_sums_agree_with_a_walk_over_all_edges(heights: Height) -> None:
     scene = built(heights, seed=7)
     v, facets, kinds = scene.vertices, scene.tin.facets, scene.facet_kinds()
@@ -312,6 +324,10 @@ def test_sums_agree_with_a_walk_over_all_edges(heights: Height) -> None:
             expected[label[f], Sum.FACETS] += 1
             area = shapely.Polygon(np.column_stack((v.x_mm, v.y_mm))[corners]).area
             expected[label[f], Sum.AREA2] += round(2 * area)
+        if label[f] >= 0 and kinds[f] == FacetKind.OBJECT:
+            for a, b in itertools.pairwise([*corners, corners[0]]):
+                place = (v.x_mm[a] + v.x_mm[b]) // 200, (v.y_mm[a] + v.y_mm[b]) // 200
+                add_moments(expected[label[f]], Sum.AREA_W, round(2 * area) // 6000, *place)
     for ends, beside in sides.items():
         a, b = ends
         length = round(math.dist((v.x_mm[a], v.y_mm[a]), (v.x_mm[b], v.y_mm[b])))
@@ -320,6 +336,15 @@ def test_sums_agree_with_a_walk_over_all_edges(heights: Height) -> None:
                 continue
             row = expected[label[f]]
             row[Sum.BOUNDARY] += length
+            if kinds[f] == FacetKind.OBJECT:
+                place = (v.x_mm[a] + v.x_mm[b]) // 200, (v.y_mm[a] + v.y_mm[b]) // 200
+                if g < 0 or kinds[g] == FacetKind.VOID:
+                    add_moments(row, Sum.GAP_W, length // 10, *place)
+                elif kinds[g] == FacetKind.BORDER:
+                    (beyond,) = set(facets[g].tolist()) - {a, b}
+                    row[Sum.OPEN] += length if v.height_mm[beyond] < (v.height_mm[a] + v.height_mm[b]) / 3 else 0
+                    if v.kind[beyond] == VertexKind.GROUND and np.ptp(v.z_mm[facets[g]]) < 300:
+                        add_moments(row, Sum.LEVEL_W, length // 10, *place)
             if g < 0 or kinds[g] == FacetKind.VOID:
                 continue
             top, foot = v.z_mm[facets[g]].max(), v.z_mm[facets[g]].min()
@@ -333,7 +358,9 @@ def test_sums_agree_with_a_walk_over_all_edges(heights: Height) -> None:
             if kinds[g] == FacetKind.STEP:
                 row[Sum.STEP] += length
     fragments, _ = scene.cut()
-    columns = [Sum.FACETS, Sum.AREA2, *range(Sum.BOUNDARY, Sum.POINTS)]
+    columns = [Sum.FACETS, Sum.AREA2, *range(Sum.BOUNDARY, Sum.POINTS), *range(Sum.OPEN, N_SUMS)]
+    assert (expected[:, [Sum.OPEN, Sum.AREA_W, Sum.GAP_W]].sum(axis=0) > 0).tolist() == [True, True, heights is slab]
+    assert (expected[:, Sum.LEVEL_W].sum() > 0) == (heights is slab)
     np.testing.assert_array_equal(fragments.sums[:, columns], expected[:, columns])
 
 
@@ -494,7 +521,10 @@ def test_a_shift_changes_nothing_but_coordinates() -> None:
     shift = -84_000_000
     here, here_labels = built(town, seed=15).cut()
     there, there_labels = built(town, seed=15, corner_mm=shift).cut()
-    np.testing.assert_array_equal(there.sums, here.sums)
+    weights = [*range(Sum.AREA_W), Sum.AREA_W, Sum.LEVEL_W, Sum.GAP_W]
+    np.testing.assert_array_equal(there.sums[:, weights], here.sums[:, weights])
+    for name, figure in shape_figures(here.sums).items():
+        np.testing.assert_allclose(shape_figures(there.sums)[name], figure, err_msg=name)
     np.testing.assert_array_equal(there_labels, here_labels)
     np.testing.assert_array_equal(there.boxes_mm, here.boxes_mm + shift)
     np.testing.assert_array_equal(there.crossing_keys, here.crossing_keys + shift)

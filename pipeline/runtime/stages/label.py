@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from uuid import uuid4
 
@@ -47,6 +48,8 @@ class LabelTask:
     """Points and terrain in, classes out."""
     buildings: tuple[PointRange, ...]
     """Points of the candidates in all tiles that the tile's neighbourhood meets."""
+    decks: tuple[PointRange, ...] = ()
+    """Points of the bridges there."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -87,6 +90,7 @@ def label(task: LabelTask) -> Labelled:
         wanted,
         task.settings.vegetation,
     )[:core]
+    found[_held_by(task, task.decks, points, window)[:core] & (found != PointClass.GROUND)] = PointClass.BRIDGE_DECK
     counts: Counter[int] = Counter()
     # points of one place and return number differ at most in their count of returns: the lowest decides for all
     first = np.argsort(points.return_count[:core], kind="stable")
@@ -125,7 +129,7 @@ def evidence_of(task: LabelTask, points: WindowPoints, window: Window) -> PointE
         height_mm=height_above(x, y, z, around.elevation_mm, around.column0, around.row0),
         rise_mm=-height_above(x, y, np.zeros_like(z), terrain.slope_mm, around.column0, around.row0),
         ground=ground,
-        building=_in_buildings(task, points, window),
+        building=_held_by(task, task.buildings, points, window),
         outlier=~dense_enough(x, y, z, task.settings.outliers),
         echoes=points.return_count > 1,
     )
@@ -142,14 +146,16 @@ def terrain_around(around: Surroundings) -> Terrain:
     )
 
 
-def _in_buildings(task: LabelTask, points: WindowPoints, window: Window) -> BoolArray:
-    """Mask of the points that a candidate holds."""
+def _held_by(task: LabelTask, parts: Sequence[PointRange], points: WindowPoints, window: Window) -> BoolArray:
+    """Mask of the points that some ranges hold."""
+    if not parts:
+        return np.zeros(len(points), np.bool_)
     pieces = []
-    for part in task.buildings:
+    for part in parts:
         stored = task.scratch.array(f"{part.folder}/{part.tile.key}", "points", mapped=True).view(POINT)
         records = np.array(stored[part.start : part.stop])
         pieces.append(records[window.contains(records["x"], records["y"])])
-    records = np.concatenate(pieces) if pieces else np.empty(0, POINT)
+    records = np.concatenate(pieces)
     at = index_of_each(points.x_mm, points.y_mm, points.z_mm, points.return_number, *_places(records))
     inside: BoolArray = at >= 0
     return inside
