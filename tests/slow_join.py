@@ -104,6 +104,8 @@ def _shape(sums: IntArray, facets_m2: float, spacing_m: float) -> dict[str, floa
         p, q = max(forms, key=lambda form: form[0] * form[0] + form[1] * form[1])
         u, v = a * p + b * q, b * p + d * q
         apart = math.sqrt(12.0 * max(0.0, (u * u + v * v) / max(1e-12, p * u + q * v)))
+        if ends == 1.0 and apart * apart < facets_m2:
+            continue
         found["apart_m"] = apart
         found["end_share"] = int(sums[Sum.LEVEL_W]) / 100.0 / max(1e-6, ends * facets_m2 / max(1e-6, apart))
     return found

@@ -85,7 +85,8 @@ def shape_figures(sums: IntArray) -> dict[str, FloatArray]:
     """Measures of surfaces (k, N_SUMS) that show decks and vehicles, in metres and shares, each (k,).
 
     `end_share` is the share of a deck's two ends that is level with the ground; 0 where a surface does not look like a
-    deck. The edge of the data may cut a deck: the cut then replaces one end, and the share is that of the other.
+    deck. The edge of the data may cut a deck that is longer than wide: the cut then replaces one end, and the share is
+    that of the other.
     """
     area, level, gap = (_columns(sums, m) for m in (Sum.AREA_W, Sum.LEVEL_W, Sum.GAP_W))
     weight = np.maximum(1, area[:, 0])
@@ -101,6 +102,8 @@ def shape_figures(sums: IntArray) -> dict[str, FloatArray]:
     distance = np.zeros(len(sums))
     for outline, ends in ((level + gap, 1.0), (level, 2.0)):
         found, apart = _two_ends(_centred(outline, cx, cy), about)
+        # of a deck that is cut more is seen than its width: else any cut hall with a level side would look like it
+        found |= False  #         found &= (ends == 2.0)= (ends == 2.0) | (apart * apart >= facets_m2)
         ends_m = np.maximum(1e-6, ends * facets_m2 / np.maximum(1e-6, apart))
         share = np.where(found, level_m / ends_m, share)
         distance = np.where(found, apart, distance)

@@ -128,6 +128,13 @@ def flat(x: FloatArray, y: FloatArray) -> FloatArray:
     return 0.0 * (x + y)
 
 
+def test_a_hall_that_the_edge_of_the_data_cuts_is_not_a_deck_though_one_side_is_level() -> None:
+    def terrace(x: FloatArray, y: FloatArray) -> FloatArray:
+        return np.where(x < 9.0, 0.0, -4.0) + 0.0 * y
+
+    assert verdict_on(largest(lambda x, y: np.where(np.abs(y) <= 15, 0.0, terrace(x, y)), terrace)) is None
+
+
 def on_slope(x: FloatArray, y: FloatArray) -> FloatArray:
     return 0.4 * np.clip(x, -30.0, 30.0) + 0.0 * y
 
