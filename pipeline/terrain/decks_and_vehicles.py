@@ -103,7 +103,7 @@ def shape_figures(sums: IntArray) -> dict[str, FloatArray]:
     for outline, ends in ((level + gap, 1.0), (level, 2.0)):
         found, apart = _two_ends(_centred(outline, cx, cy), about)
         # of a deck that is cut more is seen than its width: else any cut hall with a level side would look like it
-        found |= False  #         found &= (ends == 2.0)= (ends == 2.0) | (apart * apart >= facets_m2)
+        found &= (ends == 2.0) | (apart * apart >= facets_m2)
         ends_m = np.maximum(1e-6, ends * facets_m2 / np.maximum(1e-6, apart))
         share = np.where(found, level_m / ends_m, share)
         distance = np.where(found, apart, distance)
