@@ -58,9 +58,9 @@ def _draw(
                 r0, r1 = max(r - half, 0), min(r + half, rows - 1) + 1
                 c0, c1 = max(c - half, 0), min(c + half, columns - 1) + 1
                 # about the cell itself, in whole numbers: the same wherever the window begins
-                east = (sums[1, r1, c1] - sums[1, r0, c1] - sums[1, r1, c0] + sums[1, r0, c0] - n * c) / n
-                north = (sums[2, r1, c1] - sums[2, r0, c1] - sums[2, r1, c0] + sums[2, r0, c0] - n * r) / n
-                mean = (sums[3, r1, c1] - sums[3, r0, c1] - sums[3, r1, c0] + sums[3, r0, c0]) / n
+                east = (sums[r1, c1, 1] - sums[r0, c1, 1] - sums[r1, c0, 1] + sums[r0, c0, 1] - n * c) / n
+                north = (sums[r1, c1, 2] - sums[r0, c1, 2] - sums[r1, c0, 2] + sums[r0, c0, 2] - n * r) / n
+                mean = (sums[r1, c1, 3] - sums[r0, c1, 3] - sums[r1, c0, 3] + sums[r0, c0, 3]) / n
                 slack = max_slope * CELL_MM * math.sqrt(east * east + north * north)
                 level = min(max(level, mean - slack), mean + slack)
             terrain[r, c] = np.int32(round(level))

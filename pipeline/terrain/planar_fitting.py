@@ -21,7 +21,7 @@ from pipeline.model import BoolArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 
 Sums = npt.NDArray[np.int64]
-"""(9, rows + 1, columns + 1) integral images of 1, x, y, z, xx, xy, yy, xz, yz; x and y are cell indices, z in mm."""
+"""(rows + 1, columns + 1, 9) integral images of 1, x, y, z, xx, xy, yy, xz, yz; x and y are cell indices, z in mm."""
 
 MIN_CELLS = 5
 """Fewest cells of a plane: two more than determine it."""
@@ -37,14 +37,14 @@ MAX_LEAN = 0.6
 def plane_sums(elevation: Elevations, used: BoolArray) -> Sums:
     """Integral images of the used cells."""
     rows, columns = elevation.shape
-    sums = np.zeros((9, rows + 1, columns + 1), np.int64)
+    sums = np.zeros((rows + 1, columns + 1, 9), np.int64)
     for r in range(rows):
         run = np.zeros(9, np.int64)
         for c in range(columns):
             if used[r, c]:
                 add_to_sums(run, c, r, np.int64(elevation[r, c]))
             for k in range(9):
-                sums[k, r + 1, c + 1] = sums[k, r, c + 1] + run[k]
+                sums[r + 1, c + 1, k] = sums[r, c + 1, k] + run[k]
     return sums
 
 
@@ -63,15 +63,15 @@ def plane_around(sums: Sums, r: int, c: int, half: int) -> tuple[int, float, flo
     carries : bool
         At least `MIN_CELLS` cells that spread to both sides.
     """
-    rows, columns = sums.shape[1] - 1, sums.shape[2] - 1
+    rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
     r0, r1 = max(r - half, 0), min(r + half, rows - 1) + 1
     c0, c1 = max(c - half, 0), min(c + half, columns - 1) + 1
-    n = sums[0, r1, c1] - sums[0, r0, c1] - sums[0, r1, c0] + sums[0, r0, c0]
+    n = sums[r1, c1, 0] - sums[r0, c1, 0] - sums[r1, c0, 0] + sums[r0, c0, 0]
     if n == 0:
         return 0, 0.0, 0.0, 0.0, False
     m = np.empty(9, np.int64)
     for k in range(9):
-        m[k] = sums[k, r1, c1] - sums[k, r0, c1] - sums[k, r1, c0] + sums[k, r0, c0]
+        m[k] = sums[r1, c1, k] - sums[r0, c1, k] - sums[r1, c0, k] + sums[r0, c0, k]
     # moments about the cell (r, c), exact
     sx = m[1] - n * c
     sy = m[2] - n * r
@@ -148,10 +148,10 @@ def leaning_planes(elevation: Elevations, used: BoolArray, half: int, widest: in
             while side < widest:
                 r0, r1 = max(r - side, 0), min(r + side, rows - 1) + 1
                 c0, c1 = max(c - side, 0), min(c + side, columns - 1) + 1
-                n = sums[0, r1, c1] - sums[0, r0, c1] - sums[0, r1, c0] + sums[0, r0, c0]
+                n = sums[r1, c1, 0] - sums[r0, c1, 0] - sums[r1, c0, 0] + sums[r0, c0, 0]
                 if n >= half:
-                    east = sums[1, r1, c1] - sums[1, r0, c1] - sums[1, r1, c0] + sums[1, r0, c0] - n * c
-                    north = sums[2, r1, c1] - sums[2, r0, c1] - sums[2, r1, c0] + sums[2, r0, c0] - n * r
+                    east = sums[r1, c1, 1] - sums[r0, c1, 1] - sums[r1, c0, 1] + sums[r0, c0, 1] - n * c
+                    north = sums[r1, c1, 2] - sums[r0, c1, 2] - sums[r1, c0, 2] + sums[r0, c0, 2] - n * r
                     if max(abs(east), abs(north)) <= MAX_LEAN * side * n:
                         break
                 side = min(2 * side, widest)

@@ -26,38 +26,59 @@ _STEEPEST_MM = 1.0 * CELL_MM
 """Rise per cell of the steepest plane that is drawn on: beyond 45 degrees it says little of the next cell's level."""
 
 
+_BLOCK = 64
+"""Side in cells of the blocks whose planes are summed and tested together; no plane depends on it. Small enough for the
+processor's cache, and most blocks need only one pass."""
+
+
+@kernel
+def _join_block(
+    out: BoolArray,
+    lowest: Elevations,
+    ground: BoolArray,
+    barred: BoolArray,
+    block: tuple[int, int],
+    limits: tuple[int, float],
+) -> None:
+    """Mark in `out` the cells of a block, by its first row and column, that planes on `_FEWEST_SIDES` sides meet."""
+    half, step_mm = limits
+    first, left = max(block[0] - 2 * half, 0), max(block[1] - 2 * half, 0)
+    last, right = block[0] + _BLOCK + 2 * half, block[1] + _BLOCK + 2 * half
+    sums = plane_sums(lowest[first:last, left:right].copy(), ground[first:last, left:right].copy())
+    for r in range(block[0], min(block[0] + _BLOCK, lowest.shape[0])):
+        for c in range(block[1], min(block[1] + _BLOCK, lowest.shape[1])):
+            if ground[r, c] or barred[r, c] or lowest[r, c] == NO_DATA:
+                continue
+            met = 0
+            for k in range(len(_SIDES)):
+                down, across = _SIDES[k, 0] * half, _SIDES[k, 1] * half
+                _, level, east, north, carries = plane_around(sums, r - first + down, c - left + across, half)
+                if not carries or math.sqrt(east * east + north * north) > _STEEPEST_MM:
+                    continue
+                if abs(lowest[r, c] - (level - east * across - north * down)) <= step_mm:
+                    met += 1
+            out[r, c] = met >= _FEWEST_SIDES
+
+
 @kernel
 def _joined(
     lowest: Elevations, ground: BoolArray, barred: BoolArray, seen: LabelArray, limits: tuple[int, float]
 ) -> BoolArray:
     """Ground, and the cells that the planes through the ground of at least `_FEWEST_SIDES` squares beside them meet.
 
-    `seen` counts the ground cells around each cell at its last test. Ground only grows: a cell around which there are
-    as many as then needs no test. `limits` as in `rejoined`.
+    `seen` counts the ground cells in and around each block at its last test. Ground only grows: a block with as many as
+    then needs no test. `limits` as in `rejoined`.
     """
-    half, step_mm = limits
-    rows, columns = lowest.shape
-    sums = plane_sums(lowest, ground)
+    margin = 2 * limits[0]
     out = ground.copy()
-    for r in range(rows):
-        for c in range(columns):
-            if ground[r, c] or barred[r, c] or lowest[r, c] == NO_DATA:
-                continue
-            r0, r1 = max(r - 2 * half, 0), min(r + 2 * half, rows - 1) + 1
-            c0, c1 = max(c - 2 * half, 0), min(c + 2 * half, columns - 1) + 1
-            around = sums[0, r1, c1] - sums[0, r0, c1] - sums[0, r1, c0] + sums[0, r0, c0]
-            if around == seen[r, c]:
-                continue
-            seen[r, c] = around
-            met = 0
-            for k in range(len(_SIDES)):
-                down, across = _SIDES[k, 0] * half, _SIDES[k, 1] * half
-                _, level, east, north, carries = plane_around(sums, r + down, c + across, half)
-                if not carries or math.sqrt(east * east + north * north) > _STEEPEST_MM:
-                    continue
-                if abs(lowest[r, c] - (level - east * across - north * down)) <= step_mm:
-                    met += 1
-            out[r, c] = met >= _FEWEST_SIDES
+    for i in range(seen.shape[0]):
+        for j in range(seen.shape[1]):
+            r, c = i * _BLOCK, j * _BLOCK
+            r0, c0 = max(r - margin, 0), max(c - margin, 0)
+            around = np.count_nonzero(ground[r0 : r + _BLOCK + margin, c0 : c + _BLOCK + margin])
+            if around != seen[i, j]:
+                seen[i, j] = around
+                _join_block(out, lowest, ground, barred, (r, c), limits)
     return out
 
 
@@ -75,7 +96,7 @@ def rejoined(
     limits : tuple
         Half side in cells of the eight squares that touch a cell; farthest that a plane may pass above or below it, mm.
     """
-    seen = np.zeros(lowest.shape, np.int32)
+    seen = np.zeros((-(-lowest.shape[0] // _BLOCK), -(-lowest.shape[1] // _BLOCK)), np.int32)
     for _ in range(passes):
         out = _joined(lowest, ground, barred, seen, limits)
         if np.array_equal(out, ground):
