@@ -86,18 +86,20 @@ class MorphologicalFilterSettings(Parameters):
     regrowth_passes: int = parameter(
         2, "Number of passes in which cells level with the ground beside them join it.", minimum=0, maximum=10
     )
-    regrowth_m: int = parameter(3, "Half side of the square that counts as beside.", unit="m", minimum=1, maximum=10)
+    regrowth_m: int = parameter(
+        3, "Half side of the largest square that counts as beside.", unit="m", minimum=1, maximum=10
+    )
     regrowth_step_m: float = parameter(
         0.2, "Highest that a cell may lie above ground beside it.", unit="m", minimum=0.0, maximum=3.0
     )
     regrowth_share: float = parameter(
-        0.3,
-        "Least share of the ground beside a cell that it does not exceed by more than regrowth_step_m.",
+        0.4,
+        "Least share of the nearest ground beside a cell that it does not exceed by more than regrowth_step_m.",
         minimum=0.0,
         maximum=1.0,
     )
     rejoin_passes: int = parameter(
-        6,
+        5,
         "Number of further passes in which cells, wide objects too, join the ground if its planes meet them from two "
         "sides, as on brows, benches and terraces.",
         minimum=0,
@@ -108,6 +110,19 @@ class MorphologicalFilterSettings(Parameters):
     )
     rejoin_step_m: float = parameter(
         0.25, "Farthest that such a plane may pass above or below the cell.", unit="m", minimum=0.0, maximum=3.0
+    )
+    berm_passes: int = parameter(
+        3,
+        "Number of passes after these in which cells, wide objects too, join the ground that they rise from gently, as "
+        "berms and rims do.",
+        minimum=0,
+        maximum=10,
+    )
+    berm_slope: float = parameter(
+        0.1,
+        "Added to regrowth_step_m in these passes per metre of distance: a berm rises gently, a wall does not.",
+        minimum=0.0,
+        maximum=1.0,
     )
 
     @property
@@ -121,8 +136,9 @@ class MorphologicalFilterSettings(Parameters):
 
     @property
     def rejoined_support_m(self) -> float:
-        """How far the ground looks that rejoined by planes; terrain is drawn from it up to `NEAR_CELLS` away."""
-        return self.morphological_support_m + 2 * self.rejoin_passes * self.rejoin_m
+        """How far the ground looks that joined by planes or later; terrain is drawn from it up to `NEAR_CELLS` away."""
+        passes = 2 * self.rejoin_passes * self.rejoin_m + self.berm_passes * self.regrowth_m
+        return self.morphological_support_m + passes
 
     @property
     def second_window_m(self) -> int:

@@ -9,6 +9,8 @@ separately. Brows, crests and terraces that were lost rejoin the ground beside t
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pipeline.compiler import kernel
@@ -36,6 +38,9 @@ _CLUMP_BAND_MM = 750
 
 _FEWEST_BESIDE = 2
 """Ground cells on the same level that a cell needs beside it to rejoin: one may be an outlier."""
+
+_ENOUGH_BESIDE = 4
+"""Ground cells that show what lies beside a cell: twice as many as must agree. Farther ones do not count."""
 
 
 @kernel
@@ -129,12 +134,13 @@ def _heights(
 
 @kernel
 def regrown(
-    lowest: Elevations, ground: BoolArray, barred: BoolArray, passes: int, limits: tuple[int, int, float]
+    lowest: Elevations, ground: BoolArray, barred: BoolArray, passes: int, limits: tuple[int, int, float, float]
 ) -> BoolArray:
-    """Ground, and the cells level with the ground beside them; elevations are in mm.
+    """Ground, and the cells level with the nearest ground around them; elevations are in mm.
 
     Most of the ground beside a brow, the rim of a terrace or the crest of a dam lies along its contour; a roof has none
-    on its level, and a bush on a slope only some of it, uphill.
+    on its level, and a bush on a slope only some of it, uphill. The nearest ground is that of the smallest square with
+    at least `_ENOUGH_BESIDE` cells of it.
 
     Parameters
     ----------
@@ -143,9 +149,10 @@ def regrown(
     passes : int
         How often.
     limits : tuple
-        Half side of the square beside in cells, highest step up in mm, least share of the square's ground on the level.
+        Half side of the largest square in cells; highest step up in mm; its increase in mm per cell of distance; least
+        share of the nearest ground that lies no deeper.
     """
-    reach, step_mm, share = limits
+    reach, step_mm, rise_mm, share = limits
     rows, columns = lowest.shape
     for _ in range(passes):
         out = ground.copy()
@@ -153,13 +160,17 @@ def regrown(
             for c in range(columns):
                 if ground[r, c] or lowest[r, c] == NO_DATA or barred[r, c]:
                     continue
-                beside, level = 0, 0
-                for a in range(max(r - reach, 0), min(r + reach + 1, rows)):
-                    for b in range(max(c - reach, 0), min(c + reach + 1, columns)):
-                        if ground[a, b]:
-                            beside += 1
-                            if lowest[r, c] - lowest[a, b] <= step_mm:
-                                level += 1
+                beside, level, half = 0, 0, 0
+                while half < reach and beside < _ENOUGH_BESIDE:
+                    half += 1
+                    for a in range(max(r - half, 0), min(r + half + 1, rows)):
+                        step = 1 if abs(a - r) == half else 2 * half
+                        for b in range(c - half, c + half + 1, step):
+                            if 0 <= b < columns and ground[a, b]:
+                                beside += 1
+                                away = math.sqrt((a - r) * (a - r) + (b - c) * (b - c))
+                                if lowest[r, c] - lowest[a, b] <= step_mm + rise_mm * away:
+                                    level += 1
                 out[r, c] = level >= _FEWEST_BESIDE and level >= share * beside
         ground = out
     return ground
@@ -168,7 +179,7 @@ def regrown(
 def morphological_ground(
     lowest: Elevations, corner: tuple[int, int], settings: MorphologicalFilterSettings
 ) -> tuple[BoolArray, BoolArray]:
-    """Masks of the cells that hold ground, and of those among them that did not rejoin it by planes.
+    """Masks of the cells that hold ground, and of those among them that joined it before any did by planes.
 
     Both are False in cells without data. `lowest` is the elevation in mm of the lowest point of each cell, with single
     pits cleared and NO_DATA in empty cells. `corner` is the absolute column and row of the first cell: coarse cells are
@@ -193,7 +204,10 @@ def morphological_ground(
     second = cut_off(closed_gaps(height, GAP_CELLS), base, settings.residual_slope * 1000.0, narrow)
     # what only a wider opening sees is too wide for the second ones; on a slope it is high enough for the first
     ground = (lowest != NO_DATA) & (second == 0) & (first <= narrow) & ~wide & ~decks
-    beside = (settings.regrowth_m, round(settings.regrowth_step_m * 1000), settings.regrowth_share)
-    ground = regrown(lowest, ground, wide | decks, settings.regrowth_passes, beside)
+    step_mm, share = round(settings.regrowth_step_m * 1000), settings.regrowth_share
+    beside = (settings.regrowth_m, step_mm, 0.0, share)
+    steady = regrown(lowest, ground, wide | decks, settings.regrowth_passes, beside)
     limits_of_planes = (settings.rejoin_m, settings.rejoin_step_m * 1000.0)
-    return rejoined(lowest, ground, decks, settings.rejoin_passes, limits_of_planes), ground
+    ground = rejoined(lowest, steady, decks, settings.rejoin_passes, limits_of_planes)
+    beside = (settings.regrowth_m, step_mm, settings.berm_slope * 1000.0, share)
+    return regrown(lowest, ground, decks, settings.berm_passes, beside), steady

@@ -31,7 +31,7 @@ _BLOCK = 64
 processor's cache, and most blocks need only one pass."""
 
 
-@kernel
+@kernel(inline="always")
 def _join_block(
     out: BoolArray,
     lowest: Elevations,

@@ -81,11 +81,12 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
             fix = "use fewer passes or smaller cells"
         else:
             counts = [self.max_window_m, self.residual_window_m, self.trend_m, self.widest_m, self.regrowth_m]
-            counts += [self.regrowth_passes, self.rejoin_passes, self.rejoin_m]
+            counts += [self.regrowth_passes, self.rejoin_passes, self.rejoin_m, self.berm_passes]
             cause = (
                 f"max_window_m {self.max_window_m}, residual_window_m {self.residual_window_m}, trend_m {self.trend_m},"
-                f" widest_m {self.widest_m}, regrowth_m {self.regrowth_m} in {self.regrowth_passes} passes, "
-                f"rejoin_m {self.rejoin_m} in {self.rejoin_passes} passes, bridge_m {self.bridge_m}"
+                f" widest_m {self.widest_m}, regrowth_m {self.regrowth_m} in {self.regrowth_passes} and "
+                f"{self.berm_passes} passes, rejoin_m {self.rejoin_m} in {self.rejoin_passes} passes, "
+                f"bridge_m {self.bridge_m}"
             )
             fix = "use smaller ones"
         whole = all(isinstance(n, int) for n in (*counts, self.bridge_m))

@@ -292,6 +292,8 @@ def test_the_support_covers_both_openings_the_trend_between_them_and_the_bridge(
     assert wide.support_m >= 2 + 160 + 80 + 2
     many, few = (GroundSettings(rejoin_passes=passes) for passes in (6, 5))
     assert many.support_m == few.support_m + 2 * few.rejoin_m
+    many, few = (GroundSettings(berm_passes=passes) for passes in (4, 3))
+    assert many.support_m == few.support_m + few.regrowth_m
 
 
 @pytest.mark.parametrize("shift", [(-8, 4), (84_000, 447_000), (-1000, -2000)])

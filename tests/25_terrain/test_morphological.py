@@ -205,11 +205,39 @@ def test_what_lies_level_with_ground_beside_it_joins_pass_by_pass() -> None:
     barred = np.zeros(lowest.shape, np.bool_)
     barred[5, 10] = True
     for passes in (0, 1, 3):
-        found = regrown(lowest, ground, barred, passes, (3, 200, 0.3))
+        found = regrown(lowest, ground, barred, passes, (3, 200, 0.0, 0.4))
         expected = np.arange(30) < 10 + 3 * passes
         np.testing.assert_array_equal(found[10:], np.broadcast_to(expected, (10, 30)))
         assert not found[5, 10]
         assert not found[:, 25:].any()
+
+
+def test_only_the_nearest_ground_says_what_is_level_and_a_rise_per_metre_lets_gentle_slopes_join() -> None:
+    c, _ = coordinates(20, 40)
+    lowest = millimetres(np.where(c < 20, 0.0, 0.25 * (c - 20)))
+    lowest[:, :17] = -5000
+    ground = c < 20
+    barred = np.zeros(lowest.shape, np.bool_)
+    for rise_mm, joined in ((0.0, 21), (100.0, 24)):
+        found = regrown(lowest, ground, barred, 3, (3, 200, rise_mm, 0.4))
+        np.testing.assert_array_equal(found, c < joined)
+
+
+@pytest.mark.parametrize("turns", [0, 1])
+def test_a_berm_on_the_brow_of_a_quarry_is_ground_and_a_wall_there_is_not(turns: int) -> None:
+    c, r = coordinates(120, 160)
+    plateau = np.where(c < 80, 20.0, 2.0)
+    berm = (c > 74) & (c < 80)
+    wall = berm & (c > 76) & (r > 60)
+    low = np.where(berm & (r < 60), plateau + 0.2 * (c - 74), np.where(wall, plateau + 1.5, plateau))
+    lowest = np.rot90(millimetres(low, 30.0), turns).copy()
+    lowest[(np.arange(lowest.shape[0]) % 2 == 1)[:, None] | (np.arange(lowest.shape[1]) % 2 == 1)] = NO_DATA
+    known = lowest != NO_DATA
+    mound = np.rot90(berm & (r < 56), turns) & known
+    found, without = (ground_cells(lowest, GroundSettings(berm_passes=passes)) for passes in (3, 0))
+    assert without[mound].mean() < 0.8
+    assert found[mound].mean() > 0.95
+    assert not found[np.rot90(wall & (r > 64), turns) & known].any()
 
 
 @pytest.mark.parametrize("turns", [0, 1])
@@ -338,10 +366,11 @@ def test_a_spur_of_a_plateau_that_narrows_grows_back_from_the_plateau() -> None:
     c, r = coordinates(220, 260)
     spur = (c > 80) & (np.abs(r - 110) < 10 + 0.6 * (c - 80))
     lowest = millimetres(np.where(spur, 7.0, 0.0), 20.0)
-    kept = [ground_cells(lowest, GroundSettings(rejoin_passes=passes))[spur].mean() for passes in (0, 1, 2)]
+    chosen = [GroundSettings(rejoin_passes=passes, berm_passes=0) for passes in (0, 1, 2)]
+    kept = [ground_cells(lowest, settings)[spur].mean() for settings in chosen]
     assert kept[0] < kept[1] < kept[2]
     found, steady = morphological_ground(lowest, (0, 0), GroundSettings())
-    np.testing.assert_array_equal(steady, ground_cells(lowest, GroundSettings(rejoin_passes=0)))
+    np.testing.assert_array_equal(steady, ground_cells(lowest, chosen[0]))
     assert found[steady].all()
 
 
