@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -23,17 +25,28 @@ if TYPE_CHECKING:
 
 
 def inspect(
-    tile: Annotated[str, typer.Argument(metavar="TILE", help="A LAS, LAZ, COPC, PLY or ASCII file.")],
+    tile: Annotated[
+        str,
+        typer.Argument(metavar="TILE", help="A LAS, LAZ, COPC, PLY or ASCII file; or a run directory."),
+    ],
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Show the facts of a tile and an estimate of time and memory; reads it once, streamed."""
+    """Show the facts of a tile and an estimate of time and memory; or the figures of a run and its reasons, added up."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.inspection import inspect as inspect_tile
         from pipeline.io.source import ReadOptions
         from pipeline.runtime.monitoring.events import Event
+
+        if _is_run(tile):
+            from pipeline.report.statistics import run_statistics
+
+            statistics = run_statistics(tile)
+            show_statistics(console, statistics)
+            console.document({"run": tile, "statistics": statistics})
+            return
 
         def on_progress(done: int, total: int) -> None:
             console.on_event(Event(kind="progress", stage="read", done=done, total=total))
@@ -45,6 +58,17 @@ def inspect(
         shares = [[n, count, f"{100.0 * count / found.used_points:.1f} %"] for n, count in found.classes.items()]
         console.table("Classes", ["class", "points", "share"], shares)
         console.document(dataclasses.asdict(found))
+
+
+def _is_run(place: str) -> bool:
+    """Whether a folder or a URL is a run directory; imports nothing for files."""
+    from pipeline.io import is_url
+
+    if not is_url(place) and not Path(place).is_dir():
+        return False
+    from pipeline.ruler.evaluation.reading.run import is_run
+
+    return is_run(place)
 
 
 def digest(
@@ -146,6 +170,14 @@ def evaluate(
         console.document(document)
 
 
+def show_statistics(console: Console, statistics: Mapping[str, Any]) -> None:
+    """The figures of a run as tables."""
+    from pipeline.report.table import statistics_tables
+
+    for table in statistics_tables(statistics):
+        console.show(table)
+
+
 def show_evaluation(console: Console, evaluation: Evaluation) -> dict[str, Any]:
     """An evaluation as tables; returns it as plain JSON values."""
     from pipeline.ruler.evaluation.chapters import chapters
@@ -154,11 +186,9 @@ def show_evaluation(console: Console, evaluation: Evaluation) -> dict[str, Any]:
     document: dict[str, Any] = {"models": evaluation.models.path, "notes": list(all_notes(evaluation))}
     if evaluation.models.kind == "run":
         from pipeline.report.statistics import run_statistics
-        from pipeline.report.table import statistics_tables
 
         document["statistics"] = run_statistics(evaluation.models.path)
-        for table in statistics_tables(document["statistics"]):
-            console.show(table)
+        show_statistics(console, document["statistics"])
     for chapter in chapters(evaluation):
         rows = [
             (line.label, line.value, line.interval, line.n) for line in chapter.lines if line.measure.subset == "all"

@@ -51,6 +51,17 @@ def test_the_run_directory_is_laid_out_as_documented(run: Run) -> None:
     assert len(list(folder.glob("meshes/*/*.obj"))) == 1
 
 
+def test_inspect_adds_up_the_figures_and_reasons_of_a_run(run: Run) -> None:
+    folder, summary, _ = run
+    code, said, _ = invoke("inspect", str(folder), "--json")
+    assert code == 0
+    statistics = json.loads(said)["statistics"]
+    assert statistics["roof_types"] == {"gable": 1}
+    assert statistics["rejected_reasons"] == summary["rejected"]
+    _, said, _ = invoke("inspect", str(folder))
+    assert "Candidates" in said
+
+
 def test_levels_of_detail_are_written_side_by_side(scene: Path, run: Run, tmp_path: Path) -> None:
     words = ("reconstruct", str(scene / "gable.laz"), "--out", str(tmp_path / "run"), "--workers", "0", "--json")
     code, said, _ = invoke(*words, "--lods", "2.2, 1.2,1.3")
