@@ -34,7 +34,7 @@ def inspect(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Show the facts of a tile and an estimate of time and memory; or the figures of a run and its reasons, added up."""
+    """Show the facts of a tile and an estimate of time and memory; or the figures and reasons of a run, added up."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.inspection import inspect as inspect_tile
         from pipeline.io.source import ReadOptions
