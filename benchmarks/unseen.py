@@ -50,7 +50,7 @@ FOREST = "more/ign/forest_0906_6665.laz"
 TALLINN = "more/building3d"
 TALLINN_CRS = "EPSG:3301"
 TOLERANCES = ("0_3m", "0_5m", "1m")
-"""Of edges and corners, as the names of the measures have them."""
+"""Tolerances of edges and corners, as in the names of the measures."""
 SERIAL = Resources(workers=0)
 
 
@@ -62,8 +62,6 @@ class Tile:
     file: str
     """Below the data folder."""
     crs: str
-    thinned: bool = True
-    """Whether it is also measured thinned to the densities of sparse surveys."""
 
 
 TILES = (

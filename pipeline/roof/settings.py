@@ -233,9 +233,9 @@ class ArrangementSettings(Parameters):
         minimum=0.0,
         maximum=1.0,
     )
-    strip_width_m: float = parameter(
+    min_face_width_m: float = parameter(
         0.5,
-        "A narrower strip is not a roof face: parapets, gutters, the edge of a wall.",
+        "A narrower sliver is not a roof face: parapets, gutters, the edge of a wall.",
         unit="m",
         minimum=0.0,
         maximum=2.0,

@@ -102,7 +102,7 @@ def shape_figures(sums: IntArray) -> dict[str, FloatArray]:
     distance = np.zeros(len(sums))
     for outline, ends in ((level + gap, 1.0), (level, 2.0)):
         found, apart = _two_ends(_centred(outline, cx, cy), about)
-        # of a deck that is cut more is seen than its width: else any cut hall with a level side would look like it
+        # a cut deck is longer than wide: any cut hall with one level side would look like a shorter one
         found &= (ends == 2.0) | (apart * apart >= facets_m2)
         ends_m = np.maximum(1e-6, ends * facets_m2 / np.maximum(1e-6, apart))
         share = np.where(found, level_m / ends_m, share)

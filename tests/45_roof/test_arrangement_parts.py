@@ -180,9 +180,9 @@ def united(plan: Subdivision, misfits: IntArray, labels: LabelArray, limits: Lim
     return connected_faces(labels, pairs)[1]
 
 
-def face_limits(face_cost: int, doubtful_cost: int, strip_width_m: float = 0.0) -> Limits:
+def face_limits(face_cost: int, doubtful_cost: int, min_face_width_m: float = 0.0) -> Limits:
     usual = limits_at(0.3, ArrangementSettings())
-    return usual._replace(face_cost=face_cost, doubtful_cost=doubtful_cost, strip_width_m=strip_width_m)
+    return usual._replace(face_cost=face_cost, doubtful_cost=doubtful_cost, min_face_width_m=min_face_width_m)
 
 
 def test_a_face_that_explains_too_little_joins_its_neighbour_and_another_stays() -> None:

@@ -31,8 +31,8 @@ _TOLERANCE = 0.5
 _DOUBTFUL_SHARE = 0.5
 """Share of a face's points that misfit its own plane from which on it costs the most: a plane amid points that fill a
 space, as a crown does, is met by about half of them."""
-_STRIP = 5.0
-"""A strip is at least this many times as long as wide: narrow triangles of hips and dormers are not."""
+_SLIVER = 5.0
+"""A sliver is at least this many times as long as wide: narrow triangles of hips and dormers are not."""
 
 
 @kernel
@@ -216,8 +216,8 @@ def _borders_of_faces(faces: LabelArray, count: int, pairs: IntArray, weights: I
 
 
 @kernel(inline="always")
-def _narrowest_strip(plan: Subdivision, areas: FloatArray, faces: LabelArray, count: int, min_width_m: float) -> int:
-    """The face that is the narrowest strip of those with a neighbour, if narrower than the minimum; -1 for none.
+def _narrowest_sliver(plan: Subdivision, areas: FloatArray, faces: LabelArray, count: int, min_width_m: float) -> int:
+    """The face that is the narrowest sliver of those with a neighbour, if narrower than the minimum; -1 for none.
 
     Width and length are those of the rectangle with the area and the perimeter of the face.
     """
@@ -232,14 +232,14 @@ def _narrowest_strip(plan: Subdivision, areas: FloatArray, faces: LabelArray, co
             p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
             half[faces[f]] += 0.5e-3 * math.hypot(float(xy[q, 0] - xy[p, 0]), float(xy[q, 1] - xy[p, 1]))
             has_neighbour[faces[f]] |= g >= 0
-    least, strip = min_width_m, -1
+    least, sliver = min_width_m, -1
     for f in range(count):
         square = 0.25 * half[f] * half[f] - area[f]
         if has_neighbour[f] and square > 0.0:
             width = 0.5 * half[f] - math.sqrt(square)
-            if width < least and half[f] - width >= _STRIP * width:
-                least, strip = width, f
-    return strip
+            if width < least and half[f] - width >= _SLIVER * width:
+                least, sliver = width, f
+    return sliver
 
 
 @kernel
@@ -256,12 +256,12 @@ def unite_faces(
 
     This saves their common border, and a face for every neighbour with that label; it costs the points that misfit
     then. A face costs more the more of its own points misfit it: `face_cost` if all fit, `doubtful_cost` if half of
-    them misfit. When nothing is saved any more, strips that are too narrow for a roof go to a neighbour all the same.
+    them misfit. When nothing is saved any more, slivers that are too narrow for a roof go to a neighbour all the same.
     Misfits are those of `cell_costs`, `held` of `points_per_cell`, pairs and weights of `cell_borders`.
     """
     k, face_cost, doubtful_cost = misfits.shape[1], limits.face_cost, limits.doubtful_cost
     areas = cell_areas_m2(plan)
-    strip = -1
+    sliver = -1
     while True:
         faces, count = connected_faces(labels, pairs)
         if count < 2:
@@ -275,7 +275,7 @@ def unite_faces(
                 data[faces[i], label] += misfits[i, label]
             inside[faces[i]] += held[i]
         keys, between = _borders_of_faces(faces, count, pairs, weights)
-        best = np.int64(0) if strip < 0 else np.iinfo(np.int64).max
+        best = np.int64(0) if sliver < 0 else np.iinfo(np.int64).max
         best_face, best_label = -1, -1
         saved = np.zeros(k, np.int64)
         s = 0
@@ -294,7 +294,7 @@ def unite_faces(
             for q in range(first, s):
                 label = label_of[keys[q] % count]
                 change = data[f, label] - own - saved[label]
-                if change < best and strip in (-1, f):
+                if change < best and sliver in (-1, f):
                     best = change
                     best_face, best_label = f, label
             for q in range(first, s):
@@ -303,8 +303,8 @@ def unite_faces(
             if faces[i] == best_face:
                 labels[i] = best_label
         if best_face >= 0:
-            strip = -1
+            sliver = -1
         else:
-            strip = _narrowest_strip(plan, areas, faces, count, limits.strip_width_m)
-            if strip < 0:
+            sliver = _narrowest_sliver(plan, areas, faces, count, limits.min_face_width_m)
+            if sliver < 0:
                 return

@@ -21,8 +21,8 @@ class Limits(NamedTuple):
     """Cost of a face that all its points fit, thousandths of a point."""
     doubtful_cost: int
     """Cost of a face that half of its points misfit, thousandths of a point."""
-    strip_width_m: float
-    """Strips that are narrower are not faces."""
+    min_face_width_m: float
+    """Slivers that are narrower are not faces."""
     line_length_m: float
     line_reach_m: float
     corner_cost: float
@@ -47,7 +47,7 @@ def limits_at(spacing_m: float, settings: ArrangementSettings, clearance: float 
         cost_per_m=settings.border_cost / spacing_m,
         face_cost=round(face_cost * COST_SCALE),
         doubtful_cost=round(doubtful_cost * COST_SCALE),
-        strip_width_m=settings.strip_width_m,
+        min_face_width_m=settings.min_face_width_m,
         line_length_m=settings.line_length_m,
         line_reach_m=max(settings.line_reach_m, spacing_m),
         corner_cost=settings.corner_share * face_cost,
