@@ -366,10 +366,9 @@ def _read_statistics(run_dir: str) -> dict[str, Any]:
 
 def show_summary(console: Console, summary: RunSummary) -> None:
     """The results of a run, as tables."""
-    from pipeline.report.table import statistics_tables
+    from pipeline.cli.measuring import show_statistics
 
-    for table in statistics_tables(_statistics_of(summary.run_dir)):
-        console.show(table)
+    show_statistics(console, _statistics_of(summary.run_dir))
     console.table(
         "Time", ["stage", "wall clock"], [(k, f"{seconds:.1f} s") for k, seconds in summary.timings_s.items()]
     )
