@@ -6,7 +6,6 @@ import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import httpx
 import laspy
@@ -14,14 +13,13 @@ import numpy as np
 import pyproj
 import pytest
 from chromium import Visit, inside_of, of_hue
+from finished_jobs import finished_job
 from playwright.sync_api import expect
-from processes import wait_for
 
 pytestmark = [pytest.mark.slow]
 
 Open = Callable[..., Visit]
 
-JOB_S = 600.0
 STAGES = [
     "Prepare the inputs",
     "Plan the tiles",
@@ -41,28 +39,12 @@ SEE_STAGES = """() => {
     }).observe(document.body, { subtree: true, childList: true, attributes: true, characterData: true });
 }"""
 """Keeps what the page showed: a stage of a small job is over sooner than a test can look."""
-"""A deadline for a job, not a promise of speed."""
 
 
 @pytest.fixture(scope="module")
 def finished(service: str, tile: Path) -> str:
     """Id of a finished job, submitted as any client would."""
-    return _finished_job(service, tile)
-
-
-def _finished_job(service: str, tile: Path) -> str:
-    with httpx.Client(base_url=service, timeout=60.0) as client:
-        upload = client.post("uploads", params={"filename": tile.name}, content=tile.read_bytes()).raise_for_status()
-        inputs = {"tiles": [{"href": f"uploads/{upload.json()['uploadID']}"}], "title": tile.name}
-        job = client.post("processes/reconstruct/execution", json={"inputs": inputs}).raise_for_status().json()["jobID"]
-
-        def over() -> dict[str, Any] | None:
-            reported: dict[str, Any] = client.get(f"jobs/{job}").raise_for_status().json()
-            return reported if reported["status"] not in {"accepted", "running"} else None
-
-        status = wait_for(over, "the end of the job", JOB_S)
-        assert status["status"] == "successful", status
-        return str(job)
+    return finished_job(service, tile)
 
 
 def test_a_dropped_tile_becomes_models_and_a_click_on_one_shows_its_record(
@@ -306,7 +288,7 @@ def test_a_tile_without_crs_asks_for_one(visit: Open, service: str, tmp_path: Pa
 
 
 def test_a_result_without_buildings_says_what_to_try(visit: Open, service: str, tmp_path: Path) -> None:
-    job = _finished_job(service, _field(tmp_path / "field.laz", with_hut=True))
+    job = finished_job(service, _field(tmp_path / "field.laz", with_hut=True))
     opened = visit(service)
     opened.page.locator(f'a[href="#/jobs/{job}"]').click()
     expect(opened.page.get_by_role("heading", name="No building was found")).to_be_visible()

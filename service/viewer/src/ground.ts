@@ -99,3 +99,68 @@ export function heightAt(ground: Ground, x: number, y: number): number {
   const { xMin, yMin, cellM, nx, ny, heights } = ground;
   return bilinear(heights, nx, ny, (x - xMin) / cellM, (y - yMin) / cellM);
 }
+
+type Place = readonly [number, number, number];
+
+/**
+ * Distance at which a ray (unit direction) first meets the ground, null if it meets none of it within the lattice or
+ * begins below it.
+ */
+export function groundDistance(ground: Ground, origin: Place, direction: Place): number | null {
+  const { xMin, yMin, cellM, nx, ny } = ground;
+  const [low, high] = heightRange(ground);
+  let [enter, leave] = [0, Infinity];
+  const sides = [
+    [xMin, xMin + cellM * (nx - 1)],
+    [yMin, yMin + cellM * (ny - 1)],
+    [low - cellM, high + cellM], // level ground has no depth of its own
+  ];
+  for (const [axis, [near, far]] of sides.entries()) {
+    if (direction[axis] === 0) {
+      if (origin[axis] < near || origin[axis] > far) return null;
+      continue;
+    }
+    const [a, b] = [(near - origin[axis]) / direction[axis], (far - origin[axis]) / direction[axis]];
+    enter = Math.max(enter, Math.min(a, b));
+    leave = Math.min(leave, Math.max(a, b));
+  }
+  if (enter > leave) return null;
+  const above = (distance: number): number => {
+    const [x, y, z] = origin.map((value, axis) => value + distance * direction[axis]);
+    return z - heightAt(ground, x, y);
+  };
+  // within half a cell in plan the ground is almost a plane; a steep ray takes few steps
+  const plan = Math.hypot(direction[0], direction[1]);
+  const step = Math.max((0.5 * cellM) / Math.max(plan, 1e-9), (leave - enter) / MARCH_STEPS);
+  if (above(enter) <= 0) return null;
+  for (let before = enter; before < leave; before += step) {
+    const after = Math.min(before + step, leave);
+    if (above(after) <= 0) return crossing(above, before, after);
+  }
+  return null;
+}
+
+const MARCH_STEPS = 2000; // bounds the work of rays along very large lattices
+const HALVINGS = 40; // of a step, until floating point has no more digits
+
+/** Where a function falls through zero, between a place where it is positive and one where it is not. */
+function crossing(above: (distance: number) => number, positive: number, other: number): number {
+  for (let halving = 0; halving < HALVINGS; halving++) {
+    const middle = (positive + other) / 2;
+    if (above(middle) > 0) positive = middle;
+    else other = middle;
+  }
+  return positive;
+}
+
+const ranges = new WeakMap<Ground, readonly [number, number]>();
+
+/** Lowest and highest node. */
+function heightRange(ground: Ground): readonly [number, number] {
+  const known = ranges.get(ground);
+  if (known !== undefined) return known;
+  let [low, high] = [Infinity, -Infinity];
+  for (const height of ground.heights) [low, high] = [Math.min(low, height), Math.max(high, height)];
+  ranges.set(ground, [low, high]);
+  return [low, high];
+}

@@ -29,7 +29,7 @@ export function groundMesh(ground: Ground): Mesh {
   geometry.setAttribute("color", new BufferAttribute(colours, 4));
   geometry.setIndex(index);
   geometry.computeVertexNormals();
-  const mesh = new Mesh(geometry, new MeshLambertMaterial({ vertexColors: true, transparent: true, depthWrite: false }));
+  const mesh = new Mesh(geometry, new MeshLambertMaterial({ vertexColors: true, transparent: true }));
   mesh.renderOrder = -1;
   return mesh;
 }

@@ -17,21 +17,44 @@ type Vector = readonly [number, number, number];
 /**
  * The first building that a ray hits; null if it hits none.
  *
- * Boxes first, then the triangles of the buildings whose box is hit (Möller and Trumbore 1997), from either side.
+ * Boxes first, then the triangles of the buildings whose box is hit (Möller and Trumbore 1997).
+ *
+ * @param fromOutside Faces that are met from their inner side are passed over.
  */
-export function pick<T extends Pickable>(batches: Iterable<T>, origin: Vector, direction: Vector): Hit<T> | null {
+export function pick<T extends Pickable>(
+  batches: Iterable<T>,
+  origin: Vector,
+  direction: Vector,
+  fromOutside = false,
+): Hit<T> | null {
   let best: Hit<T> | null = null;
   for (const batch of batches) {
     for (let index = 0; index + 1 < batch.starts.length; index++) {
       const entry = boxEntry(batch.boxes, 6 * index, origin, direction);
       if (entry >= (best?.distance ?? Infinity)) continue;
       for (let corner = batch.starts[index]; corner < batch.starts[index + 1]; corner += 3) {
-        const distance = triangleDistance(batch.positions, 3 * corner, origin, direction);
+        const distance = triangleDistance(batch.positions, 3 * corner, origin, direction, fromOutside);
         if (distance < (best?.distance ?? Infinity)) best = { batch, index, distance };
       }
     }
   }
   return best;
+}
+
+/** Distance from a point to the nearest box of buildings; 0 within one, infinity without boxes. */
+export function boxDistance(batches: Iterable<Pickable>, point: Vector): number {
+  let nearest = Infinity;
+  for (const { boxes } of batches) {
+    for (let at = 0; at < boxes.length; at += 6) {
+      let squared = 0;
+      for (let axis = 0; axis < 3; axis++) {
+        const beyond = Math.max(boxes[at + axis] - point[axis], point[axis] - boxes[at + axis + 3], 0);
+        squared += beyond * beyond;
+      }
+      nearest = Math.min(nearest, squared);
+    }
+  }
+  return Math.sqrt(nearest);
 }
 
 /** Distance at which the ray enters the box, 0 from inside it, infinity if it misses. */
@@ -52,13 +75,20 @@ function boxEntry(boxes: Float32Array, at: number, origin: Vector, direction: Ve
   return enter <= leave ? enter : Infinity;
 }
 
-function triangleDistance(p: Float32Array, at: number, origin: Vector, direction: Vector): number {
+function triangleDistance(
+  p: Float32Array,
+  at: number,
+  origin: Vector,
+  direction: Vector,
+  fromOutside: boolean,
+): number {
   const [dx, dy, dz] = direction;
   const [e1x, e1y, e1z] = [p[at + 3] - p[at], p[at + 4] - p[at + 1], p[at + 5] - p[at + 2]];
   const [e2x, e2y, e2z] = [p[at + 6] - p[at], p[at + 7] - p[at + 1], p[at + 8] - p[at + 2]];
   const [px, py, pz] = [dy * e2z - dz * e2y, dz * e2x - dx * e2z, dx * e2y - dy * e2x];
   const determinant = e1x * px + e1y * py + e1z * pz;
-  if (determinant === 0) return Infinity;
+  // corners run counter-clockwise as seen from outside: the determinant is positive there
+  if (determinant === 0 || (fromOutside && determinant < 0)) return Infinity;
   const [tx, ty, tz] = [origin[0] - p[at], origin[1] - p[at + 1], origin[2] - p[at + 2]];
   const u = (tx * px + ty * py + tz * pz) / determinant;
   if (u < 0 || u > 1) return Infinity;

@@ -14,28 +14,32 @@ import {
   MeshLambertMaterial,
   PCFShadowMap,
   PerspectiveCamera,
+  Ray,
   Raycaster,
   Scene,
   Vector2,
   Vector3,
   WebGLRenderer,
 } from "three";
-import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { LineMaterial } from "three/addons/lines/LineMaterial.js";
 import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
 import type { Batch } from "./batching";
 import { framing } from "./framing";
-import { groundThrough, heightAt, type Ground } from "./ground";
+import { groundDistance, groundThrough, heightAt, type Ground } from "./ground";
 import { groundMesh } from "./ground_mesh";
 import { hatched } from "./hatching";
-import { pick } from "./picking";
+import { Navigation, EYE_M, type Surfaces } from "./navigation";
+import { boxDistance, pick, type Hit } from "./picking";
 import type { Category } from "./roof_types";
 
 const FOV_DEG = 32;
 const START = new Vector3(-0.42, -1, 0.72); // seen from the south-south-west, half from above
 const TAN_HALF_FOV = Math.tan((FOV_DEG * Math.PI) / 360);
-const NEAREST_M = 12;
+const CLOSEST_FIT_M = 12;
+const RISE_RAD = (5 * Math.PI) / 180; // a step up to where a hill no longer is in the way
+const NEAREST_PLANE_M = 0.1;
+const IN_FRAME = 0.7; // of a distance, along the view axis: less than the cosine at the corners of a wide view
 const CLICK_PX = 5; // farther is a drag
 const SHADOW_M = 1500; // wider scenes get no shadows: their map would be too coarse
 const FLIGHT_MS = 450;
@@ -62,7 +66,7 @@ export class ModelScene {
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
   private readonly camera = new PerspectiveCamera(FOV_DEG, 1, 1, 10_000);
-  private readonly controls: OrbitControls;
+  private readonly navigation: Navigation;
   private readonly sun = new DirectionalLight("#fff6e8", 2.2);
   private readonly sky = new HemisphereLight("#f4f8ff", "#a89f92", 2.1);
   private readonly surface = new MeshLambertMaterial({ vertexColors: true, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 });
@@ -85,7 +89,6 @@ export class ModelScene {
   private pointer: PointerEvent | null = null;
   private frame = 0;
   private flight: { from: number; start: [Vector3, Vector3]; end: [Vector3, Vector3] } | null = null;
-  private touched = false;
 
   /**
    * @param canvas Fills its parent.
@@ -102,17 +105,14 @@ export class ModelScene {
     this.renderer.shadowMap.type = PCFShadowMap;
     this.renderer.shadowMap.autoUpdate = false;
     this.camera.up.set(0, 0, 1);
-    this.controls = new OrbitControls(this.camera, canvas);
-    this.controls.maxPolarAngle = 0.495 * Math.PI;
-    this.controls.zoomToCursor = true;
-    this.controls.enableDamping = !this.still.matches;
-    this.controls.dampingFactor = 0.12;
-    this.controls.screenSpacePanning = false;
-    this.controls.addEventListener("change", () => this.request());
-    this.controls.addEventListener("start", () => {
-      this.touched = true;
-      this.flight = null;
-    });
+    this.navigation = new Navigation(
+      this.camera,
+      canvas,
+      this.surfaces(),
+      () => this.request(),
+      () => (this.flight = null),
+      !this.still.matches,
+    );
     this.scene.add(this.sky, this.sun, this.sun.target, new AmbientLight("#ffffff", 0.25));
     this.sun.castShadow = true;
     this.sun.shadow.mapSize.set(4096, 4096);
@@ -131,7 +131,7 @@ export class ModelScene {
   /** Draw more buildings; until the user moves the view it keeps showing all of them. */
   add(batches: readonly Batch[]): void {
     this.put(batches);
-    if (batches.length > 0 && !this.touched) this.fit(false);
+    if (batches.length > 0 && !this.navigation.touched) this.fit(false);
     this.settle();
   }
 
@@ -192,6 +192,7 @@ export class ModelScene {
     this.scene.add(this.groundMesh);
     this.paint();
     this.settle();
+    this.navigation.place(this.camera.position.clone(), this.navigation.target.clone()); // above the ground
   }
 
   /** Height of the drawn ground, 0 if there is none. */
@@ -241,36 +242,14 @@ export class ModelScene {
 
   /** See everything. */
   fit(animated = true): void {
-    if (!this.bounds.isEmpty()) this.flyTo(this.boxes(), this.touched ? this.heading() : START.clone(), 1.0, animated);
+    const direction = this.navigation.touched ? this.heading() : START.clone();
+    if (!this.bounds.isEmpty()) this.flyTo(this.boxes(), direction, 1.0, animated);
   }
 
   /** See everything from straight above, north up. */
   top(): void {
-    this.touched = true;
+    this.navigation.touched = true;
     if (!this.bounds.isEmpty()) this.flyTo(this.boxes(), new Vector3(0, -0.001, 1), 1.0);
-  }
-
-  /** Nearer (above 1) or farther. */
-  zoom(factor: number): void {
-    this.touched = true;
-    const offset = this.camera.position.clone().sub(this.controls.target).divideScalar(factor);
-    this.camera.position.copy(this.controls.target).add(offset);
-    this.controls.update();
-    this.request();
-  }
-
-  /** Turn around the target, in degrees: to the left, and up. */
-  turn(leftDeg: number, upDeg: number): void {
-    this.touched = true;
-    const offset = this.camera.position.clone().sub(this.controls.target);
-    const length = offset.length();
-    const azimuth = Math.atan2(offset.y, offset.x) - (leftDeg * Math.PI) / 180;
-    const steep = Math.asin(offset.z / length) + (upDeg * Math.PI) / 180;
-    const elevation = Math.min(Math.max(steep, 0.02), Math.PI / 2 - 0.001);
-    offset.set(Math.cos(elevation) * Math.cos(azimuth), Math.cos(elevation) * Math.sin(azimuth), Math.sin(elevation));
-    this.camera.position.copy(this.controls.target).addScaledVector(offset, length);
-    this.controls.update();
-    this.request();
   }
 
   /** Release all resources. */
@@ -279,7 +258,7 @@ export class ModelScene {
     this.frame = -1;
     this.watch.disconnect();
     this.dark.removeEventListener("change", this.paint);
-    this.controls.dispose();
+    this.navigation.dispose();
     for (const { mesh, edges } of this.drawn) {
       mesh.geometry.dispose();
       edges.geometry.dispose();
@@ -324,13 +303,10 @@ export class ModelScene {
   private draw(now: number): void {
     this.frame = 0;
     if (this.flight !== null) this.fly(now);
-    else this.controls.update();
+    else this.navigation.update();
     if (this.pointer !== null) this.hover(this.pointer);
-    const distance = this.camera.position.distanceTo(this.controls.target);
-    const radius = this.bounds.isEmpty() ? 100 : this.bounds.getSize(new Vector3()).length() / 2;
-    this.camera.near = Math.max(0.2, distance / 400);
-    this.camera.far = distance + 6 * radius;
-    this.camera.updateProjectionMatrix();
+    const distance = this.camera.position.distanceTo(this.navigation.target);
+    this.setPlanes();
     // lines of one pixel would cover small buildings: they fade before that
     const pixelsPerMetre = this.canvas.clientHeight / (2 * distance * TAN_HALF_FOV);
     this.line.opacity = Math.min(Math.max((pixelsPerMetre - 0.7) / 5, 0), 0.75);
@@ -343,8 +319,26 @@ export class ModelScene {
       triangles: render.triangles,
       calls: render.calls,
       frameMs: (performance.now() - began).toFixed(1),
+      eyeM: this.aboveGround().toFixed(2),
     });
     if (this.flight !== null) this.request();
+  }
+
+  /** Draw from just before the nearest surface to behind the farthest. */
+  private setPlanes(): void {
+    const { position } = this.camera;
+    const reach = this.bounds.isEmpty() ? 100 : this.bounds.getSize(new Vector3()).length();
+    const nearest = Math.min(boxDistance(this.shown(), position.toArray()), this.aboveGround());
+    // on a slope the ground beside the camera is nearer than the ground below it
+    this.camera.near = Math.max(NEAREST_PLANE_M, 0.5 * IN_FRAME * Math.min(nearest, 2 * reach));
+    this.camera.far = this.bounds.isEmpty() ? 1000 : position.distanceTo(this.bounds.getCenter(new Vector3())) + 1.5 * reach;
+    this.camera.updateProjectionMatrix();
+  }
+
+  /** Height of the camera above the drawn ground; infinity without one. */
+  private aboveGround(): number {
+    const { x, y, z } = this.camera.position;
+    return this.groundHeights === null ? Infinity : z - heightAt(this.groundHeights, x, y);
   }
 
   private readonly paint = (): void => {
@@ -364,7 +358,7 @@ export class ModelScene {
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
-    if (!this.touched) this.fit(false);
+    if (!this.navigation.touched) this.fit(false);
     this.request();
   }
 
@@ -383,19 +377,28 @@ export class ModelScene {
 
   /** From the target to the camera. */
   private heading(): Vector3 {
-    return this.camera.position.clone().sub(this.controls.target);
+    return this.camera.position.clone().sub(this.navigation.target);
   }
 
-  /** See boxes from a direction, at `room` times the distance that they need. */
+  /** See boxes from a direction, at `room` times the distance that they need; from farther up where a hill is there. */
   private flyTo(boxes: readonly Box3[], direction: Vector3, room: number, animated = true): void {
-    const { target, distance } = framing(boxes, direction.normalize(), TAN_HALF_FOV, this.camera.aspect);
-    const position = target.clone().addScaledVector(direction, Math.max(1.06 * room * distance, NEAREST_M));
+    const [east, north] = [direction.x, direction.y];
+    const plan = Math.max(Math.hypot(east, north), 1e-3);
+    let steep = Math.atan2(direction.z, plan);
+    let [target, position] = [new Vector3(), new Vector3()];
+    for (;;) {
+      direction.set((Math.cos(steep) * east) / plan, (Math.cos(steep) * north) / plan, Math.sin(steep)).normalize();
+      const view = framing(boxes, direction, TAN_HALF_FOV, this.camera.aspect);
+      target = view.target;
+      position = target.clone().addScaledVector(direction, Math.max(1.06 * room * view.distance, CLOSEST_FIT_M));
+      const hidden = this.groundHeights !== null && position.z < heightAt(this.groundHeights, position.x, position.y) + EYE_M;
+      if (!hidden || steep + RISE_RAD > Math.PI / 2) break;
+      steep += RISE_RAD;
+    }
     if (!animated || this.still.matches) {
-      this.controls.target.copy(target);
-      this.camera.position.copy(position);
-      this.controls.update();
+      this.navigation.place(position, target);
     } else {
-      const start: [Vector3, Vector3] = [this.controls.target.clone(), this.camera.position.clone()];
+      const start: [Vector3, Vector3] = [this.navigation.target.clone(), this.camera.position.clone()];
       this.flight = { from: performance.now(), start, end: [target, position] };
     }
     this.request();
@@ -406,10 +409,8 @@ export class ModelScene {
     const { from, start, end } = this.flight;
     const share = Math.min(Math.max((now - from) / FLIGHT_MS, 0), 1);
     const eased = share * share * (3 - 2 * share);
-    this.controls.target.lerpVectors(start[0], end[0], eased);
-    this.camera.position.lerpVectors(start[1], end[1], eased);
     if (share === 1) this.flight = null;
-    this.controls.update();
+    this.navigation.place(new Vector3().lerpVectors(start[1], end[1], eased), new Vector3().lerpVectors(start[0], end[0], eased));
   }
 
   // --- picking
@@ -419,9 +420,33 @@ export class ModelScene {
     const x = (2 * (event.clientX - frame.left)) / frame.width - 1;
     const y = 1 - (2 * (event.clientY - frame.top)) / frame.height;
     const { ray } = castRay(new Vector2(x, y), this.camera);
-    const visible = this.drawn.filter(({ mesh }) => mesh.visible).map(({ batch }) => batch);
-    const hit = pick(visible, ray.origin.toArray(), ray.direction.toArray());
+    const hit = this.firstModel(ray);
     return hit?.batch.ids[hit.index] ?? null;
+  }
+
+  /** The batches of the shown buildings. */
+  private shown(): Batch[] {
+    return this.drawn.filter(({ mesh }) => mesh.visible).map(({ batch }) => batch);
+  }
+
+  private firstModel(ray: Ray, fromOutside = false): Hit<Batch> | null {
+    return pick(this.shown(), ray.origin.toArray(), ray.direction.toArray(), fromOutside);
+  }
+
+  /** What the camera may meet. */
+  private surfaces(): Surfaces {
+    return {
+      bounds: this.bounds,
+      meet: (ray) => {
+        const [origin, direction] = [ray.origin.toArray(), ray.direction.toArray()];
+        const ground = this.groundHeights === null ? null : groundDistance(this.groundHeights, origin, direction);
+        const model = this.firstModel(ray)?.distance ?? Infinity;
+        if (ground !== null && ground < model) return { distance: ground, isGround: true };
+        return model < Infinity ? { distance: model, isGround: false } : null;
+      },
+      wall: (ray) => this.firstModel(ray, true)?.distance ?? Infinity,
+      groundAt: (x, y) => (this.groundHeights === null ? -Infinity : heightAt(this.groundHeights, x, y)),
+    };
   }
 
   private hover(event: PointerEvent): void {
@@ -453,13 +478,13 @@ export class ModelScene {
   private readonly typed = (event: KeyboardEvent): void => {
     const action = (
       {
-        ArrowLeft: () => this.turn(10, 0),
-        ArrowRight: () => this.turn(-10, 0),
-        ArrowUp: () => this.turn(0, 5),
-        ArrowDown: () => this.turn(0, -5),
-        "+": () => this.zoom(1.25),
-        "=": () => this.zoom(1.25),
-        "-": () => this.zoom(0.8),
+        ArrowLeft: () => this.navigation.turn(10, 0),
+        ArrowRight: () => this.navigation.turn(-10, 0),
+        ArrowUp: () => this.navigation.turn(0, 5),
+        ArrowDown: () => this.navigation.turn(0, -5),
+        "+": () => this.navigation.zoom(1.25),
+        "=": () => this.navigation.zoom(1.25),
+        "-": () => this.navigation.zoom(0.8),
         f: () => this.fit(),
         t: () => this.top(),
         Escape: () => this.onPick(null),

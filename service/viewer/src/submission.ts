@@ -341,7 +341,7 @@ function drawRow(sent: Sent, remove: () => void): void {
   const head = el(
     "div",
     { class: "file-head" },
-    el("span", { class: "file-name", title: file.name }, file.name),
+    el("span", { class: "file-name" }, file.name),
     el("span", { class: "file-size" }, bytes(file.size)),
     el("button", { type: "button", class: "icon", "aria-label": `Remove ${file.name}`, onclick: remove }, "×"),
   );

@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { groundThrough, heightAt } from "../src/ground";
+import { groundDistance, groundThrough, heightAt } from "../src/ground";
 
 const BOX = [-10, -10, 110, 60];
 
@@ -19,4 +19,17 @@ test("between and beyond the floors the ground stays between them", () => {
   const { heights } = groundThrough(floors, BOX, 64);
   expect(Math.min(...heights)).toBeGreaterThanOrEqual(5);
   expect(Math.max(...heights)).toBeLessThanOrEqual(11);
+});
+
+test("a ray meets the ground where it falls below it, and none above it or beside it", () => {
+  const ground = groundThrough([0, 0, 0, 100, 0, 50, 0, 50, 0, 100, 50, 50], [0, 0, 100, 50], 100);
+  const down = [0, 0, -1] as const;
+  expect(groundDistance(ground, [70, 20, 200], down)).toBeCloseTo(200 - heightAt(ground, 70, 20), 5);
+  const level = groundDistance(ground, [1, 25, 30], [1, 0, 0]);
+  expect(level).not.toBeNull();
+  expect(heightAt(ground, 1 + (level as number), 25)).toBeCloseTo(30, 4);
+  expect(groundDistance(ground, [1, 25, 30], [-1, 0, 0])).toBeNull();
+  expect(groundDistance(ground, [1, 25, 60], [1, 0, 0])).toBeNull();
+  expect(groundDistance(ground, [200, 25, 60], down)).toBeNull();
+  expect(groundDistance(groundThrough([50, 20, 7], BOX, 32), [50, 20, 17], down)).toBeCloseTo(10, 5);
 });

@@ -1,7 +1,7 @@
 import { expect, test } from "vitest";
 import { Batcher, type Batch } from "../src/batching";
 import { SequenceReader, type Building } from "../src/cityjson";
-import { pick } from "../src/picking";
+import { boxDistance, pick } from "../src/picking";
 import { GABLE, METADATA } from "./gable";
 
 /** Houses side by side, 20 m apart, the first in the middle of the frame. */
@@ -45,4 +45,19 @@ test("a batch knows where each building begins and ends", () => {
   expect(batch.starts[3]).toBe(batch.positions.length / 3);
   expect(batch.edgeStarts[3]).toBe(batch.edges.length / 3);
   expect([...batch.boxes.slice(6, 12)]).toEqual([15, -3, 0, 25, 3, 5]);
+});
+
+test("from within a house only the next house has an outer side", () => {
+  const batches = houses(2);
+  expect(pick(batches, [0, 0, 1], [1, 0, 0])?.distance).toBeCloseTo(5, 5);
+  const hit = pick(batches, [0, 0, 1], [1, 0, 0], true);
+  expect(hit?.index).toBe(1);
+  expect(hit?.distance).toBeCloseTo(15, 5);
+});
+
+test("the distance to the nearest house is that to its box", () => {
+  const batches = houses(3);
+  expect(boxDistance(batches, [0, 0, 1])).toBe(0);
+  expect(boxDistance(batches, [20, 3 + 4, 5 + 3])).toBeCloseTo(5, 5);
+  expect(boxDistance([], [0, 0, 0])).toBe(Infinity);
 });
