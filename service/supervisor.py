@@ -20,7 +20,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from service.app import create_app, start
-from service.errors import StartUpError
+from service.connections import listen, server_config
 from service.settings import ServiceSettings
 from service.store import JobStore
 
@@ -32,12 +32,6 @@ LONGEST_PAUSE_S = 30.0
 
 STEADY_S = 60.0
 """Seconds after which a driver counts as steady: if it dies, the pauses begin anew."""
-
-KEEP_ALIVE_S = 75
-"""Seconds that an idle connection stays open: longer than at proxies, which should close it first."""
-
-CLOSING_S = 10
-"""Seconds that requests get to finish when the process must end."""
 
 GRACE_S = 30.0
 """Seconds that a driver gets for its own end, in addition to those for draining."""
@@ -193,25 +187,6 @@ class _Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
 
-def listen(settings: ServiceSettings) -> tuple[socket.socket, str]:
-    """The socket of the service's address, and its URL; port 0 takes a free one.
-
-    Raises
-    ------
-    StartUpError
-        The address is not available.
-    """
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    try:
-        listening = socket.create_server((settings.host, settings.port), family=family, backlog=2048)
-    except OSError as error:
-        raise StartUpError(
-            f"cannot listen on {settings.host} port {settings.port}: {error.strerror or error}; choose another --port"
-        ) from error
-    host = f"[{settings.host}]" if family is socket.AF_INET6 else settings.host
-    return listening, f"http://{host}:{listening.getsockname()[1]}"
-
-
 def serve(settings: ServiceSettings, on_ready: Callable[[str], None], *, with_driver: bool = True) -> None:
     """Answer requests until SIGTERM or SIGINT, with a driver beside it.
 
@@ -240,15 +215,7 @@ def serve(settings: ServiceSettings, on_ready: Callable[[str], None], *, with_dr
         command = [sys.executable, "-m", "service.cli", "driver", "--with-parent"]
         supervisor = Supervisor(command, environment_of(settings, os.environ))
         app.state.driver = supervisor.status
-    config = uvicorn.Config(
-        app,
-        log_config=None,
-        access_log=False,
-        server_header=False,
-        timeout_keep_alive=KEEP_ALIVE_S,
-        timeout_graceful_shutdown=CLOSING_S,
-        root_path=settings.root_path.rstrip("/"),
-    )
+    config = server_config(app, settings)
 
     def on_exit() -> None:
         if supervisor is not None:

@@ -16,6 +16,7 @@ import uvicorn
 from processes import wait_for
 
 from service.app import create_app
+from service.connections import listen, server_config
 from service.keys import Scope, new_key
 from service.settings import ServiceSettings
 from service.store import JobStore
@@ -35,15 +36,15 @@ def settings_in(folder: Path, **values: Any) -> ServiceSettings:
 @contextlib.contextmanager
 def serving(settings: ServiceSettings) -> Iterator[str]:
     """The service's URL, while a server in a thread answers it."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        server = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="warning", lifespan="on"))
+    listener, url = listen(settings.model_copy(update={"host": "127.0.0.1", "port": 0}))
+    with listener:
+        server = uvicorn.Server(server_config(create_app(settings), settings, log_level="warning", lifespan="on"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         try:
             wait_for(lambda: server.started or not thread.is_alive(), "the start of the server")
             assert server.started, "the server ended while it started"
-            yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+            yield url
         finally:
             server.should_exit = True
             thread.join(DEADLINE_S)

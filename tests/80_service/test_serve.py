@@ -23,7 +23,8 @@ from typer.testing import CliRunner
 from pipeline.runtime.isolation.isolated_items import MIN_MEMORY_BYTES
 from service.cli import app
 from service.settings import ServiceSettings
-from service.supervisor import Supervisor, environment_of, listen, pause_s
+from service.connections import listen
+from service.supervisor import Supervisor, environment_of, pause_s
 
 
 def gablework(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
