@@ -96,9 +96,6 @@ def start(settings: ServiceSettings, store: JobStore) -> None:
     StoreError
         The database does not answer.
     """
-    folder = StateFolder(settings.state)
-    for path in (folder.root, folder.uploads, folder.jobs):
-        # other users of this machine must not read tiles, results and digests of keys
-        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    StateFolder(settings.state).make()
     store.migrate()
     settings.check_address(has_keys=store.has_keys())

@@ -202,10 +202,11 @@ def drive(
 @contextlib.contextmanager
 def _opened(state: str | None, database_url: str | None) -> Iterator[JobStore]:
     """The store, with its tables in place."""
+    from service.files import StateFolder
     from service.store import JobStore
 
     settings = _settings(state=state, database_url=database_url)
-    settings.state.mkdir(parents=True, exist_ok=True)
+    StateFolder(settings.state).make()
     with JobStore(settings.database) as store:
         store.migrate()
         yield store

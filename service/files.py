@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
+import os
 import re
+import stat
 from pathlib import Path
 
 _ID = re.compile(r"[0-9a-f]{32}")
+_log = logging.getLogger("gablework.service")
 
 
 def is_id(text: str) -> bool:
@@ -48,6 +52,12 @@ class StateFolder:
         """One folder per job."""
         return self.root / "jobs"
 
+    def make(self) -> None:
+        """Make the folders; other users of the machine must not read tiles, results and digests of keys."""
+        for path in (self.root, self.uploads, self.jobs):
+            path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            keep_private(path)
+
     def upload(self, upload_id: str) -> Path:
         """Folder of one upload; holds one file under its cleaned name."""
         return self.uploads / _checked(upload_id)
@@ -75,3 +85,27 @@ class StateFolder:
     def outputs(self, job_id: str, attempt: int) -> Path:
         """The outputs, assembled for download."""
         return self.attempt(job_id, attempt) / "outputs"
+
+
+def keep_private(path: Path) -> None:
+    """Take the rights of other users from a file or folder.
+
+    The group keeps its rights if the folder, or that of the file, has the set-group-id bit: this is how an operator
+    shares it among the accounts of API and drivers. A folder of another account is left as it is, with a warning.
+    """
+    mode = stat.S_IMODE(path.stat().st_mode)
+    folder_mode = mode if path.is_dir() else path.parent.stat().st_mode
+    is_shared = bool(folder_mode & stat.S_ISGID)
+    wanted = mode & ~(stat.S_IRWXO if is_shared else stat.S_IRWXO | stat.S_IRWXG)
+    if wanted == mode:
+        return
+    try:
+        path.chmod(wanted)
+    except PermissionError:
+        _log.warning("%s can be read by other users and belongs to another account: run chmod o= on it", path)
+
+
+def make_private_file(path: Path) -> None:
+    """Make an empty file if there is none; only this account may read it."""
+    os.close(os.open(path, os.O_CREAT | os.O_WRONLY, 0o600))
+    keep_private(path)

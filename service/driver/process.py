@@ -131,6 +131,7 @@ class Driver:
     def _start(self, threads: list[threading.Thread]) -> None:
         """Wait for the database, start the workers, then let the slots claim."""
         try:
+            self._shop.folder.make()
             if not self._until_done(self._store.migrate, "the database cannot be migrated"):
                 return
             try:

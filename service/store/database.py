@@ -17,6 +17,7 @@ from sqlalchemy.engine import URL, Connection, Engine
 
 from service import migrations
 from service.errors import StartUpError, StoreError
+from service.files import keep_private, make_private_file
 
 _EPOCH = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
 _EPOCH_JULIAN = 2440587.5
@@ -96,7 +97,13 @@ class Database:
         """
         if self.is_sqlite and self._url.database is not None:
             with self._faults_in_our_words():
-                Path(self._url.database).parent.mkdir(parents=True, exist_ok=True)
+                path = Path(self._url.database)
+                path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                make_private_file(path)
+                # SQLite makes them with the mode of the database
+                for beside in (path.with_name(path.name + ending) for ending in ("-wal", "-shm")):
+                    if beside.exists():
+                        keep_private(beside)
         with self.write() as connection:
             self.lock(connection, _LOCK_MIGRATIONS)
             found = migrations.current(connection)
