@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 import os
+import secrets
 import signal
 import socket
 import subprocess
@@ -21,6 +23,7 @@ from fastapi import FastAPI
 
 from service.app import create_app, start
 from service.connections import listen, server_config
+from service.errors import StoreError
 from service.settings import ServiceSettings
 from service.store import JobStore
 
@@ -82,14 +85,19 @@ class Supervisor:
     Parameters
     ----------
     command : sequence of str
-        Starts a driver. Its standard input is a pipe that closes when this process ends in any way.
+        Starts a driver; its unique name is appended. Its standard input is a pipe that closes when this process ends in
+        any way.
     environment : mapping
         Its environment.
+    on_death : callable
+        Gets the name of each driver that ended by itself or was killed.
     """
 
-    def __init__(self, command: list[str], environment: Mapping[str, str]) -> None:
+    def __init__(self, command: list[str], environment: Mapping[str, str], on_death: Callable[[str], None]) -> None:
         self._command = command
         self._environment = dict(environment)
+        self._on_death = on_death
+        self._name = ""
         self._child: subprocess.Popen[bytes] | None = None
         # a signal handler may take it while this thread holds it
         self._lock = threading.RLock()
@@ -118,7 +126,9 @@ class Supervisor:
     def _launch(self) -> None:
         with self._lock:
             if not self._ending.is_set():
-                self._child = subprocess.Popen(self._command, env=self._environment, stdin=subprocess.PIPE)  # noqa: S603
+                self._name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
+                command = [*self._command, self._name]
+                self._child = subprocess.Popen(command, env=self._environment, stdin=subprocess.PIPE)  # noqa: S603
 
     def _keep(self) -> None:
         while not self._ending.is_set():
@@ -131,6 +141,7 @@ class Supervisor:
             self.deaths = 1 if time.monotonic() - began > STEADY_S else self.deaths + 1
             wait_s = pause_s(self.deaths)
             _log.error("the driver ended with code %d; another one starts in %.1f s", code, wait_s)
+            self._on_death(self._name)
             if self._ending.wait(wait_s):
                 return
             self._launch()
@@ -153,10 +164,11 @@ class Supervisor:
         except subprocess.TimeoutExpired:
             _log.error("the driver did not end within %.0f s and is killed; its jobs go back to the queue", within_s)
             child.kill()
-            child.wait()
+        if child.wait():
+            self._on_death(self._name)
 
     def kill(self) -> None:
-        """End the driver now; its jobs go back to the queue when their leases end."""
+        """End the driver now; `end` gives its jobs back to the queue."""
         with self._lock:
             self._ending.set()
             if self._child is not None:
@@ -187,6 +199,15 @@ class _Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
 
+def _give_back(store: JobStore, max_attempts: int, driver: str) -> None:
+    """Put the jobs of a dead driver back into the queue now; otherwise they would wait for their leases to end."""
+    try:
+        for job_id in store.give_up(driver, max_attempts=max_attempts):
+            _log.warning("job %s of driver %s waits for another driver", job_id, driver)
+    except StoreError as error:
+        _log.warning("the jobs of driver %s wait until their leases end: %s", driver, error)
+
+
 def serve(settings: ServiceSettings, on_ready: Callable[[str], None], *, with_driver: bool = True) -> None:
     """Answer requests until SIGTERM or SIGINT, with a driver beside it.
 
@@ -212,8 +233,9 @@ def serve(settings: ServiceSettings, on_ready: Callable[[str], None], *, with_dr
     app = create_app(settings)
     supervisor = None
     if with_driver:
-        command = [sys.executable, "-m", "service.cli", "driver", "--with-parent"]
-        supervisor = Supervisor(command, environment_of(settings, os.environ))
+        command = [sys.executable, "-m", "service.cli", "driver", "--with-parent", "--name"]
+        give_back = functools.partial(_give_back, app.state.store, settings.max_attempts)
+        supervisor = Supervisor(command, environment_of(settings, os.environ), give_back)
         app.state.driver = supervisor.status
     config = server_config(app, settings)
 

@@ -327,6 +327,19 @@ class StoreContract(DatabaseContract):
         assert statuses(store, first) == ["accepted", "running", "accepted", "running", "successful"]
         assert any("a was silent" in event.message for event in store.events(first.job_id))
 
+    def test_the_jobs_of_a_driver_that_is_known_to_be_dead_wait_at_once(self, store: JobStore) -> None:
+        first, second = submit(store), submit(store)
+        held = store.claim("dead", lease_s=LONG_S, max_attempts=3)
+        other = store.claim("alive", lease_s=LONG_S, max_attempts=3)
+        assert (held.job_id, other.job_id) == (first.job_id, second.job_id)
+        assert store.give_up("dead", max_attempts=3) == [first.job_id]
+        with pytest.raises(LeaseLostError):
+            store.succeed(held, message="late", summary={})
+        again = store.claim("next", lease_s=LONG_S, max_attempts=3)
+        assert (again.job_id, again.attempt, again.lost_attempts) == (first.job_id, 2, 1)
+        assert any("driver dead ended" in event.message for event in store.events(first.job_id))
+        assert store.still_held(other) is False
+
     def test_the_same_driver_with_an_older_attempt_can_write_no_more(self, store: JobStore) -> None:
         first = running(store, "a", lease_s=SOON_S)
         until(lambda: store.claim("a", lease_s=HOUR_S, max_attempts=3))

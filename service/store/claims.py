@@ -30,8 +30,19 @@ def sweep(connection: Connection, *, now: dt.datetime, max_attempts: int) -> Non
         give_up(connection, row, now=now, max_attempts=max_attempts)
 
 
-def give_up(connection: Connection, row: sa.Row[Any], *, now: dt.datetime, max_attempts: int) -> None:
-    """Take back one locked job from a driver that was lost."""
+def give_up_all(connection: Connection, driver: str, *, now: dt.datetime, max_attempts: int) -> list[str]:
+    """Take back all jobs of a driver that is dead; returns their ids."""
+    held = sa.and_(JOBS.c.status == JobStatus.RUNNING.value, JOBS.c.lease_owner == storable(driver, 255))
+    rows = connection.execute(sa.select(JOBS).where(held).with_for_update()).all()
+    for row in rows:
+        give_up(connection, row, now=now, max_attempts=max_attempts, cause="ended")
+    return [row.job_id for row in rows]
+
+
+def give_up(
+    connection: Connection, row: sa.Row[Any], *, now: dt.datetime, max_attempts: int, cause: str = "was silent"
+) -> None:
+    """Take back one locked job from a driver that was lost; `cause` is a verb, for the message."""
     job = job_of(row)
     status = after_loss(job, max_attempts)
     counted = {"lost_attempts": job.lost_attempts + 1}
@@ -42,7 +53,7 @@ def give_up(connection: Connection, row: sa.Row[Any], *, now: dt.datetime, max_a
     elif status is JobStatus.DISMISSED:
         move(connection, row, status, now=now, message="dismissed; its driver was lost", **counted)
     else:
-        reason = f"attempt {job.attempt} is lost: driver {job.lease_owner} was silent; the job waits for another"
+        reason = f"attempt {job.attempt} is lost: driver {job.lease_owner} {cause}; the job waits for another"
         move(connection, row, status, now=now, message=reason, **counted)
 
 

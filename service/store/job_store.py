@@ -204,6 +204,16 @@ class JobStore:
             job_id = claims.take_first(connection, driver, now=now, lease_s=lease_s)
             return None if job_id is None else queries.get(connection, job_id, None)
 
+    def give_up(self, driver: str, *, max_attempts: int) -> builtins.list[str]:
+        """Take back the jobs of a driver that is known to be dead, before their leases end; returns their ids.
+
+        They go back into the queue, fail if they were lost `max_attempts` times, or are dismissed if that was
+        requested.
+        """
+        with self._database.write() as connection:
+            now = self._database.now(connection)
+            return claims.give_up_all(connection, driver, now=now, max_attempts=max_attempts)
+
     def renew(self, job: Job, *, lease_s: float) -> bool:
         """Hold a job for `lease_s` seconds from now; True if it must be dismissed.
 

@@ -204,14 +204,17 @@ def test_port_0_takes_a_free_port_and_a_taken_one_is_reported(tmp_path: Path) ->
 
 
 def test_a_supervised_process_is_started_again_and_ends_with_its_supervisor() -> None:
+    dead: list[str] = []
     # ends by itself when its standard input closes
-    supervisor = Supervisor([sys.executable, "-c", "import sys; sys.stdin.read()"], os.environ)
+    supervisor = Supervisor([sys.executable, "-c", "import sys; sys.stdin.read()"], os.environ, dead.append)
     supervisor.start()
     first = supervisor.pid
+    assert dead == []
     assert first is not None
     os.kill(first, signal.SIGKILL)
     wait_for(lambda: supervisor.pid != first and supervisor.status() == "running", "another process")
     assert supervisor.deaths == 1
+    assert len(dead) == 1
     last = supervisor.pid
     supervisor.end(LONG_S)
     assert supervisor.status() == "ending"
@@ -220,20 +223,23 @@ def test_a_supervised_process_is_started_again_and_ends_with_its_supervisor() ->
 
 
 def test_a_supervised_process_that_does_not_end_is_killed(tmp_path: Path) -> None:
+    dead: list[str] = []
     up = tmp_path / "up"
     stubborn = (
         "import pathlib, signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
         f"pathlib.Path({str(up)!r}).touch(); time.sleep(900)"
     )
-    supervisor = Supervisor([sys.executable, "-c", stubborn], os.environ)
+    supervisor = Supervisor([sys.executable, "-c", stubborn], os.environ, dead.append)
     supervisor.start()
     wait_for(up.exists, "the process ignores SIGTERM")
     supervisor.end(0.2)
+    assert len(dead) == 1
     assert supervisor.pid is not None
     assert not psutil.pid_exists(supervisor.pid)
 
 
 def test_a_supervised_process_is_asked_to_end_once_however_often_that_is_wanted(tmp_path: Path) -> None:
+    dead: list[str] = []
     up, asked = tmp_path / "up", tmp_path / "asked"
     counting = (
         "import pathlib, signal\n"
@@ -244,13 +250,14 @@ def test_a_supervised_process_is_asked_to_end_once_however_often_that_is_wanted(
         "if signal.sigtimedwait([signal.SIGTERM], 0.5):\n"
         f"    pathlib.Path({str(asked)!r}).write_text('twice')\n"
     )
-    supervisor = Supervisor([sys.executable, "-c", counting], os.environ)
+    supervisor = Supervisor([sys.executable, "-c", counting], os.environ, dead.append)
     supervisor.start()
     wait_for(up.exists, "the process waits for SIGTERM")
     supervisor.ask_to_end()
     wait_for(asked.exists, "the process is asked to end")
     supervisor.end(LONG_S)
     assert asked.read_text() == "once"
+    assert dead == []
 
 
 # --- keys
