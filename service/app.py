@@ -6,14 +6,16 @@ import contextlib
 from collections.abc import AsyncIterator
 
 import anyio
-from fastapi import APIRouter, FastAPI
+from fastapi import APIRouter, Depends, FastAPI
 from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
 
 from pipeline import __version__
 from service import openapi, problems
+from service.compression import Compressed
 from service.files import StateFolder
 from service.guard import Guard
+from service.methods import HeadAsGet, check_query
 from service.metrics import Measured, Metrics
 from service.rate_limits import RateLimiter
 from service.routes import buildings, events, health, jobs, landing, processes, results, schedules, uploads
@@ -67,6 +69,7 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
         redirect_slashes=False,
         generate_unique_id_function=lambda route: route.name,
         separate_input_output_schemas=False,
+        dependencies=[Depends(check_query)],
     )
     app.state.settings = settings
     app.state.store = kept
@@ -75,13 +78,15 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     app.state.streams = streams
     app.state.submitting = anyio.CapacityLimiter(WRITERS)
     app.state.metrics = metrics
-    problems.install(app)
+    problems.install(app, [route for router in ROUTERS for route in router.routes])
     for router in ROUTERS:
         app.include_router(router)
     if landing.VIEWER.is_dir():
         app.mount("/viewer", StaticFiles(directory=landing.VIEWER), name="viewer")
     app.openapi = lambda: openapi.document(app)  # type: ignore[method-assign]
     app.add_middleware(Guard, settings=settings)
+    app.add_middleware(Compressed)
+    app.add_middleware(HeadAsGet)
     app.add_middleware(Measured, metrics=metrics)
     return app
 

@@ -29,6 +29,8 @@ from service.vectors import VECTOR_SUFFIXES, examine_vector
 PASS_BYTES = 128 << 20
 """Text and PLY have no bounds in a header: files up to this size are read through, larger ones are only counted."""
 BLOCK_BYTES = 1 << 20
+QUICK_BYTES = 8 << 20
+"""Files up to this size are examined in a moment, whatever their format."""
 CHILD_BYTES = 2 << 30
 """Address space of the child; its libraries alone map some hundred MiB."""
 CHILD_S = 60.0
@@ -270,14 +272,24 @@ class Examiner:
                     pipe.close()
 
 
-_examiner = Examiner()
-atexit.register(_examiner.close)
+_quick_examiner, _slow_examiner = Examiner(), Examiner()
+atexit.register(_quick_examiner.close)
+atexit.register(_slow_examiner.close)
+
+
+def is_quick(path: Path) -> bool:
+    """Whether a file is examined in a moment: it is small, or a LAS or LAZ file, of which only the header is read."""
+    return path.suffix.lower() in {".las", ".laz"} or path.stat().st_size <= QUICK_BYTES
 
 
 def preflight(path: Path, max_points: int) -> Mapping[str, Any]:
-    """The content of a file's header, read by this process's child; as `examine`, but errors name only the file."""
+    """The content of a file's header, read by a child of this process; as `examine`, but errors name only the file.
+
+    Quick files have a child of their own, so they do not wait for files that are read through.
+    """
+    examiner = _quick_examiner if is_quick(path) else _slow_examiner
     try:
-        return _examiner.examine(path, max_points=max_points)
+        return examiner.examine(path, max_points=max_points)
     except InputError as fault:
         raise type(fault)(path.name, fault.problem, fault.fix) from None
 

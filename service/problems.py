@@ -18,10 +18,12 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from sqlalchemy import exc as sql
 from starlette.exceptions import HTTPException
+from starlette.routing import BaseRoute
 
 from pipeline.errors import InputError, SettingsError
 from service import errors
 from service.jobs import Fault, JobFailure
+from service.methods import allowed_methods
 from service.wire.base import respond
 from service.wire.faults import sentences
 from service.wire.problems import Problem
@@ -192,8 +194,11 @@ def answer_error(error: Exception, instance: str) -> Response:
     return answer(kind, str(error) or kind.title, instance, faults, headers, getattr(error, "members", None))
 
 
-def install(app: FastAPI) -> None:
-    """Make every error of an application a problem document, the framework's own included."""
+def install(app: FastAPI, routes: Sequence[BaseRoute]) -> None:
+    """Make every error of an application a problem document, the framework's own included.
+
+    `routes` are all routes of the application, for the header Allow.
+    """
 
     async def on_error(request: Request, error: Exception) -> Response:
         return answer_error(error, request.url.path)
@@ -204,9 +209,14 @@ def install(app: FastAPI) -> None:
         detail = str(error.detail)
         if error.status_code == HTTPStatus.NOT_FOUND and detail == kind.title:
             detail = f"There is nothing at {request.url.path}; /openapi.json lists all paths"
+        headers = dict(error.headers or {})
         if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
-            detail = f"{request.method} is not possible here"
-        return answer(kind, detail, request.url.path, (), error.headers)
+            # the framework names the methods of the first route with this path, and there is one per method
+            headers["Allow"] = ", ".join(allowed_methods(routes, request.scope))
+            detail = f"{request.method} is not possible here: use {headers['Allow']}"
+            if request.method == "OPTIONS":
+                return Response(status_code=HTTPStatus.NO_CONTENT, headers=headers)
+        return answer(kind, detail, request.url.path, (), headers)
 
     async def on_validation_error(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)

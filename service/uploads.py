@@ -24,7 +24,7 @@ from service.errors import NoSpaceError, RequestError, TooLargeError
 from service.filenames import clean_filename
 from service.files import StateFolder
 from service.jobs import Upload
-from service.preflight import preflight
+from service.preflight import is_quick, preflight
 from service.settings import ServiceSettings
 
 BLOCK_BYTES = 1 << 18
@@ -35,7 +35,8 @@ TEMPORARY = ".tmp-"
 STALE_S = 24 * 3600.0
 """Seconds without a byte after which a temporary folder counts as left behind by a dead process."""
 _writers = ThreadPoolExecutor(max_workers=WRITERS, thread_name_prefix="uploads")
-_examining = ThreadPoolExecutor(max_workers=1, thread_name_prefix="preflight")
+_quick_examining = ThreadPoolExecutor(max_workers=1, thread_name_prefix="preflight-quick")
+_slow_examining = ThreadPoolExecutor(max_workers=1, thread_name_prefix="preflight-slow")
 
 
 class UploadTable(Protocol):
@@ -135,7 +136,8 @@ async def receive(
             await loop.run_in_executor(_writers, sink.write, block)
         found = await loop.run_in_executor(_writers, sink.sync)
         _check_digest(name, found, sha256)
-        facts = await loop.run_in_executor(_examining, preflight, sink.path, settings.max_points)
+        examining = _quick_examining if is_quick(sink.path) else _slow_examining
+        facts = await loop.run_in_executor(examining, preflight, sink.path, settings.max_points)
         now = await loop.run_in_executor(_writers, store.now)
         upload = Upload(
             upload_id=upload_id,

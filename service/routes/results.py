@@ -108,7 +108,6 @@ def _file_answers() -> dict[int | str, dict[str, Any]]:
     }
 
 
-@router.head("/jobs/{jobID}/results/{outputID}", include_in_schema=False)
 @router.get(
     "/jobs/{jobID}/results/{outputID}",
     summary="One output as a file",

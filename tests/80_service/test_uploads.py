@@ -23,7 +23,7 @@ from live_service import DEADLINE_S, add_key, answer_to, las_bytes, raw_request,
 from processes import wait_for
 
 from pipeline.errors import InputError
-from service import uploads
+from service import preflight, uploads
 from service.errors import NoSpaceError, RequestError, TooLargeError
 from service.filenames import NAME_LIMIT, SUFFIXES, clean_filename
 from service.files import StateFolder
@@ -517,6 +517,38 @@ def test_a_client_is_refused_before_its_body_is_stored(tmp_path: Path) -> None:
         with raw_request(url, "POST /uploads?filename=a.laz", Content_Length="9000000") as link:
             assert link.recv(100).startswith(b"HTTP/1.1 401")
         assert list(StateFolder(settings.state).uploads.iterdir()) == []
+
+
+def test_a_small_file_does_not_wait_for_large_ones_that_are_read_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(preflight, "QUICK_BYTES", 100)
+    large, reading, done = pieces_of_text(50), threading.Event(), threading.Event()
+
+    def examine(path: Path, max_points: int) -> dict[str, Any]:
+        if path.stat().st_size > 100 and path.suffix == ".xyz":
+            reading.set()
+            assert done.wait(DEADLINE_S), "the small files waited for the large one"
+        return {"kind": "points"}
+
+    monkeypatch.setattr(uploads, "preflight", examine)
+    kept = {"store": FakeTable(), "folder": StateFolder(tmp_path), "settings": ServiceSettings(state=tmp_path)}
+
+    async def send_all() -> None:
+        slow = [
+            asyncio.create_task(receive(pieces(large), f"{number}.xyz", owner=None, **kept)) for number in range(3)
+        ]
+        await asyncio.get_running_loop().run_in_executor(None, reading.wait, DEADLINE_S)
+        await receive(pieces(pieces_of_text(1)), "small.xyz", owner=None, **kept)
+        await receive(pieces(las_bytes(500)), "large.laz", owner=None, **kept)
+        done.set()
+        await asyncio.gather(*slow)
+
+    asyncio.run(send_all())
+
+
+def pieces_of_text(lines: int) -> bytes:
+    return b"1.0 2.0 3.0\n" * lines
 
 
 def test_many_uploads_at_once_are_each_stored_once(tmp_path: Path) -> None:

@@ -1,0 +1,79 @@
+"""Methods and query parameters that the service's paths know: HEAD, OPTIONS, the header Allow, unknown parameters."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import anyio
+from fastapi import FastAPI, Request
+from starlette.routing import BaseRoute, Match, Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.errors import RequestError
+from service.wire.faults import shortened
+
+
+class HeadAsGet:
+    """Answers HEAD with the head of the answer to GET."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on; a HEAD request as GET, which ends before its body."""
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self.app(scope, receive, send)
+            return
+        with anyio.CancelScope() as until_body:
+
+            async def send_head(message: Message) -> None:
+                if message["type"] == "http.response.start":
+                    await send(message)
+                elif message["type"] == "http.response.body":
+                    await send({"type": "http.response.body", "body": b""})
+                    # an event stream would never end
+                    until_body.cancel()
+
+            await self.app({**scope, "method": "GET"}, receive, send_head)
+
+
+def allowed_methods(routes: Iterable[BaseRoute], scope: Scope) -> list[str]:
+    """The methods of all routes with the path of a request, sorted, for the header Allow."""
+    found = {"OPTIONS"}
+    for route in routes:
+        if isinstance(route, Route) and route.matches(scope)[0] is not Match.NONE:
+            found |= route.methods or set()
+    return sorted(found | {"HEAD"} if "GET" in found else found)
+
+
+async def check_query(request: Request) -> None:
+    """Refuse query parameters that the path does not have.
+
+    Raises
+    ------
+    RequestError
+        Naming them and those that the path has.
+    """
+    if not request.query_params:
+        return
+    path = getattr(request.scope.get("route"), "path", "")
+    known = _query_names(request.app).get((path, request.method.lower()))
+    if known is None:
+        return
+    takes = f"use {', '.join(known)}" if known else "this path has no query parameters"
+    unknown = [name for name in dict.fromkeys(request.query_params) if name not in known]
+    if unknown:
+        raise RequestError([f"query {shortened(name)} is not known: {takes}" for name in unknown])
+
+
+@functools.lru_cache(maxsize=8)
+def _query_names(app: FastAPI) -> Mapping[tuple[str, str], list[str]]:
+    """Names of the query parameters of every documented operation, by path and method."""
+    paths: Mapping[str, Mapping[str, Any]] = app.openapi()["paths"]
+    return {
+        (path, method): [given["name"] for given in operation.get("parameters", ()) if given["in"] == "query"]
+        for path, item in paths.items()
+        for method, operation in item.items()
+    }
