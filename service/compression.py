@@ -61,8 +61,8 @@ class _Responder(GZipResponder):
 
 
 def _weaken(start: Message) -> None:
-    """Mark the ETag as weak: a range of the compressed bytes must not be joined to one of the file's own bytes."""
+    """Mark the ETag of a file as weak: a range of its compressed bytes must not be joined to one of its own bytes."""
     headers = MutableHeaders(raw=start["headers"])
     etag = headers.get("etag")
-    if etag is not None and not etag.startswith("W/"):
+    if etag is not None and "accept-ranges" in headers and not etag.startswith("W/"):
         headers["etag"] = f"W/{etag}"

@@ -92,6 +92,8 @@ class JobRequest:
     """Licence of the source data."""
     outputs: tuple[str, ...] | None = None
     """Ids of the wanted outputs; None for all."""
+    response: str = "document"
+    """document or raw: whether the results are listed in a document or in Link headers."""
     title: str | None = None
     """The user's title."""
 

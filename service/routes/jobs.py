@@ -23,7 +23,7 @@ from service.routes.status import status_info
 from service.routes.submission import Submission, Submitting
 from service.store import JobFilter, JobStore
 from service.wire.base import page_links, respond
-from service.wire.execute import Execute
+from service.wire.execute import Execute, wanted
 from service.wire.faults import shortened
 from service.wire.jobs import JobForm, JobList, StatusInfo
 from service.wire.queries import JobQuery, interval
@@ -111,7 +111,7 @@ async def _read(request: Request, submission: Submission) -> Execute:
             inputs[name] = _value(name, text, faults)
     if faults:
         raise RequestError(faults)
-    return Execute(inputs=inputs, outputs=None if outputs is None else {name: {} for name in outputs})
+    return Execute(inputs=inputs, outputs=None if outputs is None else wanted(outputs))
 
 
 async def _stored(part: Part, submission: Submission, number: int) -> dict[str, str]:

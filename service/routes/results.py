@@ -53,6 +53,10 @@ _EXAMPLE = {
     summary="Results of a job",
     responses={
         200: document(Results, "The outputs by reference.", _EXAMPLE),
+        204: {
+            "description": "The outputs by reference, for a job that was submitted with `response` raw.",
+            "headers": header("Link", "One link per output: `rel` item, its id as `title`."),
+        },
         **problems(400, 404, *FAILED),
     },
 )
@@ -85,7 +89,12 @@ def results(
         for name, entry in stored.items()
         if not wanted or name in wanted
     }
-    return respond(Results(found), headers={"Cache-Control": "private, no-cache"})
+    headers = {"Cache-Control": "private, no-cache"}
+    if finished.job.request.response == "raw":
+        # outputs by reference have no body of their own (OGC 18-062)
+        links = (f'<{entry.href}>; rel="item"; type="{entry.type}"; title="{name}"' for name, entry in found.items())
+        return Response(status_code=204, headers=headers | {"Link": ", ".join(links)})
+    return respond(Results(found), headers=headers)
 
 
 def _file_answers() -> dict[int | str, dict[str, Any]]:

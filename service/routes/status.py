@@ -8,7 +8,7 @@ from urllib.parse import quote
 from service.jobs import InputReference, Job, JobEvent, JobRequest, JobStatus
 from service.problems import failure_document
 from service.wire.base import RELATIONS, Link, link
-from service.wire.execute import Execute
+from service.wire.execute import Execute, wanted
 from service.wire.jobs import Event, StatusInfo
 
 
@@ -98,7 +98,8 @@ def execute_request(request: JobRequest, base: str, priority: int) -> Execute:
     }
     return Execute(
         inputs={name: value for name, value in inputs.items() if value is not None},
-        outputs=None if request.outputs is None else {name: {} for name in request.outputs},
+        outputs=None if request.outputs is None else wanted(request.outputs),
+        response="raw" if request.response == "raw" else "document",
     )
 
 

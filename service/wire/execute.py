@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, field_validator
@@ -31,6 +32,36 @@ EXAMPLE = {
 }
 
 
+class OutputFormat(Request):
+    """The wanted format of an output; each output has one."""
+
+    mediaType: str | None = None
+
+
+class WantedOutput(Request):
+    """How an output is wanted."""
+
+    format: OutputFormat = Field(default_factory=OutputFormat)
+    transmissionMode: Literal["value", "reference"] = Field(
+        default="reference", description="Outputs are files: only by reference."
+    )
+
+    def faults(self, name: str, kind: OutputKind) -> list[str]:
+        """What this process does not offer."""
+        faults = []
+        if self.transmissionMode != "reference":
+            faults.append(f'outputs.{name}.transmissionMode is "value": use "reference", since outputs are files')
+        if self.format.mediaType not in {None, kind.media_type}:
+            given = shortened(self.format.mediaType)
+            faults.append(f'outputs.{name}.format.mediaType is {given}: use "{kind.media_type}"')
+        return faults
+
+
+def wanted(names: Iterable[str]) -> dict[str, WantedOutput]:
+    """Outputs of these names, each in its only format."""
+    return {name: WantedOutput() for name in names}
+
+
 class Execute(Request):
     """A request for a job; other members are ignored."""
 
@@ -41,11 +72,15 @@ class Execute(Request):
         description="By the names that the process's description lists; each a value, a reference `{href}`, a value "
         "with a media type `{value, encoding, mediaType}`, or a list of these.",
     )
-    outputs: dict[str, dict[str, Any]] | None = Field(
+    outputs: dict[str, WantedOutput] | None = Field(
         default=None, description="The wanted outputs; all if it is left out."
     )
     mode: Literal["async", "auto"] = Field(default="async", description="Jobs run asynchronously.")
-    response: Literal["raw", "document"] = "document"
+    response: Literal["raw", "document"] = Field(
+        default="document",
+        description="The answer to `/jobs/{jobID}/results`: a document that lists the outputs, or no content and one "
+        "Link header per output.",
+    )
     subscriber: SkipJsonSchema[Any] = None
 
     @field_validator("subscriber")
@@ -72,9 +107,11 @@ class Execute(Request):
             unknown = [name for name in self.outputs if name not in kinds]
             faults += [f"{shortened(name)} is not an output: use {', '.join(kinds)}" for name in unknown]
             outputs = tuple(name for name in kinds if name in self.outputs)
+            faults += [fault for name in outputs for fault in self.outputs[name].faults(name, kinds[name])]
         tiles = self.inputs.get("tiles")
         if max_inputs is not None and isinstance(tiles, list) and len(tiles) > max_inputs:
             faults.append(f"tiles has {len(tiles)} entries: use at most {max_inputs}")
         if inputs is None or faults:
             raise RequestError(faults)
-        return inputs.draft(process_id, outputs)
+        draft = inputs.draft(process_id, outputs)
+        return dataclasses.replace(draft, values={**draft.values, "response": self.response})

@@ -47,13 +47,12 @@ def test_half_a_head_after_an_answer_is_disconnected_too(tmp_path: Path, monkeyp
 def test_a_body_that_stops_is_disconnected_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "BODY_S", IMPATIENT_S)
     settings = settings_in(tmp_path)
-    with serving(settings) as url:
-        with connected(url) as client:
-            client.sendall(
-                b"POST /uploads?filename=a.xyz HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 1000\r\n\r\n1 2 3\n"
-            )
-            while client.recv(65_536):
-                pass
+    with serving(settings) as url, connected(url) as client:
+        client.sendall(
+            b"POST /uploads?filename=a.xyz HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 1000\r\n\r\n1 2 3\n"
+        )
+        while client.recv(65_536):
+            pass
     assert not list((settings.state / "uploads").iterdir())
 
 

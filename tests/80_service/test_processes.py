@@ -203,6 +203,12 @@ def test_all_faults_of_a_request_are_reported_at_once(local_service) -> None:
         ({"inputs": {}, "outputs": ["buildings"]}, "outputs is"),
         ({"inputs": {}, "mode": "sync"}, "mode is"),
         ({"inputs": {}, "response": "raw!"}, "response is"),
+        ({"inputs": {}, "outputs": {"report": {"transmissionMode": "value"}}}, 'transmissionMode is "value": use'),
+        (
+            {"inputs": {}, "outputs": {"report": {"format": {"mediaType": "text/csv"}}}},
+            'outputs.report.format.mediaType is "text/csv": use "application/json"',
+        ),
+        ({"inputs": {}, "outputs": {"report": {"colour": "red"}}}, '"colour" is not a member: use format'),
         ({"inputs": {}, "subscriber": {"successUri": "http://example.org"}}, "subscriber"),
         ({"inputs": {"tiles": None}}, "tiles is missing"),
         ({"inputs": {"tiles": 7}}, "tiles is 7"),

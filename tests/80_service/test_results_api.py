@@ -10,6 +10,7 @@ import finished_runs as runs
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from requests.utils import parse_header_links
 from starlette.testclient import TestClient
 
 from service.jobs import Fault, JobFailure
@@ -40,6 +41,18 @@ def test_the_document_lists_every_output_by_reference(client: TestClient, job_id
         assert data.headers["content-type"] == entry["type"] == OUTPUTS[name].media_type
         assert len(data.content) == entry["bytes"] == int(data.headers["content-length"])
         assert hashlib.sha256(data.content).hexdigest() == entry["sha256"]
+
+
+def test_a_job_with_raw_response_lists_its_outputs_in_links_alone(service: runs.Service) -> None:
+    job_id = service.finished(response="raw", outputs=("report", "meshes"))
+    answer = service.client.get(f"/jobs/{job_id}/results")
+    assert (answer.status_code, answer.content) == (204, b"")
+    links = {found["title"]: found for found in parse_header_links(answer.headers["link"])}
+    assert list(links) == ["meshes", "report"]
+    for name, found in links.items():
+        assert (found["rel"], found["type"]) == ("item", OUTPUTS[name].media_type)
+        assert service.client.get(found["url"]).status_code == 200
+    assert service.client.get(f"/jobs/{job_id}").json()["request"]["response"] == "raw"
 
 
 def test_outputs_can_be_chosen(client: TestClient, job_id: str) -> None:

@@ -22,8 +22,8 @@ from typer.testing import CliRunner
 
 from pipeline.runtime.isolation.isolated_items import MIN_MEMORY_BYTES
 from service.cli import app
-from service.settings import ServiceSettings
 from service.connections import listen
+from service.settings import ServiceSettings
 from service.supervisor import Supervisor, environment_of, pause_s
 
 

@@ -535,9 +535,7 @@ def test_a_small_file_does_not_wait_for_large_ones_that_are_read_through(
     kept = {"store": FakeTable(), "folder": StateFolder(tmp_path), "settings": ServiceSettings(state=tmp_path)}
 
     async def send_all() -> None:
-        slow = [
-            asyncio.create_task(receive(pieces(large), f"{number}.xyz", owner=None, **kept)) for number in range(3)
-        ]
+        slow = [asyncio.create_task(receive(pieces(large), f"{number}.xyz", owner=None, **kept)) for number in range(3)]
         await asyncio.get_running_loop().run_in_executor(None, reading.wait, DEADLINE_S)
         await receive(pieces(pieces_of_text(1)), "small.xyz", owner=None, **kept)
         await receive(pieces(las_bytes(500)), "large.laz", owner=None, **kept)
