@@ -86,6 +86,8 @@ class JobRequest:
     """Settings that differ from the defaults, as in a settings file; includes `method`, `preset` and `classes`."""
     methods: tuple[str, ...] = ()
     """Methods of a comparison, each METHOD or METHOD:PRESET; empty for other processes."""
+    raster_cell: float | None = None
+    """Side of the cells of rasters in the CRS's units; None for the default. Only for `classify`."""
     meshes: str = "building"
     """building or tile: one OBJ file for each; glb: one GLB file per tile; or none."""
     licence: str | None = None
@@ -96,6 +98,11 @@ class JobRequest:
     """document or raw: whether the results are listed in a document or in Link headers."""
     title: str | None = None
     """The user's title."""
+
+    @property
+    def has_buildings(self) -> bool:
+        """Whether its results have buildings."""
+        return self.process_id in {"reconstruct", "compare"}
 
     @property
     def upload_ids(self) -> list[str]:

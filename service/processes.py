@@ -97,6 +97,13 @@ PROCESSES: Mapping[str, Process] = MappingProxyType(
                 "every building by every method, and the results of each method as those of a reconstruction.",
                 keywords=("lidar", "point cloud", "building", "LoD2", "comparison of methods"),
             ),
+            Process(
+                process_id="classify",
+                title="Classify points",
+                description="Every point as ground, building or vegetation, written back as LAZ, and rasters of the "
+                "terrain, of the surface, and of the height above ground.",
+                keywords=("lidar", "point cloud", "classification", "terrain model", "surface model"),
+            ),
         )
     }
 )

@@ -23,6 +23,9 @@ from service.jobs import InputReference, Job, JobFailure, JobRequest, JobStatus
 from service.settings import ServiceSettings
 from service.store import JobStore
 
+SCRIPTED = ("gather", "run", "compare", "write_outputs", "write_comparison")
+"""Steps of an attempt that the script replaces; a test may replace others."""
+
 Telling = Callable[[int, int], None]
 
 
@@ -127,6 +130,7 @@ class Bench:
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
         self.patch = patch
         self.script = Script()
+        self.tools: dict[str, Any] = {}
         self.settings = ServiceSettings(
             state=folder, poll_s=0.02, lease_s=30.0, driver_jobs=1, drain_s=30.0, max_attempts=3
         )
@@ -137,13 +141,8 @@ class Bench:
 
     def driver(self, *, parent_pipe: int | None = None, **changed: Any) -> Driver:
         settings = self.settings.model_copy(update=changed)
-        tools = Tools(
-            gather=self.script.gather,
-            run=self.script.run,
-            compare=self.script.compare,
-            write_outputs=self.script.write_outputs,
-            write_comparison=self.script.write_comparison,
-        )
+        scripted = {name: getattr(self.script, name) for name in SCRIPTED}
+        tools = Tools(**(scripted | self.tools))
         cluster = SharedCluster(settings, Engine)
         driver = Driver(settings, name=f"d{len(self._running)}", parent_pipe=parent_pipe, tools=tools, cluster=cluster)
         thread = threading.Thread(target=lambda: self.codes.append(driver.run()), daemon=True)

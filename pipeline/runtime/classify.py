@@ -62,6 +62,8 @@ class ClassifyRequest:
     """Files, folders or patterns."""
     out: str
     """The folder to write; other files in it stay."""
+    only_files: bool = False
+    """Whether every input is a point cloud; folders, patterns and tile indexes are then refused."""
     settings: RunSettings = dataclasses.field(default_factory=RunSettings)
     """All settings; those of methods have no effect."""
     footprints: str | None = None
@@ -134,6 +136,7 @@ def classify(
     progress.tell("run", "plan", f"classify into {request.out}")
     run_request = RunRequest(
         inputs=request.inputs,
+        only_files=request.only_files,
         out=request.out,
         settings=request.settings,
         crs=request.crs,

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 from pipeline import __version__
 from pipeline.errors import RunCancelledError
+from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables, parse_variants
 from pipeline.runtime.monitoring.events import Event, Listener
@@ -18,13 +19,21 @@ from pipeline.runtime.request import RunRequest
 from pipeline.runtime.run import RunSummary, run
 from pipeline.settings import RunSettings
 from service.driver.leased_job import LeasedJob
-from service.driver.messages import comparison_digest, comparison_outcome, digest_of, outcome
+from service.driver.messages import (
+    classification_digest,
+    classification_outcome,
+    comparison_digest,
+    comparison_outcome,
+    digest_of,
+    outcome,
+)
 from service.driver.shared_cluster import SharedCluster
 from service.errors import RequestError
 from service.fetching import Fetched, gather
 from service.files import StateFolder
 from service.jobs import JobRequest
-from service.outputs import write_comparison_outputs, write_outputs
+from service.outputs import write_classification_outputs, write_comparison_outputs, write_outputs
+from service.outputs.kinds import RASTERS
 from service.settings import ServiceSettings
 from service.store import JobStore
 
@@ -45,6 +54,15 @@ class Compare(Protocol):
         self, request: CompareRequest, on_event: Listener, executor: Executor | None, cancelled: Callable[[], bool]
     ) -> CompareSummary:
         """Run several methods on the same candidates and write the comparison."""
+
+
+class Classify(Protocol):
+    """`pipeline.runtime.classify.classify`."""
+
+    def __call__(
+        self, request: ClassifyRequest, on_event: Listener, executor: Executor | None, cancelled: Callable[[], bool]
+    ) -> ClassifySummary:
+        """Classify all points."""
 
 
 class Gather(Protocol):
@@ -95,6 +113,20 @@ def compare(
     return compare_files(request, on_event=on_event, executor=executor, cancelled=cancelled).summary
 
 
+class WriteClassification(Protocol):
+    """`service.outputs.write_classification_outputs`."""
+
+    def __call__(
+        self,
+        summary: ClassifySummary,
+        out_dir: Path,
+        wanted: Sequence[str] | None,
+        on_progress: Callable[[int, int], None],
+        scrub: Callable[[str], str],
+    ) -> None:
+        """Assemble the outputs of a classification."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Tools:
     """The steps of an attempt; tests replace them."""
@@ -102,8 +134,10 @@ class Tools:
     gather: Gather = gather
     run: Run = run
     compare: Compare = compare
+    classify: Classify = classify
     write_outputs: WriteOutputs = write_outputs
     write_comparison: WriteComparison = write_comparison_outputs
+    write_classification: WriteClassification = write_classification_outputs
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -205,8 +239,23 @@ def _compare(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outli
     return work
 
 
+def _classify(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outlines: Fetched | None) -> _Work:
+    """The process `classify`."""
+    job, folder = held.job, shop.folder
+    place, out_dir = folder.run(job.job_id, job.attempt), folder.outputs(job.job_id, job.attempt)
+    request = classify_request(job.request, tiles, outlines, place, shop.settings)
+
+    def work(executor: Executor) -> tuple[str, dict[str, Any]]:
+        summary = shop.tools.classify(request, held.record, executor, held.cancelled)
+        begin = _outputs_begin(held)
+        shop.tools.write_classification(summary, out_dir, job.request.outputs, begin, held.scrub)
+        return classification_outcome(summary), classification_digest(summary, held.scrub, __version__)
+
+    return work
+
+
 WORK: Mapping[str, Callable[[LeasedJob, DriverParts, Sequence[Fetched], Fetched | None], _Work]] = MappingProxyType(
-    {"reconstruct": _reconstruct, "compare": _compare}
+    {"reconstruct": _reconstruct, "compare": _compare, "classify": _classify}
 )
 """The work of each process: checks the request with the fetched inputs, and returns the rest of the work."""
 
@@ -262,6 +311,31 @@ def compare_request(
         run=run_request(request, tiles, outlines, out, settings),
         variants=parse_variants(request.methods),
         tables=own_tables(request.settings),
+    )
+
+
+def classify_request(
+    request: JobRequest, tiles: Sequence[Fetched], outlines: Fetched | None, out: Path, settings: ServiceSettings
+) -> ClassifyRequest:
+    """The request of a classification, with the fetched inputs.
+
+    Raises
+    ------
+    SettingsError
+        Settings are out of range.
+    """
+    has_rasters = request.outputs is None or not set(RASTERS).isdisjoint(request.outputs)
+    return ClassifyRequest(
+        inputs=tuple(str(tile.path) for tile in tiles),
+        only_files=True,
+        out=str(out),
+        settings=RunSettings.from_mapping(request.settings),
+        footprints=None if outlines is None else str(outlines.path),
+        crs=request.crs,
+        vertical_unit=request.vertical_unit,
+        rasters=has_rasters,
+        raster_cell=request.raster_cell if has_rasters else None,
+        resources=settings.resources,
     )
 
 

@@ -12,7 +12,7 @@ from typing import Protocol, Self
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring.events import Event
 from service.driver.messages import Scrubber
-from service.driver.progress import WORDS, percent
+from service.driver.progress import CLASSIFY_WEIGHTS, WEIGHTS, WORDS, percent
 from service.errors import LeaseLostError, StoreError
 from service.jobs import Job, JobEvent
 from service.store import JobStore
@@ -88,6 +88,7 @@ class LeasedJob:
         self._over = threading.Event()
         self._pending: list[JobEvent] = []
         self._progress = 0
+        self._weights = CLASSIFY_WEIGHTS if job.request.process_id == "classify" else WEIGHTS
         self._waited = False
         self._pulse = threading.Thread(target=self._keep, name=f"lease-{job.job_id[:8]}", daemon=True)
         self.scrub = Scrubber()
@@ -180,7 +181,7 @@ class LeasedJob:
         if event.kind != "warning":
             self._waited = event.kind == "waiting"
         if event.kind in {"stage", "progress"}:
-            self._progress = max(self._progress, percent(event.stage, event.done, event.total))
+            self._progress = max(self._progress, percent(event.stage, event.done, event.total, self._weights))
         return JobEvent(
             sequence=0,
             at=self.job.updated_at,

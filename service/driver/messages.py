@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pipeline.runtime.classify import ClassifySummary
     from pipeline.runtime.compare import CompareSummary
     from pipeline.runtime.run import RunSummary
 
@@ -80,6 +82,30 @@ def comparison_outcome(summary: CompareSummary) -> str:
     return f"{sentence}; tiles of {', '.join(broken)} are missing" if broken else sentence
 
 
+CLASS_NAMES = MappingProxyType({1: "other", 2: "ground", 5: "vegetation", 6: "building", 7: "noise", 17: "bridge"})
+"""Names of the classes that a classification writes; others are kept as in the file."""
+
+
+def classification_outcome(summary: ClassifySummary) -> str:
+    """The result of a classification, in one sentence."""
+    total = sum(summary.classes.values())
+    shares = ", ".join(
+        f"{100.0 * count / total:.1f} % {CLASS_NAMES.get(code, f'class {code}')}"
+        for code, count in summary.classes.items()
+    )
+    files = f"{len(summary.files)} {'file' if len(summary.files) == 1 else 'files'}"
+    return f"{files} with {total} points: {shares}"
+
+
+def classification_digest(summary: ClassifySummary, scrub: Scrubber, engine_version: str) -> dict[str, Any]:
+    """The stored summary of a classification."""
+    return {
+        "engine_version": engine_version,
+        "classes": {str(code): count for code, count in summary.classes.items()},
+        **_measured(summary, scrub),
+    }
+
+
 def comparison_digest(summary: CompareSummary, scrub: Scrubber, engine_version: str) -> dict[str, Any]:
     """The stored summary of a comparison: the summary of each run by label."""
     runs = {label: digest_of(run, scrub, engine_version) for label, run in summary.runs.items()}
@@ -96,9 +122,16 @@ def digest_of(summary: RunSummary, scrub: Scrubber, engine_version: str) -> dict
         "rejected": dict(summary.rejected),
         "roof_types": dict(summary.roof_types),
         "counts": dict(summary.counts),
+        "failed_tiles": list(summary.failed_tiles),
+        **_measured(summary, scrub),
+    }
+
+
+def _measured(summary: RunSummary | ClassifySummary, scrub: Scrubber) -> dict[str, Any]:
+    """Times, memory and warnings of a run."""
+    return {
         "timings_s": {name: round(seconds, 3) for name, seconds in summary.timings_s.items()},
         "peak_memory_bytes": max(summary.peak_memory_bytes.values(), default=0),
         "warnings": [scrub(warning) for warning in summary.warnings[:_WARNINGS]],
         "warnings_total": len(summary.warnings),
-        "failed_tiles": list(summary.failed_tiles),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import MappingProxyType
 
 WEIGHTS = MappingProxyType(
@@ -19,6 +20,22 @@ WEIGHTS = MappingProxyType(
 )
 """The stages of a job in their order, with their share of the time in percent; measured on city blocks."""
 
+CLASSIFY_WEIGHTS = MappingProxyType(
+    {
+        "inputs": 4,
+        "plan": 1,
+        "ingest": 10,
+        "split": 35,
+        "join": 2,
+        "classify": 20,
+        "write": 10,
+        "rasters": 10,
+        "mosaics": 2,
+        "outputs": 6,
+    }
+)
+"""The stages of a classification, likewise."""
+
 WORDS = MappingProxyType(
     {
         "inputs": "inputs are prepared",
@@ -29,6 +46,10 @@ WORDS = MappingProxyType(
         "outline": "touching buildings are outlined together",
         "reconstruct": "buildings are modelled",
         "publish": "tiles are written",
+        "classify": "points are classified",
+        "write": "files are written",
+        "rasters": "rasters are drawn",
+        "mosaics": "rasters are joined",
         "records": "the runs are compared",
         "points": "points are read for the pictures",
         "pictures": "pictures are drawn",
@@ -41,15 +62,17 @@ WORDS = MappingProxyType(
 _LAST = 99
 
 
-def percent(stage: str, done: int, total: int) -> int:
+def percent(stage: str, done: int, total: int, weights: Mapping[str, int] = WEIGHTS) -> int:
     """Progress of the whole job.
 
     Parameters
     ----------
     stage : str
-        One of `WEIGHTS`; any other counts as not begun.
+        One of `weights`; any other counts as not begun.
     done, total : int
         Units of this stage; a `total` of 0 is unknown and counts as nothing done.
+    weights : mapping
+        The stages of the process.
 
     Returns
     -------
@@ -61,9 +84,9 @@ def percent(stage: str, done: int, total: int) -> int:
     >>> percent("inputs", 0, 1), percent("reconstruct", 0, 80), percent("reconstruct", 40, 80), percent("outputs", 3, 3)
     (0, 49, 68, 99)
     """
-    if stage not in WEIGHTS:
+    if stage not in weights:
         return 0
-    names = list(WEIGHTS)
-    before = sum(WEIGHTS[name] for name in names[: names.index(stage)])
+    names = list(weights)
+    before = sum(weights[name] for name in names[: names.index(stage)])
     share = min(max(done / total, 0.0), 1.0) if total > 0 else 0.0
-    return min(_LAST, int(before + WEIGHTS[stage] * share))
+    return min(_LAST, int(before + weights[stage] * share))

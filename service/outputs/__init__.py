@@ -6,10 +6,12 @@ prepared in files, and the front end loads no numerical library.
 
 from service.outputs.assemble import write_outputs
 from service.outputs.catalogue import Catalogue, output_file, read_catalogue, run_outputs
+from service.outputs.classification import write_classification_outputs
 from service.outputs.comparison import write_comparison_outputs
-from service.outputs.kinds import COMPARISON_OUTPUTS, KINDS, OUTPUTS, OutputKind
+from service.outputs.kinds import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, KINDS, OUTPUTS, OutputKind
 
 __all__ = [
+    "CLASSIFICATION_OUTPUTS",
     "COMPARISON_OUTPUTS",
     "KINDS",
     "OUTPUTS",
@@ -18,6 +20,7 @@ __all__ = [
     "output_file",
     "read_catalogue",
     "run_outputs",
+    "write_classification_outputs",
     "write_comparison_outputs",
     "write_outputs",
 ]

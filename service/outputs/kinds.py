@@ -20,6 +20,8 @@ OBJ = "model/obj"
 """Media type of Wavefront OBJ."""
 GLB = "model/gltf-binary"
 """Media type of glTF 2.0 in one binary file."""
+GEOTIFF = "image/tiff"
+"""Media type of GeoTIFF."""
 HTML = "text/html"
 """Media type of a page."""
 ZIP = "application/zip"
@@ -149,13 +151,54 @@ _OF_A_COMPARISON = (
     ),
 )
 
+_OF_A_CLASSIFICATION = (
+    OutputKind(
+        output_id="points",
+        title="Classified points as LAZ in a zip file",
+        description="One LAZ 1.4 file per tile, in the order of its points and with all their attributes; only the "
+        "classes are new: 1 other, 2 ground, 5 vegetation, 6 building, 7 noise, 17 bridge.",
+        media_type=ZIP,
+        filename="points.zip",
+        schema=_binary(ZIP),
+    ),
+    *(
+        OutputKind(
+            output_id=name,
+            title=f"{title} as cloud-optimised GeoTIFF",
+            description=f"{content} One raster for all tiles; empty cells have no value.",
+            media_type=GEOTIFF,
+            filename=f"{name}.tif",
+            schema=_binary(GEOTIFF),
+        )
+        for name, title, content in (
+            ("terrain", "Terrain", "Elevation of the ground, also below buildings."),
+            ("surface", "Surface", "Elevation of the highest point of each cell."),
+            ("height", "Height", "Height of the surface above the terrain."),
+        )
+    ),
+    OutputKind(
+        output_id="classes",
+        title="Counts by class",
+        description="Points by class, files with their points, number of buildings, warnings and timings.",
+        media_type="application/json",
+        filename="classes.json",
+        schema={"type": "object", "contentMediaType": "application/json"},
+    ),
+)
+
 OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _OF_A_RUN}
 """The outputs of a run by their ids, in the order of lists: those of the process `reconstruct`."""
 
 COMPARISON_OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _OF_A_COMPARISON}
 """The outputs of the process `compare`."""
 
-KINDS: Mapping[str, OutputKind] = {**OUTPUTS, **COMPARISON_OUTPUTS}
+CLASSIFICATION_OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _OF_A_CLASSIFICATION}
+"""The outputs of the process `classify`."""
+
+RASTERS = ("terrain", "surface", "height")
+"""Those of them that are rasters."""
+
+KINDS: Mapping[str, OutputKind] = {**OUTPUTS, **COMPARISON_OUTPUTS, **CLASSIFICATION_OUTPUTS}
 """All outputs; an id means the same in all processes."""
 
 

@@ -1,4 +1,4 @@
-"""The OBJ files of a run: all in one zip file, or those of one building. Zip files contain no times."""
+"""Zip files without times, and the lines of one building in an OBJ file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def zip_text(archive: zipfile.ZipFile, name: str, text: str) -> None:
 
 def _entry(name: str) -> zipfile.ZipInfo:
     entry = zipfile.ZipInfo(name, date_time=_EPOCH)
-    entry.compress_type = zipfile.ZIP_DEFLATED
+    entry.compress_type = zipfile.ZIP_STORED if name.endswith(".laz") else zipfile.ZIP_DEFLATED
     entry.external_attr = _FILE_MODE
     return entry
 

@@ -9,7 +9,7 @@ from urllib.parse import urlencode
 
 from fastapi import Depends, Query
 
-from service.errors import RequestError, ResultNotReadyError
+from service.errors import NoSuchOutputError, RequestError, ResultNotReadyError
 from service.jobs import Job, JobStatus
 from service.outputs import Catalogue, read_catalogue, run_outputs
 from service.outputs.comparison import RUNS
@@ -86,6 +86,9 @@ def _results(finished: _Finished, label: _Label = None) -> FinishedJob:
 
 def _buildings(finished: _Finished, label: _Label = None) -> FinishedJob:
     """The run of the buildings: by default the first one of a comparison."""
+    if not finished.job.request.has_buildings:
+        process_id = finished.job.request.process_id
+        raise NoSuchOutputError(f"a job of the process {process_id} has no buildings: see /jobs/{{jobID}}/results")
     if label is None and finished.catalogue.runs:
         return finished.run(finished.catalogue.runs[0])
     return finished if label is None else finished.run(label)

@@ -51,10 +51,9 @@ def _links(job: Job, base: str, *, with_request: bool) -> list[Link]:
     if job.schedule_id is not None:
         links.append(link(f"{base}/schedules/{job.schedule_id}", "schedule", "The schedule that made it"))
     if job.status is JobStatus.SUCCESSFUL:
-        links += [
-            link(f"{place}/results", f"{RELATIONS}results", "The results"),
-            link(f"{place}/buildings", "items", "The buildings", "application/geo+json"),
-        ]
+        links.append(link(f"{place}/results", f"{RELATIONS}results", "The results"))
+        if job.request.has_buildings:
+            links.append(link(f"{place}/buildings", "items", "The buildings", "application/geo+json"))
         if job.request.methods and (job.request.outputs is None or "page" in job.request.outputs):
             links.append(link(f"{place}/results/page", "alternate", "The comparison as a page", "text/html"))
     if job.status is JobStatus.FAILED:
@@ -91,7 +90,8 @@ def execute_request(request: JobRequest, base: str, priority: int) -> Execute:
         "bbox": None if request.bbox is None else list(request.bbox),
         "methods": list(request.methods) or None,
         "settings": dict(request.settings) or None,
-        "meshes": request.meshes,
+        "rasterCell": request.raster_cell,
+        "meshes": request.meshes if request.has_buildings else None,
         "licence": request.licence,
         "title": request.title,
         "priority": priority or None,

@@ -11,15 +11,23 @@ from pydantic.json_schema import SkipJsonSchema
 
 from service.drafts import Draft
 from service.errors import RequestError
-from service.outputs import COMPARISON_OUTPUTS, OUTPUTS, OutputKind
+from service.outputs import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, OUTPUTS, OutputKind
 from service.wire.base import Request
 from service.wire.faults import FaultsError, sentences, shortened
-from service.wire.inputs import CompareInputs, Inputs, ReconstructInputs
+from service.wire.inputs import ClassifyInputs, CompareInputs, Inputs, ReconstructInputs
 
-INPUTS: Mapping[str, type[Inputs]] = {"reconstruct": ReconstructInputs, "compare": CompareInputs}
+INPUTS: Mapping[str, type[Inputs]] = {
+    "reconstruct": ReconstructInputs,
+    "compare": CompareInputs,
+    "classify": ClassifyInputs,
+}
 """The inputs of every process."""
 
-KINDS: Mapping[str, Mapping[str, OutputKind]] = {"reconstruct": OUTPUTS, "compare": COMPARISON_OUTPUTS}
+KINDS: Mapping[str, Mapping[str, OutputKind]] = {
+    "reconstruct": OUTPUTS,
+    "compare": COMPARISON_OUTPUTS,
+    "classify": CLASSIFICATION_OUTPUTS,
+}
 """The outputs of every process."""
 
 EXAMPLE = {

@@ -143,21 +143,8 @@ class Inputs(Request):
     verticalUnit: Annotated[str, OneOf(*UNITS_M)] | None = Field(
         None, title="Vertical unit", description="Unit of elevations, if the header has none or a wrong one."
     )
-    bbox: Box | None = Field(
-        None,
-        title="Rectangle",
-        description="Only this rectangle: x_min, y_min, x_max, y_max in the tiles' CRS and its units.",
-    )
     classes: Annotated[str, OneOf(*choices("classes"))] | None = _word(
         "classes", "Classes", "How far the file's own classes are trusted."
-    )
-    meshes: Meshes = Field(
-        get_args(Meshes)[0],
-        title="Meshes",
-        description="One OBJ file per building (building) or per tile (tile), one GLB file per tile (glb), or none.",
-    )
-    licence: Text | None = Field(
-        None, title="Licence", description="Licence of the source data; goes into the results."
     )
     title: Text | None = Field(None, title="Title", description="Your own title for the job.")
     priority: int = Field(
@@ -188,9 +175,6 @@ class Inputs(Request):
             "process_id": process_id,
             "crs": self.crs,
             "vertical_unit": self.verticalUnit,
-            "bbox": None if self.bbox is None else tuple(map(float, self.bbox)),
-            "meshes": self.meshes,
-            "licence": self.licence,
             "title": self.title,
             "outputs": outputs,
             **self.of_process(),
@@ -229,7 +213,30 @@ def _completed(settings: dict[str, Any], info: ValidationInfo, *names: str) -> d
     return completed
 
 
-class ReconstructInputs(Inputs):
+class BuildingInputs(Inputs):
+    """The inputs of the processes that model buildings."""
+
+    bbox: Box | None = Field(
+        None,
+        title="Rectangle",
+        description="Only this rectangle: x_min, y_min, x_max, y_max in the tiles' CRS and its units.",
+    )
+    meshes: Meshes = Field(
+        get_args(Meshes)[0],
+        title="Meshes",
+        description="One OBJ file per building (building) or per tile (tile), one GLB file per tile (glb), or none.",
+    )
+    licence: Text | None = Field(
+        None, title="Licence", description="Licence of the source data; goes into the results."
+    )
+
+    def of_process(self) -> dict[str, Any]:
+        """Rectangle, meshes and licence."""
+        bbox = None if self.bbox is None else tuple(map(float, self.bbox))
+        return {"bbox": bbox, "meshes": self.meshes, "licence": self.licence}
+
+
+class ReconstructInputs(BuildingInputs):
     """The inputs of `reconstruct`."""
 
     method: Annotated[str, OneOf(*choices("method"))] | None = _word(
@@ -254,8 +261,8 @@ class ReconstructInputs(Inputs):
         return _completed(settings, info, "method", "preset", "lods", "classes")
 
     def of_process(self) -> dict[str, Any]:
-        """The settings."""
-        return {"settings": self.settings}
+        """The settings, too."""
+        return super().of_process() | {"settings": self.settings}
 
 
 Variant = Annotated[str, OneOf(*VARIANTS)]
@@ -275,11 +282,11 @@ def _distinct(words: list[str]) -> list[str]:
     return found
 
 
-class CompareInputs(Inputs):
+class CompareInputs(BuildingInputs):
     """The inputs of `compare`."""
 
     HINTS: ClassVar[Mapping[str, str]] = {
-        **Inputs.HINTS,
+        **BuildingInputs.HINTS,
         "methods": f"give 2 to {MAX_METHODS} of {', '.join(VARIANTS)}",
     }
 
@@ -316,5 +323,28 @@ class CompareInputs(Inputs):
         return completed
 
     def of_process(self) -> dict[str, Any]:
-        """Settings and methods."""
-        return {"settings": self.settings, "methods": tuple(self.methods)}
+        """Settings and methods, too."""
+        return super().of_process() | {"settings": self.settings, "methods": tuple(self.methods)}
+
+
+class ClassifyInputs(Inputs):
+    """The inputs of `classify`."""
+
+    rasterCell: float | None = Field(
+        None,
+        gt=0.0,
+        le=1000.0,
+        allow_inf_nan=False,
+        title="Cell of the rasters",
+        description="Side of the rasters' cells in units of the tiles' CRS; default half a metre or two feet.",
+    )
+    settings: RunSettings = _settings()
+
+    @field_validator("settings")
+    @classmethod
+    def _complete(cls, settings: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        return _completed(settings, info, "classes")
+
+    def of_process(self) -> dict[str, Any]:
+        """Settings and cell."""
+        return {"settings": self.settings, "raster_cell": self.rasterCell}

@@ -50,7 +50,7 @@ class Ids:
         page = service.client.get(f"/jobs/{alone}/buildings").json()
         self._buildings = itertools.cycle([feature["id"] for feature in page["features"]])
         self._outputs = itertools.cycle(["buildings", "report", "cityjson", "meshes", "page", "summary", "archive"])
-        self._processes = itertools.cycle(["reconstruct", "compare"])
+        self._processes = itertools.cycle(["reconstruct", "compare", "classify"])
         self._methods = itertools.cycle(finished_runs.LABELS)
         self._turn = itertools.count()
         sent = service.client.post("/uploads?filename=points.xyz", content=POINTS)

@@ -15,6 +15,15 @@ const OUTPUTS: Record<string, [string, string, string]> = {
   report: ["Report", "Settings, inputs, counts, timings, digest", "report.json"],
 };
 
+/** Outputs of a classification. */
+const CLASSIFIED: typeof OUTPUTS = {
+  points: ["Points, LAZ", "Every tile with its classes, zipped", "points.zip"],
+  terrain: ["Terrain, GeoTIFF", "Elevation of the ground", "terrain.tif"],
+  surface: ["Surface, GeoTIFF", "Elevation of the highest point of each cell", "surface.tif"],
+  height: ["Height, GeoTIFF", "Height of the surface above the ground", "height.tif"],
+  classes: ["Counts, JSON", "Points by class, warnings, timings", "classes.json"],
+};
+
 /** Outputs of a comparison as a whole; its page has a separate link. */
 const COMPARED: typeof OUTPUTS = {
   table: ["All methods, GeoParquet", "One row per building and method", "compared.parquet"],
@@ -63,17 +72,13 @@ type Offered = Record<string, Link & { bytes?: number }>;
 
 /** A menu of all outputs of the job; for a comparison those of one run, then those of all. */
 export async function downloadMenu(jobPath: string, method: string | null, signal: AbortSignal): Promise<HTMLElement> {
-  const offer = (of: string | null): Promise<Offered> => getJson<Offered>(ofRun(`${jobPath}/results`, of), { signal });
-  const entries = listed(await offer(method), OUTPUTS, jobPath, method);
-  if (method !== null) {
-    const { page: _page, ...compared } = await offer(null);
-    entries.push(...listed(compared, COMPARED, jobPath, null));
-  }
+  const list = await downloadList(jobPath, method, signal);
+  list.classList.add("menu-list");
   const menu = el(
     "details",
     { class: "menu" },
     el("summary", { class: "button primary" }, "Download"),
-    el("ul", { class: "menu-list" }, ...entries),
+    list,
   );
   menu.addEventListener("keydown", (event) => {
     if (event.key !== "Escape") return;
@@ -84,6 +89,17 @@ export async function downloadMenu(jobPath: string, method: string | null, signa
     if (!menu.contains(event.target as Node)) menu.open = false;
   }, { signal });
   return menu;
+}
+
+/** A list of the same outputs. */
+export async function downloadList(jobPath: string, method: string | null, signal: AbortSignal): Promise<HTMLElement> {
+  const offer = (of: string | null): Promise<Offered> => getJson<Offered>(ofRun(`${jobPath}/results`, of), { signal });
+  const entries = listed(await offer(method), { ...OUTPUTS, ...CLASSIFIED }, jobPath, method);
+  if (method !== null) {
+    const { page: _page, ...compared } = await offer(null);
+    entries.push(...listed(compared, COMPARED, jobPath, null));
+  }
+  return el("ul", { class: "outputs" }, ...entries);
 }
 
 /** Entries of the menu: known outputs in their order, then any others. */

@@ -1,5 +1,6 @@
 import type { Place } from "./address";
 import { Problem, getJson, isOver, request, type Status, type StatusInfo } from "./api";
+import { downloadList } from "./downloads";
 import { el } from "./elements";
 import { follow, type ServerEvent } from "./event_stream";
 import { titleOf } from "./job_list";
@@ -37,6 +38,17 @@ const STAGES: [string, string, string][] = [
   ["outputs", "Assemble the downloads", ""],
 ];
 
+/** Number of stages up to the joining of surfaces. */
+const JOINED = 1 + STAGES.findIndex(([name]) => name === "join");
+
+/** Stages of a classification that differ from those of a reconstruction. */
+const CLASSIFIED: typeof STAGES = [
+  ["classify", "Classify the points", "tiles"],
+  ["write", "Write the files", "files"],
+  ["rasters", "Draw the rasters", "tiles"],
+  ["mosaics", "Join the rasters", ""],
+];
+
 /** Further stages of a comparison, before its downloads are assembled. */
 const SIDE_BY_SIDE: typeof STAGES = [
   ["records", "Compare the runs", ""],
@@ -46,6 +58,7 @@ const SIDE_BY_SIDE: typeof STAGES = [
 ];
 
 function stagesOf(job: StatusInfo): typeof STAGES {
+  if (job.processID === "classify") return [...STAGES.slice(0, JOINED), ...CLASSIFIED, ...STAGES.slice(-1)];
   return job.processID === "compare" ? [...STAGES.slice(0, -1), ...SIDE_BY_SIDE, ...STAGES.slice(-1)] : STAGES;
 }
 
@@ -59,7 +72,9 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
     const job = await getJson<StatusInfo>(path, { signal: calledOff.signal });
     if (calledOff.signal.aborted) return;
     document.title = `${titleOf(job)} · gablework`;
-    if (job.status === "successful") {
+    if (job.status === "successful" && job.processID === "classify") {
+      place.replaceChildren(await files(job, path, calledOff.signal));
+    } else if (job.status === "successful") {
       // the 3D library is loaded only if there is something to draw
       const { showResults } = await import("./results_view");
       if (calledOff.signal.aborted) return;
@@ -94,6 +109,12 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
 async function cancel(path: string, hooks: Hooks): Promise<void> {
   await request(path, { method: "DELETE" });
   hooks.onChange();
+}
+
+/** A job whose results are files without buildings. */
+async function files(job: StatusInfo, path: string, signal: AbortSignal): Promise<HTMLElement> {
+  const list = await downloadList(path, null, signal);
+  return el("div", { class: "card" }, el("h1", {}, titleOf(job)), el("p", {}, job.message ?? ""), list);
 }
 
 /** A job that is over without results. */
