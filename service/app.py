@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import AsyncIterator
 
-import anyio
 from fastapi import APIRouter, Depends, FastAPI
 from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
@@ -20,7 +19,8 @@ from service.metrics import Measured, Metrics
 from service.rate_limits import RateLimiter
 from service.routes import buildings, events, health, jobs, landing, processes, results, schedules, uploads
 from service.routes.events import Streams
-from service.routes.submission import WRITERS
+from service.routes.replay import ReplayedError, replayed
+from service.routes.writing import writing
 from service.settings import ServiceSettings
 from service.store import JobStore
 
@@ -46,7 +46,7 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     StartUpError
         At start: other machines can reach the address, and there are no keys.
     """
-    kept = JobStore(settings.database) if store is None else store
+    kept = JobStore(settings.database, wait_s=settings.database_wait_s) if store is None else store
     streams = Streams()
     metrics = Metrics(kept, lambda: streams.count)
 
@@ -73,12 +73,13 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     )
     app.state.settings = settings
     app.state.store = kept
-    app.state.folder = StateFolder(settings.state)
+    app.state.folder = StateFolder(settings.state, settings.reserve_bytes)
     app.state.limiter = RateLimiter(settings)
     app.state.streams = streams
-    app.state.submitting = anyio.CapacityLimiter(WRITERS)
+    app.state.writing = writing(settings)
     app.state.metrics = metrics
     problems.install(app, [route for router in ROUTERS for route in router.routes])
+    app.add_exception_handler(ReplayedError, replayed)
     for router in ROUTERS:
         app.include_router(router)
     if landing.VIEWER.is_dir():

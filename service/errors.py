@@ -8,7 +8,8 @@ ServiceError
 ├── InputRefusedError        an input that is not allowed: a path outside the roots, a host that is not listed
 ├── LimitError               more than this service takes
 │   ├── TooLargeError        an upload or a body with too many bytes or points
-│   ├── NoSpaceError         the disk of the state folder is full
+│   ├── NoSpaceError         the disk of the state folder is full, or only its reserve is free
+│   ├── QuotaError           the uploads of a key have too many bytes
 │   ├── QueueFullError       too many jobs wait
 │   ├── TooManySchedulesError a key has reached its limit of schedules
 │   └── TooManyRequestsError too many requests of one client
@@ -16,9 +17,13 @@ ServiceError
 ├── ForbiddenError           a key without the scope
 ├── UploadInUseError         an upload that unfinished jobs need
 ├── ScheduleBusyError        a job of the schedule is under way, so it cannot be run now
+├── KeyInUseError            a request with the same Idempotency-Key is under way
+├── KeyReusedError           the Idempotency-Key was used for another request
 ├── ChangedMeanwhileError    the record has changed since the client read it
 ├── LeaseLostError           a driver's claim on a job has passed to another
 ├── StoreError               the database does not answer, or is not migrated
+│   ├── StoreBusyError       others hold its locks for too long
+│   └── StoreFullError       its disk is full
 └── StartUpError             settings with which the service must not start
 ```
 """
@@ -87,7 +92,23 @@ class TooLargeError(LimitError):
 
 
 class NoSpaceError(LimitError):
-    """The disk of the state folder is full."""
+    """The disk of the state folder is full, or only its reserve is free."""
+
+
+class QuotaError(LimitError):
+    """The uploads of a key have too many bytes.
+
+    Parameters
+    ----------
+    stored_bytes, more_bytes, most_bytes : int
+        Bytes of the stored uploads, of the new ones, and the limit.
+    """
+
+    def __init__(self, stored_bytes: int, more_bytes: int, most_bytes: int) -> None:
+        super().__init__(
+            f"the uploads of this key have {stored_bytes} bytes, with the new ones {stored_bytes + more_bytes} or "
+            f"more; the limit is {most_bytes}: remove uploads, or raise GABLEWORK_MAX_UPLOAD_BYTES_PER_KEY"
+        )
 
 
 class QueueFullError(LimitError):
@@ -127,12 +148,37 @@ class ScheduleBusyError(ServiceError):
         super().__init__(message)
 
 
+class KeyInUseError(ServiceError):
+    """A request with the same Idempotency-Key is under way."""
+
+    retry_after_s = 2.0
+    """Seconds after which the first request may be over."""
+
+
+class KeyReusedError(ServiceError):
+    """The Idempotency-Key was used for another request."""
+
+
 class ChangedMeanwhileError(ServiceError):
     """The record has changed since the client read it; the message names both versions."""
 
 
 class StoreError(ServiceError):
     """The database does not answer, or its tables are not those of this version; may pass."""
+
+
+class StoreBusyError(StoreError):
+    """Others hold the locks of the database for too long; nothing was written."""
+
+    retry_after_s = 5.0
+    """Seconds after which a client may try again: a lock that lasted for seconds may last for some more."""
+
+
+class StoreFullError(StoreError):
+    """The disk of the database is full; nothing was written."""
+
+    retry_after_s = 5.0
+    """Seconds after which a client may try again: by then the room that is set aside for the database is free."""
 
 
 class LeaseLostError(ServiceError):

@@ -9,6 +9,8 @@ import re
 import stat
 from pathlib import Path
 
+from service.disk import Disk
+
 _ID = re.compile(r"[0-9a-f]{32}")
 _log = logging.getLogger("gablework.service")
 
@@ -41,6 +43,13 @@ class StateFolder:
 
     root: Path
     """The folder."""
+    reserve_bytes: int = 0
+    """Free bytes of its disk that uploads, fetched inputs and runs may not use."""
+
+    @property
+    def disk(self) -> Disk:
+        """Its disk."""
+        return Disk(self.root, self.reserve_bytes)
 
     @property
     def uploads(self) -> Path:

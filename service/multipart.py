@@ -12,6 +12,7 @@ from collections.abc import AsyncIterator
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
+from service.deliveries import Fingerprint
 from service.errors import RequestError, TooLargeError
 
 
@@ -72,6 +73,8 @@ class Form:
         The request's header; names the boundary.
     max_parts : int
         Maximum number of parts.
+    fingerprint : Fingerprint, optional
+        Takes the parts as they arrive.
 
     Raises
     ------
@@ -79,7 +82,14 @@ class Form:
         The header is not one of a form.
     """
 
-    def __init__(self, stream: AsyncIterator[bytes], content_type: str, *, max_parts: int) -> None:
+    def __init__(
+        self,
+        stream: AsyncIterator[bytes],
+        content_type: str,
+        *,
+        max_parts: int,
+        fingerprint: Fingerprint | None = None,
+    ) -> None:
         kind, options = parse_options_header(content_type)
         boundary = options.get(b"boundary", b"")
         if kind != b"multipart/form-data" or not boundary:
@@ -87,6 +97,7 @@ class Form:
             raise RequestError([f"the content type {state}: send multipart/form-data with a boundary"])
         self._stream = stream
         self._max_parts = max_parts
+        self._fingerprint = fingerprint
         self._field = self._value = b""
         self._headers: dict[bytes, bytes] = {}
         # headers begin a part, bytes are data of it, None ends it
@@ -160,9 +171,13 @@ class Form:
 
     def _on_headers_finished(self) -> None:
         self._seen.append(self._headers)
+        if self._fingerprint is not None:
+            self._fingerprint.part(self._headers.get(b"content-disposition", b""))
 
     def _on_part_data(self, data: bytes, start: int, end: int) -> None:
         self._seen.append(data[start:end])
+        if self._fingerprint is not None:
+            self._fingerprint.update(data[start:end])
 
     def _on_part_end(self) -> None:
         self._seen.append(None)

@@ -75,6 +75,8 @@ KINDS: Mapping[type[Exception], Kind] = {
         status=409, type_uri=f"{OWN}schedule-busy", title="A job of the schedule is under way"
     ),
     errors.TooManySchedulesError: Kind(status=409, type_uri=f"{OWN}too-many-schedules", title="Too many schedules"),
+    errors.KeyInUseError: Kind(status=409, type_uri=f"{OWN}key-in-use", title="The request is under way", retry=True),
+    errors.KeyReusedError: Kind(status=422, type_uri=f"{OWN}key-reused", title="The key belongs to another request"),
     errors.ChangedMeanwhileError: Kind(
         status=412, type_uri=f"{OWN}changed-meanwhile", title="It was changed in the meantime"
     ),
@@ -82,8 +84,11 @@ KINDS: Mapping[type[Exception], Kind] = {
     errors.RequestError: Kind(status=400, type_uri=f"{OWN}invalid-request", title="The request does not fit"),
     errors.InputRefusedError: Kind(status=403, type_uri=f"{OWN}input-refused", title="The input is not allowed here"),
     errors.TooLargeError: Kind(status=413, type_uri=f"{OWN}too-large", title="More than this service takes"),
-    errors.NoSpaceError: Kind(status=507, type_uri=f"{OWN}no-space", title="The disk is full"),
+    errors.NoSpaceError: Kind(status=507, type_uri=f"{OWN}no-space", title="The disk is full", retry=True),
+    errors.QuotaError: Kind(status=507, type_uri=f"{OWN}quota-exceeded", title="The uploads of the key are too large"),
     errors.UploadInUseError: Kind(status=409, type_uri=f"{OWN}upload-in-use", title="The upload is still needed"),
+    errors.StoreBusyError: Kind(status=503, type_uri=f"{OWN}database-busy", title="The database is busy", retry=True),
+    errors.StoreFullError: Kind(status=507, type_uri=f"{OWN}no-space", title="The disk is full", retry=True),
     errors.StoreError: _AWAY,
     errors.QueueFullError: Kind(status=429, type_uri=f"{OWN}queue-full", title="Too many jobs wait", retry=True),
     errors.TooManyRequestsError: Kind(
@@ -98,6 +103,13 @@ KINDS: Mapping[type[Exception], Kind] = {
     sql.TimeoutError: _AWAY,
 }
 """The kind of problem of each exception; a subclass has that of its nearest base."""
+
+_STORE: Mapping[str, str] = {
+    "database-away": "The database does not answer; nothing was lost, try again.",
+    "database-busy": "Others hold the locks of the database; nothing was written, try again.",
+    "no-space": "The disk of the database is full; nothing was written. Its operator must make room, then try again.",
+}
+"""Sentences for clients, by the word of the kind: a database's own message can hold its address."""
 
 INTERNAL = Kind(status=500, type_uri=f"{OWN}internal", title="A fault of the service")
 """Anything else."""
@@ -185,10 +197,9 @@ def answer_error(error: Exception, instance: str) -> Response:
         after = getattr(error, "retry_after_s", RETRY_AFTER_S)
         headers["Retry-After"] = str(max(1, math.ceil(after)))
     faults = getattr(error, "faults", ())
-    if kind is _AWAY:
-        # a database's own message can hold its address
-        _log.error("the database does not answer: %s", error)
-        return answer(kind, "The database does not answer; nothing was lost, try again.", instance, (), headers)
+    if kind is _AWAY or isinstance(error, errors.StoreError):
+        _log.error("%s", error)
+        return answer(kind, _STORE[kind.word], instance, (), headers)
     if kind is INTERNAL:
         return answer(kind, "The service has logged the fault; please report it.", instance)
     return answer(kind, str(error) or kind.title, instance, faults, headers, getattr(error, "members", None))

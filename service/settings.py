@@ -34,6 +34,14 @@ class ServiceSettings(BaseSettings):
         default=None,
         description="SQLAlchemy URL; default SQLite in the state folder. PostgreSQL: postgresql+pg8000://user:password@host/database",
     )
+    database_wait_s: float = Field(
+        default=3.0,
+        ge=0.1,
+        le=30.0,
+        allow_inf_nan=False,
+        description="Seconds that a request, or a step of a driver, waits for locks of the database that others hold. "
+        "Then the answer is 503, and nothing is written.",
+    )
     host: str = Field(default="127.0.0.1", description="Address to listen on; all except loopback need keys.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
     public_url: str | None = Field(
@@ -63,6 +71,24 @@ class ServiceSettings(BaseSettings):
     )
 
     # limits
+    max_upload_bytes_per_key: int = Field(
+        default=0,
+        ge=0,
+        description="Maximum bytes of all uploads of one key together, or of all uploads if keys are not used; "
+        "0 for any number.",
+    )
+    reserve_bytes: int = Field(
+        default=512 * 2**20,
+        ge=0,
+        description="Free bytes of the state folder's disk that uploads, fetched inputs and runs may not use. They are "
+        "kept for the database, and for what a run still writes until it is stopped.",
+    )
+    idempotency_hours: float = Field(
+        default=24.0,
+        gt=0.0,
+        le=876_000.0,
+        description="Hours for which the answer to a request with an Idempotency-Key is kept.",
+    )
     max_queued: int = Field(default=1000, gt=0, description="Maximum number of waiting jobs; more are refused.")
     max_queued_per_key: int = Field(default=200, gt=0, description="Maximum number of waiting jobs of one key.")
     max_schedules_per_key: int = Field(

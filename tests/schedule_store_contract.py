@@ -161,7 +161,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         job_id = submit(store, settings=old).job_id
         schedule_id = make(store, request=stored).schedule_id
         with store._database.write() as connection:
-            migrate(connection, command.stamp, "0002")
+            migrate(connection, command.downgrade, "0002")
         store.migrate()
         assert store.get(job_id).request.settings == new
         assert store.schedules.get(schedule_id).definition.request.settings == new

@@ -1,5 +1,6 @@
 """What the store does on every database: the same tests for SQLite and PostgreSQL."""
 
+import dataclasses
 import datetime as dt
 import os
 import subprocess

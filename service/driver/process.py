@@ -62,9 +62,9 @@ class Driver:
         self.name = name or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
         self._settings = settings
         self._parent_pipe = parent_pipe
-        self._store = JobStore(settings.database)
+        self._store = JobStore(settings.database, wait_s=settings.database_wait_s)
         self._cluster = cluster or SharedCluster(settings)
-        folder = StateFolder(settings.state.resolve())
+        folder = StateFolder(settings.state.resolve(), settings.reserve_bytes)
         self._shop = DriverParts(
             settings=settings, folder=folder, store=self._store, cluster=self._cluster, tools=tools or Tools()
         )

@@ -9,19 +9,20 @@ import shutil
 from typing import Annotated, Any
 
 import anyio
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Response
 from starlette.concurrency import run_in_threadpool
 
 from service.errors import RequestError
 from service.files import StateFolder
 from service.jobs import Job, JobStatus
-from service.multipart import Form, Part
+from service.multipart import Part
 from service.processes import process_named
 from service.routes.answers import JOB_ID, JOB_MADE, STATUS_EXAMPLE, document, problems, reference
 from service.routes.bound import Base, Folder, Reader, Store, Submitter
-from service.routes.status import status_info
+from service.routes.status import job_made, status_info
 from service.routes.submission import Submission, Submitting
-from service.store import JobFilter, JobStore
+from service.routes.writing import Write
+from service.store import JobFilter
 from service.wire.base import page_links, respond
 from service.wire.execute import Execute, wanted
 from service.wire.faults import shortened
@@ -53,7 +54,7 @@ _log = logging.getLogger("gablework.service")
     status_code=201,
     responses={
         201: JOB_MADE,
-        **problems(400, 404, 413, 422, 507),
+        **problems(400, 404, 409, 413, 422, 507),
     },
     openapi_extra={
         "requestBody": {
@@ -67,25 +68,23 @@ _log = logging.getLogger("gablework.service")
         }
     },
 )
-async def submit(request: Request, base: Base, submitting: Submitting) -> Response:
+async def submit(base: Base, submitting: Submitting) -> Response:
     """Send one tile or more as a form and start a job with them: files go to storage as they come in.
 
     With the field `methods` the job compares these methods, else it reconstructs with one. If anything is refused,
     nothing of the call is kept.
     """
     async with submitting as submission:
-        execute = await _read(request, submission)
+        execute = await _read(submission)
         process = process_named("compare" if "methods" in execute.inputs else "reconstruct")
-        job = await submission.submit(process.draft(execute, submission.settings))
-    headers = {"Location": f"{base}/jobs/{job.job_id}"}
-    return respond(status_info(job, base), status_code=201, headers=headers)
+        draft = process.draft(execute, submission.settings)
+        return await submission.submit(draft, lambda job: job_made(job, base))
 
 
-async def _read(request: Request, submission: Submission) -> Execute:
+async def _read(submission: Submission) -> Execute:
     """The request in a form; its files are stored on the way."""
     settings = submission.settings
-    content_type = request.headers.get("content-type", "")
-    form = Form(aiter(request.stream()), content_type, max_parts=settings.max_inputs + OTHER_PARTS)
+    form = submission.form(max_parts=settings.max_inputs + OTHER_PARTS)
     inputs: dict[str, Any] = {}
     outputs: list[str] | None = None
     faults: list[str] = []
@@ -206,14 +205,15 @@ def job(job_id: JobId, base: Base, store: Store, caller: Reader) -> Response:
         **problems(404),
     },
 )
-async def dismiss(job_id: JobId, base: Base, store: Store, folder: Folder, caller: Submitter) -> Response:
+async def dismiss(job_id: JobId, base: Base, store: Store, folder: Folder, caller: Submitter, write: Write) -> Response:
     """Stop a job that waits or runs; remove one that is over, with its results."""
     before = await run_in_threadpool(store.get, job_id, owner=caller.owner)
     if before.status.is_over:
-        await run_in_threadpool(_remove, before, store, folder)
+        await write(lambda: store.remove(job_id))
+        await run_in_threadpool(_remove_files, before, folder)
         gone = dataclasses.replace(before, status=JobStatus.DISMISSED, message="removed with its results", failure=None)
         return respond(status_info(gone, base))
-    found = await run_in_threadpool(store.dismiss, job_id, owner=caller.owner)
+    found = await write(lambda: store.dismiss(job_id, owner=caller.owner))
     with anyio.move_on_after(DISMISSAL_S):
         while not found.status.is_over:
             await anyio.sleep(LOOK_S)
@@ -223,9 +223,8 @@ async def dismiss(job_id: JobId, base: Base, store: Store, folder: Folder, calle
     return respond(status_info(found, base))
 
 
-def _remove(job: Job, store: JobStore, folder: StateFolder) -> None:
-    """Remove a job, then its files; the driver's janitor removes what cannot be removed now."""
-    store.remove(job.job_id)
+def _remove_files(job: Job, folder: StateFolder) -> None:
+    """Remove the files of a job; the driver's janitor removes what cannot be removed now."""
 
     def warn(_function: object, path: str, error: tuple[type[BaseException], BaseException, object]) -> None:
         if not isinstance(error[1], FileNotFoundError):

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Body, Depends, Header, Path, Query, Response
 from service.processes import PROCESSES, process_named
 from service.routes.answers import JOB_MADE, document, problems
 from service.routes.bound import Base, Settings_, visitor
-from service.routes.status import status_info
+from service.routes.status import job_made
 from service.routes.submission import Submitting
 from service.wire.base import link, respond
 from service.wire.execute import EXAMPLE, Execute
@@ -77,7 +77,7 @@ def process(process_id: ProcessId, base: Base, settings: Settings_) -> Response:
     "/processes/{processID}/execution",
     summary="Start a job",
     status_code=201,
-    responses={201: JOB_MADE, **problems(400, 404, 422)},
+    responses={201: JOB_MADE, **problems(400, 404, 409, 422, 507)},
 )
 async def execute(
     process_id: ProcessId,
@@ -87,10 +87,9 @@ async def execute(
     prefer: Annotated[str | None, Header(description="`respond-async` always applies.")] = None,
 ) -> Response:
     """Submit a job. It always runs asynchronously: the answer comes at once and links to the job's status."""
-    draft = process_named(process_id).draft(body, submitting.settings)
-    async with submitting as submission:
-        job = await submission.submit(draft)
-    headers = {"Location": f"{base}/jobs/{job.job_id}"}
+    headers = {}
     if prefer is not None and "respond-async" in prefer.lower():
         headers["Preference-Applied"] = "respond-async"
-    return respond(status_info(job, base), status_code=201, headers=headers)
+    async with submitting as submission:
+        draft = process_named(process_id).draft(body, submission.settings)
+        return await submission.submit(draft, lambda job: job_made(job, base, headers))

@@ -10,9 +10,10 @@ from fastapi import APIRouter, Body, Header, Path, Query, Response
 from starlette.concurrency import run_in_threadpool
 
 from pipeline.schedule import Cron, Missed, Overlap
+from service.deliveries import Delivery
 from service.drafts import Draft
 from service.errors import ChangedMeanwhileError, RequestError
-from service.jobs import JobRequest
+from service.jobs import Job, JobRequest
 from service.processes import process_named
 from service.routes.answers import (
     JOB_MADE,
@@ -26,8 +27,9 @@ from service.routes.answers import (
     reference,
 )
 from service.routes.bound import Base, Reader, Settings_, Store, Submitter
-from service.routes.status import execute_request, status_info
-from service.routes.submission import Submitting
+from service.routes.status import execute_request, job_made
+from service.routes.submission import Changing, Submitting
+from service.routes.writing import Write
 from service.schedules import Definition, Schedule, ScheduleRun
 from service.settings import ServiceSettings
 from service.store import ScheduleFilter
@@ -73,16 +75,20 @@ async def make_schedule(
     kept as long as the schedule exists.
     """
     settings, caller = submitting.settings, submitting.caller
-    draft = _draft(body.processID, body.execute, settings)
 
-    def create(request: JobRequest) -> Schedule:
-        definition = _definition(body, None, request, draft.priority)
-        return store.schedules.create(definition, owner=caller.key_id, most=settings.max_schedules_per_key)
+    def answer(made: Schedule) -> Response:
+        place = f"{base}/schedules/{made.schedule_id}"
+        return _answer(made, base, status_code=201, headers={"Location": place})
 
     async with submitting as submission:
-        made = await submission.checked(draft, create)
-    place = f"{base}/schedules/{made.schedule_id}"
-    return _answer(made, base, status_code=201, headers={"Location": place})
+        draft = _draft(body.processID, body.execute, settings)
+
+        def create(request: JobRequest, delivery: Delivery[Schedule]) -> Schedule:
+            definition = _definition(body, None, request, draft.priority)
+            most = settings.max_schedules_per_key
+            return store.schedules.create(definition, owner=caller.key_id, most=most, delivery=delivery)
+
+        return await submission.checked(draft, create, answer)
 
 
 def _draft(process_id: str, execute: Execute, settings: ServiceSettings) -> Draft:
@@ -164,7 +170,7 @@ async def change_schedule(
     body: Annotated[wire.SchedulePatch, Body(openapi_examples={"pause": {"value": {"paused": True}}})],
     base: Base,
     store: Store,
-    submitting: Submitting,
+    submitting: Changing,
     if_match: Annotated[
         str | None,
         Header(description="The ETag that the client has; the change is refused if the schedule has another one."),
@@ -183,17 +189,19 @@ async def change_schedule(
     # a precondition counts only for a request that would succeed without it
     _check_version(if_match, before)
 
-    def change(request: JobRequest, priority: int) -> Schedule:
+    priority = before.definition.priority if draft is None else draft.priority
+
+    def change(request: JobRequest, delivery: Delivery[Schedule]) -> Schedule:
         definition = _definition(body, before.definition, request, priority)
-        return store.schedules.change(schedule_id, definition, version=before.version, owner=owner)
+        return store.schedules.change(schedule_id, definition, version=before.version, owner=owner, delivery=delivery)
+
+    def answer(changed: Schedule) -> Response:
+        return _answer(changed, base)
 
     if draft is None:
-        kept = before.definition
-        return _answer(await run_in_threadpool(change, kept.request, kept.priority), base)
-    priority = draft.priority
+        return await submitting.make(lambda delivery: change(before.definition.request, delivery), answer)
     async with submitting as submission:
-        changed = await submission.checked(draft, lambda request: change(request, priority))
-    return _answer(changed, base)
+        return await submission.checked(draft, change, answer)
 
 
 @router.delete(
@@ -203,9 +211,9 @@ async def change_schedule(
     response_class=Response,
     responses={204: {"description": "It is removed. Its jobs stay; a running one continues."}, **problems(404)},
 )
-def remove_schedule(schedule_id: ScheduleId, store: Store, caller: Submitter) -> Response:
+async def remove_schedule(schedule_id: ScheduleId, store: Store, caller: Submitter, write: Write) -> Response:
     """Remove a schedule with the history of its slots."""
-    store.schedules.remove(schedule_id, owner=caller.owner)
+    await write(lambda: store.schedules.remove(schedule_id, owner=caller.owner))
     return Response(status_code=204)
 
 
@@ -213,21 +221,27 @@ def remove_schedule(schedule_id: ScheduleId, store: Store, caller: Submitter) ->
     "/schedules/{scheduleID}/run",
     summary="Run a schedule now",
     status_code=201,
-    responses={201: JOB_MADE, **problems(404, 409)},
+    responses={201: JOB_MADE, **problems(400, 404, 409, 422, 507)},
 )
-def run_schedule(schedule_id: ScheduleId, base: Base, settings: Settings_, store: Store, caller: Submitter) -> Response:
+async def run_schedule(
+    schedule_id: ScheduleId, base: Base, settings: Settings_, store: Store, submitting: Submitting
+) -> Response:
     """Make a job now, independent of the clock, also if the schedule is paused.
 
     This is refused while a job of the schedule is under way; `jobID` of the problem names that job.
     """
-    job = store.schedules.run_now(
-        schedule_id,
-        owner=caller.owner,
-        max_queued=settings.max_queued,
-        max_queued_per_key=settings.max_queued_per_key,
-    )
-    headers = {"Location": f"{base}/jobs/{job.job_id}"}
-    return respond(status_info(job, base), status_code=201, headers=headers)
+
+    def run(delivery: Delivery[Job]) -> Job:
+        return store.schedules.run_now(
+            schedule_id,
+            owner=submitting.caller.owner,
+            max_queued=settings.max_queued,
+            max_queued_per_key=settings.max_queued_per_key,
+            delivery=delivery,
+        )
+
+    async with submitting as submission:
+        return await submission.make(run, lambda job: job_made(job, base))
 
 
 @router.get(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 from urllib.parse import quote
 
+from starlette.responses import Response
+
 from service.jobs import InputReference, Job, JobEvent, JobRequest, JobStatus
 from service.problems import failure_document
-from service.wire.base import RELATIONS, Link, link
+from service.wire.base import RELATIONS, Link, link, respond
 from service.wire.execute import Execute, wanted
 from service.wire.jobs import Event, StatusInfo
 
@@ -37,6 +40,12 @@ def status_info(job: Job, base: str, *, with_request: bool = True) -> StatusInfo
         request=execute_request(job.request, base, job.priority) if with_request else None,
         links=_links(job, base, with_request=with_request),
     )
+
+
+def job_made(job: Job, base: str, headers: Mapping[str, str] | None = None) -> Response:
+    """The answer to a request that made a job."""
+    location = {"Location": f"{base}/jobs/{job.job_id}"}
+    return respond(status_info(job, base), status_code=201, headers={**location, **(headers or {})})
 
 
 def _links(job: Job, base: str, *, with_request: bool) -> list[Link]:

@@ -1,83 +1,168 @@
-"""From a draft to a waiting job or a schedule. If the call is refused, what it stored is removed."""
+"""From a request to what it makes: a job, a schedule, an upload. If the request is refused, nothing of it is kept."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-from collections.abc import AsyncIterator, Callable, Iterable
+import datetime as dt
+from collections.abc import AsyncIterator, Callable
 from types import TracebackType
 from typing import Annotated, Self, TypeVar
 
 import anyio
 import anyio.to_thread
-from fastapi import Depends, Request
+from fastapi import Depends
+from fastapi.responses import Response
 
 from service.auth import Principal
+from service.deliveries import Claim, Delivery, Fingerprint, key_of
 from service.drafts import Draft, Inline
-from service.errors import ForbiddenError, UploadInUseError
+from service.errors import ForbiddenError, QuotaError, StoreBusyError, StoreError, StoreFullError
 from service.fetching import resolve_inputs
 from service.files import StateFolder
 from service.jobs import InputReference, Job, JobRequest, Upload
 from service.keys import Scope
+from service.multipart import Form
 from service.routes.bound import Folder, Settings_, Store, Submitter
+from service.routes.replay import HeldKey, IdempotencyKey, checked_replay, fingerprint_of, stored_answer
+from service.routes.writing import Write, Writer
 from service.settings import ServiceSettings
 from service.store import JobStore
 from service.uploads import receive, remove_file
 
 Made = TypeVar("Made")
-"""A job, or a schedule."""
-
-WRITERS = 3
-"""Threads that write jobs: few, because writers wait for one another and readers must not wait for them."""
+"""A job, a schedule, or whatever else a request makes."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Submission:
-    """A call that submits for one caller. As a context manager it removes its uploads if the call fails."""
+@dataclasses.dataclass(frozen=True)
+class Arrived:
+    """The uploads of a request, beside those of the store: their records are written with what the request makes."""
 
     store: JobStore
-    folder: StateFolder
-    settings: ServiceSettings
-    caller: Principal
-    threads: anyio.CapacityLimiter
-    """Limits the calls that write jobs at the same time."""
-    made: list[str] = dataclasses.field(default_factory=list)
-    """Ids of the uploads of this call."""
+    uploads: list[Upload] = dataclasses.field(default_factory=list)
+
+    def now(self) -> dt.datetime:
+        """The time, with a time zone."""
+        return self.store.now()
+
+    def add_upload(self, upload: Upload) -> None:
+        """Remember the record."""
+        self.uploads.append(upload)
+
+    def upload(self, upload_id: str, *, owner: str | None = None) -> Upload:
+        """One upload; with `owner` only if it belongs to that key."""
+        arrived = next((upload for upload in self.uploads if upload.upload_id == upload_id), None)
+        return self.store.upload(upload_id, owner=owner) if arrived is None else arrived
+
+
+class Submission:
+    """A request that makes something, for one caller; a context manager.
+
+    At its beginning it claims the request's key, or raises the answer that is kept under it. If the request fails, its
+    files are removed and its key is free again.
+
+    Parameters
+    ----------
+    writer : Writer
+        Writes for the request.
+    store, folder, settings, caller
+        As the application bound them.
+    """
+
+    def __init__(
+        self, writer: Writer, *, store: JobStore, folder: StateFolder, settings: ServiceSettings, caller: Principal
+    ) -> None:
+        self.store = store
+        self.folder = folder
+        self.settings = settings
+        self.caller = caller
+        self._writer = writer
+        self._request = writer.request
+        self._arrived = Arrived(store)
+        self._key = key_of(self._request.headers.getlist("idempotency-key"))
+        self._held: HeldKey | None = None
+        self._seen: Fingerprint | None = None
+        self._is_streamed = False
+        self._is_made = False
+
+    # --- the body
+
+    def body(self) -> AsyncIterator[bytes]:
+        """The body as it arrives."""
+        self._is_streamed = True
+        return aiter(self._request.stream()) if self._seen is None else self._counted(self._seen)
+
+    async def _counted(self, seen: Fingerprint) -> AsyncIterator[bytes]:
+        async for piece in self._request.stream():
+            seen.update(piece)
+            yield piece
+
+    def form(self, *, max_parts: int) -> Form:
+        """The body as a form that arrives."""
+        self._is_streamed = True
+        kind = self._request.headers.get("content-type", "")
+        return Form(aiter(self._request.stream()), kind, max_parts=max_parts, fingerprint=self._seen)
 
     async def receive(self, stream: AsyncIterator[bytes], filename: str, sha256: str | None = None) -> Upload:
-        """Store a file that came with the call; `sha256` is the digest that the client promised."""
-        upload = await receive(
-            stream,
+        """Store a file that came with the request; `sha256` is the digest that the client promised.
+
+        Raises
+        ------
+        QuotaError
+            The uploads of the key are too large.
+        """
+        return await receive(
+            await self._within_quota(stream),
             filename,
-            store=self.store,
+            store=self._arrived,
             folder=self.folder,
             settings=self.settings,
             owner=self.caller.key_id,
             sha256=sha256,
         )
-        self.made.append(upload.upload_id)
-        return upload
 
     async def keep(self, stream: AsyncIterator[bytes], filename: str) -> InputReference:
-        """Store a file that came with the call, as an input of its job."""
+        """Store a file that came with the request, as an input of its job."""
         return InputReference(kind="upload", value=(await self.receive(stream, filename)).upload_id)
 
-    async def submit(self, draft: Draft) -> Job:
+    async def _within_quota(self, stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+        """The same stream; it is cut off where the uploads of the key are too large."""
+        most = self.settings.max_upload_bytes_per_key
+        if most == 0:
+            return stream
+        stored = await anyio.to_thread.run_sync(self.store.stored_bytes, self.caller.key_id)
+        stored += sum(upload.size_bytes for upload in self._arrived.uploads)
+
+        async def limited() -> AsyncIterator[bytes]:
+            seen = 0
+            async for piece in stream:
+                seen += len(piece)
+                if stored + seen > most:
+                    raise QuotaError(stored, seen, most)
+                yield piece
+
+        return limited()
+
+    # --- what it makes
+
+    async def submit(self, draft: Draft, answer: Callable[[Job], Response]) -> Response:
         """Queue a job; its row is committed when this returns. Raises as `checked`, or QueueFullError."""
 
-        def create(request: JobRequest) -> Job:
+        def create(request: JobRequest, delivery: Delivery[Job]) -> Job:
             return self.store.create(
                 request,
                 owner=self.caller.key_id,
                 priority=draft.priority,
                 max_queued=self.settings.max_queued,
                 max_queued_per_key=self.settings.max_queued_per_key,
+                delivery=delivery,
             )
 
-        return await self.checked(draft, create)
+        return await self.checked(draft, create, answer)
 
-    async def checked(self, draft: Draft, write: Callable[[JobRequest], Made]) -> Made:
-        """Check a request, then write a job or a schedule from it in one of the threads that write.
+    async def checked(
+        self, draft: Draft, make: Callable[[JobRequest, Delivery[Made]], Made], answer: Callable[[Made], Response]
+    ) -> Response:
+        """Check a request, then make a job or a schedule from it.
 
         Raises
         ------
@@ -94,44 +179,108 @@ class Submission:
         for inline in draft.inline:
             stored[inline] = await self.keep(_once(inline.content), inline.filename)
 
-        def check_and_write() -> Made:
+        def check_and_make(delivery: Delivery[Made]) -> Made:
             request = draft.request(stored)
             owner = self.caller.owner
-            resolve_inputs(request, store=self.store, folder=self.folder, settings=self.settings, owner=owner)
-            return write(request)
+            resolve_inputs(request, store=self._arrived, folder=self.folder, settings=self.settings, owner=owner)
+            return make(request, delivery)
 
-        return await anyio.to_thread.run_sync(check_and_write, limiter=self.threads)
+        return await self.make(check_and_make, answer)
+
+    async def make(self, make: Callable[[Delivery[Made]], Made], answer: Callable[[Made], Response]) -> Response:
+        """Make something in one of the threads that write; `make` passes the delivery on to the store.
+
+        Raises
+        ------
+        StoreBusyError
+            The database was busy for too long: nothing was made.
+        KeyInUseError
+            The key of the request has passed to another one.
+        """
+        seen, held = self._seen, self._held
+        if seen is not None and not self._is_streamed:
+            seen.update(await self._request.body())
+        delivery: Delivery[Made] = Delivery(
+            uploads=tuple(self._arrived.uploads),
+            max_upload_bytes=self.settings.max_upload_bytes_per_key,
+            claim=None if held is None else held.claim,
+            answer=None if seen is None else lambda made: stored_answer(answer(made), seen),
+            kept_s=self.settings.idempotency_hours * 3600.0,
+        )
+
+        def written() -> Made:
+            made = make(delivery)
+            self._is_made = True
+            return made
+
+        return answer(await self._writer(written))
+
+    # --- the key, and what a failure leaves behind
 
     async def __aenter__(self) -> Self:
-        """Nothing is stored yet."""
+        """Refuse a request that there is no room for; claim its key.
+
+        Raises
+        ------
+        ReplayedError
+            The request was answered before.
+        KeyInUseError
+            It is under way.
+        KeyReusedError
+            Its key was used for another request.
+        NoSpaceError
+            Only the reserve of the disk is free, or less.
+        """
+        owner = self.caller.key_id or ""
+        if self._key is not None:
+            stored = await anyio.to_thread.run_sync(self.store.answer_to, owner, self._key)
+            if stored is not None:
+                raise await checked_replay(self._request, stored)
+        length = self._request.headers.get("content-length", "")
+        expected = int(length) if length.isascii() and length.isdigit() else 0
+        await anyio.to_thread.run_sync(self.folder.disk.require, expected, "this request")
+        if self._key is not None:
+            claim = Claim(owner=owner, key=self._key)
+            stored = await self._writer.while_body_arrives(lambda: self.store.claim_key(claim))
+            if stored is not None:
+                raise await checked_replay(self._request, stored)
+            self._held = HeldKey(self.store, self._writer, claim)
+            self._seen = fingerprint_of(self._request)
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Remove the uploads of a call that failed, also if the client has disconnected."""
-        if kind is None:
-            return
-        with anyio.CancelScope(shield=True):
-            await anyio.to_thread.run_sync(self._remove, tuple(self.made), limiter=self.threads)
+        """Leave nothing behind of a request that made nothing, also if the client has disconnected."""
+        # if the database went away during the commit, the records may be there; a janitor decides about the files
+        is_unknown = isinstance(error, StoreError) and not isinstance(error, StoreBusyError | StoreFullError)
+        if not self._is_made and not is_unknown:
+            with anyio.CancelScope(shield=True):
+                await anyio.to_thread.run_sync(self._remove_files)
+        if self._held is not None:
+            await self._held.release(is_kept=self._is_made)
 
-    def _remove(self, upload_ids: Iterable[str]) -> None:
-        for upload_id in upload_ids:
-            # in use: the job was made, but the client did not wait for the answer
-            with contextlib.suppress(UploadInUseError):
-                self.store.remove_upload(upload_id)
-                remove_file(upload_id, self.folder)
+    def _remove_files(self) -> None:
+        for upload in self._arrived.uploads:
+            remove_file(upload.upload_id, self.folder)
 
 
-async def _submission(
-    request: Request, store: Store, folder: Folder, settings: Settings_, caller: Submitter
+async def _changing(writer: Write, store: Store, folder: Folder, settings: Settings_, caller: Submitter) -> Submission:
+    return Submission(writer, store=store, folder=folder, settings=settings, caller=caller)
+
+
+async def _submitting(
+    submission: Annotated[Submission, Depends(_changing)], idempotency_key: IdempotencyKey = None
 ) -> Submission:
-    threads = request.app.state.submitting
-    return Submission(store=store, folder=folder, settings=settings, caller=caller, threads=threads)
+    del idempotency_key  # only for the OpenAPI document
+    return submission
 
 
-Submitting = Annotated[Submission, Depends(_submission)]
-"""A submission for the caller, who may submit."""
+Changing = Annotated[Submission, Depends(_changing)]
+"""A request that changes something and may bring files."""
+
+Submitting = Annotated[Submission, Depends(_submitting)]
+"""A request of the caller, who may submit, that makes something."""
 
 
 async def _once(content: bytes) -> AsyncIterator[bytes]:

@@ -11,13 +11,16 @@ from urllib.parse import unquote
 
 from fastapi import APIRouter, Depends, Header, HTTPException, Path, Query, Request, Response
 from python_multipart.multipart import parse_options_header
+from starlette.concurrency import run_in_threadpool
 
 from service.errors import RequestError, TooLargeError
 from service.jobs import Upload
 from service.multipart import Form, Part
 from service.routes.answers import document, header, problems
 from service.routes.bound import Base, Folder, Reader, Store, Submitter
+from service.routes.replay import is_form
 from service.routes.submission import Submission, Submitting
+from service.routes.writing import Write
 from service.settings import ServiceSettings
 from service.uploads import remove_file
 from service.wire import uploads as wire
@@ -115,7 +118,7 @@ def _promised(
             EXAMPLE,
             headers=header("Location", "The upload."),
         ),
-        **problems(400, 413, 415, 422, 507),
+        **problems(400, 409, 413, 415, 422, 507),
     },
     openapi_extra={
         "requestBody": {
@@ -130,6 +133,7 @@ def _promised(
 async def send(
     request: Request,
     base: Base,
+    store: Store,
     submitting: Submitting,
     named: Annotated[str, Depends(_named)],
     digest: Annotated[str | None, Depends(_promised)],
@@ -144,20 +148,20 @@ async def send(
         raise HTTPException(
             HTTPStatus.UNSUPPORTED_MEDIA_TYPE, f"Content-Encoding is {encoding[:40]!r}: send the file as it is"
         )
-    is_form = request.headers.get("content-type", "").strip().lower().startswith("multipart/")
-    _check_length(request, submitting.settings, slack_bytes=FORM_SLACK_BYTES if is_form else 0)
-    if is_form:
-        if digest is not None:
-            raise RequestError(["the digest is that of a whole form: send the file as the body itself"])
-        form = Form(aiter(request.stream()), request.headers["content-type"], max_parts=MAX_PARTS)
-        async with submitting as submission:
-            upload = await _from_form(form, submission)
-    else:
-        if not named:
-            raise RequestError(["the file has no name: add ?filename=tile.laz, or the header Content-Disposition"])
-        upload = await submitting.receive(aiter(request.stream()), named, sha256=digest)
-    headers = {"Location": f"{base}/uploads/{upload.upload_id}"}
-    return respond(upload_document(upload, base), status_code=201, headers=headers)
+    slack_bytes = FORM_SLACK_BYTES if is_form(request) else 0
+    _check_length(request, submitting.settings, slack_bytes=slack_bytes)
+    async with submitting as submission:
+        if is_form(request):
+            if digest is not None:
+                raise RequestError(["the digest is that of a whole form: send the file as the body itself"])
+            stored = await _from_form(submission.form(max_parts=MAX_PARTS), submission)
+        else:
+            if not named:
+                raise RequestError(["the file has no name: add ?filename=tile.laz, or the header Content-Disposition"])
+            stored = await submission.receive(submission.body(), named, sha256=digest)
+        headers = {"Location": f"{base}/uploads/{stored.upload_id}"}
+        answer = respond(upload_document(stored, base), status_code=201, headers=headers)
+        return await submission.make(store.add_uploads, lambda _: answer)
 
 
 def upload_document(upload: Upload, base: str) -> wire.Upload:
@@ -244,9 +248,13 @@ def upload(upload_id: UploadId, base: Base, store: Store, caller: Reader) -> Res
     status_code=204,
     responses={204: {"description": "It is removed."}, **problems(404, 409)},
 )
-def remove(upload_id: UploadId, store: Store, folder: Folder, caller: Submitter) -> Response:
+async def remove(upload_id: UploadId, store: Store, folder: Folder, caller: Submitter, write: Write) -> Response:
     """Remove an upload, unless an unfinished job or a schedule needs it."""
-    found = store.upload(upload_id, owner=caller.owner)
-    store.remove_upload(found.upload_id)
-    remove_file(found.upload_id, folder)
+
+    def removed() -> str:
+        found = store.upload(upload_id, owner=caller.owner)
+        store.remove_upload(found.upload_id)
+        return found.upload_id
+
+    await run_in_threadpool(remove_file, await write(removed), folder)
     return Response(status_code=204)

@@ -1,7 +1,8 @@
 """Jobs, events, uploads, schedules and keys in SQL: SQLite by default, the same code on PostgreSQL."""
 
 from service.store.job_store import JobStore
+from service.store.patience import Patience
 from service.store.queries import JobFilter
 from service.store.schedules import ScheduleFilter
 
-__all__ = ["JobFilter", "JobStore", "ScheduleFilter"]
+__all__ = ["JobFilter", "JobStore", "Patience", "ScheduleFilter"]

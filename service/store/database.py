@@ -16,21 +16,32 @@ from sqlalchemy import event, exc
 from sqlalchemy.engine import URL, Connection, Engine
 
 from service import migrations
-from service.errors import StartUpError, StoreError
+from service.disk import Ballast, Disk
+from service.errors import StartUpError, StoreBusyError, StoreError, StoreFullError
 from service.files import keep_private, make_private_file
+from service.store.patience import CURRENT
 
 _EPOCH = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
 _EPOCH_JULIAN = 2440587.5
 _WRITES = "gablework_writes"
 _POOL_SIZE = 10
-_WAIT_S = 30
-"""Maximum seconds that a statement waits: for SQLite's write lock, for a connection, for PostgreSQL's answer."""
+WAIT_S = 30.0
+"""Seconds that a transaction waits for locks, and for a connection, if its store is given no other number."""
+_ANSWER_S = 10.0
+"""Seconds for PostgreSQL's answer to a statement that waits for no lock; the socket gets five more."""
 _RETRY_S = 0.01
 _LOCK_MIGRATIONS = 0x6761626C01
 LOCK_SUBMISSIONS = 0x6761626C02
 """Numbers of PostgreSQL's advisory locks."""
 # PostgreSQL: connection, resources, operator, system, no database, authorisation, idle in transaction, no table
 _PASSING = ("08", "53", "57", "58", "3D", "28", "25P03", "42P01", "SQLITE_NOTADB", "SQLITE_CORRUPT")
+# a lock that is not available, a statement that was ended by its time limit
+_BUSY = ("55P03", "57014", "SQLITE_BUSY", "SQLITE_LOCKED")
+_FULL = ("53100", "SQLITE_FULL")
+_IO = ("SQLITE_IOERR", "SQLITE_CANTOPEN")
+"""SQLite's codes for a file that cannot be written; a full disk is one of the causes."""
+_LEFT_BYTES = 1 << 20
+"""Free bytes below which a disk counts as full: SQLite's log and its index grow by less at a time."""
 
 
 class Database:
@@ -40,6 +51,9 @@ class Database:
     ----------
     url : str
         `sqlite:///PATH` or `postgresql+pg8000://…`.
+    wait_s : float
+        Seconds that a transaction waits for locks and for a connection. A request with a `Patience` waits no longer
+        than that.
 
     Raises
     ------
@@ -47,12 +61,14 @@ class Database:
         The URL cannot be understood, or names a database that is not supported.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, *, wait_s: float = WAIT_S) -> None:
         self._url = _parsed(url)
+        self._wait_s = wait_s
         self.is_sqlite = self._url.get_backend_name() == "sqlite"
-        self.engine = _sqlite_engine(self._url) if self.is_sqlite else _postgresql_engine(self._url)
+        make = _sqlite_engine if self.is_sqlite else _postgresql_engine
+        self.engine = make(self._url, wait_s)
         # SQLite's own wait is a sleep of growing length; threads of one process queue here in order
-        self._one_writer = threading.Lock() if self.is_sqlite else contextlib.nullcontext()
+        self._one_writer = threading.Lock() if self.is_sqlite else None
 
     @property
     def public_name(self) -> str:
@@ -60,6 +76,11 @@ class Database:
         if self.is_sqlite:
             return f"the SQLite database {Path(self._url.database or '').name}"
         return f"the PostgreSQL database {self._url.database or ''} at {self._url.host or 'a local socket'}"
+
+    @property
+    def folder(self) -> Path:
+        """The folder of a SQLite database."""
+        return Path(self._url.database or "").absolute().parent
 
     @contextlib.contextmanager
     def read(self) -> Iterator[Connection]:
@@ -74,18 +95,49 @@ class Database:
             yield connection
 
     @contextlib.contextmanager
-    def write(self) -> Iterator[Connection]:
+    def write(self, *, wait_s: float | None = None) -> Iterator[Connection]:
         """A transaction that may write; committed at its end, rolled back on an exception.
+
+        Parameters
+        ----------
+        wait_s : float, optional
+            Maximum seconds for locks; by default the current `Patience`, or that of the database.
 
         Raises
         ------
+        StoreBusyError
+            Others hold the locks, or the caller no longer waits.
+        StoreFullError
+            The disk is full.
         StoreError
             The database does not answer.
         """
-        with self._faults_in_our_words(), self._one_writer, self.engine.connect() as connection:
-            connection.execution_options(**{_WRITES: True})
+        patience = CURRENT.get()
+        if wait_s is None:
+            wait_s = self._wait_s if patience is None else patience.left_s()
+        until_s = time.monotonic() + wait_s
+        with self._faults_in_our_words(), self._alone(wait_s), self.engine.connect() as connection:
+            left_ms = max(1, round(1e3 * (until_s - time.monotonic())))
+            connection.execution_options(**{_WRITES: left_ms})
             with connection.begin():
+                if not self.is_sqlite:
+                    _limit(connection, left_ms)
                 yield connection
+                if patience is not None:
+                    patience.commit()
+
+    @contextlib.contextmanager
+    def _alone(self, wait_s: float) -> Iterator[None]:
+        """Hold the place of the one writer of SQLite in this process."""
+        if self._one_writer is None:
+            yield
+            return
+        if not self._one_writer.acquire(timeout=wait_s):
+            raise StoreBusyError(f"{self.public_name} is busy: other threads write for more than {wait_s:g} s")
+        try:
+            yield
+        finally:
+            self._one_writer.release()
 
     def migrate(self) -> None:
         """Migrate the tables to this version; several processes may do so at once.
@@ -104,7 +156,8 @@ class Database:
                 for beside in (path.with_name(path.name + ending) for ending in ("-wal", "-shm")):
                     if beside.exists():
                         keep_private(beside)
-        with self.write() as connection:
+        # another process may be migrating: that takes as long as it takes
+        with self.write(wait_s=WAIT_S) as connection:
             self.lock(connection, _LOCK_MIGRATIONS)
             found = migrations.current(connection)
             self._check_not_newer(found)
@@ -157,12 +210,30 @@ class Database:
         """Raise faults of the database as `StoreError`, our own as they are."""
         try:
             yield
-        except (exc.OperationalError, exc.InterfaceError, exc.TimeoutError, OSError) as error:
-            raise StoreError(f"{self.public_name} does not answer: {_cause(error)}") from error
+        except exc.TimeoutError as error:
+            raise StoreBusyError(f"{self.public_name} is busy: no connection is free") from error
         except exc.DBAPIError as error:
-            if error.connection_invalidated or _code(error).startswith(_PASSING):
-                raise StoreError(f"{self.public_name} does not answer: {_cause(error)}") from error
-            raise
+            fault = self._fault(error)
+            if fault is None:
+                raise
+            raise fault from error
+        except OSError as error:
+            raise StoreError(f"{self.public_name} does not answer: {_cause(error)}") from error
+
+    def _fault(self, error: exc.DBAPIError) -> StoreError | None:
+        """The fault of a database that may pass; None for a fault of the statement."""
+        code, cause = _code(error), _cause(error)
+        if code.startswith(_FULL) or (code.startswith(_IO) and Disk(self.folder).free_bytes < _LEFT_BYTES):
+            freed = ""
+            if self.is_sqlite and Ballast(self.folder).release():
+                freed = "; the room that was set aside for it is free now"
+            return StoreFullError(f"the disk of {self.public_name} is full: {cause}{freed}")
+        if code.startswith(_BUSY):
+            return StoreBusyError(f"{self.public_name} is busy: {cause}")
+        passes = error.connection_invalidated or code.startswith(_PASSING)
+        if passes or isinstance(error, exc.OperationalError | exc.InterfaceError):
+            return StoreError(f"{self.public_name} does not answer: {cause}")
+        return None
 
 
 def _parsed(url: str) -> URL:
@@ -183,9 +254,16 @@ def _parsed(url: str) -> URL:
     return parsed
 
 
-def _sqlite_engine(url: URL) -> Engine:
+def _limit(connection: Connection, left_ms: int) -> None:
+    """Let PostgreSQL end the statements of a transaction that wait too long."""
+    limits = [sa.func.set_config(name, str(left_ms), True) for name in ("lock_timeout", "statement_timeout")]
+    connection.execute(sa.select(*limits))
+
+
+def _sqlite_engine(url: URL, wait_s: float) -> Engine:
+    wait_ms = round(1e3 * wait_s)
     engine = sa.create_engine(
-        url, pool_size=_POOL_SIZE, max_overflow=0, pool_timeout=_WAIT_S, connect_args={"timeout": _WAIT_S}
+        url, pool_size=_POOL_SIZE, max_overflow=0, pool_timeout=wait_s, connect_args={"timeout": wait_s}
     )
 
     @event.listens_for(engine, "connect")
@@ -194,7 +272,7 @@ def _sqlite_engine(url: URL) -> Engine:
         # the driver would begin transactions late, and never for reads; `begun` begins them
         connection.isolation_level = None
         cursor = connection.cursor()
-        cursor.execute(f"PRAGMA busy_timeout = {_WAIT_S * 1000}")
+        cursor.execute(f"PRAGMA busy_timeout = {wait_ms}")
         cursor.execute("PRAGMA foreign_keys = ON")
         # a job whose request was answered with 201 survives a power cut
         cursor.execute("PRAGMA synchronous = FULL")
@@ -204,8 +282,9 @@ def _sqlite_engine(url: URL) -> Engine:
     @event.listens_for(engine, "begin")
     def begun(connection: Connection) -> None:
         # a transaction that reads first and writes later would fail if another wrote in between
-        writes = connection.get_execution_options().get(_WRITES, False)
-        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+        left_ms = connection.get_execution_options().get(_WRITES)
+        connection.exec_driver_sql(f"PRAGMA busy_timeout = {left_ms or wait_ms}")
+        connection.exec_driver_sql("BEGIN" if left_ms is None else "BEGIN IMMEDIATE")
 
     return engine
 
@@ -216,7 +295,7 @@ def _use_wal(cursor: sqlite3.Cursor) -> None:
     If two connections switch at the same time, each holds the lock that the other waits for. SQLite then refuses one of
     them at once, whatever its time-out. A moment later that one finds the switch done.
     """
-    until = time.monotonic() + _WAIT_S
+    until = time.monotonic() + WAIT_S
     while cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
         try:
             cursor.execute("PRAGMA journal_mode = WAL")
@@ -226,16 +305,17 @@ def _use_wal(cursor: sqlite3.Cursor) -> None:
             time.sleep(_RETRY_S)
 
 
-def _postgresql_engine(url: URL) -> Engine:
+def _postgresql_engine(url: URL, wait_s: float) -> Engine:
+    answer_s = max(wait_s, _ANSWER_S)
     try:
         engine = sa.create_engine(
             url,
             pool_size=_POOL_SIZE,
             max_overflow=0,
-            pool_timeout=_WAIT_S,
+            pool_timeout=wait_s,
             pool_pre_ping=True,
             pool_recycle=1800,
-            connect_args={"timeout": _WAIT_S, "application_name": "gablework"},
+            connect_args={"timeout": answer_s + 5.0, "application_name": "gablework"},
         )
     except ImportError as error:
         raise StartUpError("PostgreSQL needs the driver pg8000: install gablework[postgres]") from error
@@ -245,8 +325,9 @@ def _postgresql_engine(url: URL) -> Engine:
         del record
         cursor = connection.cursor()
         # a client that vanished must lose its locks, and a statement must end before the socket's time-out
-        cursor.execute(f"SET idle_in_transaction_session_timeout = '{_WAIT_S}s'")
-        cursor.execute(f"SET statement_timeout = '{_WAIT_S - 5}s'")
+        cursor.execute(f"SET idle_in_transaction_session_timeout = '{round(WAIT_S)}s'")
+        cursor.execute(f"SET statement_timeout = {round(1e3 * answer_s)}")
+        cursor.execute(f"SET lock_timeout = {round(1e3 * wait_s)}")
         cursor.close()
         connection.commit()
 

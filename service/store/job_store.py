@@ -7,10 +7,12 @@ import datetime as dt
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
+from service.deliveries import Claim, Delivery, StoredAnswer
 from service.jobs import Job, JobEvent, JobFailure, JobRequest, JobStatus, Upload
 from service.keys import Key
-from service.store import changes, claims, keys, queries, submissions, uploads
-from service.store.database import LOCK_SUBMISSIONS, Database
+from service.store import changes, claims, idempotency, keys, queries, submissions, uploads
+from service.store.database import LOCK_SUBMISSIONS, WAIT_S, Database
+from service.store.delivering import creating
 from service.store.queries import JobFilter
 from service.store.schedule_store import ScheduleStore
 
@@ -25,6 +27,8 @@ class JobStore:
     ----------
     url : str
         SQLAlchemy's URL of a SQLite file or a PostgreSQL database. Nothing is opened yet.
+    wait_s : float
+        Seconds that a transaction waits for the locks of others.
 
     Raises
     ------
@@ -32,8 +36,8 @@ class JobStore:
         The URL cannot be understood, or names a database that is not supported.
     """
 
-    def __init__(self, url: str) -> None:
-        self._database = Database(url)
+    def __init__(self, url: str, *, wait_s: float = WAIT_S) -> None:
+        self._database = Database(url, wait_s=wait_s)
         self.schedules = ScheduleStore(self._database)
         """Schedules and the history of their slots."""
 
@@ -86,6 +90,7 @@ class JobStore:
         priority: int = 0,
         max_queued: int,
         max_queued_per_key: int,
+        delivery: Delivery[Job] | None = None,
     ) -> Job:
         """Submit a job; its row is committed when this returns.
 
@@ -99,20 +104,26 @@ class JobStore:
             Higher runs first.
         max_queued, max_queued_per_key : int
             Maximum number of waiting jobs, in total and of this key; running jobs do not count.
+        delivery : Delivery, optional
+            What is written with the job: uploads, and the answer under the request's key.
 
         Raises
         ------
         QueueFullError
             Too many jobs wait.
+        QuotaError
+            The uploads are too large.
+        KeyInUseError
+            The key of the request has passed to another one.
         NoSuchUploadError
             The request names an upload that is gone.
         """
-        with self._database.write() as connection:
+        with creating(self._database, delivery) as (connection, made):
             self._database.lock(connection, LOCK_SUBMISSIONS)
             submissions.check_queue(connection, owner, max_queued=max_queued, max_queued_per_key=max_queued_per_key)
             now = self._database.now(connection)
             job_id = submissions.insert(connection, request, owner=owner, priority=priority, now=now)
-            return queries.get(connection, job_id, None)
+            return made(queries.get(connection, job_id, None))
 
     def get(self, job_id: str, *, owner: str | None = None) -> Job:
         """One job; with an owner only its own.
@@ -312,8 +323,25 @@ class JobStore:
 
     def add_upload(self, upload: Upload) -> None:
         """Store the record of an upload; its file is already in place."""
-        with self._database.write() as connection:
-            uploads.add(connection, upload)
+        self.add_uploads(Delivery(uploads=(upload,)))
+
+    def add_uploads(self, delivery: Delivery[None]) -> None:
+        """Store the records of uploads, and the answer under the request's key.
+
+        Raises
+        ------
+        QuotaError
+            They are too large.
+        KeyInUseError
+            The key of the request has passed to another one.
+        """
+        with creating(self._database, delivery) as (_, made):
+            made(None)
+
+    def stored_bytes(self, owner: str | None) -> int:
+        """Bytes of all uploads of a key, or of all that belong to none."""
+        with self._database.read() as connection:
+            return uploads.stored_bytes(connection, owner)
 
     def upload(self, upload_id: str, *, owner: str | None = None) -> Upload:
         """One upload; with an owner only its own.
@@ -351,6 +379,39 @@ class JobStore:
         """Ids of all uploads."""
         with self._database.read() as connection:
             return uploads.known(connection)
+
+    # --- requests with a key of their own
+
+    def answer_to(self, owner: str, key: str) -> StoredAnswer | None:
+        """The answer that is kept under a client's key; None if there is none."""
+        with self._database.read() as connection:
+            return idempotency.find(connection, owner, key, self._database.now(connection))
+
+    def claim_key(self, claim: Claim) -> StoredAnswer | None:
+        """Claim a client's key for a request; the answer if one is kept under it, otherwise None.
+
+        Raises
+        ------
+        KeyInUseError
+            Another request holds the key.
+        """
+        with self._database.write() as connection:
+            return idempotency.claim(connection, claim, self._database.now(connection))
+
+    def renew_claim(self, claim: Claim) -> None:
+        """Hold a claim for some more time; one that has passed to another request is left alone."""
+        with self._database.write() as connection:
+            idempotency.renew(connection, claim, self._database.now(connection))
+
+    def drop_claim(self, claim: Claim) -> None:
+        """Free the key of a request that made nothing."""
+        with self._database.write() as connection:
+            idempotency.drop(connection, claim)
+
+    def forget_answers(self) -> int:
+        """Delete the kept answers whose time is over; their number."""
+        with self._database.write() as connection:
+            return idempotency.forget(connection, self._database.now(connection))
 
     # --- keys
 

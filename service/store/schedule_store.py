@@ -7,10 +7,12 @@ import datetime as dt
 import functools
 
 from pipeline.schedule import Outcome
+from service.deliveries import Delivery
 from service.jobs import Job
 from service.schedules import Definition, Schedule, ScheduleRun
 from service.store import queries, schedule_changes, schedules, ticks
 from service.store.database import LOCK_SUBMISSIONS, Database
+from service.store.delivering import creating
 from service.store.schedules import ScheduleFilter
 from service.store.ticks import QueueLimits
 
@@ -34,7 +36,9 @@ class ScheduleStore:
 
     # --- for clients
 
-    def create(self, definition: Definition, *, owner: str | None, most: int) -> Schedule:
+    def create(
+        self, definition: Definition, *, owner: str | None, most: int, delivery: Delivery[Schedule] | None = None
+    ) -> Schedule:
         """Make a schedule; its first slot is the next one.
 
         Parameters
@@ -45,6 +49,8 @@ class ScheduleStore:
             The key that makes it; None if keys are not used.
         most : int
             Maximum number of schedules of the key, or in total if keys are not used.
+        delivery : Delivery, optional
+            What is written with the schedule: uploads, and the answer under the request's key.
 
         Raises
         ------
@@ -53,12 +59,12 @@ class ScheduleStore:
         NoSuchUploadError
             The request names an upload that is gone.
         """
-        with self._database.write() as connection:
+        with creating(self._database, delivery) as (connection, made):
             # no other process adds one between counting and adding
             self._database.lock(connection, LOCK_SUBMISSIONS)
             now = self._database.now(connection)
             schedule_id = schedule_changes.insert(connection, definition, owner=owner, most=most, now=now)
-            return schedules.get(connection, schedule_id, None)
+            return made(schedules.get(connection, schedule_id, None))
 
     def get(self, schedule_id: str, *, owner: str | None = None) -> Schedule:
         """One schedule; with an owner only its own.
@@ -76,7 +82,15 @@ class ScheduleStore:
         with self._database.read() as connection:
             return schedules.listed(connection, criteria)
 
-    def change(self, schedule_id: str, definition: Definition, *, version: int, owner: str | None = None) -> Schedule:
+    def change(
+        self,
+        schedule_id: str,
+        definition: Definition,
+        *,
+        version: int,
+        owner: str | None = None,
+        delivery: Delivery[Schedule] | None = None,
+    ) -> Schedule:
         """Change what the client defines, if the version is still the one that the client saw.
 
         New times count from now on; slots of the old times that have passed undecided are missed.
@@ -90,10 +104,10 @@ class ScheduleStore:
         NoSuchUploadError
             The request names an upload that is gone.
         """
-        with self._database.write() as connection:
+        with creating(self._database, delivery) as (connection, made):
             now = self._database.now(connection)
             schedule_changes.change(connection, schedule_id, definition, owner=owner, version=version, now=now)
-            return schedules.get(connection, schedule_id, owner)
+            return made(schedules.get(connection, schedule_id, owner))
 
     def remove(self, schedule_id: str, *, owner: str | None = None) -> None:
         """Delete a schedule and its history; its jobs stay, and a running one continues.
@@ -119,7 +133,15 @@ class ScheduleStore:
         with self._database.read() as connection:
             return schedules.runs(connection, schedule_id, owner, limit=limit, offset=offset)
 
-    def run_now(self, schedule_id: str, *, owner: str | None = None, max_queued: int, max_queued_per_key: int) -> Job:
+    def run_now(
+        self,
+        schedule_id: str,
+        *,
+        owner: str | None = None,
+        max_queued: int,
+        max_queued_per_key: int,
+        delivery: Delivery[Job] | None = None,
+    ) -> Job:
         """Make a job now, independent of the clock, also if the schedule is paused.
 
         Raises
@@ -132,10 +154,10 @@ class ScheduleStore:
             Too many jobs wait.
         """
         limits = self._limits(max_queued, max_queued_per_key)
-        with self._database.write() as connection:
+        with creating(self._database, delivery) as (connection, made):
             now = self._database.now(connection)
             job_id = ticks.run_by_hand(connection, schedule_id, owner, now=now, limits=limits)
-            return queries.get(connection, job_id, None)
+            return made(queries.get(connection, job_id, None))
 
     def counts(self) -> tuple[dict[str, int], dict[Outcome, int]]:
         """Schedules by state (`active`, `paused`), and the slots of all of them by outcome."""

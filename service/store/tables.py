@@ -133,6 +133,27 @@ KEYS = sa.Table(
 )
 """One row per key; the key itself is not stored."""
 
+IDEMPOTENCY_KEYS = sa.Table(
+    "idempotency_keys",
+    METADATA,
+    sa.Column("owner", sa.String(64), primary_key=True),
+    sa.Column("key", sa.String(255), primary_key=True),
+    sa.Column("token", sa.String(32), nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("until", UtcTime, nullable=False),
+    sa.Column("fingerprint", sa.String(64)),
+    sa.Column("size_bytes", sa.BigInteger),
+    sa.Column("status", sa.Integer),
+    sa.Column("headers", sa.JSON(none_as_null=True)),
+    sa.Column("body", sa.Text),
+)
+"""One row per key of a request, by API key. Without a status the request is under way: its claim ends at `until`.
+
+With a status, `until` is the time at which the kept answer is deleted.
+"""
+
+sa.Index("idempotency_keys_by_end", IDEMPOTENCY_KEYS.c.until)
+
 SCHEDULES = sa.Table(
     "schedules",
     METADATA,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import datetime as dt
+from collections.abc import Sequence
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from service.errors import NoSuchUploadError, UploadInUseError
+from service.errors import NoSuchUploadError, QuotaError, UploadInUseError
 from service.files import is_id
 from service.jobs import JobStatus, Upload
 from service.store.records import storable, upload_of
@@ -30,6 +31,27 @@ def add(connection: Connection, upload: Upload) -> None:
             preflight=dict(upload.preflight),
         )
     )
+
+
+def stored_bytes(connection: Connection, owner: str | None) -> int:
+    """Bytes of all uploads of a key, or of all that belong to none."""
+    own = sa.select(sa.func.coalesce(sa.func.sum(UPLOADS.c.size_bytes), 0)).where(
+        UPLOADS.c.owner.is_not_distinct_from(owner)
+    )
+    return int(connection.execute(own).scalar_one())
+
+
+def check_quota(connection: Connection, added: Sequence[Upload], most: int) -> None:
+    """Refuse uploads of one owner that exceed its quota.
+
+    Raises
+    ------
+    QuotaError
+        They do.
+    """
+    stored, more = stored_bytes(connection, added[0].owner), sum(upload.size_bytes for upload in added)
+    if stored + more > most:
+        raise QuotaError(stored, more, most)
 
 
 def get(connection: Connection, upload_id: str, owner: str | None) -> Upload:

@@ -6,6 +6,7 @@ import sqlite3
 from pathlib import Path
 
 import pytest
+from delivery_contract import DeliveryContract
 from migrated import with_tables
 from schedule_store_contract import ScheduleStoreContract
 from store_contract import StoreContract, claim, submit
@@ -29,6 +30,10 @@ class TestJobsOnSqlite(OnSqlite, StoreContract):
 
 class TestSchedulesOnSqlite(OnSqlite, ScheduleStoreContract):
     """All of the contract of schedules, on a file."""
+
+
+class TestDeliveriesOnSqlite(OnSqlite, DeliveryContract):
+    """All of the contract of deliveries, on a file."""
 
 
 class OnceRefused:

@@ -1,13 +1,22 @@
 """The store on a real PostgreSQL."""
 
 import pytest
+from delivery_contract import DeliveryContract
 from processes import PostgresServer
 from store_contract import StoreContract, claim, running, submit
 
-from service.errors import StoreError
-from service.store import JobStore
+from service.errors import StoreBusyError, StoreError
+from service.store import JobStore, Patience
 
 pytestmark = pytest.mark.slow
+
+
+class TestDeliveriesOnPostgres(DeliveryContract):
+    """All of the contract of deliveries, on PostgreSQL."""
+
+    @pytest.fixture
+    def url(self, postgres_server: PostgresServer, request: pytest.FixtureRequest) -> str:
+        return postgres_server.create_database(with_tables="store" in request.fixturenames)
 
 
 class TestOnPostgres(StoreContract):
@@ -57,3 +66,30 @@ def test_a_job_that_another_claims_is_passed_over_and_not_waited_for(postgres_ur
             connection.exec_driver_sql(f"SELECT 1 FROM jobs WHERE job_id = '{first.job_id}' FOR UPDATE")
             assert claim(store).job_id == second.job_id
         assert claim(store).job_id == first.job_id
+
+
+@pytest.mark.parametrize("mode", ["EXCLUSIVE", "ACCESS EXCLUSIVE"])
+def test_a_locked_table_is_not_waited_for_and_nothing_is_written_later(postgres_url: str, mode: str) -> None:
+    with JobStore(postgres_url) as other, JobStore(postgres_url, wait_s=0.3) as store:
+        store.migrate()
+        with other._database.write() as connection:
+            connection.exec_driver_sql(f"LOCK TABLE jobs IN {mode} MODE")
+            # the lock is held all the time: an error can only come from the time limit
+            with pytest.raises(StoreBusyError):
+                submit(store)
+            if mode == "ACCESS EXCLUSIVE":
+                with pytest.raises(StoreBusyError):
+                    store.counts()
+        assert sum(store.counts().values()) == 0
+        submit(store)
+
+
+def test_a_writer_that_others_hold_up_at_a_row_gives_way(postgres_url: str) -> None:
+    with JobStore(postgres_url) as store, JobStore(postgres_url) as other:
+        store.migrate()
+        held = running(store)
+        with other._database.write() as connection:
+            connection.exec_driver_sql(f"SELECT 1 FROM jobs WHERE job_id = '{held.job_id}' FOR UPDATE")
+            with Patience(0.3), pytest.raises(StoreBusyError):
+                store.succeed(held, message="done", summary={})
+        store.succeed(held, message="done", summary={})
