@@ -1,6 +1,5 @@
 """What the store does on every database: the same tests for SQLite and PostgreSQL."""
 
-import dataclasses
 import datetime as dt
 import os
 import subprocess
