@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 
 from service.jobs import Fault, JobFailure
 from service.keys import Scope, new_key
-from service.outputs import COMPARISON_OUTPUTS, KINDS, OUTPUTS
+from service.outputs import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, KINDS, OUTPUTS
 
 OGC = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
 
@@ -284,5 +284,7 @@ def test_the_page_on_results_says_every_output_with_its_type_and_file() -> None:
     reported = [tuple(cell.strip().strip("`") for cell in row) for row in rows]
     of_a_run = [(kind.output_id, kind.media_type, kind.filename) for kind in OUTPUTS.values()]
     of_a_comparison = [(kind.output_id, kind.media_type, kind.filename) for kind in COMPARISON_OUTPUTS.values()]
+    classified = [(kind.output_id, kind.media_type, kind.filename) for kind in CLASSIFICATION_OUTPUTS.values()]
     assert reported[: len(of_a_run)] == of_a_run
+    assert [row for row in reported if row in classified] == classified
     assert [row for row in reported if row in of_a_comparison] == of_a_comparison
