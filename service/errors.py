@@ -139,6 +139,10 @@ class UploadInUseError(ServiceError):
     """An upload that unfinished jobs need; the message names how many."""
 
 
+class JobNotOverError(ServiceError):
+    """The job still waits or runs."""
+
+
 class ScheduleBusyError(ServiceError):
     """A job of the schedule is under way, so it cannot be run now."""
 

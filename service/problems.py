@@ -71,6 +71,7 @@ KINDS: Mapping[type[Exception], Kind] = {
     errors.NoSuchBuildingError: Kind(status=404, type_uri=f"{OWN}no-such-building", title="No such building"),
     errors.NoSuchOutputError: Kind(status=404, type_uri=f"{OWN}no-such-output", title="No such output"),
     errors.NoSuchScheduleError: Kind(status=404, type_uri=f"{OWN}no-such-schedule", title="No such schedule"),
+    errors.JobNotOverError: Kind(status=409, type_uri=f"{OWN}job-not-over", title="The job is not over yet"),
     errors.ScheduleBusyError: Kind(
         status=409, type_uri=f"{OWN}schedule-busy", title="A job of the schedule is under way"
     ),

@@ -9,22 +9,22 @@ import shutil
 from typing import Annotated, Any
 
 import anyio
-from fastapi import APIRouter, Path, Query, Response
+from fastapi import APIRouter, Body, Path, Query, Response
 from starlette.concurrency import run_in_threadpool
 
-from service.errors import RequestError
+from service.errors import JobNotOverError, RequestError
 from service.files import StateFolder
 from service.jobs import Job, JobStatus
 from service.multipart import Part
 from service.processes import process_named
 from service.routes.answers import JOB_ID, JOB_MADE, STATUS_EXAMPLE, document, problems, reference
 from service.routes.bound import Base, Folder, Reader, Store, Submitter
-from service.routes.status import job_made, status_info
+from service.routes.status import execute_request, job_made, status_info
 from service.routes.submission import Submission, Submitting
 from service.routes.writing import Write
 from service.store import JobFilter
 from service.wire.base import page_links, respond
-from service.wire.execute import Execute, wanted
+from service.wire.execute import RETRY_EXAMPLES, Execute, Retry, wanted
 from service.wire.faults import shortened
 from service.wire.jobs import JobForm, JobList, StatusInfo
 from service.wire.queries import JobQuery, interval
@@ -190,6 +190,28 @@ def job(job_id: JobId, base: Base, store: Store, caller: Reader) -> Response:
     """Status and progress of a job."""
     found = store.get(job_id, owner=caller.owner)
     return respond(status_info(found, base), headers={"Cache-Control": "no-store"})
+
+
+@router.post(
+    "/jobs/{jobID}/retry",
+    summary="Try a job again",
+    status_code=201,
+    responses={201: JOB_MADE, **problems(400, 404, 409, 422, 507)},
+)
+async def retry(
+    job_id: JobId,
+    base: Base,
+    submitting: Submitting,
+    changes: Annotated[Retry | None, Body(openapi_examples=RETRY_EXAMPLES)] = None,
+) -> Response:
+    """Start a new job with the request of one that is over, with changes if some are given. The old job stays."""
+    async with submitting as submission:
+        before = await run_in_threadpool(submission.store.get, job_id, owner=submission.caller.owner)
+        if not before.status.is_over:
+            raise JobNotOverError(f"job {job_id} is {before.status.value}: dismiss it first, or wait until it is over")
+        execute = (changes or Retry()).applied_to(execute_request(before.request, base, before.priority))
+        draft = process_named(before.request.process_id).draft(execute, submission.settings)
+        return await submission.submit(draft, lambda job: job_made(job, base))
 
 
 @router.delete(

@@ -40,6 +40,14 @@ EXAMPLE = {
 }
 
 
+RETRY_EXAMPLES: dict[str, Any] = {
+    "as before": {"value": {}},
+    "with another method": {
+        "value": {"inputs": {"method": "kmeans", "settings": {"candidates": {"min_area_m2": 15.0}}}}
+    },
+}
+
+
 class OutputFormat(Request):
     """The wanted format of an output; each output has one."""
 
@@ -68,6 +76,45 @@ class WantedOutput(Request):
 def wanted(names: Iterable[str]) -> dict[str, WantedOutput]:
     """Outputs of these names, each in its only format."""
     return {name: WantedOutput() for name in names}
+
+
+class Retry(Request):
+    """What differs from the request of the job that is tried again."""
+
+    inputs: dict[str, Any] = Field(
+        default_factory=dict,
+        description="Inputs that replace those of the job; null takes one away. Tables of `settings` are merged: "
+        "settings that are not named stay, null takes one away.",
+    )
+    outputs: dict[str, WantedOutput] | None = Field(
+        default=None, description="The wanted outputs; those of the job if it is left out."
+    )
+
+    def applied_to(self, before: Execute) -> Execute:
+        """The request of the new job."""
+        changes = dict(self.inputs)
+        settings = changes.get("settings", {})
+        if isinstance(settings, Mapping):
+            # an input such as `method` replaces the setting of this name
+            kept = {name: value for name, value in before.inputs.get("settings", {}).items() if name not in changes}
+            changes["settings"] = _merged_tables(kept, settings) or None
+        inputs = _merged(before.inputs, changes)
+        outputs = before.outputs if self.outputs is None else self.outputs
+        return Execute(inputs=inputs, outputs=outputs, response=before.response)
+
+
+def _merged(before: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Members with changes; a change to null takes a member away."""
+    return {name: value for name, value in {**before, **changes}.items() if value is not None}
+
+
+def _merged_tables(before: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with changes, table by table."""
+    tables = {
+        name: _merged(before.get(name, {}), value) or None if isinstance(value, Mapping) else value
+        for name, value in changes.items()
+    }
+    return _merged(before, tables)
 
 
 class Execute(Request):

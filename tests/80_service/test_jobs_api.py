@@ -333,3 +333,76 @@ def test_a_key_to_read_may_not_submit(local_service) -> None:
     answer = send(local_service, ("a.xyz", POINTS), headers=local_service.key(Scope.READ), crs="EPSG:28992")
     assert answer.status_code == 403
     assert kept_files(local_service) == []
+
+
+# --- another try
+
+
+def ended(service, **fields: str) -> str:
+    """The id of a job that failed."""
+    job_id = send(service, ("a.xyz", POINTS), crs="EPSG:28992", **fields).json()["jobID"]
+    held = service.store.claim("a driver", lease_s=3600.0, max_attempts=3)
+    assert held.job_id == job_id
+    service.store.fail(held, JobFailure(fault=Fault.SETTINGS, detail="x"))
+    return job_id
+
+
+def retried(service, job_id: str, **changes: object):
+    return service.client.post(f"/jobs/{job_id}/retry", json=changes)
+
+
+def test_a_job_that_is_over_is_tried_again_as_it_was(local_service) -> None:
+    job_id = ended(local_service, method="kmeans", title="a title", outputs="report", priority="-2")
+    for answer in (local_service.client.post(f"/jobs/{job_id}/retry"), retried(local_service, job_id)):
+        assert answer.status_code == 201, answer.text
+        again = local_service.store.get(answer.json()["jobID"])
+        before = local_service.store.get(job_id)
+        assert (again.request, again.priority) == (before.request, before.priority)
+        assert (again.status, before.status) == (JobStatus.ACCEPTED, JobStatus.FAILED)
+        assert answer.headers["location"].endswith(again.job_id)
+
+
+def test_another_try_may_change_inputs_settings_and_outputs(local_service) -> None:
+    settings = '{"candidates": {"min_area_m2": 15, "min_height_m": 3.0}, "preset": "robust"}'
+    job_id = ended(local_service, method="kmeans", settings=settings, title="before", outputs="report")
+    changes = {
+        "inputs": {
+            "method": "fuzzy-sart",
+            "title": None,
+            "bbox": [0, 0, 9, 9],
+            "settings": {"candidates": {"min_area_m2": 20, "min_height_m": None}, "preset": None},
+        },
+        "outputs": {"cityjson": {}},
+    }
+    answer = retried(local_service, job_id, **changes)
+    request = local_service.request_of(answer)
+    assert request.settings == {"method": "fuzzy-sart", "candidates": {"min_area_m2": 20}}
+    assert (request.title, request.bbox, request.outputs) == (None, (0.0, 0.0, 9.0, 9.0), ("cityjson",))
+    assert request.tiles == local_service.store.get(job_id).request.tiles
+    without = local_service.request_of(retried(local_service, job_id, inputs={"settings": None, "method": None}))
+    assert without.settings == {}
+
+
+def test_faults_of_changes_are_reported_together_and_make_no_job(local_service) -> None:
+    job_id = ended(local_service)
+    answer = retried(local_service, job_id, inputs={"method": "guess", "settings": {"roof": {"x": 1}}, "colour": 1})
+    assert answer.status_code == 400
+    for words in ("method is", "[roof] x", '"colour" is not an input'):
+        assert words in answer.text.replace('\\"', '"')
+    assert len(local_service.client.get("/jobs").json()["jobs"]) == 1
+
+
+def test_a_job_that_is_not_over_is_not_tried_again(local_service) -> None:
+    job = local_service.waiting()
+    answer = retried(local_service, job.job_id)
+    assert (answer.status_code, answer.json()["type"]) == (409, "urn:gablework:problem:job-not-over")
+    assert retried(local_service, "0" * 32).status_code == 404
+
+
+def test_another_try_whose_upload_is_gone_says_so(local_service) -> None:
+    job_id = ended(local_service)
+    (tile,) = local_service.store.get(job_id).request.tiles
+    assert local_service.client.delete(f"/uploads/{tile.value}").status_code == 204
+    answer = retried(local_service, job_id)
+    assert answer.status_code == 400
+    assert tile.value in answer.json()["detail"]
