@@ -19,6 +19,7 @@ from service.multipart import Part
 from service.processes import process_named
 from service.routes.answers import JOB_ID, JOB_MADE, STATUS_EXAMPLE, document, problems, reference
 from service.routes.bound import Base, Folder, Reader, Store, Submitter
+from service.routes.html import PageRoute, in_either_form
 from service.routes.status import execute_request, job_made, status_info
 from service.routes.submission import Submission, Submitting
 from service.routes.writing import Write
@@ -29,7 +30,7 @@ from service.wire.faults import shortened
 from service.wire.jobs import JobForm, JobList, StatusInfo
 from service.wire.queries import JobQuery, interval
 
-router = APIRouter(tags=["jobs"])
+router = APIRouter(tags=["jobs"], route_class=PageRoute)
 
 DISMISSAL_S = 5.0
 """Seconds that a dismissal waits for the driver to stop."""
@@ -146,6 +147,7 @@ def _value(name: str, text: str, faults: list[str]) -> Any:
 @router.get(
     "/jobs",
     summary="List jobs",
+    dependencies=[in_either_form],
     responses={
         200: document(JobList, "The jobs, newest first.", {"jobs": [STATUS_EXAMPLE], "links": []}),
         **problems(400),
@@ -184,6 +186,7 @@ def jobs(base: Base, store: Store, caller: Reader, query: Annotated[JobQuery, Qu
 @router.get(
     "/jobs/{jobID}",
     summary="Status of a job",
+    dependencies=[in_either_form],
     responses={200: document(StatusInfo, "Its status.", STATUS_EXAMPLE), **problems(404)},
 )
 def job(job_id: JobId, base: Base, store: Store, caller: Reader) -> Response:

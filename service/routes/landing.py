@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from html import escape
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse
 
 from service.routes.answers import document, problems
 from service.routes.bound import Base, visitor
-from service.routes.negotiation import preferred
+from service.routes.html import Format, PageRoute, in_either_form, wants_html
 from service.wire.base import RELATIONS, link, respond
 from service.wire.landing import Conformance, LandingPage
 
@@ -22,18 +22,14 @@ VIEWER = Path(__file__).resolve().parents[1] / "viewer" / "dist"
 SPECIFICATION = "http://www.opengis.net/spec/ogcapi-processes-1/1.0/conf/"
 
 CONFORMANCE = tuple(
-    f"{SPECIFICATION}{name}" for name in ("core", "json", "oas30", "ogc-process-description", "job-list", "dismiss")
+    f"{SPECIFICATION}{name}"
+    for name in ("core", "json", "html", "oas30", "ogc-process-description", "job-list", "dismiss")
 )
 """The implemented parts of the standard."""
 
 OPENAPI_TYPE = "application/vnd.oai.openapi+json;version=3.0"
 
-router = APIRouter(tags=["service"], dependencies=[Depends(visitor)])
-
-Format = Annotated[Literal["json", "html"] | None, Query(alias="f", description="Overrides the header Accept.")]
-
-REPRESENTATIONS: Mapping[str, str] = {"application/json": "json", "text/html": "html"}
-"""Media types of the landing page with their names in the parameter f; the first one wins among equals."""
+router = APIRouter(tags=["service"], dependencies=[Depends(visitor)], route_class=PageRoute)
 
 _JSON_OR_PAGE = document(
     LandingPage,
@@ -50,8 +46,7 @@ _JSON_OR_PAGE["content"]["text/html"] = {"schema": {"type": "string"}}
 )
 def landing(request: Request, base: Base, wanted: Format = None) -> Response:
     """Links to everything: JSON for machines, the web page for browsers."""
-    chosen = wanted or preferred(request.headers.get("accept"), list(REPRESENTATIONS))
-    return web_page() if REPRESENTATIONS.get(chosen, chosen) == "html" else _for_machines(base)
+    return web_page() if wants_html(request, wanted) else _for_machines(base)
 
 
 def _for_machines(base: str) -> Response:
@@ -98,6 +93,7 @@ UNBUILT = """<!doctype html>
 @router.get(
     "/conformance",
     summary="Conformance classes",
+    dependencies=[in_either_form],
     responses={200: document(Conformance, "The classes.", {"conformsTo": list(CONFORMANCE)})},
 )
 def conformance() -> Response:

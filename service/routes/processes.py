@@ -9,13 +9,14 @@ from fastapi import APIRouter, Body, Depends, Header, Path, Query, Response
 from service.processes import PROCESSES, process_named
 from service.routes.answers import JOB_MADE, document, problems
 from service.routes.bound import Base, Settings_, visitor
+from service.routes.html import PageRoute, in_either_form
 from service.routes.status import job_made
 from service.routes.submission import Submitting
 from service.wire.base import link, respond
 from service.wire.execute import EXAMPLE, Execute
 from service.wire.processes import Process, ProcessList
 
-router = APIRouter(tags=["processes"])
+router = APIRouter(tags=["processes"], route_class=PageRoute)
 
 ProcessId = Annotated[
     str, Path(alias="processID", description="As in the list of processes.", examples=["reconstruct"])
@@ -34,7 +35,7 @@ _SUMMARY = {
 @router.get(
     "/processes",
     summary="List the processes",
-    dependencies=[Depends(visitor)],
+    dependencies=[Depends(visitor), in_either_form],
     responses={200: document(ProcessList, "The processes.", {"processes": [_SUMMARY], "links": []})},
 )
 def processes(
@@ -54,7 +55,7 @@ def processes(
 @router.get(
     "/processes/{processID}",
     summary="Describe a process",
-    dependencies=[Depends(visitor)],
+    dependencies=[Depends(visitor), in_either_form],
     responses={
         200: document(
             Process,

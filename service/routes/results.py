@@ -16,12 +16,13 @@ from service.outputs.kinds import HTML
 from service.routes.answers import JOB_ID, document, header, problems
 from service.routes.bound import Base
 from service.routes.finished_jobs import Finished
+from service.routes.html import PageRoute, in_either_form
 from service.routes.negotiation import preferred
 from service.wire.base import respond
 from service.wire.queries import words
 from service.wire.results import OutputFile, Results
 
-router = APIRouter(tags=["results"])
+router = APIRouter(tags=["results"], route_class=PageRoute)
 
 FAILED = (422, 500, 503)
 """Status codes of a failed job's results, by the cause."""
@@ -51,6 +52,7 @@ _EXAMPLE = {
 @router.get(
     "/jobs/{jobID}/results",
     summary="Results of a job",
+    dependencies=[in_either_form],
     responses={
         200: document(Results, "The outputs by reference.", _EXAMPLE),
         204: {

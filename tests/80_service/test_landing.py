@@ -60,7 +60,7 @@ def test_a_built_page_and_its_files_are_served(starting, monkeypatch, tmp_path: 
 
 def test_conformance_names_what_is_met_and_nothing_else(local_service) -> None:
     classes = {uri.rpartition("/")[2] for uri in local_service.client.get("/conformance").json()["conformsTo"]}
-    assert classes == {"core", "json", "oas30", "ogc-process-description", "job-list", "dismiss"}
+    assert classes == {"core", "json", "html", "oas30", "ogc-process-description", "job-list", "dismiss"}
     assert local_service.client.get("/openapi.json").json()["openapi"].startswith("3.0.")
 
 
