@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.io.area_of_use import Location
 from pipeline.io.source import ReadOptions, Source, SourceInfo, open_source
 from pipeline.model import FloatArray
 from pipeline.runtime.expected import RATES, expected
@@ -35,6 +36,8 @@ class Inspection:
     """Facts of the header."""
     warnings: tuple[str, ...]
     """What is odd but usable, of the header and of the points."""
+    location: Location | None
+    """The place on Earth; None if unknown."""
     used_points: int
     """Points that a run would use."""
     dropped: dict[str, int]
@@ -75,6 +78,7 @@ class Inspection:
                 f"{self.used_points} used of {info.point_count}" + (f" (left out: {kept_out})" if kept_out else ""),
             ),
             ("CRS", reference.name if reference.epsg is None else f"{reference.name} (EPSG:{reference.epsg})"),
+            ("place", "unknown" if self.location is None else str(self.location)),
             (
                 "units",
                 f"horizontal {reference.horizontal_unit_m:g} m, vertical {reference.vertical_unit_m:g} m{assumed}",
@@ -130,7 +134,8 @@ def _inspection(
     work = expected(plan, objects)
     return Inspection(
         info=source.info,
-        warnings=source.warnings,
+        warnings=source.warnings + _outside(source.info),
+        location=source.info.location,
         used_points=used,
         dropped=source.dropped,
         classes={int(k): int(classes[k]) for k in np.flatnonzero(classes)},
@@ -143,6 +148,14 @@ def _inspection(
         estimated_seconds=RATES.start_s + sum(work.wall_s(_CORES).values()),
         estimated_gib=RATES.process_gib + plan.window_bytes / 2**30,
     )
+
+
+def _outside(info: SourceInfo) -> tuple[str, ...]:
+    """A warning about a tile that a run refuses for its place."""
+    location = info.location
+    if location is None or not location.is_far_outside:
+        return ()
+    return (f"{location.problem}. {location.fix}",)
 
 
 class _Raster:

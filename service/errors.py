@@ -5,6 +5,7 @@ ServiceError
 ├── NoSuchJobError, NoSuchProcessError, NoSuchUploadError, NoSuchBuildingError, NoSuchOutputError, NoSuchScheduleError
 ├── ResultNotReadyError      the job is not over yet, or was dismissed
 ├── RequestError             inputs that do not fit the process: lists all faults at once
+├── OutsideAreaError         tiles far outside the area of use of their CRS: lists them all
 ├── InputRefusedError        an input that is not allowed: a path outside the roots, a host that is not listed
 ├── LimitError               more than this service takes
 │   ├── TooLargeError        an upload or a body with too many bytes or points
@@ -72,6 +73,20 @@ class RequestError(ServiceError):
     ----------
     faults : sequence of str
         One sentence per fault with the input, its value and what is allowed.
+    """
+
+    def __init__(self, faults: Sequence[str]) -> None:
+        self.faults = tuple(faults)
+        super().__init__("; ".join(self.faults))
+
+
+class OutsideAreaError(ServiceError):
+    """Tiles that would lie far outside the area of use of their CRS; the message lists every one.
+
+    Parameters
+    ----------
+    faults : sequence of str
+        One sentence per tile with the CRS, its area and the place.
     """
 
     def __init__(self, faults: Sequence[str]) -> None:

@@ -7,13 +7,21 @@ from pathlib import Path
 from typing import Protocol
 
 from pipeline.errors import InputError
+from pipeline.io.area_of_use import location_of
 from pipeline.io.formats import POINT_SUFFIXES
 from service.downloads import Cancel, download, name_of
-from service.errors import InputRefusedError, NoSuchUploadError, RequestError, ServiceError, TooLargeError
+from service.errors import (
+    InputRefusedError,
+    NoSuchUploadError,
+    OutsideAreaError,
+    RequestError,
+    ServiceError,
+    TooLargeError,
+)
 from service.files import StateFolder
-from service.input_policy import checked_path, checked_url
+from service.input_policy import checked_crs, checked_path, checked_url
 from service.jobs import InputReference, JobRequest, Upload
-from service.preflight import preflight, promised_points
+from service.preflight import outside_area, preflight, promised_points
 from service.settings import ServiceSettings
 from service.vectors import VECTOR_SUFFIXES
 
@@ -51,6 +59,8 @@ def resolve_inputs(
     ------
     RequestError
         Listing all faults.
+    OutsideAreaError
+        The only faults are tiles far outside the area of use of their CRS.
     InputRefusedError
         The only faults are inputs that are not allowed.
     TooLargeError
@@ -62,7 +72,7 @@ def resolve_inputs(
     if len(sources) > settings.max_inputs:
         raise TooLargeError(f"the job names {len(sources)} inputs, this service takes {settings.max_inputs}")
     faults: list[str] = []
-    refusals, points = 0, 0
+    refusals, outside, points = 0, 0, 0
     for source, suffixes in dict.fromkeys(sources):
         try:
             if source.kind == "upload":
@@ -78,6 +88,9 @@ def resolve_inputs(
         except (ServiceError, InputError) as fault:
             faults.append(str(fault))
             refusals += isinstance(fault, InputRefusedError)
+            outside += isinstance(fault, OutsideAreaError)
+    if faults and outside == len(faults):
+        raise OutsideAreaError(faults)
     if faults:
         raise InputRefusedError("; ".join(faults)) if refusals == len(faults) else RequestError(faults)
     _check_sum(points, settings)
@@ -95,10 +108,25 @@ def _check_upload(
     upload = store.upload(source.value, owner=owner)
     _upload_path(upload, folder)
     _check_suffix(source, upload.filename, suffixes)
-    problems = [str(problem) for problem in upload.preflight.get("problems", ())]
+    far = _outside_area(upload, request.crs)
+    problems = [str(problem) for problem in upload.preflight.get("problems", ()) if problem != far]
     if problems and request.crs is None:
         raise RequestError([f"upload {upload.upload_id} ({upload.filename}): {'; '.join(problems)}"])
+    if far is not None and not request.allow_outside_area_of_use:
+        raise OutsideAreaError([f"{upload.filename}: {far}"])
     return int(upload.preflight.get("pointCount") or 0)
+
+
+def _outside_area(upload: Upload, crs: str | None) -> str | None:
+    """Why the tile's place is refused, by the given CRS or that of its header; None if it is not, or not known."""
+    if crs is None:
+        far: str | None = upload.preflight.get("outsideAreaOfUse")
+        return far
+    bounds = upload.preflight.get("bounds")
+    if bounds is None:
+        return None
+    wkt = checked_crs(crs, path="crs").to_wkt("WKT2_2019")
+    return outside_area(location_of(wkt, (bounds[0], bounds[1], bounds[3], bounds[4])))
 
 
 def _upload_path(upload: Upload, folder: StateFolder) -> Path:

@@ -80,6 +80,8 @@ class JobRequest:
     """Overrides the CRS in the headers."""
     vertical_unit: str | None = None
     """Overrides the vertical unit in the headers."""
+    allow_outside_area_of_use: bool = False
+    """Accept tiles that lie far outside the area of use of their CRS."""
     bbox: tuple[float, float, float, float] | None = None
     """x_min, y_min, x_max, y_max in the CRS's units."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)

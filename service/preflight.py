@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import dataclasses
 import json
 import math
 import os
@@ -22,9 +23,11 @@ from pathlib import Path
 from typing import IO, Any
 
 from pipeline.errors import CrsError, EmptyInputError, InputError, UnreadableInputError
+from pipeline.io.area_of_use import Location
 from pipeline.io.formats import recognise_format
 from service.errors import TooLargeError
 from service.vectors import VECTOR_SUFFIXES, examine_vector
+from service.wording import as_inputs
 
 PASS_BYTES = 128 << 20
 """Text and PLY have no bounds in a header: files up to this size are read through, larger ones are only counted."""
@@ -48,9 +51,9 @@ def examine(path: Path, *, max_points: int) -> dict[str, Any]:
     dict
         Plain JSON values. `kind` points or footprints, `format`, `usable`, `problems` that `crs` or other inputs of a
         job may still fix, `warnings`, `crs` (name and EPSG code); for points `pointCount`, `horizontalUnitM`,
-        `verticalUnitM`, `bounds` (x_min, y_min, z_min, x_max, y_max, z_max in the CRS's units), `densityPerM2`,
-        `hasReturns`, `hasClasses`, `acquiredFrom`, `acquiredTo`; for footprints `featureCount`, `layers`. Unknown
-        values are None.
+        `verticalUnitM`, `bounds` (x_min, y_min, z_min, x_max, y_max, z_max in the CRS's units), `place` (longitude and
+        latitude of their middle), `areaOfUse`, `outsideAreaOfUse` (a sentence), `densityPerM2`, `hasReturns`,
+        `hasClasses`, `acquiredFrom`, `acquiredTo`; for footprints `featureCount`, `layers`. Unknown values are None.
 
     Raises
     ------
@@ -92,8 +95,8 @@ def _examine_points(path: Path, max_points: int) -> dict[str, Any]:
             bounds=list(facts.bounds),
             hasReturns=facts.has_returns,
             hasClasses=facts.has_classes,
-            warnings=list(facts.warnings),
-            problems=[f"{fault.problem}. {fault.fix}"],
+            warnings=[as_inputs(warning) for warning in facts.warnings],
+            problems=[as_inputs(f"{fault.problem}. {fault.fix}")],
         )
     _check_facts(path, known.point_count, known.bounds_m, max_points)
     reference = known.reference
@@ -111,8 +114,30 @@ def _examine_points(path: Path, max_points: int) -> dict[str, Any]:
         hasClasses=known.has_classes,
         acquiredFrom=known.acquired_from.isoformat() if known.acquired_from else None,
         acquiredTo=known.acquired_to.isoformat() if known.acquired_to else None,
-        warnings=list(known.warnings),
+        warnings=[as_inputs(warning) for warning in known.warnings],
+        **_place_facts(known.location),
     )
+
+
+def _place_facts(location: Location | None) -> dict[str, Any]:
+    """Where the tile would lie, and whether a job refuses that."""
+    if location is None:
+        return {}
+    place = location.longitude_latitude
+    far = outside_area(location)
+    return {
+        "place": None if place is None else {"longitude": round(place[0], 5), "latitude": round(place[1], 5)},
+        "areaOfUse": None if location.area is None else dataclasses.asdict(location.area),
+        "outsideAreaOfUse": far,
+        "problems": [] if far is None else [far],
+    }
+
+
+def outside_area(location: Location | None) -> str | None:
+    """Why a job refuses a tile at this place unless it allows it; None if it does not."""
+    if location is None or not location.is_far_outside:
+        return None
+    return as_inputs(f"{location.problem}. {location.fix}")
 
 
 def _check_facts(path: Path, count: int, bounds: Iterable[float], max_points: int) -> None:
@@ -126,7 +151,7 @@ def _points(kind: str, count: int, **known: Any) -> dict[str, Any]:
     """The facts of points; None if unknown."""
     names = ("crs", "horizontalUnitM", "verticalUnitM", "bounds", "densityPerM2", "hasReturns", "hasClasses")
     facts: dict[str, Any] = {"kind": "points", "format": kind, "pointCount": count}
-    facts |= dict.fromkeys((*names, "acquiredFrom", "acquiredTo"))
+    facts |= dict.fromkeys((*names, "place", "areaOfUse", "outsideAreaOfUse", "acquiredFrom", "acquiredTo"))
     facts |= {"warnings": [], "problems": []} | known
     return facts | {"usable": not facts["problems"]}
 

@@ -27,6 +27,7 @@ from service.methods import allowed_methods
 from service.wire.base import respond
 from service.wire.faults import sentences
 from service.wire.problems import Problem
+from service.wording import as_inputs
 
 OGC = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
 """Prefix of the standard's types."""
@@ -83,6 +84,9 @@ KINDS: Mapping[type[Exception], Kind] = {
     ),
     errors.ResultNotReadyError: Kind(status=404, type_uri=f"{OGC}result-not-ready", title="The results are not ready"),
     errors.RequestError: Kind(status=400, type_uri=f"{OWN}invalid-request", title="The request does not fit"),
+    errors.OutsideAreaError: Kind(
+        status=422, type_uri=f"{OWN}outside-area-of-use", title="A tile would lie far from where its CRS is used"
+    ),
     errors.InputRefusedError: Kind(status=403, type_uri=f"{OWN}input-refused", title="The input is not allowed here"),
     errors.TooLargeError: Kind(status=413, type_uri=f"{OWN}too-large", title="More than this service takes"),
     errors.NoSpaceError: Kind(status=507, type_uri=f"{OWN}no-space", title="The disk is full", retry=True),
@@ -197,13 +201,13 @@ def answer_error(error: Exception, instance: str) -> Response:
     if kind.retry:
         after = getattr(error, "retry_after_s", RETRY_AFTER_S)
         headers["Retry-After"] = str(max(1, math.ceil(after)))
-    faults = getattr(error, "faults", ())
+    faults = [as_inputs(fault) for fault in getattr(error, "faults", ())]
     if kind is _AWAY or isinstance(error, errors.StoreError):
         _log.error("%s", error)
         return answer(kind, _STORE[kind.word], instance, (), headers)
     if kind is INTERNAL:
         return answer(kind, "The service has logged the fault; please report it.", instance)
-    return answer(kind, str(error) or kind.title, instance, faults, headers, getattr(error, "members", None))
+    return answer(kind, as_inputs(str(error)) or kind.title, instance, faults, headers, getattr(error, "members", None))
 
 
 def install(app: FastAPI, routes: Sequence[BaseRoute]) -> None:

@@ -21,7 +21,7 @@ from service.keys import Scope, new_key
 from service.settings import ServiceSettings
 from service.store import JobStore
 
-POINTS = b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(20) for y in range(20))
+POINTS = b"".join(b"%d.0 %d.0 3.5\n" % (84_000 + x, 447_000 + y) for x in range(20) for y in range(20))
 """A point cloud as text, small and valid."""
 
 DEADLINE_S = 60.0

@@ -39,6 +39,9 @@ class InputsTable(Parameters):
 
     crs: str = parameter("", "CRS of the inputs, if their header has none or a wrong one.")
     vertical_unit: str = parameter("", "Unit of elevations: m, ft or us-ft; empty takes it from the header.")
+    allow_outside_area_of_use: bool = parameter(
+        False, "Accept inputs that lie far outside the area of use of their CRS."
+    )
     footprints: str = parameter("", "Building outlines to model; empty finds the buildings in the points.")
     overrides: str = parameter("", "File with manual overrides for single buildings.")
     aoi: str = parameter("", "Vector file with polygons; only points inside them are used.")
@@ -207,6 +210,7 @@ class Batch:
             overrides=given(self.inputs.overrides),
             crs=self.inputs.crs or None,
             vertical_unit=self.inputs.vertical_unit or None,
+            allow_outside_area_of_use=self.inputs.allow_outside_area_of_use,
             bbox=self.bbox,
             aoi=given(self.inputs.aoi),
             resources=Resources(

@@ -16,6 +16,7 @@ KEYS: Mapping[str, str] = {
     "--crs EPSG:n": '[inputs] crs = "EPSG:n"',
     "--crs": "[inputs] crs",
     "--vertical-unit": "[inputs] vertical_unit",
+    "--allow-outside-area-of-use": "[inputs] allow_outside_area_of_use = true",
     "--footprints": "[inputs] footprints",
     "--workers 1": "[cluster] workers = 1",
     "--workers": "[cluster] workers",

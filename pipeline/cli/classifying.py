@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipeline.cli.options import (
+    AllowOutside,
     AsJson,
     Classes,
     Crs,
@@ -43,6 +44,7 @@ def classify(
     footprints: Footprints = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
+    allow_outside_area_of_use: AllowOutside = False,
     classes: Classes = None,
     settings: SettingsFile = None,
     workers: Workers = None,
@@ -74,6 +76,7 @@ def classify(
             footprints=footprints,
             crs=crs,
             vertical_unit=vertical_unit,
+            allow_outside_area_of_use=allow_outside_area_of_use,
             rasters=rasters,
             raster_cell=raster_cell,
             resources=Resources(workers=workers, scheduler=scheduler, tls=given_tls(tls_ca, tls_cert, tls_key)),

@@ -10,6 +10,7 @@ import typer
 from pipeline.cli.options import (
     BUILDING_MEMORY_GIB,
     BUILDING_TIMEOUT_S,
+    AllowOutside,
     Aoi,
     AsJson,
     AsSurveyed,
@@ -67,6 +68,7 @@ def reconstruct(
     ] = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
+    allow_outside_area_of_use: AllowOutside = False,
     bbox: Bbox = None,
     aoi: Aoi = None,
     classes: Classes = None,
@@ -106,6 +108,7 @@ def reconstruct(
             overrides=overrides,
             crs=crs,
             vertical_unit=vertical_unit,
+            allow_outside_area_of_use=allow_outside_area_of_use,
             bbox=bbox,
             aoi=aoi,
             resources=Resources(
@@ -192,6 +195,7 @@ def compare(
     footprints: Footprints = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
+    allow_outside_area_of_use: AllowOutside = False,
     bbox: Bbox = None,
     aoi: Aoi = None,
     classes: Classes = None,
@@ -239,6 +243,7 @@ def compare(
                 footprints=footprints,
                 crs=crs,
                 vertical_unit=vertical_unit,
+                allow_outside_area_of_use=allow_outside_area_of_use,
                 bbox=bbox,
                 aoi=aoi,
                 resources=Resources(

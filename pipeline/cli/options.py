@@ -14,6 +14,10 @@ Crs = Annotated[
 VerticalUnit = Annotated[
     str | None, typer.Option(metavar="UNIT", help="Unit of elevations: m, ft or us-ft; default from the header.")
 ]
+AllowOutside = Annotated[
+    bool,
+    typer.Option("--allow-outside-area-of-use", help="Accept tiles that lie far outside the area of use of their CRS."),
+]
 AUTO = "auto"
 """The word for as many workers as the job needs and the machine has."""
 _MAX_WORKERS = 1024

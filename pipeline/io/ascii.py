@@ -19,6 +19,7 @@ from pipeline.errors import EmptyInputError, InconsistentInputError, SettingsErr
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.readable import Readable
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
+from pipeline.io.strays import thinned, typical_bounds
 from pipeline.model import FloatArray
 
 COLUMN_NAMES = {
@@ -225,8 +226,10 @@ class AsciiFile:
     def _measure(self, sample: FloatArray) -> FileFacts:
         """Count and bounds by a pass over the file; classes and times from the sample."""
         low, high, count, has_returns = np.full(3, np.inf), np.full(3, -np.inf), 0, False
+        places = []
         for piece in self.records(100_000, None):
             count += len(piece)
+            places.append(thinned(piece.xyz))
             low, high = np.minimum(low, piece.xyz.min(axis=0)), np.maximum(high, piece.xyz.max(axis=0))
             has_returns = has_returns or (piece.return_count is not None and bool((piece.return_count > 1).any()))
         if count == 0:
@@ -255,6 +258,7 @@ class AsciiFile:
             has_gps_time=kind is not GpsTimeKind.NONE,
             gps_time_kind=kind,
             gps_time_range=None if kind is GpsTimeKind.NONE else times,
+            typical_bounds=typical_bounds(places),
             warnings=warnings,
         )
 

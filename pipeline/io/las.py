@@ -23,6 +23,7 @@ from pipeline.io.las_header import REWRITE, header_crs, read_header_block
 from pipeline.io.laz_chunks import CHUNK_SIZE_LIMIT, ChunkTable, check_chunks, read_chunk_table
 from pipeline.io.readable import Readable
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
+from pipeline.io.strays import typical_bounds
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -281,6 +282,7 @@ class LasFile:
             has_gps_time=kind is not GpsTimeKind.NONE,
             gps_time_kind=kind,
             gps_time_range=None if kind is GpsTimeKind.NONE else time_range,
+            typical_bounds=typical_bounds([sample.xyz]),
             created=header.creation_date,
             warnings=tuple(self._warnings),
         )

@@ -18,6 +18,7 @@ from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableI
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.readable import Readable
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
+from pipeline.io.strays import thinned, typical_bounds
 
 SCALARS = {
     "char": "i1",
@@ -217,8 +218,10 @@ class PlyFile:
         """Bounds, returns, classes and times by a pass over the vertices."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         earliest, latest, classified, has_returns = np.inf, -np.inf, False, False
+        sample = []
         for piece in self.records(100_000, None):
             low, high = np.minimum(low, piece.xyz.min(axis=0)), np.maximum(high, piece.xyz.max(axis=0))
+            sample.append(thinned(piece.xyz))
             if piece.gps_time is not None:
                 earliest, latest = min(earliest, piece.gps_time.min()), max(latest, piece.gps_time.max())
             if piece.classification is not None:
@@ -239,6 +242,7 @@ class PlyFile:
             has_gps_time=kind is not GpsTimeKind.NONE,
             gps_time_kind=kind,
             gps_time_range=None if kind is GpsTimeKind.NONE else times,
+            typical_bounds=typical_bounds(sample),
             warnings=self._precision_warnings(np.maximum(np.abs(low), np.abs(high))),
         )
 

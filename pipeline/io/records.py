@@ -92,6 +92,8 @@ class FileFacts:
     """Smallest and largest sampled GPS time, seconds as in the file."""
     created: dt.date | None = None
     """Day on which the file was made, which is not the day of the flight."""
+    typical_bounds: tuple[float, float, float, float, float, float] | None = None
+    """As `bounds`, of nearly all sampled points: single far points do not widen them; None if unknown."""
     warnings: tuple[str, ...] = ()
     """What is odd but usable, one sentence each."""
 

@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import shapely
 
-from pipeline.errors import CrsError, SettingsError
+from pipeline.errors import CrsError, InconsistentInputError, SettingsError
+from pipeline.io.area_of_use import Location, location_of
 from pipeline.io.crs import SpatialReference, resolve_reference
 from pipeline.io.formats import recognise_format
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.io.readable import Readable
 from pipeline.io.records import FileFacts, PointFile, PointRecords, Window
 from pipeline.io.remote_file import file_at
+from pipeline.io.strays import MOST_STRAYS, off_earth, without_strays
 from pipeline.model import BoolArray, ByteArray, FloatArray, PointCloud
 
 if TYPE_CHECKING:
@@ -96,7 +98,8 @@ class SourceInfo:
     point_count: int
     """Points in the file, before anything is dropped."""
     bounds_m: tuple[float, float, float, float, float, float]
-    """x_min, y_min, z_min, x_max, y_max, z_max in metres of the CRS: from the header, or measured where it has none."""
+    """x_min, y_min, z_min, x_max, y_max, z_max in metres of the CRS: from the header, or measured where it has none;
+    single far points do not widen them."""
     reference: SpatialReference
     """CRS and units."""
     density_per_m2: float
@@ -123,6 +126,15 @@ class SourceInfo:
     """When the file was last written, nanoseconds since 1970."""
     facts: FileFacts
     """What the file says about itself."""
+
+    @property
+    def location(self) -> Location | None:
+        """The place on Earth; None without a CRS, or for one without such places."""
+        if self.reference.wkt is None:
+            return None
+        unit = self.reference.horizontal_unit_m
+        x_min, y_min, _, x_max, y_max, _ = self.bounds_m
+        return location_of(self.reference.wkt, (x_min / unit, y_min / unit, x_max / unit, y_max / unit))
 
     def is_of(self, path: Readable) -> bool:
         """Whether a file is still the one that was looked at, by its size and its time."""
@@ -182,7 +194,8 @@ class Source:
             known = None
         self._file = READERS[recognise_format(path)](path, options, None if known is None else known.facts)
         self._info = _info_of(path, self._file, options) if known is None else known
-        self._dropped = dict.fromkeys(("withheld", "noise_class", "outside"), 0)
+        self._dropped = dict.fromkeys(("withheld", "noise_class", "outside", "off_earth"), 0)
+        self._first_off_earth: list[float] = []
         self._warnings: list[str] = []
 
     @property
@@ -192,7 +205,7 @@ class Source:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Points left out by the last pass of `chunks`, by cause: outside, then withheld, then noise_class."""
+        """Points left out by the last pass of `chunks`, by cause: outside, then off_earth, withheld, noise_class."""
         return dict(self._dropped)
 
     @property
@@ -204,7 +217,8 @@ class Source:
         """The wanted points in metres, in the file's order (COPC with a window: in the octree's), in pieces.
 
         A piece has at least one and at most `chunk_size` points, which bounds the memory. Raises UnreadableInputError
-        if the data end or break before the promised count, InconsistentInputError if a coordinate is NaN or infinite.
+        if the data end or break before the promised count, InconsistentInputError if a coordinate is NaN or infinite,
+        or if more than single points are no place on Earth.
         """
         if chunk_size < 1:
             raise SettingsError([f"chunk_size is {chunk_size}: use 1 or more"])
@@ -228,6 +242,17 @@ class Source:
         self._dropped["outside"] += self._info.point_count - n_read
         if n_beyond:
             self._warnings.append(f"{n_beyond} points lie outside the bounds in the header")
+        if self._dropped["off_earth"]:
+            self._judge_off_earth(n_read)
+
+    def _judge_off_earth(self, n_read: int) -> None:
+        """Warn of single points that are no place on Earth; refuse a file with many of them."""
+        count = self._dropped["off_earth"]
+        x, y, z = self._first_off_earth
+        problem = f"{count} of {n_read} points are no place on Earth, such as x {x:.10g}, y {y:.10g}, z {z:.10g}"
+        if count > max(1, MOST_STRAYS * n_read):
+            raise InconsistentInputError(str(self._path), problem, "Check the columns, the scale and the units")
+        self._warnings.append(f"{problem}: left out")
 
     @property
     def file(self) -> PointFile:
@@ -269,6 +294,13 @@ class Source:
                 inside = np.flatnonzero(keep)
                 keep[inside] = shapely.intersects_xy(options.aoi, records.xyz[inside, 0], records.xyz[inside, 1])
             self._dropped["outside"] += int(len(keep) - keep.sum())
+        stray = off_earth(records.xyz, self._factors) if len(records) else None
+        if stray is not None:
+            stray &= keep
+            self._dropped["off_earth"] += int(stray.sum())
+            if stray.any() and not self._first_off_earth:
+                self._first_off_earth = records.xyz[np.argmax(stray)].tolist()
+            keep &= ~stray
         if records.withheld is not None and not options.keep_withheld:
             self._dropped["withheld"] += int((keep & records.withheld).sum())
             keep &= ~records.withheld
@@ -327,9 +359,12 @@ def _info_of(path: Readable, file: PointFile, options: ReadOptions) -> SourceInf
     )
     _refuse_degrees(path, facts, reference)
     plan, up = reference.horizontal_unit_m, reference.vertical_unit_m
-    x_min, y_min, z_min, x_max, y_max, z_max = facts.bounds
+    bounds, strays = without_strays(facts.bounds, facts.typical_bounds, np.array([plan, plan, up]))
+    x_min, y_min, z_min, x_max, y_max, z_max = bounds
     bounds_m = (x_min * plan, y_min * plan, z_min * up, x_max * plan, y_max * plan, z_max * up)
-    area_m2 = (bounds_m[3] - bounds_m[0]) * (bounds_m[4] - bounds_m[1])
+    # spoiled bounds are cut with a wide margin, which holds no points
+    filled = facts.typical_bounds if strays and facts.typical_bounds is not None else bounds
+    area_m2 = (filled[3] - filled[0]) * (filled[4] - filled[1]) * plan * plan
     acquired, now = None, path.stat()
     if facts.gps_time_kind is GpsTimeKind.ADJUSTED and facts.gps_time_range is not None:
         acquired = utc_of(facts.gps_time_range[0]), utc_of(facts.gps_time_range[1])
@@ -347,7 +382,7 @@ def _info_of(path: Readable, file: PointFile, options: ReadOptions) -> SourceInf
         acquired_from=acquired[0] if acquired else None,
         acquired_to=acquired[1] if acquired else None,
         created=facts.created,
-        warnings=facts.warnings + warnings,
+        warnings=facts.warnings + warnings + strays,
         file_size=now.st_size,
         modified_ns=now.st_mtime_ns,
         facts=facts,

@@ -72,6 +72,8 @@ class ClassifyRequest:
     """Overrides the CRS in the headers, and is written."""
     vertical_unit: str | None = None
     """Overrides the vertical unit in the headers."""
+    allow_outside_area_of_use: bool = False
+    """Accept inputs that lie far outside the area of use of their CRS."""
     rasters: bool = False
     """Also write rasters of terrain, surface and height."""
     raster_cell: float | None = None
@@ -141,6 +143,7 @@ def classify(
         settings=request.settings,
         crs=request.crs,
         vertical_unit=request.vertical_unit,
+        allow_outside_area_of_use=request.allow_outside_area_of_use,
     )
     plan, paths = plan_inputs(run_request, progress)
     for path in paths:

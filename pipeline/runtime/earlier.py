@@ -135,6 +135,7 @@ def request_of(manifest: RunManifest) -> RunRequest:
         footprints=asked["footprints"],
         crs=asked["crs"],
         vertical_unit=asked["vertical_unit"],
+        allow_outside_area_of_use=True,  # decided by the run itself
         bbox=None if asked["bbox"] is None else tuple(asked["bbox"]),
         aoi=asked["aoi"],
         meshes=asked["meshes"],

@@ -9,9 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import shapely
 
-from pipeline.errors import CrsError, EmptyInputError, InputError, all_at_fault
+from pipeline.errors import CrsError, EmptyInputError, InconsistentInputError, InputError, all_at_fault
 from pipeline.io import ReadOptions, SourceInfo, SpatialReference, is_url, open_source, shown
+from pipeline.io.area_of_use import refuse_far_outside
 from pipeline.io.gps_time import GpsTimeKind
+from pipeline.io.source import IMPOSSIBLE_DENSITY
 from pipeline.runtime.cluster.memory_needs import WINDOW_BASE_BYTES
 from pipeline.settings import RunSettings
 from pipeline.terrain.scene_settings import ClassesInUse
@@ -145,6 +147,18 @@ def _looked_at(paths: Sequence[str], options: ReadOptions) -> tuple[SourceInfo, 
         return tuple(threads.map(look, paths))
 
 
+def check_places(plan: Plan) -> None:
+    """Refuse inputs that would lie far outside the area of use of their CRS; raises CrsError."""
+    faults: list[InputError] = []
+    for info in plan.sources:
+        try:
+            refuse_far_outside(info.path, info.location)
+        except CrsError as fault:
+            faults.append(fault)
+    if faults:
+        raise all_at_fault(faults)
+
+
 def without_far_files(plan: Plan, paths: Sequence[str]) -> tuple[Plan, list[str]]:
     """The plan and paths without remote files that lie off --bbox and --aoi by their headers: no need to fetch them.
 
@@ -177,6 +191,15 @@ def check_memory(plan: Plan, limit_bytes: int | None) -> None:
     """Refuse a plan whose largest task does not fit into a worker with this memory limit, before the first task."""
     if limit_bytes is None or plan.window_bytes <= limit_bytes:
         return
+    densest = max(plan.sources, key=lambda info: info.density_per_m2 if math.isfinite(info.density_per_m2) else 0.0)
+    if densest.density_per_m2 > IMPOSSIBLE_DENSITY:
+        x_min, y_min, _, x_max, y_max, _ = densest.bounds_m
+        raise InconsistentInputError(
+            densest.path,
+            f"its {densest.point_count} points lie within {x_max - x_min:.3g} by {y_max - y_min:.3g} m, denser than "
+            "any airborne survey",
+            "Check the columns, the scale and the CRS: degrees are not lengths",
+        )
     raise InputError(
         plan.sources[0].path,
         f"a tile of {plan.grid.size_mm / MM:g} m needs about {plan.window_bytes / 1e9:.1f} GB a worker, "

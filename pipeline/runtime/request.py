@@ -14,7 +14,7 @@ from pipeline.io.remote_file import on_this_machine
 from pipeline.io.tile_index import TileIndex
 from pipeline.runtime.manifest import InputFile
 from pipeline.runtime.monitoring.progress import Progress
-from pipeline.runtime.plan import Plan, make_plan, without_far_files
+from pipeline.runtime.plan import Plan, check_places, make_plan, without_far_files
 from pipeline.runtime.resources import Resources
 from pipeline.settings import RunSettings
 
@@ -39,6 +39,8 @@ class RunRequest:
     """Overrides the CRS in the headers."""
     vertical_unit: str | None = None
     """Overrides the vertical unit in the headers."""
+    allow_outside_area_of_use: bool = False
+    """Accept inputs that lie far outside the area of use of their CRS."""
     bbox: tuple[float, float, float, float] | None = None
     """x_min, y_min, x_max, y_max in the CRS's units."""
     aoi: str | None = None
@@ -78,7 +80,10 @@ def plan_inputs(request: RunRequest, progress: Progress) -> tuple[Plan, list[str
     if request.aoi is not None:
         reference = open_source(paths[0], options).info.reference
         options = dataclasses.replace(options, aoi=read_area(request.aoi, reference))
-    plan, paths = without_far_files(make_plan(paths, options, request.settings), paths)
+    plan = make_plan(paths, options, request.settings)
+    if not request.allow_outside_area_of_use:
+        check_places(plan)
+    plan, paths = without_far_files(plan, paths)
     for warning in plan.warnings:
         progress.warn("plan", warning)
     if not any(info.has_returns for info in plan.sources):

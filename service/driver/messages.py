@@ -1,4 +1,4 @@
-"""Sentences for clients: the result of a run, and messages without the paths of this machine."""
+"""Sentences for clients: the result of a run, and messages without paths of this machine or options of commands."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import re
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
+
+from service.wording import as_inputs
 
 if TYPE_CHECKING:
     from pipeline.runtime.classify import ClassifySummary
@@ -20,7 +22,7 @@ _WARNINGS = 100
 
 
 class Scrubber:
-    """Removes the paths of this machine and the addresses of the cluster from messages.
+    """Removes the paths of this machine and the addresses of the cluster from messages, and names inputs for options.
 
     Parameters
     ----------
@@ -43,10 +45,12 @@ class Scrubber:
         'tile 1.laz: 12 m/s at https://host/a/b, see run.json'
         >>> scrub("the scheduler tcp://10.0.0.7:8786 was lost: start it")
         'the scheduler was lost: start it'
+        >>> scrub("/state/uploads/0a/b.laz: no CRS. Give --crs EPSG:n")
+        'b.laz: no CRS. Give the input crs'
         """
         for path in sorted(self._names, key=len, reverse=True):
             message = message.replace(path, self._names[path])
-        return _ABSOLUTE.sub(lambda found: found[1] or "…", _ADDRESS.sub("", message))
+        return as_inputs(_ABSOLUTE.sub(lambda found: found[1] or "…", _ADDRESS.sub("", message)))
 
 
 def outcome(summary: RunSummary) -> str:

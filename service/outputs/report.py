@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from service.outputs.catalogue import ResultsCrs
+from service.wording import as_inputs
 
 FORMAT = 1
 """Version of the report's layout."""
@@ -132,7 +133,7 @@ def _without(entry: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def cleaner(paths: Sequence[str], run_dir: Path) -> Callable[[str], str]:
-    """A function that removes the server's folders from a text: only file names remain."""
+    """A function that removes the server's folders from a text, where only file names remain, and names inputs."""
     folders = {str(Path(path).parent) for path in paths} | {str(run_dir), str(run_dir.resolve())}
     # longest first: otherwise the end of a subfolder would remain
     ordered = sorted((folder for folder in folders if folder not in ("/", ".")), key=len, reverse=True)
@@ -140,6 +141,6 @@ def cleaner(paths: Sequence[str], run_dir: Path) -> Callable[[str], str]:
     def clean(text: str) -> str:
         for folder in ordered:
             text = text.replace(f"{folder}/", "").replace(folder, "the run")
-        return text
+        return as_inputs(text)
 
     return clean

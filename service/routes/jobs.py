@@ -129,8 +129,8 @@ def _words(text: str) -> list[str]:
 
 
 def _value(name: str, text: str, faults: list[str]) -> Any:
-    """A field's value: settings are JSON, a rectangle and a priority are numbers, anything else is text."""
-    if name not in {"settings", "bbox", "priority"}:
+    """A field's value: settings, numbers and permissions (true, false) are JSON, anything else is text."""
+    if name not in {"settings", "bbox", "priority", "allowOutsideAreaOfUse"}:
         return text.strip()
     if name == "bbox" and not text.strip().startswith(("[", "{")):
         text = f"[{text}]"

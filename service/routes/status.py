@@ -96,6 +96,7 @@ def execute_request(request: JobRequest, base: str, priority: int) -> Execute:
         "footprints": None if request.footprints is None else reference(request.footprints),
         "crs": request.crs,
         "verticalUnit": request.vertical_unit,
+        "allowOutsideAreaOfUse": request.allow_outside_area_of_use or None,
         "bbox": None if request.bbox is None else list(request.bbox),
         "methods": list(request.methods) or None,
         "settings": dict(request.settings) or None,

@@ -143,6 +143,11 @@ class Inputs(Request):
     verticalUnit: Annotated[str, OneOf(*UNITS_M)] | None = Field(
         None, title="Vertical unit", description="Unit of elevations, if the header has none or a wrong one."
     )
+    allowOutsideAreaOfUse: bool = Field(
+        False,
+        title="Allow places outside the area of use",
+        description="Accept tiles that lie far outside the area of use of their CRS, which mostly means a wrong CRS.",
+    )
     classes: Annotated[str, OneOf(*choices("classes"))] | None = _word(
         "classes", "Classes", "How far the file's own classes are trusted."
     )
@@ -175,6 +180,7 @@ class Inputs(Request):
             "process_id": process_id,
             "crs": self.crs,
             "vertical_unit": self.verticalUnit,
+            "allow_outside_area_of_use": self.allowOutsideAreaOfUse,
             "title": self.title,
             "outputs": outputs,
             **self.of_process(),

@@ -89,6 +89,7 @@ class JobForm(Answer):
     footprints: File | None = Field(None, description="Building outlines, as a file or an href.")
     crs: str | None = None
     verticalUnit: str | None = None
+    allowOutsideAreaOfUse: bool | None = None
     bbox: str | None = Field(None, description="x_min,y_min,x_max,y_max in the tiles' CRS.")
     method: str | None = None
     preset: str | None = Field(None, description="Starting point of the method's settings.")

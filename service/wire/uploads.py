@@ -16,6 +16,23 @@ class Crs(Answer):
     epsg: int | None
 
 
+class Place(Answer):
+    """A place on Earth, WGS 84, in degrees."""
+
+    longitude: float
+    latitude: float
+
+
+class AreaOfUse(Answer):
+    """The area for which a CRS is made; it crosses the antimeridian if west is larger than east."""
+
+    name: str
+    west: float
+    south: float
+    east: float
+    north: float
+
+
 def _nullable(schema: dict[str, Any]) -> None:
     """Describe members that may be absent or null."""
     for found in schema["properties"].values():
@@ -39,6 +56,11 @@ class Preflight(BaseModel):
     verticalUnitM: float | None = None
     bounds: list[float] | None = Field(
         None, description="x_min, y_min, z_min, x_max, y_max, z_max in the units of the CRS."
+    )
+    place: Place | None = Field(None, description="Place of the middle of the bounds.")
+    areaOfUse: AreaOfUse | None = Field(None, description="Area of use of the CRS.")
+    outsideAreaOfUse: str | None = Field(
+        None, description="Why a job needs allowOutsideAreaOfUse; null if it does not. Also one of the problems."
     )
     densityPerM2: float | None = None
     hasReturns: bool | None = None

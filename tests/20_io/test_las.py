@@ -67,11 +67,11 @@ def test_withheld_points_and_noise_are_dropped_and_counted(tmp_path, points, wri
     )
     source = open_source(path)
     assert sum(map(len, source.chunks(33))) == 400 - 200 - 10
-    assert source.dropped == {"withheld": 20, "noise_class": 190, "outside": 0}
+    assert source.dropped == {"withheld": 20, "noise_class": 190, "outside": 0, "off_earth": 0}
     everything = ReadOptions(keep_withheld=True, drop_classes=())
     source = open_source(path, everything)
     assert sum(map(len, source.chunks())) == 400
-    assert source.dropped == {"withheld": 0, "noise_class": 0, "outside": 0}
+    assert source.dropped == {"withheld": 0, "noise_class": 0, "outside": 0, "off_earth": 0}
 
 
 def test_the_old_withheld_bit_is_heeded_too(tmp_path, points, write_las):

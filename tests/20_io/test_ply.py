@@ -62,7 +62,7 @@ def test_every_encoding_gives_the_same_points(tmp_path, points, encoding, with_o
     xyz = np.concatenate([piece.xyz for piece in pieces])
     kept = rows[np.arange(500) % 10 != 0]
     np.testing.assert_array_equal(xyz, np.column_stack([kept["x"], kept["y"], kept["z"].astype(np.float64)]))
-    assert source.dropped == {"withheld": 0, "noise_class": 50, "outside": 0}
+    assert source.dropped == {"withheld": 0, "noise_class": 50, "outside": 0, "off_earth": 0}
     assert max(map(len, pieces)) <= 70
     info = source.info
     assert (info.format, info.point_count, info.has_classes, info.has_returns) == ("ply", 500, True, False)

@@ -7,13 +7,11 @@ import laspy
 import numpy as np
 import pytest
 
-from pipeline.errors import InconsistentInputError
 from pipeline.io import ReadOptions
 from pipeline.io.las import LasFile
 from pipeline.io.records import PointRecords
-from pipeline.model import PointCloud
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages.ingest import IngestTask, ingest_file, to_records
+from pipeline.runtime.stages.ingest import IngestTask, ingest_file
 from pipeline.runtime.stages.ingested import spread_m
 from pipeline.tiling import TileGrid
 
@@ -74,20 +72,6 @@ def test_a_town_has_the_spread_that_numpy_finds(suburb: Path, tmp_path: Path) ->
     assert spread_m([found]) == pytest.approx(np.sqrt(np.linalg.eigvalsh(covariance)[0]), rel=1e-6)
 
 
-def test_an_elevation_beyond_32_bits_of_millimetres_is_refused() -> None:
-    n = 2
-    cloud = PointCloud(
-        xyz=np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 3e6]]),
-        return_number=np.ones(n, np.uint8),
-        return_count=np.ones(n, np.uint8),
-        classification=np.zeros(n, np.uint8),
-        gps_time=np.zeros(n),
-        source_id=np.zeros(n, np.uint16),
-    )
-    with pytest.raises(InconsistentInputError, match="elevation 3e\\+06 m"):
-        to_records(cloud, "tile.las")
-
-
 def test_many_tiles_in_a_chunk_are_sorted_apart_as_few_are(
     suburb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,3 +94,15 @@ def test_a_run_samples_each_file_once(suburb: Path, reconstruct: Any, monkeypatc
     monkeypatch.setattr(LasFile, "_sample", counted)
     reconstruct(suburb)
     assert len(sampled) == 1
+
+
+@pytest.mark.parametrize("stray", [(1e12, 5_934_000.0, 90.0), (5e7, 5_934_000.0, 90.0), (565_010.0, 5_934_000.0, 1e12)])
+@pytest.mark.parametrize("place", [0, 500])
+def test_one_stray_point_does_not_put_all_points_on_one_line(
+    tmp_path: Path, stray: tuple[float, float, float], place: int
+) -> None:
+    xyz = np.random.default_rng(2).uniform((565_000.0, 5_934_000.0, 60.0), (565_030.0, 5_934_030.0, 90.0), (2000, 3))
+    np.savetxt(tmp_path / "a.xyz", np.insert(xyz, place, stray, axis=0), fmt="%.3f")
+    found = ingest_file(task(tmp_path / "a.xyz", tmp_path / "scratch"))
+    assert spread_m([found]) > 5.0
+    assert sum(found.points_by_tile.values()) == 2000 + (stray[0] == 5e7)

@@ -1,5 +1,6 @@
 """What a plan says of inputs that cannot be used: of all of them, not of the first alone."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,9 +9,11 @@ import numpy as np
 import pyproj
 import pytest
 
-from pipeline.errors import CrsError, InputError, UnreadableInputError
+from pipeline.errors import CrsError, InconsistentInputError, InputError, UnreadableInputError
 from pipeline.io import ReadOptions
-from pipeline.runtime.plan import make_plan
+from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.plan import check_memory, make_plan
+from pipeline.runtime.request import RunRequest, plan_inputs
 from pipeline.settings import RunSettings
 
 
@@ -58,3 +61,22 @@ def test_inputs_of_another_crs_are_named_together(tmp_path: Path) -> None:
     assert type(fault) is CrsError
     assert fault.path == paths[1]
     assert f"{paths[2]}: its CRS is ETRS89 / UTM zone 34N" in str(fault)
+
+
+def test_inputs_far_outside_the_area_of_use_of_their_crs_are_refused_together_unless_allowed(tmp_path: Path) -> None:
+    paths = [_file(tmp_path / f"{name}.laz", "EPSG:28992") for name in "ab"]
+    request = RunRequest(inputs=tuple(paths), out=str(tmp_path / "run"))
+    with pytest.raises(CrsError, match="in EPSG:28992") as refused:
+        plan_inputs(request, Progress(lambda _: None))
+    assert f"1 more input cannot be used: {paths[1]}: in EPSG:28992" in str(refused.value)
+    allowed = dataclasses.replace(request, allow_outside_area_of_use=True)
+    assert plan_inputs(allowed, Progress(lambda _: None))[1] == paths
+
+
+def test_a_plan_that_is_denser_than_any_survey_names_the_extent_and_no_absurd_memory(tmp_path: Path) -> None:
+    xyz = np.random.default_rng(1).uniform(0.0, 1.0, (1000, 3)) * [1e-5, 1e-5, 9.0] + [84_000.0, 447_000.0, 0.0]
+    np.savetxt(tmp_path / "a.xyz", xyz, fmt="%.8f")
+    plan = make_plan([str(tmp_path / "a.xyz")], ReadOptions(), RunSettings())
+    with pytest.raises(InconsistentInputError, match=r"its 1000 points lie within 1e-05 by 9.98e-06 m") as refused:
+        check_memory(plan, 4 << 30)
+    assert "GB" not in str(refused.value)

@@ -198,8 +198,8 @@ def test_feet_give_the_buildings_of_metres(tmp_path: Path, suburb: Path, reconst
     xyz = np.column_stack((las.x - 450000, las.y - 5500000, las.z))
     np.savetxt(tmp_path / "metres.xyz", xyz, fmt="%.3f")
     np.savetxt(tmp_path / "feet.xyz", xyz / 0.3048, fmt="%.5f")
-    metres = reconstruct(tmp_path / "metres.xyz", crs="EPSG:25832")
-    feet = reconstruct(tmp_path / "feet.xyz", crs="EPSG:2994")
+    metres = reconstruct(tmp_path / "metres.xyz", crs="EPSG:25832", allow_outside_area_of_use=True)
+    feet = reconstruct(tmp_path / "feet.xyz", crs="EPSG:2994", allow_outside_area_of_use=True)
     assert feet.statuses == metres.statuses
     height = {r["building_id"]: r for r in rows(metres.run_dir)}
     areas = sorted(row["footprint_area_m2"] for row in height.values())

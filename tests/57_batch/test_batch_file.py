@@ -49,6 +49,7 @@ def test_all_that_can_be_said_reaches_the_engine(tmp_path: Path) -> None:
     paths = ["a.laz", "b"]
     crs = "EPSG:28992"
     vertical_unit = "m"
+    allow_outside_area_of_use = true
     footprints = "f.gpkg"
     overrides = "o.toml"
     aoi = "aoi.geojson"
@@ -73,6 +74,7 @@ def test_all_that_can_be_said_reaches_the_engine(tmp_path: Path) -> None:
     assert request.aoi == str(tmp_path / "aoi.geojson")
     assert request.overrides == str(tmp_path / "o.toml")
     assert (request.crs, request.vertical_unit, request.licence) == ("EPSG:28992", "m", "CC0")
+    assert request.allow_outside_area_of_use
     assert request.settings.general.method == "kmeans"
     assert request.settings.scene.candidates.min_area_m2 == 20.0
     resources = request.resources

@@ -298,7 +298,7 @@ def test_what_is_odd_in_every_input_is_reported_once(folder: Path, tmp_path: Pat
     for name in ("a.laz", "b.laz", "c.laz"):
         shutil.copy(laz, tmp_path / name)
     file = tmp_path / "city.toml"
-    file.write_text('[inputs]\npaths = ["*.laz"]\ncrs = "EPSG:28992"\n[output]\npath = "models"\n')
+    file.write_text('[inputs]\npaths = ["*.laz"]\ncrs = "EPSG:25833"\n[output]\npath = "models"\n')
     reported = json.loads(call("plan", file, "--json")[1])["warnings"]
     assert reported
     assert all(text.startswith(f"{tmp_path}/a.laz and 2 more inputs: ") for text in reported)

@@ -28,7 +28,7 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_file_comes_back_with_classes_and_rasters(house: Path, tmp_path: Path) -> None:
     words = (str(house), "--out", str(tmp_path / "out"), "--workers", "0", "--rasters", "--json")
-    code, out, _ = invoke("classify", *words, "--crs", "EPSG:7415", "--raster-cell", "1")
+    code, out, _ = invoke("classify", *words, "--crs", "EPSG:7415", "--allow-outside-area-of-use", "--raster-cell", "1")
     assert code == 0
     reported = json.loads(out)
     las = laspy.read(reported["files"][0]["path"])

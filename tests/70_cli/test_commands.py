@@ -97,6 +97,45 @@ def test_inspect_says_what_a_tile_holds(tmp_path: Path) -> None:
     assert "EPSG:28992" in said
 
 
+@pytest.mark.parametrize("command", ["reconstruct", "classify"])
+def test_a_tile_far_outside_the_area_of_its_crs_is_refused_with_place_area_and_fix(
+    tmp_path: Path, command: str
+) -> None:
+    out = tmp_path / "out"
+    words = (command, str(ascii_tile(tmp_path)), "--crs", "EPSG:2193", "--out", str(out), "--workers", "0")
+    code, _, said = invoke(*words)
+    assert code == 3
+    plain = " ".join(said.split())
+    for part in ("EPSG:2193", "New Zealand", "° S", "--crs EPSG:n", "--allow-outside-area-of-use"):
+        assert part in plain
+    assert not list(out.glob("*"))
+    assert invoke(*words, "--allow-outside-area-of-use")[0] == 0
+
+
+def test_a_batch_names_its_key_for_a_tile_far_outside(tmp_path: Path) -> None:
+    ascii_tile(tmp_path)
+    text = '[inputs]\npaths = ["tile.xyz"]\ncrs = "EPSG:2193"\n{}[output]\npath = "models"\n[cluster]\nworkers = 0\n'
+    (tmp_path / "city.toml").write_text(text.format(""))
+    code, _, said = invoke("batch", "plan", str(tmp_path / "city.toml"))
+    assert code == 3
+    assert "[inputs] allow_outside_area_of_use = true" in " ".join(said.split())
+    (tmp_path / "city.toml").write_text(text.format("allow_outside_area_of_use = true\n"))
+    assert invoke("batch", "plan", str(tmp_path / "city.toml"))[0] == 0
+
+
+def test_inspect_shows_the_place_and_warns_of_one_that_a_run_refuses(tmp_path: Path) -> None:
+    code, said, warned = invoke("inspect", str(ascii_tile(tmp_path)), "--crs", "EPSG:2193", "--json")
+    found = json.loads(said)
+    assert code == 0
+    longitude, latitude = found["location"]["longitude_latitude"]
+    assert (longitude, latitude) == pytest.approx((83.0, -75.8), abs=0.1)
+    assert found["location"]["area"]["name"].startswith("New Zealand")
+    assert any("--allow-outside-area-of-use" in warning for warning in found["warnings"])
+    assert "--allow-outside-area-of-use" in warned
+    near = json.loads(invoke("inspect", str(ascii_tile(tmp_path)), "--json")[1])
+    assert near["location"] is None
+
+
 def test_inspect_counts_the_raised_box_for_machines(tmp_path: Path) -> None:
     code, said, events = invoke("inspect", str(ascii_tile(tmp_path)), "--json")
     found = json.loads(said)

@@ -12,6 +12,7 @@ import jsonschema
 import pyarrow.parquet as pq
 import pytest
 from driver_bench import Bench
+from live_service import POINTS
 from starlette.testclient import TestClient
 
 from pipeline.errors import ClusterError, SettingsError
@@ -123,7 +124,7 @@ def test_outputs_are_those_of_the_process(local_service) -> None:
 
 
 def send_form(service, **fields: object):
-    files = {"tile": ("a.xyz", b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(9) for y in range(9)))}
+    files = {"tile": ("a.xyz", POINTS)}
     return service.client.post("/jobs", files=files, data={"crs": "EPSG:28992", **fields})
 
 

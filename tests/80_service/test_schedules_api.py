@@ -222,10 +222,10 @@ def test_the_request_of_a_schedule_is_changed_as_a_whole_and_its_old_upload_may_
     made = make(local_service)
     old = made["execute"]["inputs"]["tiles"][0]["href"].rpartition("/")[2]
     new = local_service.upload()
-    execute = {"inputs": {"tiles": [{"href": f"/uploads/{new}"}], "crs": "EPSG:25832"}}
+    execute = {"inputs": {"tiles": [{"href": f"/uploads/{new}"}], "crs": "EPSG:7415"}}
     answer = patch(local_service, made, execute=execute)
     assert answer.status_code == 200, answer.text
-    assert answer.json()["execute"]["inputs"]["crs"] == "EPSG:25832"
+    assert answer.json()["execute"]["inputs"]["crs"] == "EPSG:7415"
     assert "outputs" not in answer.json()["execute"]
     assert local_service.client.delete(f"/uploads/{old}").status_code == 204
     assert local_service.client.delete(f"/uploads/{new}").status_code == 409

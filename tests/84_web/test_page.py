@@ -321,7 +321,7 @@ def test_a_key_is_asked_for_kept_for_the_tab_and_never_put_into_an_address(
     opened = visit(url)
     opened.expect_error("status of 401")
     page = opened.page
-    field = page.get_by_label("Bearer key")
+    field = page.get_by_label("Your key")
     expect(field).to_be_visible()
     field.fill(key)
     page.get_by_role("button", name="Use this key").click()

@@ -33,7 +33,6 @@ _CHUNK_POINTS = 250_000
 """Points per chunk: few enough that numpy uses the same memory again for each chunk."""
 _LINE_SPREAD_M = 0.05
 """Points that stray less from one line make no surface. Not a setting: the noise of a scanner is of this size."""
-_MAX_MM = 2**31 - 2
 _TWO_BYTES = 2**16
 
 
@@ -112,14 +111,8 @@ def part_of(path: str) -> str:
     return hashlib.sha256(path.encode()).hexdigest()[:16]
 
 
-def to_records(cloud: PointCloud, path: str) -> npt.NDArray[np.void]:
-    """Points in whole millimetres.
-
-    Raises InconsistentInputError if an elevation is beyond what whole millimetres of 32 bits hold (2,147 km).
-    """
-    if np.abs(cloud.xyz[:, 2]).max(initial=0.0) * MM > _MAX_MM:
-        worst = float(cloud.xyz[np.abs(cloud.xyz[:, 2]).argmax(), 2])
-        raise InconsistentInputError(path, f"a point has elevation {worst:g} m", "Check the vertical unit and scale")
+def to_records(cloud: PointCloud) -> npt.NDArray[np.void]:
+    """Points in whole millimetres; sources leave out those that 32 bits would not hold (`pipeline.io.strays`)."""
     records = np.empty(len(cloud), POINT)
     rounded = np.rint(cloud.xyz * MM)
     records["x"] = rounded[:, 0]
@@ -172,7 +165,7 @@ def _ingested(task: IngestTask) -> Ingested:
     multiple = False
     for cloud in source.chunks(_CHUNK_POINTS):
         task.scratch.check_cancelled()
-        records = to_records(cloud, task.path)
+        records = to_records(cloud)
         x, y, z = (np.ascontiguousarray(records[name]) for name in "xyz")
         for axis, values in enumerate((x, y, z)):
             low[axis] = min(low[axis], int(values.min()))

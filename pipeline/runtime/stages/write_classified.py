@@ -123,7 +123,7 @@ class _Labels:
         labels = np.full(len(kept), KEEP, np.uint8)
         if len(cloud) == 0:
             return labels
-        records = to_records(cloud, self._task.path)
+        records = to_records(cloud)
         columns, rows = self._task.grid.columns_rows(records["x"], records["y"])
         places = np.column_stack((columns, rows))
         # points of one tile mostly come in runs

@@ -12,6 +12,8 @@ export class Problem extends Error {
     readonly detail: string,
     /** What to do about it. */
     readonly remedy: string,
+    /** The kind of problem, the last part of its URN; empty if it has none. */
+    readonly kind = "",
   ) {
     super(detail === "" ? title : `${title}: ${detail}`);
   }
@@ -107,7 +109,7 @@ export function unreachable(): Problem {
 
 /** A problem from an answer; for another body the text of the status line. */
 export function problemOf(status: number, reason: string, body: string, retryAfter: string | null): Problem {
-  let document: { title?: unknown; detail?: unknown } = {};
+  let document: { type?: unknown; title?: unknown; detail?: unknown } = {};
   try {
     document = JSON.parse(body) as typeof document;
   } catch {
@@ -115,15 +117,19 @@ export function problemOf(status: number, reason: string, body: string, retryAft
   }
   const title = typeof document?.title === "string" ? document.title : reason || `Status ${status}`;
   const detail = typeof document?.detail === "string" ? document.detail : "";
-  return new Problem(status, title, detail, remedyOf(status, retryAfter));
+  const kind = typeof document?.type === "string" ? (document.type.split(":").at(-1) ?? "") : "";
+  // about keys, the service speaks to programmers and operators
+  if (kind === "unauthorized") return new Problem(status, "This service needs a key", "", remedyOf(status, retryAfter), kind);
+  if (kind === "forbidden") return new Problem(status, title, detail.split(": ")[0] ?? "", remedyOf(status, retryAfter), kind);
+  return new Problem(status, title, detail, remedyOf(status, retryAfter), kind);
 }
 
 function remedyOf(status: number, retryAfter: string | null): string {
   switch (status) {
     case 401:
-      return "Enter a key that this service knows. Its operator makes one with gablework keys create.";
+      return "Enter a valid key. The operator of this service gives you one.";
     case 403:
-      return "This key may not do that. Ask the service's operator for a key with the required scope.";
+      return "Your key may not do that. Ask the operator of this service for one that may.";
     case 404:
     case 410:
       return "It may have been removed. Reload the list of jobs.";

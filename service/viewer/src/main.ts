@@ -48,6 +48,9 @@ const dialog = byId<HTMLDialogElement>("key-dialog");
 
 function askForKey(problem: Problem | null): void {
   if (dialog.open) return;
+  if (problem !== null && currentKey() !== null) {
+    problem = new Problem(problem.status, "This key is not valid", "It may be mistyped or revoked.", problem.remedy);
+  }
   const field = el("input", {
     id: "key-field",
     type: "password",
@@ -61,9 +64,9 @@ function askForKey(problem: Problem | null): void {
     { method: "dialog" },
     el("h2", { id: "key-title" }, "Key of this service"),
     problem === null ? null : problemNotice(problem),
-    el("label", { for: "key-field" }, "Bearer key"),
+    el("label", { for: "key-field" }, "Your key"),
     field,
-    el("p", { class: "hint", id: "key-hint" }, "Stored in this tab until it is closed; sent as a header, never in an address."),
+    el("p", { class: "hint", id: "key-hint" }, "It begins with gw_. This tab forgets it when you close it."),
     el(
       "div",
       { class: "actions" },

@@ -1,5 +1,6 @@
 import { Problem } from "./api";
 import { el } from "./elements";
+import { inFields } from "./fields";
 
 /** An error as the service reported it, with the fix. */
 export function problemNotice(problem: Problem, again?: () => void): HTMLElement {
@@ -7,7 +8,7 @@ export function problemNotice(problem: Problem, again?: () => void): HTMLElement
     "div",
     { class: "notice notice-error", role: "alert" },
     el("strong", {}, problem.title),
-    problem.detail === "" ? null : el("p", {}, problem.detail),
+    problem.detail === "" ? null : el("p", {}, inFields(problem.detail)),
     problem.remedy === "" ? null : el("p", { class: "remedy" }, problem.remedy),
     again === undefined ? null : el("button", { type: "button", onclick: again }, "Try again"),
   );
@@ -15,10 +16,11 @@ export function problemNotice(problem: Problem, again?: () => void): HTMLElement
 
 /** A warning. */
 export function warningNotice(...messages: string[]): HTMLElement {
+  const words = messages.map(inFields);
   return el(
     "div",
     { class: "notice notice-warning" },
-    ...(messages.length === 1 ? messages.map((m) => el("p", {}, m)) : [el("ul", {}, ...messages.map((m) => el("li", {}, m)))]),
+    ...(words.length === 1 ? words.map((m) => el("p", {}, m)) : [el("ul", {}, ...words.map((m) => el("li", {}, m)))]),
   );
 }
 

@@ -46,3 +46,11 @@ export function ago(then: Date, now: Date): string {
   if (seconds < 86_400) return `${Math.floor(seconds / 3600)}${NARROW}h ago`;
   return then.toLocaleDateString(undefined, { day: "numeric", month: "short", year: "numeric" });
 }
+
+/** A place on Earth, latitude first; null if there is none. */
+export function placeWords(place: unknown): string | null {
+  const { longitude, latitude } = (place ?? {}) as { longitude?: unknown; latitude?: unknown };
+  if (typeof longitude !== "number" || typeof latitude !== "number") return null;
+  const degrees = (value: number, signs: string): string => `${Math.abs(value).toFixed(2)}°\u202f${signs[value < 0 ? 1 : 0]}`;
+  return `${degrees(latitude, "NS")}, ${degrees(longitude, "EW")}`;
+}

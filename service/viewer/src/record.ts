@@ -2,6 +2,7 @@ import { ofRun } from "./address";
 import { getJson, type Feature, type Problem } from "./api";
 import { downloadLink } from "./downloads";
 import { el, swatch } from "./elements";
+import { capital } from "./fields";
 import { asProblem, problemNotice, warningNotice } from "./notices";
 import { count, measure } from "./numbers";
 import { CATEGORIES, categoryOf } from "./roof_types";
@@ -197,8 +198,4 @@ function takeAway(meshPath: unknown, path: string, method: string | null, buildi
 
 function roofWord(category: string): string {
   return category === "fallback" || category === "failed" ? "" : " roof";
-}
-
-function capital(text: string): string {
-  return text.charAt(0).toUpperCase() + text.slice(1);
 }

@@ -1,9 +1,10 @@
 import { variantOf } from "./address";
 import { Problem, getJson, request, upload, type UploadInfo } from "./api";
 import { el, svg } from "./elements";
+import { LABELS, capital } from "./fields";
 import { levelWords, levelsOffered, lodsInput } from "./levels_of_detail";
 import { announce, asProblem, problemNotice, warningNotice } from "./notices";
-import { bytes, count, measure } from "./numbers";
+import { bytes, count, measure, placeWords } from "./numbers";
 
 const TILE_ENDINGS = ".las,.laz,.ply,.xyz,.txt,.csv,.asc,.pts";
 const FOOTPRINT_ENDINGS = ".gpkg,.geojson,.json,.parquet,.geoparquet";
@@ -32,6 +33,15 @@ export class Submission {
   private readonly note = el("div");
   private readonly go = el("button", { type: "submit", class: "primary wide" }, "Reconstruct");
   private readonly crs = el("input", { id: "crs", type: "text", placeholder: "EPSG:28992", autocomplete: "off", spellcheck: "false" });
+  private readonly anywhere = el("input", { id: "anywhere", type: "checkbox", "aria-describedby": "anywhere-hint" });
+  private readonly anywhereField = el(
+    "div",
+    { class: "field" },
+    el("label", {}, this.anywhere, ` ${LABELS.allowOutsideAreaOfUse}`),
+    el("p", { class: "hint", id: "anywhere-hint" }, "Only if the CRS is right: they are far from where it is used."),
+  );
+  /** The service refused the place of a tile by the CRS of the form. */
+  private placeRefused = false;
   private readonly verticalUnit = choice("vertical-unit", VERTICAL_UNITS);
   private readonly method = choice("method", {});
   private readonly preset = choice("preset", {});
@@ -69,10 +79,11 @@ export class Submission {
     });
     this.options.append(
       el("summary", {}, "Options"),
-      field("CRS", this.crs, "If the file has none or a wrong one."),
-      field("Vertical unit", this.verticalUnit),
-      field("Method", this.method),
-      field("Preset", this.preset, "Settings that measured better, or those of the method's paper."),
+      field(LABELS.crs, this.crs, "If the file has none or a wrong one."),
+      this.anywhereField,
+      field(LABELS.verticalUnit, this.verticalUnit),
+      field(LABELS.method, this.method),
+      field(LABELS.preset, this.preset, "Settings that measured better, or those of the method's paper."),
       el(
         "fieldset",
         { class: "field", "aria-describedby": this.levelsHint.id },
@@ -81,12 +92,15 @@ export class Submission {
         this.levelsHint,
       ),
       el("fieldset", { class: "field" }, el("legend", {}, "Compare with"), this.others),
-      field("Classes of the file", this.classes, "Trusted, only compared with the result, or ignored."),
-      field("Footprints", footprintPicker, "GeoPackage, GeoJSON or GeoParquet: one model per polygon."),
+      field(LABELS.classes, this.classes, "Trusted, only compared with the result, or ignored."),
+      field(LABELS.footprints, footprintPicker, "GeoPackage, GeoJSON or GeoParquet: one model per polygon."),
       this.footprintRow,
-      field("Title", this.title),
+      field(LABELS.title, this.title),
     );
-    for (const control of [this.method, this.preset, this.levels]) control.addEventListener("change", () => this.draw());
+    for (const control of [this.method, this.preset, this.levels, this.anywhere]) {
+      control.addEventListener("change", () => this.draw());
+    }
+    this.crs.addEventListener("input", () => this.draw());
     const form = el(
       "form",
       { novalidate: true },
@@ -276,6 +290,7 @@ export class Submission {
       if (variants.length > 1) inputs["methods"] = variants;
       else chosen.push(["method", this.method.value], ["preset", this.preset.value], ["lods", this.lods()]);
       for (const [name, value] of chosen) if (value !== "") inputs[name] = value;
+      if (this.anywhere.checked) inputs["allowOutsideAreaOfUse"] = true;
       if (this.footprints?.uploaded != null) inputs["footprints"] = { href: this.footprints.uploaded.href };
       const response = await request(`processes/${variants.length > 1 ? "compare" : "reconstruct"}/execution`, {
         method: "POST",
@@ -287,7 +302,10 @@ export class Submission {
       announce("The job is submitted.");
       this.onSubmitted(jobID);
     } catch (error) {
-      this.tell(asProblem(error));
+      const problem = asProblem(error);
+      this.placeRefused = problem.kind === "outside-area-of-use";
+      if (this.placeRefused) this.options.open = true;
+      this.tell(problem);
     } finally {
       this.starting = false;
       this.draw();
@@ -298,6 +316,8 @@ export class Submission {
     this.tiles = [];
     this.footprints = null;
     this.title.value = "";
+    this.placeRefused = false;
+    this.anywhere.checked = false;
     this.rows.replaceChildren();
     this.footprintRow.replaceChildren();
   }
@@ -315,7 +335,12 @@ export class Submission {
     const comparison = this.variants().length > 1;
     const levelBoxes = [...this.levels.querySelectorAll("input")];
     const noLevel = !comparison && levelBoxes.length > 0 && this.lods() === "";
-    const ready = this.tiles.length > 0 && !refused && !waiting && !noLevel && !this.starting;
+    const isFar = this.tiles.some(({ uploaded }) => typeof uploaded?.preflight["outsideAreaOfUse"] === "string");
+    this.anywhereField.hidden = !isFar && !this.placeRefused;
+    if (this.anywhereField.hidden) this.anywhere.checked = false;
+    // by another CRS the tiles lie elsewhere, which the service finds out
+    const unplaced = isFar && this.crs.value.trim() === "" && !this.anywhere.checked;
+    const ready = this.tiles.length > 0 && !refused && !waiting && !noLevel && !unplaced && !this.starting;
     for (const box of levelBoxes) box.disabled = comparison;
     this.levelsHint.textContent = comparison ? "Comparisons are made at LoD2.2." : "One or several; the records describe the finest.";
     const chosen = this.chosen();
@@ -328,11 +353,13 @@ export class Submission {
         ? "Uploading…"
         : refused
           ? "Remove what was refused"
-          : comparison
-            ? `Compare ${this.variants().length} methods`
-            : noLevel
-              ? "Choose a level of detail"
-              : "Reconstruct";
+          : unplaced
+            ? "Correct the CRS"
+            : comparison
+              ? `Compare ${this.variants().length} methods`
+              : noLevel
+                ? "Choose a level of detail"
+                : "Reconstruct";
   }
 }
 
@@ -369,11 +396,13 @@ function preflight(known: Record<string, unknown>): HTMLElement[] {
           typeof known["densityPerM2"] === "number" ? measure(known["densityPerM2"], 1, "per m²") : null,
           crsText,
         ];
-  const notes = [...texts(known["problems"]), ...texts(known["warnings"])];
+  const notes = [...texts(known["problems"]), ...texts(known["warnings"])].map(capital);
+  const place = placeWords(known["place"]);
   return [
     el("p", { class: "facts", title: crs?.name ?? null }, facts.filter((fact) => fact !== null).join(" · ")),
-    ...(notes.length === 0 ? [] : [warningNotice(...notes)]),
-  ];
+    place === null ? null : el("p", { class: "place" }, `Lies at ${place}`),
+    notes.length === 0 ? null : warningNotice(...notes),
+  ].filter((part) => part !== null);
 }
 
 function texts(value: unknown): string[] {

@@ -1,6 +1,7 @@
 import { expect, test } from "vitest";
 import { problemOf } from "../src/api";
-import { bytes, count, counted, duration, measure } from "../src/numbers";
+import { inFields } from "../src/fields";
+import { bytes, count, counted, duration, measure, placeWords } from "../src/numbers";
 import { CATEGORIES, categoryOf } from "../src/roof_types";
 
 test("numbers are grouped and carry their unit", () => {
@@ -35,4 +36,27 @@ test("a problem document is shown with what to do, anything else with its status
   expect(problemOf(429, "Too Many Requests", "<html>", "7").remedy).toBe("Try again in 7 seconds.");
   expect(problemOf(502, "Bad Gateway", "", null).title).toBe("Bad Gateway");
   expect(problemOf(500, "", "null", null).title).toBe("Status 500");
+});
+
+test("messages name the fields of the page, not inputs of a process or settings of the operator", () => {
+  expect(inFields("no usable CRS in the file; give the input crs")).toBe("no usable CRS in the file; set “CRS” under Options");
+  expect(inFields("Give the right CRS with the input crs, or give the input allowOutsideAreaOfUse if it is")).toBe(
+    "Give the right CRS in “CRS” under Options, or set “Use the tiles where they lie” under Options if it is",
+  );
+  expect(inFields("Check the input bbox")).toBe("Check the input bbox");
+  expect(inFields("cut it into tiles, or raise GABLEWORK_MAX_POINTS")).toBe(
+    "cut it into tiles, or ask the operator of this service to raise the limit",
+  );
+});
+
+test("problems about keys say what a user can do", () => {
+  const body = { type: "urn:gablework:problem:unauthorized", title: "A key is needed", detail: "Send the header `Authorization`" };
+  const refused = problemOf(401, "", JSON.stringify(body), null);
+  expect([refused.kind, refused.title, refused.detail]).toEqual(["unauthorized", "This service needs a key", ""]);
+  expect(refused.remedy).not.toMatch(/header|gablework keys/);
+});
+
+test("a place is shown with its latitude first", () => {
+  expect(placeWords({ longitude: 99.206, latitude: -75.981 })).toBe("75.98°\u202fS, 99.21°\u202fE");
+  expect(placeWords(null)).toBeNull();
 });

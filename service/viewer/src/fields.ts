@@ -1,0 +1,30 @@
+/** The words of the service for readers of the page: labels of fields in place of inputs of a process. */
+
+/** Labels of the form's fields by the input that they set. */
+export const LABELS = {
+  crs: "CRS",
+  verticalUnit: "Vertical unit",
+  allowOutsideAreaOfUse: "Use the tiles where they lie",
+  method: "Method",
+  preset: "Preset",
+  classes: "Classes of the file",
+  footprints: "Footprints",
+  title: "Title",
+} as const;
+
+/** A message that names fields in place of inputs, and no settings of the operator. */
+export function inFields(message: string): string {
+  return message
+    .replace(/\b(give|with)?( ?)the input (\w+)/gi, (whole: string, verb: string | undefined, space: string, name: string) => {
+      if (!(name in LABELS)) return whole;
+      const field = `“${LABELS[name as keyof typeof LABELS]}” under Options`;
+      if (verb === undefined) return `${space}${field}`;
+      return verb === "with" ? `in ${field}` : `${verb === "Give" ? "Set" : "set"} ${field}`;
+    })
+    .replace(/,? or raise GABLEWORK_\w+/g, ", or ask the operator of this service to raise the limit");
+}
+
+/** A text that begins with a capital letter. */
+export function capital(text: string): string {
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
