@@ -48,7 +48,8 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     """
     kept = JobStore(settings.database, wait_s=settings.database_wait_s) if store is None else store
     streams = Streams()
-    metrics = Metrics(kept, lambda: streams.count)
+    folder = StateFolder(settings.state, settings.reserve_bytes)
+    metrics = Metrics(kept, lambda: streams.count, folder.disk)
 
     @contextlib.asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -73,7 +74,7 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     )
     app.state.settings = settings
     app.state.store = kept
-    app.state.folder = StateFolder(settings.state, settings.reserve_bytes)
+    app.state.folder = folder
     app.state.limiter = RateLimiter(settings)
     app.state.streams = streams
     app.state.writing = writing(settings)
@@ -104,4 +105,5 @@ def start(settings: ServiceSettings, store: JobStore) -> None:
     """
     StateFolder(settings.state).make()
     store.migrate()
+    store.fill_ballast(settings.reserve_bytes)
     settings.check_address(has_keys=store.has_keys())

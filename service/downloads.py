@@ -7,7 +7,6 @@ checked like the first URL.
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import os
 import time
@@ -18,6 +17,7 @@ from urllib.parse import unquote
 import httpx
 
 from pipeline.errors import RunCancelledError, UnreadableInputError
+from service.disk import FULL, Disk
 from service.errors import NoSpaceError, TooLargeError
 from service.filenames import clean_filename
 from service.input_policy import checked_url, shown
@@ -99,7 +99,7 @@ def download(text: str, *, settings: ServiceSettings, target: Path, cancelled: C
     TooLargeError
         More bytes than allowed.
     NoSpaceError
-        The disk is full.
+        The disk is full, or only its reserve is free.
     UnreadableInputError
         The server does not deliver it.
     RunCancelledError
@@ -122,7 +122,7 @@ def download(text: str, *, settings: ServiceSettings, target: Path, cancelled: C
                     problem = f"{fault.problem} (tried {attempt} times)"
                     raise UnreadableInputError(shown(url), problem, "Check the URL, or upload the file") from fault
             except OSError as fault:
-                if fault.errno in {errno.ENOSPC, errno.EDQUOT}:
+                if fault.errno in FULL:
                     raise NoSpaceError(f"there is no room on the disk for {path.name}") from fault
                 raise
             attempt += 1
@@ -180,8 +180,10 @@ def _stream_to(
     """The body to a file, counted; its SHA-256."""
     limit, promised = settings.max_upload_bytes, response.headers.get("content-length", "")
     until_s, size, digest = time.monotonic() + FETCH_S, 0, hashlib.sha256()
+    disk = Disk(path.parent, settings.reserve_bytes)
     if promised.isdigit():
         _check_size(url, int(promised), limit)
+        disk.require(int(promised), path.name)
     with _removed_on_failure(path), path.open("wb") as stream:
         for piece in response.iter_raw(PIECE_BYTES):
             _check_cancelled(cancelled)
@@ -189,6 +191,7 @@ def _stream_to(
             _check_size(url, size, limit)
             if time.monotonic() > until_s:
                 raise UnreadableInputError(shown(url), f"not fetched within {FETCH_S:g} s", "Upload the file")
+            disk.require(len(piece), path.name)
             digest.update(piece)
             stream.write(piece)
         stream.flush()

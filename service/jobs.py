@@ -52,6 +52,8 @@ class Fault(StrEnum):
     """There is no cluster, or it was lost repeatedly."""
     LOST = "lost"
     """Drivers died repeatedly during the job."""
+    NO_SPACE = "no-space"
+    """The disk had no room for it, repeatedly."""
     INTERNAL = "internal"
     """A fault of the service."""
 

@@ -1,4 +1,4 @@
-"""Metrics for Prometheus: requests and durations, jobs by status and longest wait, schedules, event streams."""
+"""Metrics for Prometheus: requests and durations, jobs by status and longest wait, schedules, disk, event streams."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.disk import Disk
 from service.jobs import JobStatus
 from service.store import JobFilter, JobStore
 
@@ -20,9 +21,10 @@ BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0
 class _Jobs(Collector):
     """Counts in the store on each scrape."""
 
-    def __init__(self, store: JobStore, streams: Callable[[], int]) -> None:
+    def __init__(self, store: JobStore, streams: Callable[[], int], disk: Disk) -> None:
         self._store = store
         self._streams = streams
+        self._disk = disk
 
     def collect(self) -> Iterator[Metric]:
         """The current figures."""
@@ -50,6 +52,14 @@ class _Jobs(Collector):
         for outcome, count in slots.items():
             fates.add_metric([outcome.value], count)
         yield fates
+        yield GaugeMetricFamily(
+            "gablework_disk_free_bytes", "Free bytes of the state folder's disk.", value=self._disk.free_bytes
+        )
+        yield GaugeMetricFamily(
+            "gablework_disk_reserve_bytes",
+            "Free bytes below which uploads and jobs are refused.",
+            value=self._disk.reserve_bytes,
+        )
         yield GaugeMetricFamily("gablework_event_streams", "Event streams that are open.", value=self._streams())
 
     def _oldest_s(self, waiting: int) -> float:
@@ -64,7 +74,7 @@ class _Jobs(Collector):
 class Metrics:
     """The figures of one application."""
 
-    def __init__(self, store: JobStore, streams: Callable[[], int]) -> None:
+    def __init__(self, store: JobStore, streams: Callable[[], int], disk: Disk) -> None:
         self.registry = CollectorRegistry()
         self.requests = Counter(
             "gablework_requests", "Requests answered.", ["method", "path", "status"], registry=self.registry
@@ -77,7 +87,7 @@ class Metrics:
             registry=self.registry,
         )
         self.received = Counter("gablework_received_bytes", "Bytes of bodies received.", registry=self.registry)
-        self.registry.register(_Jobs(store, streams))
+        self.registry.register(_Jobs(store, streams, disk))
         ProcessCollector(registry=self.registry)
 
     def render(self) -> bytes:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import datetime as dt
-import errno
 import hashlib
 import os
 import shutil
@@ -20,6 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Protocol
 
+from service.disk import FULL
 from service.errors import NoSpaceError, RequestError, TooLargeError
 from service.filenames import clean_filename
 from service.files import StateFolder
@@ -54,6 +54,7 @@ class _Sink:
 
     def __init__(self, folder: StateFolder, upload_id: str, filename: str) -> None:
         self._lock = threading.Lock()
+        self._disk = folder.disk
         self._digest = hashlib.sha256()
         self._final = folder.upload(upload_id)
         self._temporary = folder.uploads / f"{TEMPORARY}{upload_id}"
@@ -66,6 +67,7 @@ class _Sink:
         """Hash and write some bytes."""
         with self._lock:
             if not self._over:
+                self._disk.require(len(block), self.path.name)
                 self._digest.update(block)
                 view = memoryview(block)
                 while view:
@@ -121,7 +123,7 @@ async def receive(
     TooLargeError
         More bytes or points than allowed.
     NoSpaceError
-        The disk is full.
+        The disk is full, or only its reserve is free.
     InputError
         The file cannot be used.
     """
@@ -155,7 +157,7 @@ async def receive(
             discarded = _writers.submit(sink.discard)
             if isinstance(fault, Exception):
                 await asyncio.wrap_future(discarded)
-        if isinstance(fault, OSError) and fault.errno in {errno.ENOSPC, errno.EDQUOT}:
+        if isinstance(fault, OSError) and fault.errno in FULL:
             raise NoSpaceError(f"there is no room on the disk for {name}: free some, or try later") from fault
         raise
     return upload

@@ -6,19 +6,23 @@ import contextlib
 import secrets
 import shutil
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
 from pipeline.errors import ClusterError, GableworkError, RunCancelledError
 from service.driver.attempt import DriverParts, perform
-from service.driver.failures import failure_of, is_tried_again, pause_s
+from service.driver.failures import FULL_BYTES, NO_SPACE_PAUSE_S, failure_of, has_no_space, is_tried_again, pause_s
+from service.driver.finished_work import leave, take_over
 from service.driver.leased_job import LOG, LeasedJob, Stop
-from service.errors import LeaseLostError, ServiceError, StoreError
+from service.errors import LeaseLostError, NoSpaceError, ServiceError, StoreError
 from service.jobs import JobStatus
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 15.0
 """Seconds between two tries to reach the database: the first and the longest pause; each is twice the one before."""
+LAST_PAUSE_S = 1.0
+"""Seconds before the last try of a driver that ends."""
 
 
 class Attempts:
@@ -30,14 +34,14 @@ class Attempts:
         Store, folder, cluster.
     name : str
         Name of the driver, for messages.
-    at_once : threading.Event
-        Set when the driver must end without waiting for the database any longer.
+    ending : threading.Event
+        Set when the driver ends: it then waits for the database no longer than one more try.
     """
 
-    def __init__(self, shop: DriverParts, *, name: str, at_once: threading.Event) -> None:
+    def __init__(self, shop: DriverParts, *, name: str, ending: threading.Event) -> None:
         self._shop = shop
         self._name = name
-        self._at_once = at_once
+        self._ending = ending
 
     def work(self, held: LeasedJob) -> None:
         """Run one attempt and write its outcome."""
@@ -46,7 +50,8 @@ class Attempts:
             try:
                 if held.cancelled():
                     raise RunCancelledError("the job was cancelled")  # noqa: TRY301
-                message, summary = perform(held, self._shop)
+                found = take_over(self._shop.folder, held.job)
+                message, summary = perform(held, self._shop) if found is None else found
             except BaseException as error:  # noqa: BLE001 - every exception must end the job, not the driver
                 self._end_early(held, error)
                 return
@@ -60,6 +65,11 @@ class Attempts:
             self._forget(held, before=True)
         elif done is False:
             self._forget(held)
+        else:
+            try:
+                leave(self._shop.folder, held.job, message, summary)
+            except OSError as error:
+                LOG.warning("the job must be run again: %s", error, extra=held.facts)
 
     def _end_early(self, held: LeasedJob, error: BaseException) -> None:
         """Write the outcome of an attempt that did not succeed: dismissed, given back, tried again or failed."""
@@ -71,12 +81,16 @@ class Attempts:
             self._forget(held, whole=True)
             self._settle(held, lambda: self._shop.store.dismissed(job), JobStatus.DISMISSED)
             return
-        if reason is not None:
+        if reason is Stop.NO_SPACE:
+            error = NoSpaceError("the disk is full except for its reserve")
+        elif reason is not None:
             self._forget(held)
             message = f"driver {self._name} ended; the job waits for another" if reason is Stop.RELEASED else ""
             lost = reason is Stop.LOST
             self._settle(held, lambda: self._shop.store.release(job, lost=lost, message=message), JobStatus.ACCEPTED)
             return
+        elif self._is_full(error):
+            error = NoSpaceError(f"the disk is full ({type(error).__name__})")
         reference = secrets.token_hex(4)
         facts: dict[str, Any] = {**held.facts, "reference": reference}
         expected = isinstance(error, GableworkError | ServiceError)
@@ -85,9 +99,9 @@ class Attempts:
             self._shop.cluster.replace(held.engine)
         self._forget(held)
         if is_tried_again(error, job, self._shop.settings.max_attempts):
-            pause = pause_s(job.lost_attempts)
+            pause = NO_SPACE_PAUSE_S if isinstance(error, NoSpaceError) else pause_s(job.lost_attempts)
             message = f"waiting: {held.scrub(str(error))}; tried again in {pause:g} s"
-            lost = isinstance(error, ClusterError)
+            lost = isinstance(error, ClusterError | NoSpaceError)
             self._settle(
                 held,
                 lambda: self._shop.store.release(job, lost=lost, message=message, retry_after_s=pause),
@@ -97,13 +111,20 @@ class Attempts:
         failure = failure_of(error, scrub=held.scrub, reference=reference, attempts=job.lost_attempts + 1)
         self._settle(held, lambda: self._shop.store.fail(job, failure), JobStatus.FAILED)
 
+    def _is_full(self, error: BaseException) -> bool:
+        """Whether the full disk is the cause. What a worker met arrives in words, so the disk is looked at, too."""
+        if isinstance(error, StoreError):
+            return False
+        return has_no_space(error) or self._shop.folder.disk.free_bytes < FULL_BYTES
+
     def _settle(self, held: LeasedJob, write: Callable[[], None], status: JobStatus) -> bool | None:
         """Write the outcome of an attempt, as soon as the database answers; False if the lease is lost.
 
         If the answer to a commit was lost, the job already has this status at this attempt. None if the driver
-        must end before the outcome is known: a janitor decides about the files when the database is back.
+        must end before the outcome is known: the job goes back to the queue when its lease has ended, and the next
+        driver finds what was done.
         """
-        pause = FIRST_PAUSE_S
+        pause, is_last = FIRST_PAUSE_S, False
         while True:
             try:
                 try:
@@ -118,8 +139,11 @@ class Attempts:
                     return False
             except StoreError as error:
                 LOG.warning("the end of the attempt cannot be written yet: %s", error, extra=held.facts)
-                if self._at_once.wait(pause):
+                if is_last:
                     return None
+                if self._ending.is_set():
+                    time.sleep(LAST_PAUSE_S)
+                is_last = self._ending.wait(pause)
                 pause = min(LONGEST_PAUSE_S, 2.0 * pause)
             else:
                 return True

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Callable
 
 from pipeline.errors import ClusterError, InputError, RunError, SettingsError, VersionMismatchError
+from service.disk import FULL
 from service.errors import (
     InputRefusedError,
     LimitError,
@@ -19,7 +19,10 @@ from service.jobs import Fault, Job, JobFailure
 
 _FIRST_PAUSE_S = 2.0
 _LONGEST_PAUSE_S = 60.0
-_NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+NO_SPACE_PAUSE_S = 30.0
+"""Seconds until a job that the disk had no room for is tried again: others may end by then."""
+FULL_BYTES = 1 << 20
+"""Free bytes below which any failure is put down to the full disk."""
 
 
 def pause_s(losses: int) -> float:
@@ -32,11 +35,21 @@ def pause_s(losses: int) -> float:
 
 
 def is_tried_again(error: BaseException, job: Job, max_attempts: int) -> bool:
-    """Whether the job goes back to the queue: its cluster or the database was lost, and not too often yet."""
+    """Whether the job goes back to the queue: the cluster, the database or the disk failed, and not too often yet."""
     if isinstance(error, StoreError):
         return True
-    lost = isinstance(error, ClusterError) and not isinstance(error, VersionMismatchError)
+    lost = isinstance(error, ClusterError | NoSpaceError) and not isinstance(error, VersionMismatchError)
     return lost and job.lost_attempts + 1 < max_attempts
+
+
+def has_no_space(error: BaseException) -> bool:
+    """Whether a full disk is the error, or its cause."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, NoSpaceError) or (isinstance(seen, OSError) and seen.errno in FULL):
+            return True
+        seen = seen.__cause__ or seen.__context__
+    return False
 
 
 def failure_of(error: BaseException, *, scrub: Callable[[str], str], reference: str, attempts: int) -> JobFailure:
@@ -61,9 +74,13 @@ def failure_of(error: BaseException, *, scrub: Callable[[str], str], reference: 
     message = scrub(str(error))
     if isinstance(error, SettingsError):
         return JobFailure(fault=Fault.SETTINGS, detail=message)
-    if isinstance(error, NoSpaceError) or (isinstance(error, OSError) and error.errno in _NO_SPACE):
-        detail = f"the service's disk is full (reference {reference}): its operator must make room, then submit again"
-        return JobFailure(fault=Fault.INTERNAL, detail=detail)
+    if has_no_space(error):
+        times = "once" if attempts == 1 else f"{attempts} times"
+        detail = (
+            f"the service's disk had no room for this job, tried {times} (reference {reference}): remove finished jobs "
+            "or uploads, use fewer or smaller tiles, or ask the operator to make room; then submit again"
+        )
+        return JobFailure(fault=Fault.NO_SPACE, detail=detail)
     if isinstance(error, InputRefusedError | LimitError):
         return JobFailure(fault=Fault.REFUSED, detail=message)
     if isinstance(error, InputError | NoSuchUploadError | RequestError | NoSuchOutputError):

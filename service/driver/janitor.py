@@ -8,6 +8,7 @@ import shutil
 import time
 from pathlib import Path
 
+from service.driver import finished_work
 from service.errors import UploadInUseError
 from service.files import StateFolder, is_id
 from service.jobs import JobStatus
@@ -20,7 +21,7 @@ _ATTEMPT = re.compile(r"attempt-([0-9]+)")
 
 
 def tidy(store: JobStore, folder: StateFolder) -> list[Path]:
-    """Remove the files that jobs and uploads left behind.
+    """Remove the files that jobs and uploads left behind, and old answers; set room aside for the database again.
 
     Several drivers may do so at once.
 
@@ -36,7 +37,10 @@ def tidy(store: JobStore, folder: StateFolder) -> list[Path]:
     list of Path
         The removed folders.
     """
-    return [*tidy_jobs(store, folder), *tidy_uploads(store, folder)]
+    removed = [*tidy_jobs(store, folder), *tidy_uploads(store, folder)]
+    store.forget_answers()
+    store.fill_ballast(folder.reserve_bytes)
+    return removed
 
 
 def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
@@ -60,7 +64,9 @@ def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
         last = attempt if status in {JobStatus.ACCEPTED, JobStatus.FAILED} else attempt - 1
         for path in _entries(folder.job(job_id)):
             number = _ATTEMPT.fullmatch(path.name)
-            if number is not None and int(number[1]) <= last:
+            # results whose end no driver could write yet: the next one does
+            is_kept = not status.is_over and finished_work.is_left(path)
+            if number is not None and int(number[1]) <= last and not is_kept:
                 removed.append(path)
     for path in removed:
         shutil.rmtree(path, ignore_errors=True)

@@ -43,11 +43,13 @@ class Engine(Protocol):
 class Stop(IntEnum):
     """Why an attempt must end early; a higher reason wins."""
 
-    RELEASED = 1
+    NO_SPACE = 1
+    """Only the reserve of the disk is free: the job is tried again later."""
+    RELEASED = 2
     """The driver ends: the job goes back to the queue."""
-    DISMISSED = 2
+    DISMISSED = 3
     """The client dismissed it."""
-    LOST = 3
+    LOST = 4
     """The job belongs to another driver, or may belong to one by now."""
 
 

@@ -17,6 +17,7 @@ from pipeline.errors import ClusterError
 from pipeline.schedule import Outcome
 from service.driver.attempt import DriverParts, Tools
 from service.driver.attempts import FIRST_PAUSE_S, LONGEST_PAUSE_S, Attempts
+from service.driver.disk_watch import LOOK_S, DiskWatch
 from service.driver.janitor import tidy
 from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.driver.logs import configure, quieten
@@ -73,7 +74,9 @@ class Driver:
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._at_once = threading.Event()
-        self._attempts = Attempts(self._shop, name=self.name, at_once=self._at_once)
+        self._attempts = Attempts(self._shop, name=self.name, ending=self._stopping)
+        self._disk_watch = DiskWatch(folder.disk, self._all_held)
+        self._ended = threading.Event()
         # the signal handler counts here, since it must not take a lock
         self._stops = 0
         self._parent_gone = False
@@ -111,12 +114,14 @@ class Driver:
         janitor = threading.Thread(target=self._tidy, name="janitor", daemon=True)
         if self._parent_pipe is not None:
             threading.Thread(target=self._watch_parent, name="parent", daemon=True).start()
+        threading.Thread(target=self._watch_disk, name="disk", daemon=True).start()
         starter = threading.Thread(target=self._start, args=([*slots, clock, janitor],), name="start", daemon=True)
         starter.start()
         self._wait_for_stop()
         with self._lock:
             self._stopping.set()
         clean = self._drain()
+        self._ended.set()
         starter.join(_TICK_S)
         for thread in [*slots, clock, janitor]:
             if thread.ident is not None:
@@ -193,6 +198,14 @@ class Driver:
         LOG.info("the parent is gone", extra=self._facts)
         self._parent_gone = True
 
+    def _watch_disk(self) -> None:
+        """Stop jobs that use the reserve, until the last one is over."""
+        while not self._ended.wait(LOOK_S):
+            try:
+                self._disk_watch.look()
+            except OSError as error:
+                LOG.warning("the disk cannot be looked at: %s", error, extra=self._facts)
+
     # --- the slots
 
     def _slot(self) -> None:
@@ -229,6 +242,8 @@ class Driver:
         """
         if any(held.overdue for held in self._all_held()):
             # this machine slept: our own leases are renewed first, or our own jobs would count as lost
+            return False
+        if self._shop.folder.disk.is_short:
             return False
         settings, claimed_s = self._settings, time.monotonic()
         job = self._store.claim(self.name, lease_s=settings.lease_s, max_attempts=settings.max_attempts)

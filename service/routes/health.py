@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
+from typing import Literal
 
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
@@ -31,7 +31,9 @@ async def healthz() -> Response:
     return respond(Health(status="ok"))
 
 
-_READY = {"status": "ok", "checks": {"database": "ok", "state": "ok", "driver": "running"}}
+_READY = {"status": "ok", "checks": {"database": "ok", "state": "ok", "disk": "ok", "driver": "running"}}
+_PROBE_BYTES = 4096
+"""Bytes that are written to see whether the disk is full: one block, since a file without bytes needs none."""
 
 
 @router.get(
@@ -47,19 +49,33 @@ _READY = {"status": "ok", "checks": {"database": "ok", "state": "ok", "driver": 
     },
 )
 def readyz(request: Request, store: Store, folder: Folder) -> Response:
-    """Check whether the database answers and the state folder can be written.
+    """Check whether the database answers, the state folder can be written, and the reserve of its disk is free.
 
-    The driver is listed but does not count: without a driver jobs are still accepted, and wait.
+    The driver is listed but does not count: without a driver jobs are still accepted, and wait. With less than the
+    reserve free, the status is `degraded`, with 200: uploads and jobs are refused with 507, but results can be fetched
+    and removed, which is how room is made.
     """
     checks = {"database": _database(store), "state": _state(folder)}
     is_ready = all(found == "ok" for found in checks.values())
+    checks["disk"] = disk = _disk(folder)
     driver = getattr(request.app.state, "driver", None)
     checks["driver"] = "elsewhere" if driver is None else driver()
+    status: Literal["ok", "degraded", "unavailable"] = "ok" if disk == "ok" else "degraded"
     return respond(
-        Health(status="ok" if is_ready else "unavailable", checks=checks),
+        Health(status=status if is_ready else "unavailable", checks=checks),
         status_code=200 if is_ready else 503,
         headers={"Cache-Control": "no-store"},
     )
+
+
+def _disk(folder: StateFolder) -> str:
+    try:
+        free_bytes = folder.disk.free_bytes
+    except OSError as error:
+        return error.strerror or "cannot be read"
+    if free_bytes >= folder.reserve_bytes:
+        return "ok"
+    return f"{free_bytes} bytes are free, the reserve is {folder.reserve_bytes}: uploads and jobs are refused"
 
 
 def _database(store: JobStore) -> str:
@@ -72,9 +88,8 @@ def _database(store: JobStore) -> str:
 
 def _state(folder: StateFolder) -> str:
     try:
-        handle, name = tempfile.mkstemp(prefix=".ready-", dir=folder.root)
-        os.close(handle)
-        os.unlink(name)  # noqa: PTH108 - mkstemp gives a text
+        with tempfile.NamedTemporaryFile(prefix=".ready-", dir=folder.root, buffering=0) as probe:
+            probe.write(bytes(_PROBE_BYTES))
     except OSError as error:
         return error.strerror or "cannot be written"
     return "ok"

@@ -12,6 +12,7 @@ import anyio.to_thread
 from fastapi import Depends, Request
 from starlette.requests import ClientDisconnect
 
+from service.errors import StoreFullError
 from service.settings import ServiceSettings
 from service.store import Patience
 
@@ -56,7 +57,11 @@ class Writer:
 
         def patiently() -> Written:
             with patience:
-                return write()
+                try:
+                    return write()
+                except StoreFullError:
+                    # the room that was set aside for the database is free now
+                    return write()
 
         work = asyncio.ensure_future(anyio.to_thread.run_sync(patiently, limiter=self.threads, abandon_on_cancel=True))
         both: set[asyncio.Future[Any]] = {work, gone}

@@ -82,6 +82,18 @@ class Database:
         """The folder of a SQLite database."""
         return Path(self._url.database or "").absolute().parent
 
+    def fill_ballast(self, reserve_bytes: int) -> None:
+        """Set room aside for a SQLite database, if the reserve of the disk stays free.
+
+        Raises
+        ------
+        StoreError
+            Its folder cannot be written.
+        """
+        if self.is_sqlite:
+            with self._faults_in_our_words():
+                Ballast(self.folder).fill(reserve_bytes)
+
     @contextlib.contextmanager
     def read(self) -> Iterator[Connection]:
         """A transaction that only reads.

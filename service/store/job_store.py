@@ -75,6 +75,10 @@ class JobStore:
         """
         self._database.check()
 
+    def fill_ballast(self, reserve_bytes: int) -> None:
+        """Set room aside for a SQLite database, if the reserve stays free; it is used when the disk is full."""
+        self._database.fill_ballast(reserve_bytes)
+
     def now(self) -> dt.datetime:
         """The database's clock, in UTC."""
         with self._database.read() as connection:

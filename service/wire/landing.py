@@ -24,5 +24,5 @@ class Conformance(Answer):
 class Health(Answer):
     """Whether the service works."""
 
-    status: Literal["ok", "unavailable"]
+    status: Literal["ok", "degraded", "unavailable"]
     checks: dict[str, str] | None = None

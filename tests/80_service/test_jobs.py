@@ -198,8 +198,8 @@ def test_the_outcome_is_reported_honestly() -> None:
         (ClusterError("the scheduler was lost"), Fault.CLUSTER, "lost 2 times"),
         (VersionMismatchError("python 3.11 here, 3.12 there"), Fault.CLUSTER, "3.12 there"),
         (RunError("/jobs/ab/run cannot be written"), Fault.INTERNAL, "run cannot be written (reference ab12)"),
-        (NoSpaceError("12 bytes left on /x/y"), Fault.INTERNAL, "disk is full (reference ab12)"),
-        (OSError(errno.ENOSPC, "no space", "/x/y"), Fault.INTERNAL, "disk is full"),
+        (NoSpaceError("12 bytes left on /x/y"), Fault.NO_SPACE, "tried 2 times (reference ab12)"),
+        (OSError(errno.ENOSPC, "no space", "/x/y"), Fault.NO_SPACE, "disk had no room"),
         (KeyError("password=hunter2"), Fault.INTERNAL, "KeyError (reference ab12)"),
         (MemoryError(), Fault.INTERNAL, "MemoryError"),
     ],
@@ -214,11 +214,13 @@ def test_every_exception_has_its_kind_and_says_no_path_and_no_secret(
     assert "hunter2" not in reported.detail
 
 
-def test_only_a_lost_cluster_and_an_absent_database_are_tried_again() -> None:
+def test_only_a_lost_cluster_an_absent_database_and_a_full_disk_are_tried_again() -> None:
     assert is_tried_again(ClusterError("x"), job(), max_attempts=3)
     assert not is_tried_again(ClusterError("x"), job(lost_attempts=2), max_attempts=3)
     assert not is_tried_again(VersionMismatchError("x"), job(), max_attempts=3)
     assert is_tried_again(StoreError("x"), job(lost_attempts=2), max_attempts=3)
+    assert is_tried_again(NoSpaceError("x"), job(), max_attempts=3)
+    assert not is_tried_again(NoSpaceError("x"), job(lost_attempts=2), max_attempts=3)
     assert not is_tried_again(RunError("x"), job(), max_attempts=3)
 
 
