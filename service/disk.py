@@ -84,7 +84,7 @@ class Ballast:
         # a name of its own for each process: the file has its whole size when it gets its name
         new = self.path.with_name(f"{BALLAST}-{os.getpid()}")
         try:
-            with new.open("wb") as stream:
+            with os.fdopen(os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as stream:
                 # not zeros: some file systems store none
                 stream.write(os.urandom(self.size_bytes))
                 stream.flush()

@@ -92,7 +92,10 @@ class Database:
         """
         if self.is_sqlite:
             with self._faults_in_our_words():
-                Ballast(self.folder).fill(reserve_bytes)
+                ballast = Ballast(self.folder)
+                ballast.fill(reserve_bytes)
+                if ballast.path.exists():
+                    keep_private(ballast.path)
 
     @contextlib.contextmanager
     def read(self) -> Iterator[Connection]:
