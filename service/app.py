@@ -11,13 +11,14 @@ from starlette.concurrency import run_in_threadpool
 
 from pipeline import __version__
 from service import openapi, problems
+from service.arrivals import Arrivals
 from service.compression import Compressed
 from service.files import StateFolder
 from service.guard import Guard
 from service.methods import HeadAsGet, check_query
 from service.metrics import Measured, Metrics
 from service.rate_limits import RateLimiter
-from service.routes import buildings, events, health, jobs, landing, processes, results, schedules, uploads
+from service.routes import buildings, events, health, jobs, landing, processes, results, schedules, tus, uploads
 from service.routes.events import Streams
 from service.routes.replay import ReplayedError, replayed
 from service.routes.writing import writing
@@ -28,6 +29,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     landing.router,
     processes.router,
     uploads.router,
+    tus.router,
     jobs.router,
     events.router,
     schedules.router,
@@ -79,7 +81,9 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     app.state.streams = streams
     app.state.writing = writing(settings)
     app.state.metrics = metrics
-    problems.install(app, [route for router in ROUTERS for route in router.routes])
+    app.state.arrivals = Arrivals(kept, app.state.folder, settings)
+    routes = [route for router in ROUTERS for route in router.routes]
+    problems.install(app, routes)
     app.add_exception_handler(ReplayedError, replayed)
     for router in ROUTERS:
         app.include_router(router)
@@ -88,7 +92,7 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     app.openapi = lambda: openapi.document(app)  # type: ignore[method-assign]
     app.add_middleware(Guard, settings=settings)
     app.add_middleware(Compressed)
-    app.add_middleware(HeadAsGet)
+    app.add_middleware(HeadAsGet, routes=routes)
     app.add_middleware(Measured, metrics=metrics)
     return app
 

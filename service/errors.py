@@ -13,10 +13,14 @@ ServiceError
 │   ├── QuotaError           the uploads of a key have too many bytes
 │   ├── QueueFullError       too many jobs wait
 │   ├── TooManySchedulesError a key has reached its limit of schedules
+│   ├── TooManyUploadsError  a key has reached its limit of unfinished uploads
 │   └── TooManyRequestsError too many requests of one client
 ├── UnauthorizedError        no key, or one that is not known
 ├── ForbiddenError           a key without the scope
 ├── UploadInUseError         an upload that unfinished jobs need
+├── UploadBusyError          an unfinished upload that another request sends
+├── OffsetError              bytes that do not continue an unfinished upload
+├── ChecksumError            bytes that differ from their checksum
 ├── ScheduleBusyError        a job of the schedule is under way, so it cannot be run now
 ├── KeyInUseError            a request with the same Idempotency-Key is under way
 ├── KeyReusedError           the Idempotency-Key was used for another request
@@ -134,6 +138,10 @@ class TooManySchedulesError(LimitError):
     """A key has reached its limit of schedules."""
 
 
+class TooManyUploadsError(LimitError):
+    """A key has reached its limit of unfinished uploads."""
+
+
 class TooManyRequestsError(LimitError):
     """Too many requests of one client."""
 
@@ -156,6 +164,21 @@ class UploadInUseError(ServiceError):
 
 class JobNotOverError(ServiceError):
     """The job still waits or runs."""
+
+
+class UploadBusyError(ServiceError):
+    """An unfinished upload that another request sends."""
+
+    retry_after_s = 1.0
+    """Seconds after which the other request may be over."""
+
+
+class OffsetError(ServiceError):
+    """Bytes that do not continue an unfinished upload; the message names both offsets."""
+
+
+class ChecksumError(ServiceError):
+    """Bytes that differ from their checksum; they were not kept."""
 
 
 class ScheduleBusyError(ServiceError):

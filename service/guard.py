@@ -8,7 +8,7 @@ rebinding"), and a request that changes anything must not come from another orig
 from __future__ import annotations
 
 import functools
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -19,8 +19,11 @@ from service.errors import TooLargeError
 from service.problems import FOREIGN, KINDS, answer
 from service.settings import ServiceSettings
 
-STREAMED = frozenset({("POST", "/jobs"), ("POST", "/uploads")})
-"""Requests with files: their routes count the bytes."""
+STREAMED = frozenset({("POST", "/jobs"), ("POST", "/uploads"), ("POST", "/uploads/tus"), ("PATCH", "/uploads/tus/*")})
+"""Requests with files: their routes count the bytes. `*` is any last part of a path."""
+
+TUS = "/uploads/tus"
+"""Path of resumable uploads; all answers there name the version of their protocol."""
 
 READING = frozenset({"GET", "HEAD", "OPTIONS"})
 """Methods that change nothing; without CORS another site cannot read their answers."""
@@ -54,13 +57,14 @@ class Guard:
             await self.app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        guarded_send = functools.partial(self._send, send)
+        path = scope["path"].removeprefix(scope.get("root_path", ""))
+        own = {"Tus-Resumable": "1.0.0"} if path == TUS or path.startswith(f"{TUS}/") else {}
+        guarded_send = functools.partial(self._send, send, own)
         refusal = self._foreign(scope["method"], scope.get("scheme", "http"), headers)
         if refusal is not None:
             await answer(FOREIGN, refusal, scope["path"])(scope, receive, guarded_send)
             return
-        path = scope["path"].removeprefix(scope.get("root_path", ""))
-        if (scope["method"], path) in STREAMED:
+        if not STREAMED.isdisjoint({(scope["method"], path), (scope["method"], f"{path.rpartition('/')[0]}/*")}):
             await self.app(scope, receive, guarded_send)
             return
         most = self.settings.max_body_bytes
@@ -89,9 +93,10 @@ class Guard:
         return None
 
     @staticmethod
-    async def _send(send: Send, message: Message) -> None:
+    async def _send(send: Send, own: Mapping[str, str], message: Message) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
+            headers.update(own)
             is_page = headers.get("content-type", "").startswith("text/html")
             headers["X-Content-Type-Options"] = "nosniff"
             headers["Referrer-Policy"] = "no-referrer"

@@ -16,14 +16,15 @@ from service.wire.faults import shortened
 
 
 class HeadAsGet:
-    """Answers HEAD with the head of the answer to GET."""
+    """Answers HEAD with the head of the answer to GET, unless a route answers HEAD itself."""
 
-    def __init__(self, app: ASGIApp) -> None:
+    def __init__(self, app: ASGIApp, routes: Iterable[BaseRoute] = ()) -> None:
         self.app = app
+        self._own = [route for route in routes if isinstance(route, Route) and "HEAD" in (route.methods or ())]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on; a HEAD request as GET, which ends before its body."""
-        if scope["type"] != "http" or scope["method"] != "HEAD":
+        if scope["type"] != "http" or scope["method"] != "HEAD" or self._has_own(scope):
             await self.app(scope, receive, send)
             return
         with anyio.CancelScope() as until_body:
@@ -37,6 +38,9 @@ class HeadAsGet:
                     until_body.cancel()
 
             await self.app({**scope, "method": "GET"}, receive, send_head)
+
+    def _has_own(self, scope: Scope) -> bool:
+        return any(route.matches(scope)[0] is Match.FULL for route in self._own)
 
 
 def allowed_methods(routes: Iterable[BaseRoute], scope: Scope) -> list[str]:

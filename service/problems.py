@@ -94,6 +94,14 @@ KINDS: Mapping[type[Exception], Kind] = {
     errors.UploadInUseError: Kind(status=409, type_uri=f"{OWN}upload-in-use", title="The upload is still needed"),
     errors.StoreBusyError: Kind(status=503, type_uri=f"{OWN}database-busy", title="The database is busy", retry=True),
     errors.StoreFullError: Kind(status=507, type_uri=f"{OWN}no-space", title="The disk is full", retry=True),
+    errors.UploadBusyError: Kind(
+        status=423, type_uri=f"{OWN}upload-busy", title="Another request sends it", retry=True
+    ),
+    errors.OffsetError: Kind(status=409, type_uri=f"{OWN}wrong-offset", title="The bytes do not continue the upload"),
+    errors.ChecksumError: Kind(status=460, type_uri=f"{OWN}wrong-checksum", title="The bytes arrived damaged"),
+    errors.TooManyUploadsError: Kind(
+        status=429, type_uri=f"{OWN}too-many-uploads", title="Too many unfinished uploads", retry=True
+    ),
     errors.StoreError: _AWAY,
     errors.QueueFullError: Kind(status=429, type_uri=f"{OWN}queue-full", title="Too many jobs wait", retry=True),
     errors.TooManyRequestsError: Kind(

@@ -69,6 +69,15 @@ class ServiceSettings(BaseSettings):
     upload_days: float = Field(
         default=7.0, gt=0.0, le=36_500.0, description="Days after which an upload that no job needs is removed."
     )
+    unfinished_upload_hours: float = Field(
+        default=24.0,
+        gt=0.0,
+        le=876_000.0,
+        description="Hours after its last request after which an unfinished resumable upload is removed.",
+    )
+    max_unfinished_uploads: int = Field(
+        default=100, gt=0, description="Maximum number of unfinished resumable uploads of one key."
+    )
 
     # limits
     max_upload_bytes_per_key: int = Field(

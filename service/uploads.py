@@ -134,23 +134,11 @@ async def receive(
         size = 0
         async for block in _blocks(stream):
             size += len(block)
-            _check_size(name, size, settings.max_upload_bytes)
+            check_size(name, size, settings.max_upload_bytes)
             await loop.run_in_executor(_writers, sink.write, block)
         found = await loop.run_in_executor(_writers, sink.sync)
-        _check_digest(name, found, sha256)
-        examining = _quick_examining if is_quick(sink.path) else _slow_examining
-        facts = await loop.run_in_executor(examining, preflight, sink.path, settings.max_points)
-        now = await loop.run_in_executor(_writers, store.now)
-        upload = Upload(
-            upload_id=upload_id,
-            owner=owner,
-            filename=name,
-            size_bytes=size,
-            sha256=found,
-            created_at=now,
-            expires_at=now + dt.timedelta(days=settings.upload_days),
-            preflight=facts,
-        )
+        check_digest(name, found, sha256)
+        upload = await examined(sink.path, upload_id, found, store=store, settings=settings, owner=owner)
         await loop.run_in_executor(_writers, sink.keep, upload, store)
     except BaseException as fault:
         if sink is not None:
@@ -163,7 +151,35 @@ async def receive(
     return upload
 
 
-def _check_size(name: str, size: int, limit: int) -> None:
+async def examined(
+    path: Path, upload_id: str, sha256: str, *, store: UploadTable, settings: ServiceSettings, owner: str | None
+) -> Upload:
+    """The record of a file that has arrived, with the content of its header; it is not stored.
+
+    Raises
+    ------
+    TooLargeError
+        More points than allowed.
+    InputError
+        The file cannot be used.
+    """
+    loop = asyncio.get_running_loop()
+    examining = _quick_examining if is_quick(path) else _slow_examining
+    facts = await loop.run_in_executor(examining, preflight, path, settings.max_points)
+    now = await loop.run_in_executor(_writers, store.now)
+    return Upload(
+        upload_id=upload_id,
+        owner=owner,
+        filename=path.name,
+        size_bytes=path.stat().st_size,
+        sha256=sha256,
+        created_at=now,
+        expires_at=now + dt.timedelta(days=settings.upload_days),
+        preflight=facts,
+    )
+
+
+def check_size(name: str, size: int, limit: int) -> None:
     """Refuse a file as soon as it is too large."""
     if size > limit:
         raise TooLargeError(
@@ -171,7 +187,7 @@ def _check_size(name: str, size: int, limit: int) -> None:
         )
 
 
-def _check_digest(name: str, found: str, promised: str | None) -> None:
+def check_digest(name: str, found: str, promised: str | None) -> None:
     """Refuse bytes that differ from the promised digest."""
     if promised is not None and promised != found:
         raise RequestError([f"the SHA-256 of {name} is {found}, not {promised} as promised: send it again"])

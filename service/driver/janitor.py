@@ -12,6 +12,7 @@ from service.driver import finished_work
 from service.errors import UploadInUseError
 from service.files import StateFolder, is_id
 from service.jobs import JobStatus
+from service.resumable import remove_expired
 from service.store import JobStore
 from service.uploads import STALE_S, remove_file, remove_leftovers
 
@@ -74,7 +75,7 @@ def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
 
 
 def tidy_uploads(store: JobStore, folder: StateFolder) -> list[Path]:
-    """Remove expired uploads, and the files of uploads without a record."""
+    """Remove expired uploads, finished or not, and the files of uploads without a record."""
     removed = []
     for upload in store.expired_uploads(store.now()):
         try:
@@ -92,6 +93,7 @@ def tidy_uploads(store: JobStore, folder: StateFolder) -> list[Path]:
             remove_file(path.name, folder)
             removed.append(path)
     if folder.uploads.is_dir():
+        removed += remove_expired(folder, store.now())
         removed += remove_leftovers(folder, now_s=now_s)
     return removed
 

@@ -3,6 +3,7 @@
 CI runs some hundred; `GABLEWORK_OPENAPI_CASES=5000 .venv/bin/python -m pytest -m slow tests/83_openapi -s` runs more.
 """
 
+import base64
 import contextlib
 import itertools
 import os
@@ -26,6 +27,8 @@ from service.schedules import Definition
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "80_service"))
 
 import finished_runs
+
+schemathesis.serializer.alias("application/offset+octet-stream", "application/octet-stream")
 
 CASES = int(os.environ.get("GABLEWORK_OPENAPI_CASES", "500"))
 """Requests to be generated, at least."""
@@ -56,12 +59,21 @@ class Ids:
         sent = service.client.post("/uploads?filename=points.xyz", content=POINTS)
         assert sent.status_code == 201, sent.text
         self._upload = sent.json()["uploadID"]
+        name = base64.b64encode(b"points.xyz").decode()
+        self._tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "5", "Upload-Metadata": f"filename {name}"}
         self._schedules = itertools.cycle([self._schedule() for _ in range(3)])
 
     def _schedule(self) -> str:
         asked = finished_runs.JobRequest(tiles=(finished_runs.InputReference(kind="upload", value=self._upload),))
         definition = Definition(cron=Cron("30 2 * * *", "Europe/Amsterdam"), request=asked)
         return self._service.store.schedules.create(definition, owner=None, most=10**6).schedule_id
+
+    def _unfinished(self) -> str:
+        made = self._service.client.post("/uploads/tus", headers=self._tus)
+        if made.status_code == 429:
+            return self._upload
+        assert made.status_code == 201, made.text
+        return str(made.headers["location"].rpartition("/")[2])
 
     def _execute(self) -> dict[str, Any]:
         return {"inputs": {"tiles": [{"href": f"/uploads/{self._upload}"}], "crs": "EPSG:28992"}}
@@ -73,7 +85,7 @@ class Ids:
 
     def put_into(self, case: Any, mode: GenerationMode) -> None:
         parameters = case.path_parameters or {}
-        if next(self._turn) % 2:
+        if next(self._turn) % 2 and not (case.path.startswith("/uploads/tus") and mode is GenerationMode.NEGATIVE):
             return
         process = next(self._processes)
         if case.path.endswith("/execution") and mode is GenerationMode.POSITIVE:
@@ -95,7 +107,12 @@ class Ids:
             case.query["method"] = next(self._methods)
         if "jobID" in parameters:
             parameters["jobID"] = self._waiting() if case.method == "DELETE" else next(self._finished)
-        if "uploadID" in parameters and case.method == "GET":
+        if case.path.startswith("/uploads/tus"):
+            fitting = self._tus if mode is GenerationMode.POSITIVE else {"Tus-Resumable": "1.0.0"}
+            case.headers = {**(case.headers or {}), **fitting}
+        if "uploadID" in parameters and case.path.startswith("/uploads/tus"):
+            parameters["uploadID"] = self._unfinished()
+        elif "uploadID" in parameters and case.method == "GET":
             parameters["uploadID"] = self._upload
         if "buildingID" in parameters:
             parameters["buildingID"] = next(self._buildings)
