@@ -90,6 +90,8 @@ class JobRequest:
     """Settings that differ from the defaults, as in a settings file; includes `method`, `preset` and `classes`."""
     methods: tuple[str, ...] = ()
     """Methods of a comparison, each METHOD or METHOD:PRESET; empty for other processes."""
+    echo: Mapping[str, Any] | None = None
+    """Message and delay in seconds; only for `echo`, which has no tiles."""
     raster_cell: float | None = None
     """Side of the cells of rasters in the CRS's units; None for the default. Only for `classify`."""
     meshes: str = "building"

@@ -104,6 +104,12 @@ PROCESSES: Mapping[str, Process] = MappingProxyType(
                 "terrain, of the surface, and of the height above ground.",
                 keywords=("lidar", "point cloud", "classification", "terrain model", "surface model"),
             ),
+            Process(
+                process_id="echo",
+                title="Echo",
+                description="A job that answers with its message after a delay: for tests of clients and networks.",
+                keywords=("test",),
+            ),
         )
     }
 )

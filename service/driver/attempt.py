@@ -32,7 +32,7 @@ from service.errors import RequestError
 from service.fetching import Fetched, gather
 from service.files import StateFolder
 from service.jobs import JobRequest
-from service.outputs import write_classification_outputs, write_comparison_outputs, write_outputs
+from service.outputs import write_classification_outputs, write_comparison_outputs, write_echo, write_outputs
 from service.outputs.kinds import RASTERS
 from service.settings import ServiceSettings
 from service.store import JobStore
@@ -254,8 +254,23 @@ def _classify(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outl
     return work
 
 
+def _echo(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outlines: Fetched | None) -> _Work:
+    """The process `echo`."""
+    del tiles, outlines
+    job = held.job
+    asked = job.request.echo or {}
+
+    def work(_executor: Executor) -> tuple[str, dict[str, Any]]:
+        held.wait(asked["delay"])
+        _outputs_begin(held)
+        write_echo(asked["message"], shop.folder.outputs(job.job_id, job.attempt))
+        return "echoed", {"engine_version": __version__}
+
+    return work
+
+
 WORK: Mapping[str, Callable[[LeasedJob, DriverParts, Sequence[Fetched], Fetched | None], _Work]] = MappingProxyType(
-    {"reconstruct": _reconstruct, "compare": _compare, "classify": _classify}
+    {"reconstruct": _reconstruct, "compare": _compare, "classify": _classify, "echo": _echo}
 )
 """The work of each process: checks the request with the fetched inputs, and returns the rest of the work."""
 

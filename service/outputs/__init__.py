@@ -8,11 +8,20 @@ from service.outputs.assemble import write_outputs
 from service.outputs.catalogue import Catalogue, output_file, read_catalogue, run_outputs
 from service.outputs.classification import write_classification_outputs
 from service.outputs.comparison import write_comparison_outputs
-from service.outputs.kinds import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, KINDS, OUTPUTS, OutputKind
+from service.outputs.echo import write_echo
+from service.outputs.kinds import (
+    CLASSIFICATION_OUTPUTS,
+    COMPARISON_OUTPUTS,
+    ECHO_OUTPUTS,
+    KINDS,
+    OUTPUTS,
+    OutputKind,
+)
 
 __all__ = [
     "CLASSIFICATION_OUTPUTS",
     "COMPARISON_OUTPUTS",
+    "ECHO_OUTPUTS",
     "KINDS",
     "OUTPUTS",
     "Catalogue",
@@ -22,5 +31,6 @@ __all__ = [
     "run_outputs",
     "write_classification_outputs",
     "write_comparison_outputs",
+    "write_echo",
     "write_outputs",
 ]

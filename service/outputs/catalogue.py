@@ -38,6 +38,11 @@ class ResultsCrs:
     accuracy_m: float | None
     """Accuracy of that transformation in metres; None if PROJ gives none."""
 
+    @classmethod
+    def unknown(cls) -> ResultsCrs:
+        """That of results without coordinates of their own."""
+        return cls(name=None, uri=None, to_wgs84=None, accuracy_m=None)
+
     @property
     def is_known(self) -> bool:
         """Whether there are coordinates in WGS 84."""

@@ -68,8 +68,8 @@ def write_classification_outputs(
             storage.put(kind.filename, _counts(summary, scrub))
         stored[kind.output_id] = StoredOutput(size_bytes=path.stat().st_size, sha256=sha256_of(path))
     on_progress(len(names), len(names))
-    unknown = ResultsCrs(name=None, uri=None, to_wgs84=None, accuracy_m=None)
-    storage.put(CATALOGUE_NAME, Catalogue(outputs=stored, crs=unknown, n_buildings=0).to_json().encode())
+    catalogue = Catalogue(outputs=stored, crs=ResultsCrs.unknown(), n_buildings=0)
+    storage.put(CATALOGUE_NAME, catalogue.to_json().encode())
     shutil.rmtree(folder, ignore_errors=True)
 
 

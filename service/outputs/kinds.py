@@ -195,10 +195,22 @@ COMPARISON_OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in
 CLASSIFICATION_OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _OF_A_CLASSIFICATION}
 """The outputs of the process `classify`."""
 
+ECHO_OUTPUTS: Mapping[str, OutputKind] = {
+    "echo": OutputKind(
+        output_id="echo",
+        title="The message",
+        description="The message that came with the request.",
+        media_type="application/json",
+        filename="echo.json",
+        schema={"type": "object", "contentMediaType": "application/json"},
+    )
+}
+"""The output of the process `echo`."""
+
 RASTERS = ("terrain", "surface", "height")
 """Those of them that are rasters."""
 
-KINDS: Mapping[str, OutputKind] = {**OUTPUTS, **COMPARISON_OUTPUTS, **CLASSIFICATION_OUTPUTS}
+KINDS: Mapping[str, OutputKind] = {**OUTPUTS, **COMPARISON_OUTPUTS, **CLASSIFICATION_OUTPUTS, **ECHO_OUTPUTS}
 """All outputs; an id means the same in all processes."""
 
 

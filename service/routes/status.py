@@ -92,7 +92,8 @@ def execute_request(request: JobRequest, base: str, priority: int) -> Execute:
         return {"href": f"file://{quote(source.value)}" if source.kind == "path" else source.value}
 
     inputs: dict[str, Any] = {
-        "tiles": [reference(tile) for tile in request.tiles],
+        **(request.echo or {}),
+        "tiles": [reference(tile) for tile in request.tiles] or None,
         "footprints": None if request.footprints is None else reference(request.footprints),
         "crs": request.crs,
         "verticalUnit": request.vertical_unit,

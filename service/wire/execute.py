@@ -11,15 +11,16 @@ from pydantic.json_schema import SkipJsonSchema
 
 from service.drafts import Draft
 from service.errors import RequestError
-from service.outputs import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, OUTPUTS, OutputKind
+from service.outputs import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, ECHO_OUTPUTS, OUTPUTS, OutputKind
 from service.wire.base import Request
 from service.wire.faults import FaultsError, sentences, shortened
-from service.wire.inputs import ClassifyInputs, CompareInputs, Inputs, ReconstructInputs
+from service.wire.inputs import ClassifyInputs, CompareInputs, EchoInputs, JobInputs, ReconstructInputs
 
-INPUTS: Mapping[str, type[Inputs]] = {
+INPUTS: Mapping[str, type[JobInputs]] = {
     "reconstruct": ReconstructInputs,
     "compare": CompareInputs,
     "classify": ClassifyInputs,
+    "echo": EchoInputs,
 }
 """The inputs of every process."""
 
@@ -27,6 +28,7 @@ KINDS: Mapping[str, Mapping[str, OutputKind]] = {
     "reconstruct": OUTPUTS,
     "compare": COMPARISON_OUTPUTS,
     "classify": CLASSIFICATION_OUTPUTS,
+    "echo": ECHO_OUTPUTS,
 }
 """The outputs of every process."""
 

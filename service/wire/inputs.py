@@ -121,10 +121,85 @@ def _settings() -> Any:
     )
 
 
-class Inputs(Request):
-    """The inputs of all processes. `settings` comes last in a subclass: it is checked together with the others."""
+_LISTS = ("tiles", "methods")
+"""Inputs that are missing if they are empty."""
+
+
+def _unwrapped(name: str, value: Any) -> Any:
+    if isinstance(value, list) and len(value) == 1 and name not in {"methods", "bbox"}:
+        value = value[0]
+    if isinstance(value, Mapping) and set(value) <= {"value", "mediaType"} and "value" in value:
+        return value["value"]
+    return value
+
+
+def _completed(settings: dict[str, Any], info: ValidationInfo, *names: str) -> dict[str, Any]:
+    """Settings with the general ones that are inputs of their own; raises all their faults and contradictions."""
+    given = {name: info.data[name] for name in names if info.data.get(name) is not None}
+    faults = [
+        f"{name} is {word} and settings.{name} is {shortened(settings[name])}: give one of them"
+        for name, word in given.items()
+        if settings.get(name, word) != word
+    ]
+    completed = settings | given
+    faults += [f"settings: {fault}" for fault in settings_faults(completed)]
+    if faults:
+        raise FaultsError(faults)
+    return completed
+
+
+class JobInputs(Request):
+    """The inputs of all processes."""
 
     NOUN: ClassVar[str] = "an input"
+
+    title: Text | None = Field(None, title="Title", description="Your own title for the job.")
+    priority: int = Field(
+        0,
+        ge=-10,
+        le=10,
+        title="Priority",
+        description="Higher runs first; more than 0 needs a key with the scope admin, if keys are used.",
+    )
+
+    @classmethod
+    def prepared(cls, given: Any) -> Any:
+        """Inputs without wrappings: a client may send each value in a list, or with its media type; null is absent."""
+        if not isinstance(given, Mapping):
+            return given
+        plain = {name: value if name in FILES else _unwrapped(name, value) for name, value in given.items()}
+        return {name: value for name, value in plain.items() if value is not None and (value or name not in _LISTS)}
+
+    def draft(self, process_id: str, outputs: tuple[str, ...] | None) -> Draft:
+        """The draft of a job; outputs are None for all."""
+        values = {"process_id": process_id, "title": self.title, "outputs": outputs, **self.of_process()}
+        return Draft(tiles=(), footprints=None, priority=self.priority, values=values)
+
+    def of_process(self) -> dict[str, Any]:
+        """The fields of a `JobRequest` that differ between processes."""
+        raise NotImplementedError
+
+
+class EchoInputs(JobInputs):
+    """The inputs of `echo`."""
+
+    HINTS: ClassVar[Mapping[str, str]] = {"message": "give a text"}
+
+    message: Annotated[str, Field(max_length=10_000), AfterValidator(_printable)] = Field(
+        title="Message", description="The text to answer with."
+    )
+    delay: float = Field(
+        0.0, ge=0.0, le=60.0, allow_inf_nan=False, title="Delay", description="Seconds that the job takes."
+    )
+
+    def of_process(self) -> dict[str, Any]:
+        """Message and delay."""
+        return {"echo": {"message": self.message, "delay": self.delay}}
+
+
+class Inputs(JobInputs):
+    """The inputs of processes that read tiles. `settings` comes last in a subclass: it needs the others."""
+
     HINTS: ClassVar[Mapping[str, str]] = {"tiles": "give one point cloud or more"}
 
     tiles: PointClouds = Field(title="Tiles", description=f"Point clouds. {GIVEN_BY}")
@@ -151,22 +226,6 @@ class Inputs(Request):
     classes: Annotated[str, OneOf(*choices("classes"))] | None = _word(
         "classes", "Classes", "How far the file's own classes are trusted."
     )
-    title: Text | None = Field(None, title="Title", description="Your own title for the job.")
-    priority: int = Field(
-        0,
-        ge=-10,
-        le=10,
-        title="Priority",
-        description="Higher runs first; more than 0 needs a key with the scope admin, if keys are used.",
-    )
-
-    @classmethod
-    def prepared(cls, given: Any) -> Any:
-        """Inputs without wrappings: a client may send each value in a list, or with its media type; null is absent."""
-        if not isinstance(given, Mapping):
-            return given
-        plain = {name: value if name in FILES else _unwrapped(name, value) for name, value in given.items()}
-        return {name: value for name, value in plain.items() if value is not None and (value or name not in _LISTS)}
 
     def draft(self, process_id: str, outputs: tuple[str, ...] | None) -> Draft:
         """The draft of a job; outputs are None for all."""
@@ -177,46 +236,12 @@ class Inputs(Request):
             for n, tile in enumerate(self.tiles)
         )
         values = {
-            "process_id": process_id,
             "crs": self.crs,
             "vertical_unit": self.verticalUnit,
             "allow_outside_area_of_use": self.allowOutsideAreaOfUse,
-            "title": self.title,
-            "outputs": outputs,
-            **self.of_process(),
         }
-        return Draft(tiles=tiles, footprints=self.footprints, priority=self.priority, values=values)
-
-    def of_process(self) -> dict[str, Any]:
-        """The fields of a `JobRequest` that differ between processes."""
-        raise NotImplementedError
-
-
-_LISTS = ("tiles", "methods")
-"""Inputs that are missing if they are empty."""
-
-
-def _unwrapped(name: str, value: Any) -> Any:
-    if isinstance(value, list) and len(value) == 1 and name not in {"methods", "bbox"}:
-        value = value[0]
-    if isinstance(value, Mapping) and set(value) <= {"value", "mediaType"} and "value" in value:
-        return value["value"]
-    return value
-
-
-def _completed(settings: dict[str, Any], info: ValidationInfo, *names: str) -> dict[str, Any]:
-    """Settings with the general ones that are inputs of their own; raises all their faults and contradictions."""
-    given = {name: info.data[name] for name in names if info.data.get(name) is not None}
-    faults = [
-        f"{name} is {word} and settings.{name} is {shortened(settings[name])}: give one of them"
-        for name, word in given.items()
-        if settings.get(name, word) != word
-    ]
-    completed = settings | given
-    faults += [f"settings: {fault}" for fault in settings_faults(completed)]
-    if faults:
-        raise FaultsError(faults)
-    return completed
+        plain = super().draft(process_id, outputs)
+        return dataclasses.replace(plain, tiles=tiles, footprints=self.footprints, values={**values, **plain.values})
 
 
 class BuildingInputs(Inputs):

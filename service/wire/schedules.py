@@ -18,7 +18,7 @@ from service.wire.inputs import Text
 LONGEST_GRACE_S = 30 * 86_400
 """A month; a client that accepts a later start wants to run every slot."""
 
-ProcessId = Literal["reconstruct", "compare", "classify"]
+ProcessId = Literal["reconstruct", "compare", "classify", "echo"]
 Missed = Annotated[
     Literal["run-latest", "skip"],
     Field(

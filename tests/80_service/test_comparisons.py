@@ -202,7 +202,7 @@ def test_a_process_that_a_driver_does_not_know_fails_with_those_that_it_does(ben
     bench.driver()
     done = bench.over(job)
     assert done.failure.fault is Fault.INPUT
-    assert "does not run the process paint, only reconstruct, compare, classify" in done.failure.detail
+    assert "does not run the process paint, only reconstruct, compare, classify, echo" in done.failure.detail
 
 
 def request_of(tmp_path: Path, *methods: str, **settings: Any) -> compare.CompareRequest:

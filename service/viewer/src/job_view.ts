@@ -57,6 +57,9 @@ const SIDE_BY_SIDE: typeof STAGES = [
   ["page", "Write the page", ""],
 ];
 
+/** Processes whose results have buildings. */
+const MODELLED = new Set(["reconstruct", "compare"]);
+
 function stagesOf(job: StatusInfo): typeof STAGES {
   if (job.processID === "classify") return [...STAGES.slice(0, JOINED), ...CLASSIFIED, ...STAGES.slice(-1)];
   return job.processID === "compare" ? [...STAGES.slice(0, -1), ...SIDE_BY_SIDE, ...STAGES.slice(-1)] : STAGES;
@@ -72,7 +75,7 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
     const job = await getJson<StatusInfo>(path, { signal: calledOff.signal });
     if (calledOff.signal.aborted) return;
     document.title = `${titleOf(job)} · gablework`;
-    if (job.status === "successful" && job.processID === "classify") {
+    if (job.status === "successful" && !MODELLED.has(job.processID ?? "reconstruct")) {
       place.replaceChildren(await files(job, path, calledOff.signal));
     } else if (job.status === "successful") {
       // the 3D library is loaded only if there is something to draw
