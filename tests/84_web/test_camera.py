@@ -15,8 +15,8 @@ pytestmark = [pytest.mark.slow]
 
 Open = Callable[..., Visit]
 
-HILL = 0.6
-"""Slope of the hillside on which the tests put the suburb: its 200 m rise by 120 m."""
+SLOPE = 0.8
+"""Slope of both sides of the ridge on which the tests put the suburb: its middle rises by 80 m."""
 EYE_M = 1.7
 """Least height of the camera above the ground, as in navigation.ts."""
 
@@ -27,13 +27,14 @@ def finished(service: str, tile: Path) -> str:
     return finished_job(service, tile)
 
 
-def on_a_hillside(models: str) -> str:
-    """CityJSON text sequence with each building moved up by the hillside at its place."""
+def on_a_ridge(models: str) -> str:
+    """CityJSON text sequence with each building moved up by a ridge: the middle of all boxes is inside the hill."""
     lines = [json.loads(line) for line in models.splitlines() if line]
-    scale, west = lines[0]["transform"]["scale"], lines[0]["metadata"]["geographicalExtent"][0]
+    scale, extent = lines[0]["transform"]["scale"], lines[0]["metadata"]["geographicalExtent"]
+    ridge, half = (extent[0] + extent[3]) / 2, (extent[3] - extent[0]) / 2
     for feature in lines[1:]:
         east = [x * scale[0] + lines[0]["transform"]["translate"][0] for x, _, _ in feature["vertices"]]
-        rise = round(HILL * (np.mean(east) - west) / scale[2])
+        rise = round(SLOPE * (half - abs(np.mean(east) - ridge)) / scale[2])
         feature["vertices"] = [[x, y, z + rise] for x, y, z in feature["vertices"]]
     return "\n".join(json.dumps(line) for line in lines)
 
@@ -45,7 +46,7 @@ def hill(visit: Open, service: str, finished: str) -> Visit:
 
     def answer(route: Route) -> None:
         response = route.fetch()
-        route.fulfill(response=response, body=on_a_hillside(response.text()))
+        route.fulfill(response=response, body=on_a_ridge(response.text()))
 
     opened.page.route("**/results/cityjson", answer)
     opened.open_job(finished)
