@@ -18,7 +18,19 @@ from service.guard import Guard
 from service.methods import HeadAsGet, check_query
 from service.metrics import Measured, Metrics
 from service.rate_limits import RateLimiter
-from service.routes import buildings, events, health, jobs, landing, processes, results, schedules, tus, uploads
+from service.routes import (
+    buildings,
+    events,
+    health,
+    jobs,
+    landing,
+    processes,
+    results,
+    schedules,
+    tus,
+    uploads,
+    webhooks,
+)
 from service.routes.events import Streams
 from service.routes.replay import ReplayedError, replayed
 from service.routes.writing import writing
@@ -33,6 +45,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     jobs.router,
     events.router,
     schedules.router,
+    webhooks.router,
     results.router,
     buildings.router,
     health.router,

@@ -3,10 +3,12 @@
 ```
 ServiceError
 ├── NoSuchJobError, NoSuchProcessError, NoSuchUploadError, NoSuchBuildingError, NoSuchOutputError, NoSuchScheduleError
+├── NoSuchWebhookError, NoSuchDeliveryError
 ├── ResultNotReadyError      the job is not over yet, or was dismissed
 ├── RequestError             inputs that do not fit the process: lists all faults at once
 ├── OutsideAreaError         tiles far outside the area of use of their CRS: lists them all
 ├── InputRefusedError        an input that is not allowed: a path outside the roots, a host that is not listed
+├── TargetRefusedError       a URL to which webhooks are not sent
 ├── LimitError               more than this service takes
 │   ├── TooLargeError        an upload or a body with too many bytes or points
 │   ├── NoSpaceError         the disk of the state folder is full, or only its reserve is free
@@ -24,6 +26,7 @@ ServiceError
 ├── ScheduleBusyError        a job of the schedule is under way, so it cannot be run now
 ├── KeyInUseError            a request with the same Idempotency-Key is under way
 ├── KeyReusedError           the Idempotency-Key was used for another request
+├── NotReplayableError       a delivery that is being sent, or whose webhook is gone
 ├── ChangedMeanwhileError    the record has changed since the client read it
 ├── LeaseLostError           a driver's claim on a job has passed to another
 ├── StoreError               the database does not answer, or is not migrated
@@ -66,6 +69,18 @@ class NoSuchScheduleError(ServiceError):
     """The schedule does not exist, or belongs to another key."""
 
 
+class NoSuchWebhookError(ServiceError):
+    """The webhook does not exist."""
+
+
+class NoSuchDeliveryError(ServiceError):
+    """The delivery does not exist, was removed from the log, or belongs to another key."""
+
+
+class NotReplayableError(ServiceError):
+    """A delivery that cannot be sent again now: it is being sent, or its webhook is gone or disabled."""
+
+
 class ResultNotReadyError(ServiceError):
     """The job has no results (yet)."""
 
@@ -100,6 +115,10 @@ class OutsideAreaError(ServiceError):
 
 class InputRefusedError(ServiceError):
     """An input that this service is not allowed to read."""
+
+
+class TargetRefusedError(ServiceError):
+    """A URL to which this service sends no webhooks."""
 
 
 class LimitError(ServiceError):

@@ -69,6 +69,26 @@ class InputReference:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Subscriber:
+    """Where a client wants to get news of its job: the subscriber of OGC API - Processes."""
+
+    success_uri: str | None = None
+    """Gets the results document."""
+    in_progress_uri: str | None = None
+    """Gets the status when the job starts, and its progress."""
+    failed_uri: str | None = None
+    """Gets the status if the job fails or is dismissed."""
+    base: str = ""
+    """The service's own URL as the client knows it, for links."""
+
+    @property
+    def uris(self) -> list[str]:
+        """All that are given, each once."""
+        given = (self.success_uri, self.in_progress_uri, self.failed_uri)
+        return list(dict.fromkeys(uri for uri in given if uri is not None))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class JobRequest:
     """The job's request, validated at submission."""
 
@@ -104,6 +124,8 @@ class JobRequest:
     """document or raw: whether the results are listed in a document or in Link headers."""
     title: str | None = None
     """The user's title."""
+    subscriber: Subscriber | None = None
+    """Where to send news of the job."""
 
     @property
     def has_buildings(self) -> bool:
@@ -132,6 +154,8 @@ class JobRequest:
         values["tiles"] = tuple(InputReference(**tile) for tile in stored["tiles"])
         if stored.get("footprints") is not None:
             values["footprints"] = InputReference(**stored["footprints"])
+        if stored.get("subscriber") is not None:
+            values["subscriber"] = Subscriber(**stored["subscriber"])
         for name in ("bbox", "outputs", "methods"):
             if stored.get(name) is not None:
                 values[name] = tuple(stored[name])

@@ -60,6 +60,12 @@ class _Jobs(Collector):
             "Free bytes below which uploads and jobs are refused.",
             value=self._disk.reserve_bytes,
         )
+        deliveries = GaugeMetricFamily(
+            "gablework_webhook_deliveries", "Webhooks in the log, by state.", labels=["state"]
+        )
+        for state, count in self._store.webhooks.counts().items():
+            deliveries.add_metric([state.value], count)
+        yield deliveries
         yield GaugeMetricFamily("gablework_event_streams", "Event streams that are open.", value=self._streams())
 
     def _oldest_s(self, waiting: int) -> float:

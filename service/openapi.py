@@ -28,6 +28,7 @@ TAGS = (
     {"name": "uploads", "description": "Files that jobs read."},
     {"name": "jobs", "description": "Status, events and dismissal of jobs."},
     {"name": "schedules", "description": "Jobs that run again and again: when, and what happened each time."},
+    {"name": "webhooks", "description": "News that the service sends: receivers, signatures, the log of deliveries."},
     {"name": "results", "description": "Files and single buildings."},
 )
 """Chapters of the document."""

@@ -73,6 +73,14 @@ KINDS: Mapping[type[Exception], Kind] = {
     errors.NoSuchOutputError: Kind(status=404, type_uri=f"{OWN}no-such-output", title="No such output"),
     errors.NoSuchScheduleError: Kind(status=404, type_uri=f"{OWN}no-such-schedule", title="No such schedule"),
     errors.JobNotOverError: Kind(status=409, type_uri=f"{OWN}job-not-over", title="The job is not over yet"),
+    errors.NoSuchWebhookError: Kind(status=404, type_uri=f"{OWN}no-such-webhook", title="No such webhook"),
+    errors.NoSuchDeliveryError: Kind(status=404, type_uri=f"{OWN}no-such-delivery", title="No such delivery"),
+    errors.NotReplayableError: Kind(
+        status=409, type_uri=f"{OWN}not-replayable", title="The delivery cannot be sent again now"
+    ),
+    errors.TargetRefusedError: Kind(
+        status=403, type_uri=f"{OWN}target-refused", title="Webhooks are not sent to this URL"
+    ),
     errors.ScheduleBusyError: Kind(
         status=409, type_uri=f"{OWN}schedule-busy", title="A job of the schedule is under way"
     ),

@@ -108,6 +108,26 @@ class ServiceSettings(BaseSettings):
     )
     max_event_streams: int = Field(default=200, gt=0, description="Maximum number of open event streams.")
 
+    # webhooks
+    webhook_hosts: tuple[str, ...] = Field(
+        default=(),
+        description="Hosts (name, name:port or http://name:port) to which webhooks are sent although their addresses "
+        "are private or they use plain http; none by default. Public addresses need https and no entry.",
+    )
+    webhook_hours: float = Field(
+        default=24.0, gt=0.0, le=24.0 * 30.0, description="Hours for which a webhook that fails is tried again."
+    )
+    webhook_pause_s: float = Field(
+        default=5.0,
+        gt=0.0,
+        le=3600.0,
+        description="Seconds before the second attempt at a webhook; each further pause is three times as long, up to "
+        "4 hours.",
+    )
+    webhook_log_days: float = Field(
+        default=30.0, gt=0.0, le=36_500.0, description="Days after which a finished delivery is removed from the log."
+    )
+
     # the driver and its cluster
     scheduler: str | None = Field(default=None, description="Address of a Dask scheduler; default an embedded cluster.")
     tls_ca: str | None = Field(

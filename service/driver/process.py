@@ -22,6 +22,7 @@ from service.driver.janitor import tidy
 from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.driver.logs import configure, quieten
 from service.driver.shared_cluster import SharedCluster
+from service.driver.webhooks import Sender
 from service.errors import LeaseLostError, StoreError
 from service.files import StateFolder
 from service.settings import ServiceSettings
@@ -76,6 +77,7 @@ class Driver:
         self._at_once = threading.Event()
         self._attempts = Attempts(self._shop, name=self.name, ending=self._stopping)
         self._disk_watch = DiskWatch(folder.disk, self._all_held)
+        self._sender = Sender(self._store, folder, settings, name=self.name)
         self._ended = threading.Event()
         # the signal handler counts here, since it must not take a lock
         self._stops = 0
@@ -115,15 +117,18 @@ class Driver:
         if self._parent_pipe is not None:
             threading.Thread(target=self._watch_parent, name="parent", daemon=True).start()
         threading.Thread(target=self._watch_disk, name="disk", daemon=True).start()
-        starter = threading.Thread(target=self._start, args=([*slots, clock, janitor],), name="start", daemon=True)
+        threads = [*slots, clock, janitor, *self._sender.threads]
+        starter = threading.Thread(target=self._start, args=(threads,), name="start", daemon=True)
         starter.start()
         self._wait_for_stop()
         with self._lock:
             self._stopping.set()
         clean = self._drain()
         self._ended.set()
+        # only now: jobs that ended while it drained have news, too
+        self._sender.stop()
         starter.join(_TICK_S)
-        for thread in [*slots, clock, janitor]:
+        for thread in threads:
             if thread.ident is not None:
                 thread.join(1.0 if clean else _TICK_S)
         self._cluster.close()
@@ -304,6 +309,8 @@ class Driver:
         while True:
             try:
                 removed = tidy(self._store, self._shop.folder)
+                while self._store.webhooks.forget(self._settings.webhook_log_days):
+                    continue
             except (StoreError, OSError) as error:
                 LOG.warning("the state folder could not be tidied: %s", error, extra=self._facts)
             else:

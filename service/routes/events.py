@@ -18,7 +18,7 @@ from service.routes.answers import document, problems, reference
 from service.routes.bound import Base, Reader, Settings_, Store
 from service.routes.jobs import JobId
 from service.routes.negotiation import preferred
-from service.routes.status import event_document
+from service.status import event_document
 from service.store import JobStore
 from service.wire.base import link, respond
 from service.wire.jobs import EventList, ServerSentEvent

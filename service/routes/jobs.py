@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import anyio
 from fastapi import APIRouter, Body, Path, Query, Response
+from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from service.errors import JobNotOverError, RequestError
@@ -20,13 +21,13 @@ from service.processes import process_named
 from service.routes.answers import JOB_ID, JOB_MADE, STATUS_EXAMPLE, document, problems, reference
 from service.routes.bound import Base, Folder, Reader, Store, Submitter
 from service.routes.html import PageRoute, in_either_form
-from service.routes.status import execute_request, job_made, status_info
 from service.routes.submission import Submission, Submitting
 from service.routes.writing import Write
+from service.status import execute_request, job_made, status_info
 from service.store import JobFilter
 from service.wire.base import page_links, respond
 from service.wire.execute import RETRY_EXAMPLES, Execute, Retry, wanted
-from service.wire.faults import shortened
+from service.wire.faults import sentences, shortened
 from service.wire.jobs import JobForm, JobList, StatusInfo
 from service.wire.queries import JobQuery, interval
 
@@ -111,7 +112,13 @@ async def _read(submission: Submission) -> Execute:
             inputs[name] = _value(name, text, faults)
     if faults:
         raise RequestError(faults)
-    return Execute(inputs=inputs, outputs=None if outputs is None else wanted(outputs))
+    given = {"subscriber": inputs.pop("subscriber")} if "subscriber" in inputs else {}
+    try:
+        return Execute.model_validate(
+            {"inputs": inputs, "outputs": None if outputs is None else wanted(outputs), **given}
+        )
+    except ValidationError as error:
+        raise RequestError(sentences(error.errors(include_url=False))) from error
 
 
 async def _stored(part: Part, submission: Submission, number: int) -> dict[str, str]:
@@ -129,8 +136,8 @@ def _words(text: str) -> list[str]:
 
 
 def _value(name: str, text: str, faults: list[str]) -> Any:
-    """A field's value: settings, numbers and permissions (true, false) are JSON, anything else is text."""
-    if name not in {"settings", "bbox", "priority", "allowOutsideAreaOfUse"}:
+    """A field's value: settings, subscriber, numbers and permissions (true, false) are JSON, anything else is text."""
+    if name not in {"settings", "subscriber", "bbox", "priority", "allowOutsideAreaOfUse"}:
         return text.strip()
     if name == "bbox" and not text.strip().startswith(("[", "{")):
         text = f"[{text}]"

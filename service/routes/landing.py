@@ -23,7 +23,7 @@ SPECIFICATION = "http://www.opengis.net/spec/ogcapi-processes-1/1.0/conf/"
 
 CONFORMANCE = tuple(
     f"{SPECIFICATION}{name}"
-    for name in ("core", "json", "html", "oas30", "ogc-process-description", "job-list", "dismiss")
+    for name in ("core", "json", "html", "oas30", "ogc-process-description", "job-list", "callback", "dismiss")
 )
 """The implemented parts of the standard."""
 
@@ -62,6 +62,7 @@ def _for_machines(base: str) -> Response:
             link(f"{base}/processes", f"{RELATIONS}processes", "The processes"),
             link(f"{base}/jobs", f"{RELATIONS}job-list", "The jobs"),
             link(f"{base}/schedules", "schedules", "The schedules"),
+            link(f"{base}/webhooks/deliveries", "deliveries", "The log of webhooks"),
         ],
     )
     return respond(page, headers={"Vary": "Accept"})

@@ -10,8 +10,8 @@ from service.processes import PROCESSES, process_named
 from service.routes.answers import JOB_MADE, document, problems
 from service.routes.bound import Base, Settings_, visitor
 from service.routes.html import PageRoute, in_either_form
-from service.routes.status import job_made
 from service.routes.submission import Submitting
+from service.status import job_made
 from service.wire.base import link, respond
 from service.wire.execute import EXAMPLE, Execute
 from service.wire.processes import Process, ProcessList

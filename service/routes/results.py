@@ -18,9 +18,10 @@ from service.routes.bound import Base
 from service.routes.finished_jobs import Finished
 from service.routes.html import PageRoute, in_either_form
 from service.routes.negotiation import preferred
+from service.status import results_document
 from service.wire.base import respond
 from service.wire.queries import words
-from service.wire.results import OutputFile, Results
+from service.wire.results import Results
 
 router = APIRouter(tags=["results"], route_class=PageRoute)
 
@@ -79,24 +80,15 @@ def results(
     if missing:
         raise finished.catalogue.missing(missing[0])
     place = f"{base}/jobs/{finished.job.job_id}/results"
-    found = {
-        name: OutputFile(
-            href=finished.address(f"{place}/{name}"),
-            rel="item",
-            type=KINDS[name].media_type,
-            title=KINDS[name].title,
-            bytes=entry.size_bytes,
-            sha256=entry.sha256,
-        )
-        for name, entry in stored.items()
-        if not wanted or name in wanted
-    }
+    found = results_document(finished.catalogue, lambda name: finished.address(f"{place}/{name}"), wanted)
     headers = {"Cache-Control": "private, no-cache"}
     if finished.job.request.response == "raw":
         # outputs by reference have no body of their own (OGC 18-062)
-        links = (f'<{entry.href}>; rel="item"; type="{entry.type}"; title="{name}"' for name, entry in found.items())
+        links = (
+            f'<{entry.href}>; rel="item"; type="{entry.type}"; title="{name}"' for name, entry in found.root.items()
+        )
         return Response(status_code=204, headers=headers | {"Link": ", ".join(links)})
-    return respond(Results(found), headers=headers)
+    return respond(found, headers=headers)
 
 
 def _file_answers() -> dict[int | str, dict[str, Any]]:

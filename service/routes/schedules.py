@@ -27,11 +27,11 @@ from service.routes.answers import (
     reference,
 )
 from service.routes.bound import Base, Reader, Settings_, Store, Submitter
-from service.routes.status import execute_request, job_made
 from service.routes.submission import Changing, Submitting
 from service.routes.writing import Write
 from service.schedules import Definition, Schedule, ScheduleRun
 from service.settings import ServiceSettings
+from service.status import execute_request, job_made
 from service.store import ScheduleFilter
 from service.wire import schedules as wire
 from service.wire.base import link, page_links, respond

@@ -19,15 +19,16 @@ from service.drafts import Draft, Inline
 from service.errors import ForbiddenError, QuotaError, StoreBusyError, StoreError, StoreFullError
 from service.fetching import resolve_inputs
 from service.files import StateFolder
-from service.jobs import InputReference, Job, JobRequest, Upload
+from service.jobs import InputReference, Job, JobRequest, Subscriber, Upload
 from service.keys import Scope
 from service.multipart import Form
-from service.routes.bound import Folder, Settings_, Store, Submitter
+from service.routes.bound import Base, Folder, Settings_, Store, Submitter
 from service.routes.replay import HeldKey, IdempotencyKey, checked_replay, fingerprint_of, stored_answer
 from service.routes.writing import Write, Writer
 from service.settings import ServiceSettings
 from service.store import JobStore
 from service.uploads import receive, remove_file
+from service.webhook_targets import check_receiver
 
 Made = TypeVar("Made")
 """A job, a schedule, or whatever else a request makes."""
@@ -64,17 +65,25 @@ class Submission:
     ----------
     writer : Writer
         Writes for the request.
-    store, folder, settings, caller
+    store, folder, settings, caller, base
         As the application bound them.
     """
 
     def __init__(
-        self, writer: Writer, *, store: JobStore, folder: StateFolder, settings: ServiceSettings, caller: Principal
+        self,
+        writer: Writer,
+        *,
+        store: JobStore,
+        folder: StateFolder,
+        settings: ServiceSettings,
+        caller: Principal,
+        base: str,
     ) -> None:
         self.store = store
         self.folder = folder
         self.settings = settings
         self.caller = caller
+        self._base = base
         self._writer = writer
         self._request = writer.request
         self._arrived = Arrived(store)
@@ -168,6 +177,8 @@ class Submission:
         ------
         RequestError, InputRefusedError, NoSuchUploadError
             An input cannot be used.
+        TargetRefusedError
+            The job's news would go to a URL to which webhooks are not sent.
         ForbiddenError
             The priority needs another scope.
         """
@@ -175,12 +186,17 @@ class Submission:
             raise ForbiddenError(
                 f"priority is {draft.priority}: this needs the scope {Scope.ADMIN}, use 0 or less with this key"
             )
+        subscriber: Subscriber | None = draft.values.get("subscriber")
+        if subscriber is not None:
+            for uri in subscriber.uris:
+                await check_receiver(uri, self.settings)
+            subscriber = dataclasses.replace(subscriber, base=self._base)
         stored: dict[Inline, InputReference] = {}
         for inline in draft.inline:
             stored[inline] = await self.keep(_once(inline.content), inline.filename)
 
         def check_and_make(delivery: Delivery[Made]) -> Made:
-            request = draft.request(stored)
+            request = dataclasses.replace(draft.request(stored), subscriber=subscriber)
             owner = self.caller.owner
             resolve_inputs(request, store=self._arrived, folder=self.folder, settings=self.settings, owner=owner)
             return make(request, delivery)
@@ -265,8 +281,10 @@ class Submission:
             remove_file(upload.upload_id, self.folder)
 
 
-async def _changing(writer: Write, store: Store, folder: Folder, settings: Settings_, caller: Submitter) -> Submission:
-    return Submission(writer, store=store, folder=folder, settings=settings, caller=caller)
+async def _changing(
+    writer: Write, store: Store, folder: Folder, settings: Settings_, caller: Submitter, base: Base
+) -> Submission:
+    return Submission(writer, store=store, folder=folder, settings=settings, caller=caller, base=base)
 
 
 async def _submitting(

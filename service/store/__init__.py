@@ -4,5 +4,6 @@ from service.store.job_store import JobStore
 from service.store.patience import Patience
 from service.store.queries import JobFilter
 from service.store.schedules import ScheduleFilter
+from service.store.webhook_deliveries import DeliveryFilter
 
-__all__ = ["JobFilter", "JobStore", "Patience", "ScheduleFilter"]
+__all__ = ["DeliveryFilter", "JobFilter", "JobStore", "Patience", "ScheduleFilter"]

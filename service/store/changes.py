@@ -12,9 +12,11 @@ from sqlalchemy.engine import Connection
 from service.errors import LeaseLostError
 from service.files import is_id
 from service.jobs import Job, JobEvent, JobStatus
+from service.store.outbox import announce
 from service.store.policies import duration_ms
 from service.store.records import job_of, storable
 from service.store.tables import EVENTS, JOBS
+from service.webhooks import EVENT_OF, EventType
 
 MAX_KEPT = 1000
 """Events kept per job, in addition to its status events and the latest progress of each stage."""
@@ -67,7 +69,7 @@ def _row(connection: Connection, job_id: str, *, locked: bool) -> sa.Row[Any] | 
 def move(
     connection: Connection, row: sa.Row[Any], status: JobStatus, *, now: dt.datetime, message: str, **values: Any
 ) -> None:
-    """Change the status of a locked job, with an event."""
+    """Change the status of a locked job, with an event and its webhooks."""
     message = storable(message)
     ends: dict[str, Any] = {}
     if status is not JobStatus.RUNNING:
@@ -91,6 +93,7 @@ def move(
             message=message,
         )
     )
+    announce(connection, row, EVENT_OF[status], now)
 
 
 def append(connection: Connection, row: sa.Row[Any], events: Sequence[JobEvent], now: dt.datetime) -> None:
@@ -138,6 +141,7 @@ def append(connection: Connection, row: sa.Row[Any], events: Sequence[JobEvent],
             progress=progress, stage=stage, message=message, updated_at=now, last_event=row.last_event + len(events)
         )
     )
+    announce(connection, row, EventType.PROGRESS, now)
 
 
 def _forget_oldest(connection: Connection, job_id: str) -> None:

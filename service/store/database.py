@@ -32,6 +32,7 @@ _ANSWER_S = 10.0
 _RETRY_S = 0.01
 _LOCK_MIGRATIONS = 0x6761626C01
 LOCK_SUBMISSIONS = 0x6761626C02
+LOCK_SECRETS = 0x6761626C03
 """Numbers of PostgreSQL's advisory locks."""
 # PostgreSQL: connection, resources, operator, system, no database, authorisation, idle in transaction, no table
 _PASSING = ("08", "53", "57", "58", "3D", "28", "25P03", "42P01", "SQLITE_NOTADB", "SQLITE_CORRUPT")

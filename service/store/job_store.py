@@ -10,11 +10,12 @@ from typing import Any, Self
 from service.deliveries import Claim, Delivery, StoredAnswer
 from service.jobs import Job, JobEvent, JobFailure, JobRequest, JobStatus, Upload
 from service.keys import Key
-from service.store import changes, claims, idempotency, keys, queries, submissions, uploads
+from service.store import changes, claims, idempotency, keys, queries, submissions, uploads, webhook_deliveries
 from service.store.database import LOCK_SUBMISSIONS, WAIT_S, Database
 from service.store.delivering import creating
 from service.store.queries import JobFilter
 from service.store.schedule_store import ScheduleStore
+from service.store.webhook_store import WebhookStore
 
 
 class JobStore:
@@ -40,6 +41,8 @@ class JobStore:
         self._database = Database(url, wait_s=wait_s)
         self.schedules = ScheduleStore(self._database)
         """Schedules and the history of their slots."""
+        self.webhooks = WebhookStore(self._database)
+        """Receivers of news, and the news that are sent to them."""
 
     def __enter__(self) -> Self:
         """For `with`: closes the connections at the end."""
@@ -223,10 +226,11 @@ class JobStore:
         """Take back the jobs of a driver that is known to be dead, before their leases end; returns their ids.
 
         They go back into the queue, fail if they were lost `max_attempts` times, or are dismissed if that was
-        requested.
+        requested. Webhooks that it was sending are sent again.
         """
         with self._database.write() as connection:
             now = self._database.now(connection)
+            webhook_deliveries.give_up_all(connection, driver)
             return claims.give_up_all(connection, driver, now=now, max_attempts=max_attempts)
 
     def renew(self, job: Job, *, lease_s: float) -> bool:

@@ -12,10 +12,12 @@ from sqlalchemy.engine import Connection
 from service.errors import NoSuchUploadError, QueueFullError, ResultNotReadyError
 from service.jobs import JobRequest, JobStatus
 from service.store.changes import lock_job, move
+from service.store.outbox import announce
 from service.store.policies import lease_expired
 from service.store.queries import no_such_job
 from service.store.records import job_of, storable
 from service.store.tables import EVENTS, JOB_UPLOADS, JOBS, UPLOADS
+from service.webhooks import EventType
 
 
 def check_queue(connection: Connection, owner: str | None, *, max_queued: int, max_queued_per_key: int) -> None:
@@ -94,6 +96,8 @@ def insert(
     hold_uploads(connection, needed)
     if needed:
         connection.execute(sa.insert(JOB_UPLOADS), [{"job_id": job_id, "upload_id": name} for name in needed])
+    made = connection.execute(sa.select(JOBS).where(JOBS.c.job_id == job_id)).one()
+    announce(connection, made, EventType.ACCEPTED, now)
     return job_id
 
 

@@ -218,3 +218,83 @@ SCHEDULE_UPLOADS = sa.Table(
 """One row per schedule and upload that it needs."""
 
 sa.Index("schedule_uploads_by_upload", SCHEDULE_UPLOADS.c.upload_id)
+
+WEBHOOKS = sa.Table(
+    "webhooks",
+    METADATA,
+    sa.Column("endpoint_id", sa.String(32), primary_key=True),
+    sa.Column("url", sa.Text, nullable=False),
+    sa.Column("events", sa.JSON, nullable=False),
+    sa.Column("description", sa.Text),
+    sa.Column("is_enabled", sa.Boolean, nullable=False),
+    sa.Column("disabled_reason", sa.Text),
+    sa.Column("base", sa.Text, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    sa.Column("secret", sa.String(64), nullable=False),
+    sa.Column("old_secret", sa.String(64)),
+    sa.Column("old_until", UtcTime),
+    sa.Column("changed_at", UtcTime, nullable=False),
+)
+"""One row per endpoint that gets the events of all jobs. Secrets are stored, since they sign."""
+
+WEBHOOK_SECRETS = sa.Table(
+    "webhook_secrets",
+    METADATA,
+    sa.Column("owner", sa.String(64), primary_key=True),
+    sa.Column("secret", sa.String(64), nullable=False),
+    sa.Column("old_secret", sa.String(64)),
+    sa.Column("old_until", UtcTime),
+    sa.Column("changed_at", UtcTime, nullable=False),
+)
+"""One row per key whose subscribers get signed messages; the owner is empty if keys are not used."""
+
+WEBHOOK_DELIVERIES = sa.Table(
+    "webhook_deliveries",
+    METADATA,
+    sa.Column("delivery_id", sa.String(32), primary_key=True),
+    sa.Column("endpoint_id", sa.String(32)),
+    sa.Column("job_id", sa.String(32), nullable=False),
+    sa.Column("owner", sa.String(64)),
+    sa.Column("url", sa.Text, nullable=False),
+    sa.Column("base", sa.Text, nullable=False),
+    sa.Column("event", sa.String(32), nullable=False),
+    sa.Column("snapshot", sa.JSON, nullable=False),
+    sa.Column("body", sa.Text),
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("reason", sa.Text),
+    sa.Column("attempts", sa.Integer, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("tried_since", UtcTime, nullable=False),
+    sa.Column("due_at", UtcTime),
+    sa.Column("finished_at", UtcTime),
+    sa.Column("lease_owner", sa.String(255)),
+    sa.Column("lease_until", UtcTime),
+)
+"""One row per message and receiver: the outbox, and later the log. Not tied to jobs, which may be removed before."""
+
+sa.Index("webhook_deliveries_in_line", WEBHOOK_DELIVERIES.c.state, WEBHOOK_DELIVERIES.c.due_at)
+sa.Index("webhook_deliveries_by_lease", WEBHOOK_DELIVERIES.c.lease_until)
+sa.Index("webhook_deliveries_by_job", WEBHOOK_DELIVERIES.c.job_id)
+sa.Index("webhook_deliveries_by_endpoint", WEBHOOK_DELIVERIES.c.endpoint_id, WEBHOOK_DELIVERIES.c.state)
+sa.Index("webhook_deliveries_by_age", WEBHOOK_DELIVERIES.c.created_at, WEBHOOK_DELIVERIES.c.delivery_id)
+sa.Index("webhook_deliveries_by_owner", WEBHOOK_DELIVERIES.c.owner, WEBHOOK_DELIVERIES.c.created_at)
+sa.Index("webhook_deliveries_by_end", WEBHOOK_DELIVERIES.c.finished_at)
+
+WEBHOOK_ATTEMPTS = sa.Table(
+    "webhook_attempts",
+    METADATA,
+    sa.Column(
+        "delivery_id",
+        sa.String(32),
+        sa.ForeignKey("webhook_deliveries.delivery_id", ondelete="CASCADE"),
+        primary_key=True,
+    ),
+    sa.Column("number", sa.Integer, primary_key=True),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("driver", sa.String(255), nullable=False),
+    sa.Column("duration_ms", sa.BigInteger),
+    sa.Column("status", sa.Integer),
+    sa.Column("error", sa.Text),
+)
+"""One row per attempt, written before it begins."""

@@ -6,15 +6,16 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
-from pydantic import ConfigDict, Field, ValidationError, field_validator
-from pydantic.json_schema import SkipJsonSchema
+from pydantic import ConfigDict, Field, ValidationError
 
 from service.drafts import Draft
 from service.errors import RequestError
+from service.jobs import Subscriber
 from service.outputs import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, ECHO_OUTPUTS, OUTPUTS, OutputKind
 from service.wire.base import Request
 from service.wire.faults import FaultsError, sentences, shortened
 from service.wire.inputs import ClassifyInputs, CompareInputs, EchoInputs, JobInputs, ReconstructInputs
+from service.wire.webhooks import ReceiverUrl
 
 INPUTS: Mapping[str, type[JobInputs]] = {
     "reconstruct": ReconstructInputs,
@@ -80,6 +81,23 @@ def wanted(names: Iterable[str]) -> dict[str, WantedOutput]:
     return {name: WantedOutput() for name in names}
 
 
+class SubscriberUris(Request):
+    """Where to send news of the job; the page on webhooks shows bodies and signatures."""
+
+    successUri: ReceiverUrl | None = Field(None, description="Gets the results document when the job succeeds.")
+    inProgressUri: ReceiverUrl | None = Field(
+        None, description="Gets the job's status when it starts, and its progress at most every 10 s."
+    )
+    failedUri: ReceiverUrl | None = Field(None, description="Gets the job's status when it fails or is dismissed.")
+
+    @classmethod
+    def prepared(cls, given: Any) -> Any:
+        """The URIs, if there are any."""
+        if given == {}:
+            raise FaultsError([f"subscriber is empty: give one of {', '.join(cls.model_fields)}"])
+        return given
+
+
 class Retry(Request):
     """What differs from the request of the job that is tried again."""
 
@@ -102,7 +120,7 @@ class Retry(Request):
             changes["settings"] = _merged_tables(kept, settings) or None
         inputs = _merged(before.inputs, changes)
         outputs = before.outputs if self.outputs is None else self.outputs
-        return Execute(inputs=inputs, outputs=outputs, response=before.response)
+        return Execute(inputs=inputs, outputs=outputs, response=before.response, subscriber=before.subscriber)
 
 
 def _merged(before: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -138,13 +156,7 @@ class Execute(Request):
         description="The answer to `/jobs/{jobID}/results`: a document that lists the outputs, or no content and one "
         "Link header per output.",
     )
-    subscriber: SkipJsonSchema[Any] = None
-
-    @field_validator("subscriber")
-    @classmethod
-    def _no_subscriber(cls, value: Any) -> None:
-        if value is not None:
-            raise FaultsError(["subscriber is given: this service does not call back, follow the job's events"])
+    subscriber: SubscriberUris | None = Field(default=None, description="Where to send news of the job.")
 
     def draft(self, process_id: str, max_inputs: int | None = None) -> Draft:
         """The draft of a job of a process with at most `max_inputs` point clouds.
@@ -171,4 +183,11 @@ class Execute(Request):
         if inputs is None or faults:
             raise RequestError(faults)
         draft = inputs.draft(process_id, outputs)
-        return dataclasses.replace(draft, values={**draft.values, "response": self.response})
+        values = {**draft.values, "response": self.response, "subscriber": self._subscriber()}
+        return dataclasses.replace(draft, values=values)
+
+    def _subscriber(self) -> Subscriber | None:
+        given = self.subscriber
+        if given is None:
+            return None
+        return Subscriber(success_uri=given.successUri, in_progress_uri=given.inProgressUri, failed_uri=given.failedUri)

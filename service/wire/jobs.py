@@ -105,4 +105,5 @@ class JobForm(Answer):
     licence: str | None = None
     title: str | None = None
     priority: int | None = None
+    subscriber: str | None = Field(None, description="JSON, as in a process's execution.")
     outputs: str | None = Field(None, description="Ids of the wanted outputs, with commas between them.")

@@ -8,7 +8,7 @@ from pipeline import __version__
 from service.errors import StartUpError
 from service.keys import Scope
 from service.routes import landing
-from service.routes.status import RELATIONS
+from service.status import RELATIONS
 
 
 def test_the_landing_page_links_to_all_that_the_standard_wants(local_service) -> None:
@@ -60,7 +60,8 @@ def test_a_built_page_and_its_files_are_served(starting, monkeypatch, tmp_path: 
 
 def test_conformance_names_what_is_met_and_nothing_else(local_service) -> None:
     classes = {uri.rpartition("/")[2] for uri in local_service.client.get("/conformance").json()["conformsTo"]}
-    assert classes == {"core", "json", "html", "oas30", "ogc-process-description", "job-list", "dismiss"}
+    wanted = {"core", "json", "html", "oas30", "ogc-process-description", "job-list", "callback", "dismiss"}
+    assert classes == wanted
     assert local_service.client.get("/openapi.json").json()["openapi"].startswith("3.0.")
 
 

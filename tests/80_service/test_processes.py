@@ -34,7 +34,7 @@ def faults_of(answer) -> str:
 
 def test_the_fields_of_the_form_are_inputs_of_the_processes() -> None:
     inputs = {*ReconstructInputs.model_fields, *CompareInputs.model_fields}
-    assert {name.replace("tile", "tiles") for name in JobForm.model_fields} == inputs | {"outputs"}
+    assert {name.replace("tile", "tiles") for name in JobForm.model_fields} == inputs | {"outputs", "subscriber"}
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,11 @@ def test_all_faults_of_a_request_are_reported_at_once(local_service) -> None:
             'outputs.report.format.mediaType is "text/csv": use "application/json"',
         ),
         ({"inputs": {}, "outputs": {"report": {"colour": "red"}}}, '"colour" is not a member: use format'),
-        ({"inputs": {}, "subscriber": {"successUri": "http://example.org"}}, "subscriber"),
+        ({"inputs": {}, "subscriber": {}}, "subscriber is empty: give one of successUri"),
+        (
+            {"inputs": {}, "subscriber": {"sucessUri": "https://example.org"}},
+            '"sucessUri" is not a member: use successUri',
+        ),
         ({"inputs": {"tiles": None}}, "tiles is missing"),
         ({"inputs": {"tiles": 7}}, "tiles is 7"),
         ({"inputs": {}, "mode": []}, "mode is []"),

@@ -10,6 +10,7 @@ from delivery_contract import DeliveryContract
 from migrated import with_tables
 from schedule_store_contract import ScheduleStoreContract
 from store_contract import StoreContract, claim, submit
+from webhook_store_contract import WebhookStoreContract
 
 from service.errors import StartUpError, StoreError
 from service.store import JobStore, database
@@ -34,6 +35,10 @@ class TestSchedulesOnSqlite(OnSqlite, ScheduleStoreContract):
 
 class TestDeliveriesOnSqlite(OnSqlite, DeliveryContract):
     """All of the contract of deliveries, on a file."""
+
+
+class TestWebhooksOnSqlite(OnSqlite, WebhookStoreContract):
+    """All of the contract of webhooks, on a file."""
 
 
 class OnceRefused:

@@ -1,18 +1,20 @@
-"""From the records of a job to the documents that clients see."""
+"""From the records of a job to the documents that clients and receivers of webhooks see."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 from urllib.parse import quote
 
 from starlette.responses import Response
 
-from service.jobs import InputReference, Job, JobEvent, JobRequest, JobStatus
+from service.jobs import InputReference, Job, JobEvent, JobRequest, JobStatus, Subscriber
+from service.outputs import KINDS, Catalogue
 from service.problems import failure_document
 from service.wire.base import RELATIONS, Link, link, respond
-from service.wire.execute import Execute, wanted
+from service.wire.execute import Execute, SubscriberUris, wanted
 from service.wire.jobs import Event, StatusInfo
+from service.wire.results import OutputFile, Results
 
 
 def status_info(job: Job, base: str, *, with_request: bool = True) -> StatusInfo:
@@ -111,6 +113,43 @@ def execute_request(request: JobRequest, base: str, priority: int) -> Execute:
         inputs={name: value for name, value in inputs.items() if value is not None},
         outputs=None if request.outputs is None else wanted(request.outputs),
         response="raw" if request.response == "raw" else "document",
+        subscriber=None if request.subscriber is None else _uris(request.subscriber),
+    )
+
+
+def _uris(subscriber: Subscriber) -> SubscriberUris:
+    return SubscriberUris(
+        successUri=subscriber.success_uri, inProgressUri=subscriber.in_progress_uri, failedUri=subscriber.failed_uri
+    )
+
+
+def results_document(
+    catalogue: Catalogue, place: Callable[[str], str], wanted_outputs: Collection[str] = ()
+) -> Results:
+    """The document that lists the outputs of a job.
+
+    Parameters
+    ----------
+    catalogue : Catalogue
+        The outputs.
+    place : callable
+        The URL of an output, by its id.
+    wanted_outputs : collection of str
+        Only these; all if it is empty.
+    """
+    return Results(
+        {
+            name: OutputFile(
+                href=place(name),
+                rel="item",
+                type=KINDS[name].media_type,
+                title=KINDS[name].title,
+                bytes=entry.size_bytes,
+                sha256=entry.sha256,
+            )
+            for name, entry in catalogue.outputs.items()
+            if not wanted_outputs or name in wanted_outputs
+        }
     )
 
 

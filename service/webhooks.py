@@ -1,0 +1,330 @@
+"""Webhooks: endpoints, deliveries, signatures, and when a delivery is tried again.
+
+No SQL, no HTTP; time is an argument.
+
+```
+             2xx
+ waiting ----------> delivered
+  |  ^  |  410
+  |  |  +----------> gone       nothing more goes to this URL
+  +--+  |  too old, or refused
+ retry  +----------> failed
+        |  overtaken, webhook disabled or removed
+        +----------> dropped
+```
+
+Each delivery is a row that is written in the transaction that changes the job, so no change goes unreported. A replay
+makes any of them wait again. Signatures follow Standard Webhooks (standardwebhooks.com).
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import datetime as dt
+import hashlib
+import hmac
+import secrets
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+from typing import Any
+
+from service.jobs import Fault, Job, JobFailure, JobRequest, JobStatus
+
+SECRET_PREFIX = "whsec_"  # noqa: S105 - the prefix that the standard gives to secrets
+_SECRET_BYTES = 32
+"""As long as the digest that it keys; the standard asks for 24 to 64."""
+
+OLD_SECRET = dt.timedelta(days=1)
+"""How long a replaced secret still signs: receivers have a day to take the new one."""
+
+PROGRESS_S = 10.0
+"""Minimum seconds between two reports of progress to one receiver; people who look at it need no more."""
+
+LONGEST_PAUSE_S = 4.0 * 3600.0
+"""Longest pause between two attempts: a receiver that comes back after a night gets its news within the morning."""
+_GROWTH = 3.0
+"""Each pause is so many times the one before: about ten attempts in a day."""
+
+GONE = 410
+"""The status by which a receiver ends its deliveries."""
+
+
+class EventType(StrEnum):
+    """What a webhook reports."""
+
+    ACCEPTED = "job.accepted"
+    """A job waits for a driver: it is new, or an attempt was lost."""
+    RUNNING = "job.running"
+    """A driver has begun."""
+    PROGRESS = "job.progress"
+    """The job has progressed; at most once in `PROGRESS_S` seconds."""
+    SUCCESSFUL = "job.successful"
+    FAILED = "job.failed"
+    DISMISSED = "job.dismissed"
+
+    @property
+    def is_end(self) -> bool:
+        """Whether nothing follows."""
+        return self in {EventType.SUCCESSFUL, EventType.FAILED, EventType.DISMISSED}
+
+
+EVENT_OF: Mapping[JobStatus, EventType] = {status: EventType(f"job.{status.value}") for status in JobStatus}
+"""The event of a new status."""
+
+
+class DeliveryState(StrEnum):
+    """State of a delivery."""
+
+    WAITING = "waiting"
+    """It will be sent, or sent again."""
+    DELIVERED = "delivered"
+    """The receiver answered with 2xx."""
+    FAILED = "failed"
+    """It was refused, or tried for too long."""
+    GONE = "gone"
+    """The receiver answered 410."""
+    DROPPED = "dropped"
+    """It is not needed any longer; the reason says why."""
+
+
+# --- secrets and signatures
+
+
+def new_secret() -> str:
+    """A random secret for signatures."""
+    return SECRET_PREFIX + base64.b64encode(secrets.token_bytes(_SECRET_BYTES)).decode()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SigningSecret:
+    """A secret, and the one that it replaced."""
+
+    secret: str
+    """Signs every delivery."""
+    old_secret: str | None = None
+    """Signs as well, until `old_until`."""
+    old_until: dt.datetime | None = None
+    changed_at: dt.datetime
+    """When the secret was made."""
+
+    def rotated(self, now: dt.datetime) -> SigningSecret:
+        """A new secret; this one still signs for a day."""
+        return SigningSecret(secret=new_secret(), old_secret=self.secret, old_until=now + OLD_SECRET, changed_at=now)
+
+    def valid(self, now: dt.datetime) -> list[str]:
+        """All secrets that sign now, the newest first."""
+        is_old_valid = self.old_secret is not None and self.old_until is not None and now < self.old_until
+        return [self.secret, *([self.old_secret] if is_old_valid and self.old_secret is not None else [])]
+
+
+def signature(secret: str, message_id: str, timestamp_s: int, body: bytes) -> str:
+    """The signature of a message: `v1,` and the base64 of HMAC-SHA256 over id, timestamp and body.
+
+    Raises
+    ------
+    ValueError
+        The secret is not base64.
+
+    >>> signature("whsec_" + "QUJD" * 8, "m", 1, b"{}")[:8]
+    'v1,8ECeu'
+    """
+    key = base64.b64decode(secret.removeprefix(SECRET_PREFIX), validate=True)
+    digest = hmac.new(key, f"{message_id}.{timestamp_s}.".encode() + body, hashlib.sha256).digest()
+    return f"v1,{base64.b64encode(digest).decode()}"
+
+
+def signed_headers(secrets_: Sequence[str], message_id: str, timestamp_s: int, body: bytes) -> dict[str, str]:
+    """The headers of a message, with one signature per secret."""
+    return {
+        "webhook-id": message_id,
+        "webhook-timestamp": str(timestamp_s),
+        "webhook-signature": " ".join(signature(secret, message_id, timestamp_s, body) for secret in secrets_),
+    }
+
+
+# --- records
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Endpoint:
+    """A receiver of the events of all jobs, as an operator made it."""
+
+    endpoint_id: str
+    """32 hexadecimal digits."""
+    url: str
+    events: tuple[EventType, ...]
+    """Only these are sent."""
+    description: str | None
+    is_enabled: bool
+    disabled_reason: str | None
+    """Why nothing is sent; None if it is enabled."""
+    base: str
+    """The service's own URL when it was made, for links."""
+    created_at: dt.datetime
+    """With a time zone, like all times here."""
+    updated_at: dt.datetime
+    old_secret_until: dt.datetime | None = None
+    """Time until which the replaced secret still signs."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """One attempt to send a delivery."""
+
+    number: int
+    """From 1."""
+    at: dt.datetime
+    driver: str
+    """The driver that sent it."""
+    duration_ms: int | None = None
+    """None while it is under way."""
+    status: int | None = None
+    """HTTP status of the answer; None without one."""
+    error: str | None = None
+    """What went wrong; None if the receiver took it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Delivery:
+    """One message to one receiver."""
+
+    delivery_id: str
+    """32 hexadecimal digits; the header `webhook-id`, the same in all attempts."""
+    endpoint_id: str | None
+    """The endpoint; None if the receiver is the subscriber of a job."""
+    job_id: str
+    owner: str | None
+    """The key of the job."""
+    url: str
+    event: EventType
+    state: DeliveryState
+    reason: str | None
+    """Why it is in this state, if that needs words."""
+    attempts: int
+    """Number of attempts."""
+    created_at: dt.datetime
+    """Time of the event."""
+    tried_since: dt.datetime
+    """Time from which the hours of retries count: that of the event, or of the last replay."""
+    due_at: dt.datetime | None
+    """Time of the next attempt; None if it does not wait."""
+    finished_at: dt.datetime | None
+    body: str | None = None
+    """The body as it was sent; None before the first attempt."""
+    log: tuple[Attempt, ...] = ()
+    """All attempts, the first one first; only if one delivery was asked for."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Parcel:
+    """A delivery that a driver sends now."""
+
+    delivery: Delivery
+    driver: str
+    """The driver that holds it."""
+    job: Job
+    """The job at the time of the event."""
+    base: str
+    """The service's own URL, for links."""
+    secrets: Sequence[str]
+    """All that sign."""
+    sent_at: dt.datetime
+    """The time of this attempt."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Result:
+    """How an attempt ended."""
+
+    duration_ms: int
+    status: int | None = None
+    """HTTP status of the answer; None without one."""
+    error: str | None = None
+    """What went wrong; None if the receiver took it."""
+    retry_after_s: float = 0.0
+    """Seconds that the receiver asks for."""
+    is_final: bool = False
+    """Whether another attempt cannot help."""
+    body: str | None = None
+    """The body that was sent, or would have been."""
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the receiver took it."""
+        return self.error is None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RetryPolicy:
+    """For how long a delivery is tried."""
+
+    hours: float
+    """Hours from the event, or from a replay."""
+    first_pause_s: float
+    """Seconds before the second attempt."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What becomes of a delivery after an attempt."""
+
+    state: DeliveryState
+    due_at: dt.datetime | None = None
+    """Time of the next attempt."""
+    reason: str | None = None
+
+
+def pause_s(attempts: int, policy: RetryPolicy, chance: float) -> float:
+    """Seconds after a number of failed attempts; `chance` in [0, 1) spreads receivers that fail together.
+
+    >>> policy = RetryPolicy(hours=24.0, first_pause_s=5.0)
+    >>> [round(pause_s(n, policy, 0.5)) for n in (1, 2, 3, 7, 8, 20)]
+    [5, 15, 45, 3645, 10935, 14400]
+    >>> pause_s(1, policy, 0.0), pause_s(500, policy, 0.0)
+    (2.5, 7200.0)
+    """
+    grown = policy.first_pause_s * _GROWTH ** min(attempts - 1, 50)
+    return min(grown, LONGEST_PAUSE_S) * (0.5 + chance)
+
+
+def verdict(delivery: Delivery, result: Result, now: dt.datetime, policy: RetryPolicy, chance: float) -> Verdict:
+    """What becomes of a delivery whose attempt has just ended."""
+    if result.is_success:
+        return Verdict(state=DeliveryState.DELIVERED)
+    if result.status == GONE:
+        return Verdict(state=DeliveryState.GONE, reason="the receiver answered 410: nothing more is sent to this URL")
+    if result.is_final:
+        return Verdict(state=DeliveryState.FAILED, reason=result.error)
+    pause = max(pause_s(delivery.attempts, policy, chance), min(result.retry_after_s, LONGEST_PAUSE_S))
+    due_at = now + dt.timedelta(seconds=pause)
+    if due_at > delivery.tried_since + dt.timedelta(hours=policy.hours):
+        reason = f"tried for {policy.hours:g} hours; the last time: {result.error}"
+        return Verdict(state=DeliveryState.FAILED, reason=reason)
+    return Verdict(state=DeliveryState.WAITING, due_at=due_at, reason=result.error)
+
+
+# --- the job as it was
+
+
+def snapshot_of(job: Job) -> dict[str, Any]:
+    """All that a message says of a job, as plain JSON values; without its inputs, settings and lease."""
+    small = dataclasses.replace(job.request, tiles=(), footprints=None, settings={}, subscriber=None)
+    values = {field.name: getattr(job, field.name) for field in dataclasses.fields(job)}
+    values |= {"request": small.as_dict(), "status": job.status.value, "lease_owner": None, "lease_until": None}
+    if job.failure is not None:
+        values["failure"] = {"fault": job.failure.fault.value, "detail": job.failure.detail}
+    return {name: value.isoformat() if isinstance(value, dt.datetime) else value for name, value in values.items()}
+
+
+def job_of(snapshot: Mapping[str, Any]) -> Job:
+    """The inverse of `snapshot_of`."""
+    values = dict(snapshot)
+    for name, value in snapshot.items():
+        if name.endswith("_at") and value is not None:
+            values[name] = dt.datetime.fromisoformat(value)
+    values |= {"request": JobRequest.from_dict(snapshot["request"]), "status": JobStatus(snapshot["status"])}
+    failure = snapshot["failure"]
+    if failure is not None:
+        values["failure"] = JobFailure(fault=Fault(failure["fault"]), detail=failure["detail"])
+    return Job(**values)
