@@ -1,10 +1,12 @@
 import { variantOf } from "./address";
-import { Problem, getJson, request, upload, type UploadInfo } from "./api";
+import { Problem, getJson, request, type UploadInfo } from "./api";
 import { el, svg } from "./elements";
 import { LABELS, capital } from "./fields";
+import { type Interrupted, fingerprint, forget, interrupted, keyOf } from "./interrupted";
 import { levelWords, levelsOffered, lodsInput } from "./levels_of_detail";
 import { announce, asProblem, problemNotice, warningNotice } from "./notices";
 import { bytes, count, measure, placeWords } from "./numbers";
+import { SMALL_BYTES, send } from "./sending";
 
 const TILE_ENDINGS = ".las,.laz,.ply,.xyz,.txt,.csv,.asc,.pts";
 const FOOTPRINT_ENDINGS = ".gpkg,.geojson,.json,.parquet,.geoparquet";
@@ -16,6 +18,8 @@ interface Sent {
   calledOff: AbortController;
   uploaded: UploadInfo | null;
   share: number;
+  /** Why nothing is sent at the moment. */
+  waiting: string | null;
   problem: Problem | null;
 }
 
@@ -29,6 +33,7 @@ export class Submission {
   private footprints: Sent | null = null;
   private starting = false;
   private readonly rows = el("ul", { class: "files" });
+  private readonly unfinished = el("ul", { class: "files", "aria-label": "Interrupted uploads" });
   private readonly footprintRow = el("ul", { class: "files" });
   private readonly note = el("div");
   private readonly go = el("button", { type: "submit", class: "primary wide" }, "Reconstruct");
@@ -107,6 +112,7 @@ export class Submission {
       el("h2", { id: "submission-title" }, "New job"),
       picker,
       zone,
+      this.unfinished,
       this.rows,
       this.options,
       this.note,
@@ -119,6 +125,24 @@ export class Submission {
     place.replaceChildren(form);
     this.draw();
     void this.describe();
+    void this.offerUnfinished();
+  }
+
+  /** Files that were not sent to their end before the page was left. */
+  private async offerUnfinished(): Promise<void> {
+    for (const one of await interrupted()) {
+      const row = unfinishedRow(one, () => {
+        row.remove();
+        void forget(one.key);
+      });
+      row.dataset["key"] = one.key;
+      if (!this.isSent(one.key)) this.unfinished.append(row);
+    }
+  }
+
+  private isSent(key: string): boolean {
+    const files = this.footprints === null ? this.tiles : [...this.tiles, this.footprints];
+    return files.some(({ file }) => keyOf(fingerprint(file)) === key);
   }
 
   /** Fill the choices from the process's own description. */
@@ -233,6 +257,7 @@ export class Submission {
       calledOff: new AbortController(),
       uploaded: null,
       share: 0,
+      waiting: null,
       problem: null,
     };
     const remove = (): void => {
@@ -243,14 +268,22 @@ export class Submission {
     };
     const draw = (): void => drawRow(sent, remove);
     draw();
-    upload(
-      file,
-      (share) => {
+    for (const row of [...this.unfinished.children]) {
+      if (row instanceof HTMLElement && row.dataset["key"] === keyOf(fingerprint(file))) row.remove();
+    }
+    const report = {
+      progress: (share: number): void => {
         sent.share = share;
         draw();
       },
-      sent.calledOff.signal,
-    ).then(
+      waiting: (reason: string | null): void => {
+        if (reason === sent.waiting) return;
+        sent.waiting = reason;
+        announce(reason === null ? `${file.name} is being sent.` : `${file.name}: ${reason}`);
+        draw();
+      },
+    };
+    send(file, report, sent.calledOff.signal).then(
       (uploaded) => {
         sent.uploaded = uploaded;
         const problems = texts(uploaded.preflight["problems"]);
@@ -378,10 +411,32 @@ function drawRow(sent: Sent, remove: () => void): void {
     // keep the same element: screen readers and transitions keep their place
     const bar = row.querySelector("progress") ?? el("progress", { max: 1, "aria-label": `Upload of ${file.name}` });
     bar.value = sent.share;
-    if (!bar.isConnected) row.replaceChildren(head, bar);
+    const words = row.querySelector(".sent") ?? el("p", { class: "facts sent" });
+    words.textContent = sent.waiting ?? sentWords(file.size, sent.share);
+    if (!bar.isConnected) row.replaceChildren(head, bar, ...(file.size > SMALL_BYTES ? [words] : []));
   } else {
     row.replaceChildren(head, ...preflight(uploaded.preflight));
   }
+}
+
+function sentWords(size: number, share: number): string {
+  return share < 1 ? `${bytes(size * share)} of ${bytes(size)} are sent` : "All is sent, it is being examined";
+}
+
+function unfinishedRow({ name, size, offset }: Interrupted, remove: () => void): HTMLElement {
+  return el(
+    "li",
+    { class: "file" },
+    el(
+      "div",
+      { class: "file-head" },
+      el("span", { class: "file-name" }, name),
+      el("span", { class: "file-size" }, bytes(size)),
+      el("button", { type: "button", class: "icon", "aria-label": `Forget ${name}`, onclick: remove }, "×"),
+    ),
+    el("progress", { max: 1, value: offset / size, "aria-label": `Upload of ${name}` }),
+    el("p", { class: "facts" }, `${bytes(offset)} of ${bytes(size)} are sent. Choose the file again to continue.`),
+  );
 }
 
 /** The facts that the service read in the header. */
