@@ -21,7 +21,7 @@ from service.errors import StoreBusyError
 from service.settings import ServiceSettings
 from service.store import JobFilter, JobStore, Patience
 
-WAIT_S = 0.5
+WAIT_S = 1.0
 EXECUTE = {"inputs": {"tiles": [{"href": "/uploads/ID"}], "crs": "EPSG:28992"}}
 
 
@@ -118,7 +118,7 @@ def test_a_client_that_gives_up_while_the_database_is_locked_makes_nothing(tmp_p
 
 
 def test_threads_of_one_process_wait_no_longer_than_asked(tmp_path: Path) -> None:
-    with JobStore(f"sqlite:///{tmp_path / 'a.db'}", wait_s=0.05) as store:
+    with JobStore(f"sqlite:///{tmp_path / 'a.db'}", wait_s=0.5) as store:
         store.migrate()
         with store._database.write(), ThreadPoolExecutor(4) as crew:
             for waiting in [crew.submit(store.forget_answers) for _ in range(4)]:

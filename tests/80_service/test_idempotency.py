@@ -184,12 +184,13 @@ def is_claimed(store: JobStore) -> bool:
 
 def test_a_client_that_goes_away_frees_its_key(tmp_path: Path) -> None:
     settings = settings_in(tmp_path)
-
-    def broken() -> Any:
-        yield POINTS
-        raise ConnectionError
-
     with serving(settings) as url, JobStore(settings.database) as store:
+
+        def broken() -> Any:
+            yield POINTS
+            wait_for(lambda: is_claimed(store), "the claim of the key")
+            raise ConnectionError
+
         with pytest.raises(ConnectionError):
             httpx.post(f"{url}/uploads?filename=a.xyz", content=broken(), headers=KEY, timeout=DEADLINE_S)
         wait_for(lambda: not is_claimed(store), "the free key")

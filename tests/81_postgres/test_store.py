@@ -70,7 +70,7 @@ def test_a_job_that_another_claims_is_passed_over_and_not_waited_for(postgres_ur
 
 @pytest.mark.parametrize("mode", ["EXCLUSIVE", "ACCESS EXCLUSIVE"])
 def test_a_locked_table_is_not_waited_for_and_nothing_is_written_later(postgres_url: str, mode: str) -> None:
-    with JobStore(postgres_url) as other, JobStore(postgres_url, wait_s=0.3) as store:
+    with JobStore(postgres_url) as other, JobStore(postgres_url, wait_s=1.0) as store:
         store.migrate()
         with other._database.write() as connection:
             connection.exec_driver_sql(f"LOCK TABLE jobs IN {mode} MODE")
@@ -90,6 +90,6 @@ def test_a_writer_that_others_hold_up_at_a_row_gives_way(postgres_url: str) -> N
         held = running(store)
         with other._database.write() as connection:
             connection.exec_driver_sql(f"SELECT 1 FROM jobs WHERE job_id = '{held.job_id}' FOR UPDATE")
-            with Patience(0.3), pytest.raises(StoreBusyError):
+            with Patience(1.0), pytest.raises(StoreBusyError):
                 store.succeed(held, message="done", summary={})
         store.succeed(held, message="done", summary={})
