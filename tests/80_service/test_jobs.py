@@ -26,7 +26,7 @@ from pipeline.errors import (
 from pipeline.runtime.monitoring.logs import formatter
 from service.driver.failures import failure_of, is_tried_again, pause_s
 from service.driver.messages import Scrubber, outcome
-from service.driver.progress import WEIGHTS, WORDS, percent
+from service.driver.progress import CLASSIFY_WEIGHTS, WEIGHTS, WORDS, percent
 from service.errors import (
     InputRefusedError,
     NoSpaceError,
@@ -136,10 +136,12 @@ def test_progress_grows_with_the_stages_and_within_them(steps: list[tuple[str, i
 
 
 def test_the_stages_make_up_the_whole_job() -> None:
-    assert sum(WEIGHTS.values()) == 100
     # what a comparison does besides is short: progress stands still meanwhile
-    assert set(WORDS) - set(WEIGHTS) == {"records", "points", "pictures", "page"}
-    assert set(WEIGHTS) <= set(WORDS)
+    assert set(WORDS) - set(WEIGHTS) - set(CLASSIFY_WEIGHTS) == {"records", "points", "pictures", "page"}
+    for weights in (WEIGHTS, CLASSIFY_WEIGHTS):
+        assert sum(weights.values()) == 100
+        assert set(weights) <= set(WORDS)
+    assert percent("write", 1, 2, CLASSIFY_WEIGHTS) == 77
     assert percent("inputs", 0, 0) == 0
     assert percent("outputs", 5, 5) == 99
     assert percent("unheard of", 5, 5) == 0
