@@ -20,8 +20,8 @@ LEFT_OUT = ("| sweep-", "| samp", "| autzen")
 _PART = re.compile(r"(<!-- begin (\S+) -->\n).*?(<!-- end \2 -->)", re.DOTALL)
 
 
-def filled(page: str, out: Path) -> tuple[str, list[str]]:
-    """The page with the parts that are there, and the names of those that are not."""
+def filled(page: str, out: Path, left_out: tuple[str, ...] = ()) -> tuple[str, list[str]]:
+    """The page with the parts that are there, and the names of those that are not. Lines with a prefix are dropped."""
     missing = []
 
     def part(found: re.Match[str]) -> str:
@@ -29,7 +29,7 @@ def filled(page: str, out: Path) -> tuple[str, list[str]]:
         if not path.exists():
             missing.append(found[2])
             return found[0]
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith(LEFT_OUT)]
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith(left_out)]
         text = "\n".join(lines).strip()
         return f"{found[1]}\n{text}\n\n{found[3]}"
 
@@ -42,7 +42,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--page", type=Path, default=PAGE)
     arguments = parser.parse_args()
-    page, missing = filled(arguments.page.read_text(encoding="utf-8"), arguments.out)
+    page, missing = filled(arguments.page.read_text(encoding="utf-8"), arguments.out, LEFT_OUT)
     arguments.page.write_text(page, encoding="utf-8")
     if (arguments.out / PLOT).exists():
         pictures = arguments.page.parent / "pictures"

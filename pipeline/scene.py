@@ -17,10 +17,11 @@ from pipeline.terrain.facets import SceneVertices, VertexKind
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
 from pipeline.terrain.outliers import dense_enough
-from pipeline.terrain.point_assignment import ScenePoints
+from pipeline.terrain.point_assignment import Allowed, ScenePoints
 from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
 from pipeline.terrain.surfaces import Fragments, fragments_of
-from pipeline.terrain.thinning import highest_per_cell
+from pipeline.terrain.thin_objects import are_thin
+from pipeline.terrain.thinning import highest_per_cell, lowest_below
 from pipeline.terrain.vegetation import crowns, planarity
 from pipeline.tiling import Window
 from pipeline.tin.delaunay import triangulate
@@ -153,8 +154,39 @@ def _vertices(
         kind[points.classification[chosen] == GROUND_CLASS] = VertexKind.GROUND
     kind[building[chosen]] = VertexKind.BUILDING
     planar = planarity(x, y, z, kind == VertexKind.OBJECT, settings.vegetation)
+    stands = used & (height_mm >= round(1000 * settings.ground.tolerance_m))
+    planar[_has_floor(points, height_mm, stands, chosen, planar == 0, settings)] = 1
     kind[crowns(x, y, z, planar, several[chosen], settings.vegetation)] = VertexKind.CROWN
     return SceneVertices(x_mm=x, y_mm=y, z_mm=z, height_mm=height_mm[chosen], kind=kind, planar=planar)
+
+
+def _has_floor(
+    points: WindowPoints,
+    height_mm: IntArray,
+    stands: BoolArray,
+    chosen: IntArray,
+    rough: BoolArray,
+    settings: SceneSettings,
+) -> BoolArray:
+    """Which rough vertices (m,) stand on an even floor, as railings, plants and furniture on a roof do.
+
+    `chosen` (m,) are the points that became the vertices, `stands` (n,) marks the points above the ground. The floor is
+    the lowest of them in each cell. It is as even as a scanner measures; the lowest points in a crown are as rough as
+    the highest. Floors of beds and hedges lie lower than roofs.
+    """
+    vegetation = settings.vegetation
+    x, y, z = points.x_mm, points.y_mm, points.z_mm
+    floor = lowest_below(x, y, z, stands, chosen, settings.surfaces.thinning_m, vegetation.level_m)
+    wanted = rough & (height_mm[floor] >= round(1000 * settings.candidates.min_height_m))
+    even: BoolArray = planarity(x[floor], y[floor], z[floor], wanted, vegetation, vegetation.smooth_m) > 0
+    return even
+
+
+def _thin(points: WindowPoints, height_mm: IntArray, vertices: SceneVertices, settings: SceneSettings) -> BoolArray:
+    """Which points (n,) are low and thin between ground on both sides: garden walls, fences and hedges."""
+    low_mm = round(1000 * settings.candidates.min_height_m)
+    low = (height_mm >= round(1000 * settings.ground.tolerance_m)) & (height_mm < low_mm)
+    return are_thin(points.x_mm, points.y_mm, low, vertices, low_mm, round(1000 * settings.surfaces.thin_m))
 
 
 def split_tile(
@@ -180,21 +212,23 @@ def split_tile(
         excluded = np.isin(points.classification, VEGETATION_CLASSES)
     vertices = _vertices(points, height, terrain, building, excluded, settings, classes)
     core_index = np.flatnonzero(core.contains(points.x_mm, points.y_mm) & (height != NO_DATA))
-    allowed = np.ones(len(core_index), np.int8)
-    allowed[excluded[core_index]] = 0
-    allowed[building[core_index]] = 2
+    owned = points.take(core_index)
+    allowed = np.where(_thin(owned, height[core_index], vertices, settings), Allowed.EVIDENCE, Allowed.ANY)
+    allowed = allowed.astype(np.int8)
+    allowed[excluded[core_index]] = Allowed.NEVER
+    allowed[building[core_index]] = Allowed.BUILDING
     if classes.ground:
-        allowed[points.classification[core_index] == GROUND_CLASS] = 0
+        allowed[owned.classification == GROUND_CLASS] = Allowed.NEVER
     fragments, point_fragment = fragments_of(
         triangulate(np.column_stack((vertices.x_mm, vertices.y_mm))),
         vertices,
         ScenePoints(
-            x_mm=points.x_mm[core_index],
-            y_mm=points.y_mm[core_index],
-            z_mm=points.z_mm[core_index],
+            x_mm=owned.x_mm,
+            y_mm=owned.y_mm,
+            z_mm=owned.z_mm,
             height_mm=height[core_index],
-            last=_is_last(points)[core_index],
-            several=points.return_count[core_index] > 1,
+            last=_is_last(owned),
+            several=owned.return_count > 1,
             allowed=allowed,
         ),
         (core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm),

@@ -177,7 +177,7 @@ def classify(
             context, request.settings.scene, request.settings.building.roof.min_strip_offset_m, splits, footprints
         )
         tiles = sorted(splits.places)
-        _label_all(context, request.settings, tiles, joined, ingested)
+        _label_all(context, request.settings, tiles, joined, ingested, given=footprints is not None)
         files = _write_all(context, paths, ingested, out)
         rasters = _draw_all(context, request.settings, tiles, ingested, cell, out) if request.rasters else []
     return _summary(progress, out, files, rasters, len(joined.candidates), began)
@@ -216,9 +216,15 @@ def _summary(
 
 
 def _label_all(
-    context: RunContext, settings: RunSettings, tiles: Sequence[Tile], joined: Joined, ingested: Sequence[Ingested]
+    context: RunContext,
+    settings: RunSettings,
+    tiles: Sequence[Tile],
+    joined: Joined,
+    ingested: Sequence[Ingested],
+    *,
+    given: bool,
 ) -> None:
-    """The classes of all tiles' points, in scratch."""
+    """The classes of all tiles' points, in scratch; buildings may be `given` by footprints."""
     grid = context.plan.grid
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
     buildings = _by_tile(joined.candidates)
@@ -229,6 +235,7 @@ def _label_all(
             grid=grid,
             settings=settings.scene,
             classes=classes,
+            given=given or classes.building,
             scratch=context.scratch,
             buildings=tuple(part for other in near for part in buildings.get(other, ())),
             decks=tuple(part for other in near for part in decks.get(other, ())),

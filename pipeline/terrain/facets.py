@@ -7,6 +7,7 @@ order: every tile that sees a facet decides the same.
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -14,6 +15,13 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
+
+_GAP_SPACINGS = 5.0
+"""A wide facet is no surface if its circumradius is this many times the distance from each corner to the second nearest
+vertex.
+
+Not a setting: among randomly scattered points one circumradius in a million is that large.
+"""
 
 
 class FacetKind(IntEnum):
@@ -111,6 +119,22 @@ def first_corner(x: IntArray, y: IntArray, facets: LabelArray, f: int) -> int:
 
 
 @kernel
+def _bridges_gap(x: IntArray, y: IntArray, corners: tuple[int, int, int], radius_mm: float) -> bool:
+    """Whether each corner has two other vertices far nearer than the circumradius; vertices come sorted by (x, y)."""
+    near_mm = int(radius_mm / _GAP_SPACINGS)
+    for v in corners:
+        found = 0
+        for step in (-1, 1):
+            w = v + step
+            while 0 <= w < x.size and abs(x[w] - x[v]) <= near_mm:
+                found += (x[w] - x[v]) ** 2 + (y[w] - y[v]) ** 2 <= near_mm * near_mm
+                w += step
+        if found < 2:
+            return False
+    return True
+
+
+@kernel
 def classify_facets(vertices: SceneVertices, facets: LabelArray, limits: FacetLimits) -> KindArray:
     """FacetKind of every facet (m, 3), int8 (m,): by circumradius, MX_zdiff, slope and the kinds of the vertices."""
     x, y, z, height, kind, _ = vertices
@@ -126,7 +150,9 @@ def classify_facets(vertices: SceneVertices, facets: LabelArray, limits: FacetLi
         # one order of multiplication, whichever vertex comes first
         least, most = min(u2, v2, w2), max(u2, v2, w2)
         middle = max(min(u2, v2), min(max(u2, v2), w2))
-        if least * middle * most > 4.0 * (float(area2) * area2) * max_radius_mm * max_radius_mm:
+        whole = 4.0 * (float(area2) * area2)
+        radius2 = least * middle * most
+        if radius2 > whole * max_radius_mm * max_radius_mm:
             out[f] = FacetKind.VOID
             continue
         z_difference = max(z[a], z[b], z[c]) - min(z[a], z[b], z[c])
@@ -148,6 +174,10 @@ def classify_facets(vertices: SceneVertices, facets: LabelArray, limits: FacetLi
         if cuts:
             high = min(height[a], height[b], height[c]) >= limits.step_height_mm
             out[f] = FacetKind.STEP if high else FacetKind.BORDER
+        elif 4.0 * radius2 > whole * max_radius_mm * max_radius_mm and _bridges_gap(
+            x, y, (a, b, c), math.sqrt(radius2 / whole)
+        ):
+            out[f] = FacetKind.VOID
         elif kind[a] == kind[b] and kind[b] == kind[c] and kind[a] != VertexKind.CROWN:
             out[f] = FacetKind.BUILDING if kind[a] == VertexKind.BUILDING else FacetKind.OBJECT
         elif kind[a] != VertexKind.BUILDING and kind[b] != VertexKind.BUILDING and kind[c] != VertexKind.BUILDING:

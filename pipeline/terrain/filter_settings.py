@@ -27,7 +27,7 @@ class MorphologicalFilterSettings(Parameters):
         maximum=60,
     )
     window_slope: float = parameter(
-        0.15,
+        0.12,
         "Height that a step of the first openings may remove, per metre of radius.",
         minimum=0.01,
         maximum=2.0,

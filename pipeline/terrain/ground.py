@@ -18,6 +18,7 @@ from pipeline.terrain.hierarchical_filter import hierarchical_ground
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, lowest_per_cell, without_pits
 from pipeline.terrain.morphological import morphological_ground
 from pipeline.terrain.planar_fitting import MIN_CELLS, plane_around, plane_sums
+from pipeline.terrain.rejoining import FEWEST_SIDES, meeting_sides
 from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.support import NEAR_CELLS
 
@@ -30,11 +31,14 @@ def _draw(
     halves: tuple[int, int, bool],
     max_slope: float,
     drawn: tuple[int, int, int, int],
+    beside: tuple[int, float],
 ) -> None:
     """Terrain in mm where there is none yet: the plane through the ground of the smallest square that determines one.
 
     `halves` are the half sides of the first and the last square in cells, and whether the last one must suffice. Only
-    the cells of `drawn`, first and one past the last column and row, get an elevation.
+    the cells of `drawn`, first and one past the last column and row, get an elevation. `beside` are the half side of
+    the squares beside a cell and a step in mm: ground that lies farther than the step above its plane, as at a brow or
+    a crest, is terrain itself if the planes of `meeting_sides` meet it. A half side of 0 leaves them out.
     """
     first, last, is_final = halves
     rows, columns = lowest.shape
@@ -64,6 +68,10 @@ def _draw(
                 slack = max_slope * CELL_MM * math.sqrt(east * east + north * north)
                 level = min(max(level, mean - slack), mean + slack)
             terrain[r, c] = np.int32(round(level))
+            above = beside[0] > 0 and ground[r, c] and lowest[r, c] - level > beside[1]
+            # squares that do not touch the cell: it must not agree with itself
+            if above and meeting_sides(sums, (r, c), beside, 1, lowest[r, c]) >= FEWEST_SIDES:
+                terrain[r, c] = lowest[r, c]
 
 
 def _terrain(
@@ -72,16 +80,19 @@ def _terrain(
     reach: int,
     max_slope: float,
     drawn: tuple[int, int, int, int],
+    beside: tuple[int, float] = (0, 0.0),
 ) -> Elevations:
     """Terrain in mm (rows, columns) through two masks of ground: that of squares up to `NEAR_CELLS`, and of wider ones.
 
-    No square reaches farther than `reach` cells; `drawn` as in `_draw`.
+    No square reaches farther than `reach` cells; `drawn` and `beside` as in `_draw`.
     """
     near = min(NEAR_CELLS, reach)
     terrain = np.full(lowest.shape, NO_DATA, np.int32)
-    _draw(terrain, lowest, grounds[0], (1, near, near == reach), max_slope, drawn)
+    # the squares beside a cell reach twice their half side and one cell
+    sides = (min(beside[0], (near - 1) // 2), beside[1])
+    _draw(terrain, lowest, grounds[0], (1, near, near == reach), max_slope, drawn, sides)
     if near < reach:
-        _draw(terrain, lowest, grounds[1], (min(2 * near, reach), reach, True), max_slope, drawn)
+        _draw(terrain, lowest, grounds[1], (min(2 * near, reach), reach, True), max_slope, drawn, (0, 0.0))
     return terrain
 
 
@@ -163,6 +174,7 @@ def ground_of(
     part = np.ascontiguousarray(lowest[seen])
     if part.size:
         is_ground = steady = part != NO_DATA
+        beside = (0, 0.0)
         if not trusted:
             pit_depth_mm = round(settings.pit_depth_m * 1000)
             part = without_pits(part, pit_depth_mm)
@@ -171,11 +183,12 @@ def ground_of(
                 is_ground = steady = hierarchical_ground(part, corner, settings, pit_depth_mm)
             else:
                 is_ground, steady = morphological_ground(part, corner, settings)
+                beside = (settings.rejoin_m, settings.rejoin_step_m * 1000.0)
         # one cell more for heights between the middles of cells, one for the slope there
         west, south, width, depth = window if wanted is None else wanted
         west, south = west - column0 - seen[1].start - 2, south - row0 - seen[0].start - 2
         drawn = (west, south, west + width + 4, south + depth + 4)
-        elevation[seen] = _terrain(part, (is_ground, steady), settings.reach_m, settings.max_slope, drawn)
+        elevation[seen] = _terrain(part, (is_ground, steady), settings.reach_m, settings.max_slope, drawn, beside)
         slope[seen] = slopes_of(elevation[seen])
         measured[seen] = is_ground
     return Terrain(elevation_mm=elevation, slope_mm=slope, measured=measured, column0=column0, row0=row0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -65,6 +66,19 @@ def _nearest_vertex(px: int, py: int, pz: int, x: IntArray, y: IntArray, z: IntA
     return best
 
 
+class Allowed(IntEnum):
+    """What a point may belong to."""
+
+    NEVER = 0
+    """To no building, by its trusted class."""
+    ANY = 1
+    """To any surface."""
+    BUILDING = 2
+    """It is building, by its trusted class."""
+    EVIDENCE = 3
+    """To none, since it is a low, thin object; it counts where its surface is judged."""
+
+
 class ScenePoints(NamedTuple):
     """The points that a tile's core owns; arrays of one length n, absolute mm."""
 
@@ -78,7 +92,7 @@ class ScenePoints(NamedTuple):
     several: BoolArray
     """The pulse has more than one return."""
     allowed: KindArray
-    """By the trusted classes: 0 may not belong to a building, 2 is building, 1 anything else."""
+    """As in `Allowed`."""
 
 
 class AssignmentLimits(NamedTuple):
@@ -176,6 +190,13 @@ def _of_corner_on_level(
     return fragment if best <= reach_mm else -1
 
 
+@kernel(inline="always")
+def _lower(p: IntArray, px: int, py: int, pz: int) -> None:
+    """Replace a place by one that is lexicographically smaller."""
+    if px < p[0] or (px == p[0] and (py < p[1] or (py == p[1] and pz < p[2]))):
+        p[0], p[1], p[2] = px, py, pz
+
+
 @kernel
 def assign_points(
     points: ScenePoints,
@@ -198,7 +219,7 @@ def assign_points(
     hint, column0, row0, columns, rows = _hints(vertices, facets)
     previous = 0
     for i in range(out.size):
-        if points.allowed[i] == 0 or points.height_mm[i] < limits.ground:
+        if points.allowed[i] == Allowed.NEVER or points.height_mm[i] < limits.ground:
             continue
         px, py, pz = points.x_mm[i], points.y_mm[i], points.z_mm[i]
         c, r = px // _HINT_MM - column0, py // _HINT_MM - row0
@@ -227,13 +248,13 @@ def assign_points(
             fragment = _of_corner_on_level(px, py, pz, f, vertices, tin, limits.reach)
         if fragment < 0 or not stands_up(tin.fragment_kind[fragment]):
             continue
-        if tin.fragment_kind[fragment] == FacetKind.BUILDING and points.allowed[i] != 2:
+        if tin.fragment_kind[fragment] == FacetKind.BUILDING and points.allowed[i] != Allowed.BUILDING:
             continue
-        out[i] = fragment
         sums[fragment, Sum.POINTS] += 1
         sums[fragment, Sum.SEVERAL] += points.several[i]
         sums[fragment, Sum.THROUGH] += not points.last[i]
-        p = lowest_point[fragment]
-        if px < p[0] or (px == p[0] and (py < p[1] or (py == p[1] and pz < p[2]))):
-            p[0], p[1], p[2] = px, py, pz
+        if points.allowed[i] == Allowed.EVIDENCE:
+            continue
+        out[i] = fragment
+        _lower(lowest_point[fragment], px, py, pz)
     return out

@@ -17,6 +17,7 @@ from pipeline.spatial_hash import slot_of_key
 from pipeline.terrain.binning import points_by_cell
 from pipeline.terrain.lattice import NO_DATA, PIT_MATES
 from pipeline.terrain.settings import VegetationSettings
+from pipeline.terrain.sparse_points import FAR_MM, Role, SparsePoints, likely_building
 from pipeline.terrain.thinning import highest_per_cell
 from pipeline.terrain.vegetation import planarity
 
@@ -41,16 +42,15 @@ WALL_REACH_MM = 1000
 """A point this near to a building in plan, and no higher than it there, is its wall unless it is leafy."""
 UNDER_ROOF_MM = 500
 """This near, it is always wall or lies under the roof: eaves scatter pulses as leaves do."""
-MATE_REACH_MM = 3000
-"""Where points lie farther apart than `UNDER_ROOF_MM`, a roof goes on this far: 1.5 spacings at 0.3 points/m2."""
-MATE_LEVEL_MM = 500
-"""Largest difference in elevation of points of such a roof that lie beside each other."""
-MATES = 2
-"""Fewest building points within both that make a point building: one is beside many things."""
 ON_ROOF_MM = 2500
 """Largest height of chimneys, antennas and parapets above the roof."""
 TALL_MM = 2000
 """Higher than cars and fences: rough points that are not building are vegetation."""
+MAX_SPARSE_PER_M2 = 2
+"""Where fewer points lie, `sparse_points` judges each one above the ground: its weights were fitted up to there."""
+CROWD_MM = 10_000
+"""Side of the cells over 3 x 3 of which points are counted for it. Where none of them is from a pulse of several
+returns, the scanner may record one per pulse: then no point is judged so."""
 CELL_M = 0.5
 """Side of the cells of which one point each is judged for smoothness."""
 UNKNOWN, SMOOTH, LEAFY = -1, 0, 1
@@ -85,7 +85,8 @@ class PointEvidence:
 
 def support_m(vegetation: VegetationSettings) -> float:
     """How far the classes look, beside the outliers' own search."""
-    return vegetation.support_m + CELL_M + (2 * AROUND_MM + PIT_REACH_MM) / 1000.0
+    leafy_m = vegetation.support_m + CELL_M + 2 * AROUND_MM / 1000.0
+    return max(leafy_m, 2 * CROWD_MM / 1000.0, FAR_MM / 1000.0) + PIT_REACH_MM / 1000.0
 
 
 @kernel
@@ -112,29 +113,6 @@ def tops_nearby(x: IntArray, y: IntArray, z: IntArray, used: BoolArray, wanted: 
                         top = z[j]
         if top > -(2**62):
             out[i] = top
-    return out
-
-
-@kernel
-def mates_nearby(
-    x: IntArray, y: IntArray, z: IntArray, used: BoolArray, wanted: BoolArray, reach: int, level: int
-) -> IntArray:
-    """How many used points lie within a distance in plan and in elevation of each wanted one, int64 (n,); all in mm."""
-    n = x.size
-    out = np.zeros(n, np.int64)
-    if n == 0:
-        return out
-    start, members, column0, row0, columns, rows = points_by_cell(x, y, used, reach)
-    for i in range(n):
-        if not wanted[i]:
-            continue
-        c, r = x[i] // reach - column0, y[i] // reach - row0
-        for rr in range(max(r - 1, 0), min(r + 2, rows)):
-            for cc in range(max(c - 1, 0), min(c + 2, columns)):
-                for m in range(start[rr * columns + cc], start[rr * columns + cc + 1]):
-                    j = members[m]
-                    near = (x[j] - x[i]) ** 2 + (y[j] - y[i]) ** 2 <= reach * reach
-                    out[i] += near and abs(z[j] - z[i]) <= level
     return out
 
 
@@ -218,10 +196,13 @@ def index_of_each(
     return out
 
 
-def classes_of(evidence: PointEvidence, wanted: BoolArray, vegetation: VegetationSettings) -> ByteArray:
+def classes_of(
+    evidence: PointEvidence, wanted: BoolArray, vegetation: VegetationSettings, *, given: bool = False
+) -> ByteArray:
     """`PointClass` of every wanted point, (n,) uint8; 0 for the others.
 
-    `evidence` holds the points of a window that reaches `support_m` beyond the wanted ones.
+    `evidence` holds the points of a window that reaches `support_m` beyond the wanted ones. Buildings that are `given`,
+    by classes or footprints, keep their points; others may lose and gain points where the survey is sparse.
     """
     e = evidence
     x, y, z = e.x_mm, e.y_mm, e.z_mm
@@ -230,29 +211,51 @@ def classes_of(evidence: PointEvidence, wanted: BoolArray, vegetation: Vegetatio
     # a lonely point on the terrain is ground: sparse surveys are full of them
     noise &= ~(e.outlier & e.ground & (e.height_mm >= -DEEP_MM))
     ground = e.ground & ~noise
-    building = e.building & ~noise
-    open_ = ~(noise | ground | building)
-    top = tops_nearby(x, y, z, building, open_ & wanted, WALL_REACH_MM)
+    held = e.building & ~noise
+    open_ = ~(noise | ground | held)
+    top = tops_nearby(x, y, z, held, open_ & wanted, WALL_REACH_MM)
     beside = (top != NO_DATA) & (z <= top)
-    close = tops_nearby(x, y, z, building, beside, UNDER_ROOF_MM)
+    close = tops_nearby(x, y, z, held, beside, UNDER_ROOF_MM)
     # where points lie farther apart than that, the roof's edge is known no better than to their spacing
     crowd = sums_around(x, y, np.ones(len(x), np.bool_), np.ones((len(x), 1), np.int64), AROUND_MM)[:, 0]
     sparse = crowd * UNDER_ROOF_MM**2 < 9 * AROUND_MM**2
-    mates = mates_nearby(x, y, z, building, open_ & wanted & sparse, MATE_REACH_MM, MATE_LEVEL_MM)
     under = beside & (sparse | ((close != NO_DATA) & (z <= close)))
     over = (top != NO_DATA) & ~beside & (z <= top + ON_ROOF_MM)
     tall = ~known | (e.height_mm >= TALL_MM)
     leafy = leafiness(e, open_, tall, vegetation)
+    building = held | (open_ & (under | ((beside | over) & (leafy != LEAFY))))
+    if not given:
+        building = _with_sparse(e, building, (held, ground, noise), wanted)
     # what stands alone on a roof is part of it; in the open it is not known to be anything smooth
     unknown = leafy == UNKNOWN
     out = np.full(len(x), PointClass.OTHER, np.uint8)
-    out[open_ & ((leafy == LEAFY) | (unknown & tall))] = PointClass.VEGETATION
-    out[open_ & ((mates >= MATES) | under | ((beside | over) & (leafy != LEAFY)))] = PointClass.BUILDING
+    out[(leafy == LEAFY) | (unknown & tall)] = PointClass.VEGETATION
     out[building] = PointClass.BUILDING
     out[ground] = PointClass.GROUND
     out[noise] = PointClass.NOISE
     out[~wanted] = 0
     return out
+
+
+def _with_sparse(
+    evidence: PointEvidence, building: BoolArray, parts: tuple[BoolArray, BoolArray, BoolArray], wanted: BoolArray
+) -> BoolArray:
+    """The points of buildings, (n,); where the survey is sparse, the likely ones among all above the ground.
+
+    `parts` are the points of candidates, of the ground, and the noise: neighbours count by these, not by a judgement.
+    """
+    x, y = evidence.x_mm, evidence.y_mm
+    held, ground, noise = parts
+    values = np.column_stack((np.ones(len(x), np.int64), evidence.echoes.astype(np.int64)))
+    crowd, echoes = sums_around(x, y, np.ones(len(x), np.bool_), values, CROWD_MM).T
+    judged = wanted & (evidence.height_mm != NO_DATA) & ~ground & ~noise & (echoes > 0)
+    judged &= crowd * 1_000_000 < MAX_SPARSE_PER_M2 * 9 * CROWD_MM**2
+    role = np.full(len(x), Role.OTHER, np.int8)
+    role[held], role[ground], role[noise] = Role.HELD, Role.GROUND, Role.NOISE
+    points = SparsePoints(
+        x_mm=x, y_mm=y, z_mm=evidence.z_mm, height_mm=evidence.height_mm, role=role, several=evidence.echoes
+    )
+    return np.where(judged, likely_building(points, judged), building)
 
 
 def noise_of(x_mm: IntArray, y_mm: IntArray, height_mm: IntArray, rise_mm: IntArray, outlier: BoolArray) -> BoolArray:

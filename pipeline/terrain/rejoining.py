@@ -14,12 +14,12 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, LabelArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
-from pipeline.terrain.planar_fitting import plane_around, plane_sums
+from pipeline.terrain.planar_fitting import Sums, plane_around, plane_sums
 
 _SIDES = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
 """Directions of the squares beside a cell."""
 
-_FEWEST_SIDES = 2
+FEWEST_SIDES = 2
 """Sides whose planes must meet a cell: a ridge that happens to end at the level of the ground meets only one."""
 
 _STEEPEST_MM = 1.0 * CELL_MM
@@ -32,6 +32,25 @@ processor's cache, and most blocks need only one pass."""
 
 
 @kernel(inline="always")
+def meeting_sides(sums: Sums, cell: tuple[int, int], limits: tuple[int, float], gap: int, level_mm: int) -> int:
+    """Number of squares beside a cell whose planes meet an elevation there.
+
+    `cell` is its row and column in `sums`; `limits` as in `rejoined`. The eight squares touch the cell with a gap of 0,
+    and leave it out with a gap of 1.
+    """
+    half, step_mm = limits
+    met = 0
+    for k in range(len(_SIDES)):
+        down, across = _SIDES[k, 0] * (half + gap), _SIDES[k, 1] * (half + gap)
+        _, level, east, north, carries = plane_around(sums, cell[0] + down, cell[1] + across, half)
+        if not carries or math.sqrt(east * east + north * north) > _STEEPEST_MM:
+            continue
+        if abs(level_mm - (level - east * across - north * down)) <= step_mm:
+            met += 1
+    return met
+
+
+@kernel(inline="always")
 def _join_block(
     out: BoolArray,
     lowest: Elevations,
@@ -40,8 +59,8 @@ def _join_block(
     block: tuple[int, int],
     limits: tuple[int, float],
 ) -> None:
-    """Mark in `out` the cells of a block, by its first row and column, that planes on `_FEWEST_SIDES` sides meet."""
-    half, step_mm = limits
+    """Mark in `out` the cells of a block, by its first row and column, that planes on `FEWEST_SIDES` sides meet."""
+    half = limits[0]
     first, left = max(block[0] - 2 * half, 0), max(block[1] - 2 * half, 0)
     last, right = block[0] + _BLOCK + 2 * half, block[1] + _BLOCK + 2 * half
     sums = plane_sums(lowest[first:last, left:right].copy(), ground[first:last, left:right].copy())
@@ -49,22 +68,15 @@ def _join_block(
         for c in range(block[1], min(block[1] + _BLOCK, lowest.shape[1])):
             if ground[r, c] or barred[r, c] or lowest[r, c] == NO_DATA:
                 continue
-            met = 0
-            for k in range(len(_SIDES)):
-                down, across = _SIDES[k, 0] * half, _SIDES[k, 1] * half
-                _, level, east, north, carries = plane_around(sums, r - first + down, c - left + across, half)
-                if not carries or math.sqrt(east * east + north * north) > _STEEPEST_MM:
-                    continue
-                if abs(lowest[r, c] - (level - east * across - north * down)) <= step_mm:
-                    met += 1
-            out[r, c] = met >= _FEWEST_SIDES
+            met = meeting_sides(sums, (r - first, c - left), limits, 0, lowest[r, c])
+            out[r, c] = met >= FEWEST_SIDES
 
 
 @kernel
 def _joined(
     lowest: Elevations, ground: BoolArray, barred: BoolArray, seen: LabelArray, limits: tuple[int, float]
 ) -> BoolArray:
-    """Ground, and the cells that the planes through the ground of at least `_FEWEST_SIDES` squares beside them meet.
+    """Ground, and the cells that the planes through the ground of at least `FEWEST_SIDES` squares beside them meet.
 
     `seen` counts the ground cells in and around each block at its last test. Ground only grows: a block with as many as
     then needs no test. `limits` as in `rejoined`.

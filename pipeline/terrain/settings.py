@@ -201,6 +201,14 @@ class SurfaceSettings(Parameters):
     steep_m: float = parameter(
         1.0, "Least elevation difference of a facet that cuts by its slope.", unit="m", minimum=0.2, maximum=10.0
     )
+    thin_m: float = parameter(
+        1.75,
+        "What is lower than min_height_m and thinner than this, between ground on both sides, belongs to no building: "
+        "hedges and garden walls of a metre, and the distance to the ground points beside them. 0 keeps all.",
+        unit="m",
+        minimum=0.0,
+        maximum=5.0,
+    )
     step_height_m: float = parameter(
         2.0, "A wall whose foot stands this high above the terrain is a step.", unit="m", minimum=0.5, maximum=20.0
     )
@@ -214,8 +222,8 @@ class SurfaceSettings(Parameters):
 
     @property
     def support_m(self) -> float:
-        """How far the facets of a fragment look: two facets and their circumcircles."""
-        return 4.0 * self.max_circumradius_m + 2.0 * self.thinning_m
+        """How far the facets of a fragment look: two facets, their circumcircles, and the cells of their vertices."""
+        return 4.0 * self.max_circumradius_m + 3.0 * self.thinning_m
 
     @property
     def far_mm(self) -> int:

@@ -110,3 +110,51 @@ def highest_per_cell(
     # one sort of one whole number in place of two; all are different
     result: IntArray = chosen[np.argsort(((x - x.min()) << _BITS) | (y - y.min()))]
     return result
+
+
+@kernel
+def _lowest_below(
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, used: BoolArray, chosen: IntArray, cell_mm: int, level_mm: int
+) -> IntArray:
+    """Kernel of `lowest_below`."""
+    size = 2
+    while size < 2 * chosen.size:
+        size *= 2
+    mask = size - 1
+    holder = np.full(size, -1, np.int64)
+    lowest = chosen.copy()
+    for k in range(chosen.size):
+        i = chosen[k]
+        s = slot_of_key(((x_mm[i] // cell_mm) << _BITS) ^ (y_mm[i] // cell_mm), mask)
+        while holder[s] >= 0:
+            s = (s + 1) & mask
+        holder[s] = k
+    for i in range(x_mm.size):
+        if not used[i]:
+            continue
+        column, row = x_mm[i] // cell_mm, y_mm[i] // cell_mm
+        s = slot_of_key((column << _BITS) ^ row, mask)
+        while holder[s] >= 0:
+            top = chosen[holder[s]]
+            if x_mm[top] // cell_mm == column and y_mm[top] // cell_mm == row:
+                j = lowest[holder[s]]
+                lower = z_mm[i] < z_mm[j]
+                if z_mm[i] == z_mm[j]:
+                    lower = y_mm[i] < y_mm[j] or (y_mm[i] == y_mm[j] and x_mm[i] < x_mm[j])
+                if lower and z_mm[i] >= z_mm[top] - level_mm:
+                    lowest[holder[s]] = i
+                break
+            s = (s + 1) & mask
+    return lowest
+
+
+def lowest_below(
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, used: BoolArray, chosen: IntArray, cell_m: float, level_m: float
+) -> IntArray:
+    """Index of the lowest used point in the cell of each chosen one, no more than `level_m` below it, (m,) int64.
+
+    The chosen point itself where no used one lies lower. Cells are those of `highest_per_cell`; of points equally low
+    the southernmost counts, then the westernmost.
+    """
+    found: IntArray = _lowest_below(x_mm, y_mm, z_mm, used, chosen, round(cell_m * 1000), round(level_m * 1000))
+    return found

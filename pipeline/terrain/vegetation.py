@@ -198,9 +198,14 @@ def _planar(
 
 
 def planarity(
-    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, wanted: BoolArray, settings: VegetationSettings
+    x_mm: IntArray,
+    y_mm: IntArray,
+    z_mm: IntArray,
+    wanted: BoolArray,
+    settings: VegetationSettings,
+    roughness_m: float | None = None,
 ) -> KindArray:
-    """How planar the surroundings of each wanted vertex are.
+    """How planar the surroundings of each wanted vertex are; `roughness_m` replaces that of the settings.
 
     2 smooth, 1 planar, 0 rough, -1 not wanted or few neighbours. Only the window in the middle can be smooth.
     A vertex is judged by the most planar of nine windows: one around it and eight shifted by 0.8 of the radius, as
@@ -208,11 +213,12 @@ def planarity(
     Vertices are thinned points in millimetres; all within `level_m` in elevation are neighbours.
     """
     verdict = np.full(len(x_mm), -1, np.int8)
+    least_m = settings.roughness_m if roughness_m is None else roughness_m
     for scale in range(PLANARITY_SCALES):
         windows = _Windows(
             radius_mm=round(settings.radius_m * 1000) * 2**scale,
             min_points=settings.min_neighbours,
-            roughness_mm=settings.roughness_m * 1000.0 * 1.5**scale,
+            roughness_mm=least_m * 1000.0 * 1.5**scale,
             smooth_mm=settings.smooth_m * 1000.0 * 1.5**scale,
             level_mm=round(settings.level_m * 1000),
         )

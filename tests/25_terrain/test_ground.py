@@ -157,6 +157,40 @@ def test_a_house_on_a_slope_of_10_degrees_is_cut_off_and_the_slope_is_drawn_unde
     assert error[terrain.measured].max() <= 1
 
 
+@pytest.mark.parametrize("turns", range(4))
+def test_the_terrain_reaches_the_brow_of_a_sparse_scarp_and_no_lone_bump(turns: int) -> None:
+    # a scarp of 4 m; a plane through few cells passes far below its brow
+    random = np.random.default_rng(3)
+    c = np.arange(80)
+    z = np.rot90(np.broadcast_to(np.clip((c - 40) * 1000, 0, 4000), (80, 80)), turns)
+    bump = (20, 30)
+    kept = random.random((80, 80)) < 0.3
+    lowest = np.where(kept, z, NO_DATA).astype(np.int32)
+    lowest[bump] += 900 if lowest[bump] != NO_DATA else 0
+    is_ground = lowest != NO_DATA
+    whole = (0, 0, 80, 80)
+    with_brow = ground._terrain(lowest, (is_ground, is_ground), 20, 1.0, whole, (4, 250.0))
+    without = ground._terrain(lowest, (is_ground, is_ground), 20, 1.0, whole)
+    brow = is_ground & (np.rot90(np.broadcast_to((c == 44) | (c == 45), (80, 80)), turns))
+    assert np.max((lowest - without)[brow]) > 500
+    assert np.max((lowest - with_brow)[brow]) <= 250
+    changed = with_brow != without
+    np.testing.assert_array_equal(with_brow[changed], lowest[changed])
+    assert not changed[bump]
+
+
+def test_sparse_points_on_a_scarp_are_ground_up_to_its_brow() -> None:
+    # at 0.2 points per m2, where the planes of the smallest squares cut the brow off
+    random = np.random.default_rng(1)
+    n = 2880
+    x, y = random.integers(0, 120_000, (2, n))
+    z = np.clip((x - 60_000) * 0.9, 0, 5400).astype(np.int64)
+    points = np.column_stack((x, y, z)).astype(np.int64)
+    found = ground_points(x, y, z, terrain_under(points, (0, 0, 120, 120)), GroundSettings())
+    brow = (abs(x - 66_000) < 3000) & (y > 10_000) & (y < 110_000)
+    assert found[brow].all()
+
+
 def test_local_planes_agree_with_least_squares_of_numpy() -> None:
     random = np.random.default_rng(9)
     lowest = (random.integers(-200, 200, (26, 31)) + 90 * np.arange(31)).astype(np.int32)

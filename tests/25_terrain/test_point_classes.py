@@ -17,7 +17,6 @@ from pipeline.terrain.point_classes import (
     classes_of,
     counts_nearby,
     index_of_each,
-    mates_nearby,
     noise_of,
     sums_around,
     tops_nearby,
@@ -39,14 +38,6 @@ def test_the_highest_points_nearby_are_those_of_a_full_search(cloud: Any) -> Non
     for i in range(len(x)):
         near = used & ((x - x[i]) ** 2 + (y - y[i]) ** 2 <= 700**2)
         assert found[i] == (z[near].max() if wanted[i] and near.any() else NO_DATA)
-
-
-def test_the_mates_nearby_are_those_of_a_full_search(cloud: Any) -> None:
-    x, y, z, used, wanted = cloud
-    found = mates_nearby(x, y, z, used, wanted, 1500, 800)
-    for i in range(len(x)):
-        near = used & ((x - x[i]) ** 2 + (y - y[i]) ** 2 <= 1500**2) & (abs(z - z[i]) <= 800)
-        assert found[i] == (near.sum() if wanted[i] else 0)
 
 
 def test_the_counts_nearby_are_those_of_a_full_search(cloud: Any) -> None:
@@ -132,15 +123,6 @@ def test_a_hedge_beside_a_wall_is_vegetation_but_what_hangs_under_the_eaves_is_n
     eaves = -rng.uniform(0.05, 0.4, 300), across, height, {"echoes": True}
     dense = (*grid(0, 0, 8, 8, 0.1), 6.0, {"building": True})
     assert classes(dense, GROUND, hedge, eaves)[2:] == [[PointClass.VEGETATION], [PointClass.BUILDING]]
-
-
-def test_where_points_are_sparse_a_roof_goes_on_at_its_level() -> None:
-    roof = (*grid(0, 0, 8, 8, 2.0), 6.0, {"building": True})
-    floor = (*grid(-10, -10, 18, 18, 2.0), 0.0, {})
-    level = np.full(3, -1.8), np.array([1.0, 3.0, 5.0]), 6.2, {"echoes": True}
-    lower = np.full(3, -1.8), np.array([1.0, 3.0, 5.0]), 5.2, {"echoes": True}
-    assert classes(roof, floor, level)[2] == [PointClass.BUILDING]
-    assert classes(roof, floor, lower)[2] == [PointClass.VEGETATION]
 
 
 def test_a_mast_is_building_up_to_a_height_above_the_roof() -> None:

@@ -25,7 +25,7 @@ from pipeline.terrain.facets import (
     label_vertices,
 )
 from pipeline.terrain.fragment_sums import N_SUMS, Sum
-from pipeline.terrain.point_assignment import ScenePoints
+from pipeline.terrain.point_assignment import Allowed, ScenePoints
 from pipeline.terrain.settings import SurfaceSettings
 from pipeline.terrain.surfaces import Fragments, fragments_of
 from pipeline.tin.delaunay import triangulate
@@ -147,7 +147,8 @@ def slow_kind(scene: Scene, facet: npt.NDArray[np.int32]) -> FacetKind:
     plan = p[:, :2]
     sides = [float(np.linalg.norm(plan[k] - plan[k - 1])) for k in range(3)]
     area = float(shapely.Polygon(plan).area)
-    if math.prod(sides) / (4 * area) > 6.0:
+    radius = math.prod(sides) / (4 * area)
+    if radius > 6.0:
         return FacetKind.VOID
     kinds = v.kind[facet]
     difference = float(np.ptp(p[:, 2]))
@@ -159,6 +160,10 @@ def slow_kind(scene: Scene, facet: npt.NDArray[np.int32]) -> FacetKind:
     slope_deg = math.degrees(math.acos(normal[2] / np.linalg.norm(normal)))
     if (difference >= 2.0 and slope_deg > 55.0) or (difference >= 1.0 and slope_deg > 70.0):
         return FacetKind.STEP if v.height_mm[facet].min() >= 2000 else FacetKind.BORDER
+    places = np.column_stack((v.x_mm, v.y_mm)) / 1000.0
+    second = [float(np.sort(np.hypot(*(places - at).T))[2]) for at in plan] if radius > 3.0 else []
+    if second and max(second) <= radius / 5.0:
+        return FacetKind.VOID
     if (kinds == VertexKind.OBJECT).all():
         return FacetKind.OBJECT
     if (kinds == VertexKind.BUILDING).any():
@@ -181,6 +186,22 @@ def test_facet_kinds_agree_with_a_slow_twin() -> None:
     found = scene.facet_kinds().tolist()
     assert found == [slow_kind(scene, facet) for facet in scene.tin.facets]
     assert set(found) == set(FacetKind)
+
+
+@pytest.mark.parametrize(("spacing_m", "spans"), [(0.5, False), (1.5, True)])
+def test_no_surface_spans_a_gap_that_is_wide_for_its_points(spacing_m: float, *, spans: bool) -> None:
+    """Two roofs with 8 m of dark water between them; where points are sparse, one roof may look like that."""
+    scene = built(lambda x, _: np.full(len(x), 6.0), spacing_m=spacing_m, seed=20)
+    x = scene.vertices.x_mm
+    kept = np.flatnonzero((x < 16_000) | (x >= 24_000))
+    v = SceneVertices(*(values[kept] for values in scene.vertices))
+    scene = dataclasses.replace(scene, vertices=v, tin=triangulate(np.column_stack((v.x_mm, v.y_mm))))
+    corners = scene.tin.facets
+    # those at the hull are gaps by their circumradius alone
+    inside = (v.y_mm[corners].min(axis=1) > 4000) & (v.y_mm[corners].max(axis=1) < 36_000)
+    across = inside & (np.ptp(v.x_mm[corners], axis=1) > 7500)
+    assert across.sum() > 20
+    assert (scene.facet_kinds()[across] == (FacetKind.OBJECT if spans else FacetKind.VOID)).all()
 
 
 def test_facet_kinds_do_not_depend_on_the_first_vertex() -> None:
@@ -447,10 +468,24 @@ def test_earlier_returns_above_a_surface_are_its_canopy_and_no_points_of_it() ->
 def test_points_that_the_classes_exclude_are_not_assigned() -> None:
     scene = built(box, seed=12)
     excluded = np.random.default_rng(12).random(len(scene.points.x_mm)) < 0.3
-    allowed = np.where(excluded, 0, 1).astype(np.int8)
+    allowed = np.where(excluded, Allowed.NEVER, Allowed.ANY).astype(np.int8)
     _, before = scene.cut()
     _, after = dataclasses.replace(scene, points=scene.points._replace(allowed=allowed)).cut()
     np.testing.assert_array_equal(after, np.where(excluded, -1, before))
+
+
+def test_points_of_thin_objects_are_evidence_alone() -> None:
+    scene = built(box, seed=12)
+    thin = np.random.default_rng(12).random(len(scene.points.x_mm)) < 0.3
+    allowed = np.where(thin, Allowed.EVIDENCE, Allowed.ANY).astype(np.int8)
+    whole, before = scene.cut()
+    found, after = dataclasses.replace(scene, points=scene.points._replace(allowed=allowed)).cut()
+    np.testing.assert_array_equal(after, np.where(thin, -1, before))
+    np.testing.assert_array_equal(found.sums, whole.sums)
+    p = scene.points
+    (roof,) = of_kind(found, FacetKind.OBJECT)
+    rest = np.column_stack((p.x_mm, p.y_mm, p.z_mm))[after == roof]
+    np.testing.assert_array_equal(found.lowest_point_mm[roof], min(map(tuple, rest.tolist())))
 
 
 def test_only_points_of_class_building_join_a_surface_of_that_class() -> None:
@@ -458,7 +493,7 @@ def test_only_points_of_class_building_join_a_surface_of_that_class() -> None:
     v = scene.vertices
     kind = np.where(v.kind == VertexKind.OBJECT, VertexKind.BUILDING, v.kind).astype(np.int8)
     building = np.random.default_rng(13).random(len(scene.points.x_mm)) < 0.5
-    points = scene.points._replace(allowed=np.where(building, 2, 1).astype(np.int8))
+    points = scene.points._replace(allowed=np.where(building, Allowed.BUILDING, Allowed.ANY).astype(np.int8))
     fragments, labels = dataclasses.replace(scene, vertices=v._replace(kind=kind), points=points).cut()
     (roof,) = of_kind(fragments, FacetKind.BUILDING)
     np.testing.assert_array_equal(labels == roof, building & (points.z_mm == 6000))

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.model import BoolArray
-from pipeline.terrain.thinning import highest_per_cell
+from pipeline.terrain.thinning import highest_per_cell, lowest_below
 
 Points = npt.NDArray[np.int64]
 
@@ -118,3 +118,21 @@ def test_where_nothing_may_be_chosen_nothing_is() -> None:
     nothing = np.zeros(2, np.bool_)
     assert thinned(points, nothing, nothing).shape == (0,)
     assert thinned(np.empty((0, 3), np.int64), nothing[:0], nothing[:0]).shape == (0,)
+
+
+@settings(deadline=None, max_examples=examples(30))
+@given(members=rows, cell_m=st.sampled_from([0.5, 1.7]), seed=st.integers(0, 1000))
+def test_the_lowest_of_each_cell_is_that_of_a_walk_over_all_points(
+    members: list[tuple[int, int, int, bool, bool]], cell_m: float, seed: int
+) -> None:
+    points, stands, used = as_arrays(members)
+    points = points[np.random.default_rng(seed).permutation(len(points))]
+    chosen = thinned(points, np.zeros(len(points), np.bool_), used, cell_m)
+    x, y, z = (np.ascontiguousarray(points[:, k]) for k in range(3))
+    lowest = lowest_below(x, y, z, stands, chosen, cell_m, 0.002)
+    cell_mm = round(cell_m * 1000)
+    for top, found in zip(chosen.tolist(), lowest.tolist(), strict=True):
+        cell = x[top] // cell_mm, y[top] // cell_mm
+        near = [i for i in range(len(x)) if (x[i] // cell_mm, y[i] // cell_mm) == cell and z[i] >= z[top] - 2]
+        among = [(z[i], y[i], x[i]) for i in near if stands[i] or i == top]
+        assert (z[found], y[found], x[found]) == min(among)

@@ -258,8 +258,8 @@ def test_a_file_that_changes_meanwhile_is_reported(
 
     label_all = module._label_all
 
-    def then_change(*arguments: Any) -> None:
-        label_all(*arguments)
+    def then_change(*arguments: Any, **options: Any) -> None:
+        label_all(*arguments, **options)
         other = laspy.LasData(las.header)
         n = len(las.points)
         other.points = las.points[np.arange(n + change) % n]

@@ -44,6 +44,8 @@ class LabelTask:
     """Outliers, ground and vegetation."""
     classes: ClassesInUse
     """Which of the file's classes are believed."""
+    given: bool
+    """Buildings are known by footprints or classes: no point leaves or joins them for its own evidence alone."""
     scratch: Scratch
     """Points and terrain in, classes out."""
     buildings: tuple[PointRange, ...]
@@ -85,11 +87,8 @@ def label(task: LabelTask) -> Labelled:
     task.scratch.check_cancelled()
     wanted = np.zeros(len(points), np.bool_)
     wanted[:core] = True
-    found = classes_of(
-        evidence_of(task, points, window),
-        wanted,
-        task.settings.vegetation,
-    )[:core]
+    evidence = evidence_of(task, points, window)
+    found = classes_of(evidence, wanted, task.settings.vegetation, given=task.given)[:core]
     found[_held_by(task, task.decks, points, window)[:core] & (found != PointClass.GROUND)] = PointClass.BRIDGE_DECK
     counts: Counter[int] = Counter()
     # points of one place and return number differ at most in their count of returns: the lowest decides for all
