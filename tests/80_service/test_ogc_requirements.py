@@ -10,7 +10,7 @@ from html_pages import links_of
 from live_service import POINTS
 from openapi_spec_validator import OpenAPIV30SpecValidator
 
-from service.jobs import Fault, JobFailure, JobStatus
+from service.jobs import Fault, JobFailure, JobStatus, Subscriber
 from service.routes.landing import CONFORMANCE
 
 OGC = "http://www.opengis.net/def/rel/ogc/1.0/"
@@ -32,6 +32,8 @@ def requirement(*names: str) -> Callable[[Callable[[runs.Service], None]], Calla
     return add
 
 
+HOOK = "https://192.88.99.1/hook"
+"""A public address; nothing is sent, since no driver runs."""
 CONTEXT: dict[str, str] = {}
 """Ids that the checks use."""
 
@@ -45,6 +47,10 @@ def context(service: runs.Service) -> None:
     # before any job waits: a driver would claim that one first
     CONTEXT["finished"] = service.finished()
     CONTEXT["raw"] = service.finished(response="raw", outputs=("report",))
+    asked = Subscriber(success_uri=f"{HOOK}/done", in_progress_uri=f"{HOOK}/runs", failed_uri=f"{HOOK}/failed")
+    subscribed = service.running(subscriber=asked)
+    service.store.fail(subscribed, JobFailure(fault=Fault.INPUT, detail="tile.laz is empty"))
+    CONTEXT["subscribed"] = subscribed.job_id
     CONTEXT["failed"] = service.failed(JobFailure(fault=Fault.INPUT, detail="tile.laz is empty"))
 
 
@@ -354,6 +360,16 @@ def dismissal(service: runs.Service) -> None:
     answer = service.client.delete(f"/jobs/{job_id}")
     assert (answer.status_code, answer.json()["status"]) == (200, "dismissed")
     problem(service.client.delete(f"/jobs/{NONE}"), 404, "no-such-job")
+
+
+# --- callback
+
+
+@requirement("callback/job-callback")
+def callback(service: runs.Service) -> None:
+    accepted(execute(service, subscriber={"successUri": HOOK, "inProgressUri": HOOK, "failedUri": HOOK}))
+    found = service.client.get("/webhooks/deliveries", params={"job": CONTEXT["subscribed"]}).json()["deliveries"]
+    assert {delivery["url"] for delivery in found} == {f"{HOOK}/runs", f"{HOOK}/failed"}
 
 
 @pytest.mark.parametrize("name", list(CHECKS))
