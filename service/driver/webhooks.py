@@ -59,6 +59,7 @@ class Sender:
         self._policy = RetryPolicy(hours=settings.webhook_hours, first_pause_s=settings.webhook_pause_s)
         self._claiming = threading.Lock()
         self._stopping = threading.Event()
+        self._look_again = threading.Event()
         self.threads = [
             threading.Thread(target=self._work, name=f"webhooks-{number}", daemon=True) for number in range(SENDERS)
         ]
@@ -67,6 +68,7 @@ class Sender:
     def stop(self) -> None:
         """Claim nothing more; an attempt that is under way ends within its time."""
         self._stopping.set()
+        self._look_again.set()
 
     def _work(self) -> None:
         while True:
@@ -76,11 +78,14 @@ class Sender:
             if parcel is None:
                 return
             self.deliver(parcel)
+            # its receiver is free for the next message
+            self._look_again.set()
 
     def _next(self) -> Parcel | None:
         """Wait for a delivery that is due; None at the end."""
         pause = FIRST_PAUSE_S
         while not self._stopping.is_set():
+            self._look_again.clear()
             wait_s = self._settings.poll_s
             try:
                 parcel = self._store.webhooks.claim(self._name, lease_s=LEASE_S)
@@ -94,7 +99,8 @@ class Sender:
                 if parcel is not None:
                     return parcel
                 pause = FIRST_PAUSE_S
-            self._stopping.wait(wait_s)
+            if not self._stopping.is_set():
+                self._look_again.wait(wait_s)
         return None
 
     def deliver(self, parcel: Parcel) -> None:

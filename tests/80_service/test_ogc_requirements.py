@@ -1,6 +1,7 @@
 """Requirements of OGC API - Processes 1.0 (OGC 18-062r2), one check each, by the last parts of their URIs."""
 
 import base64
+import json
 from collections.abc import Callable
 
 import finished_runs as runs
@@ -10,8 +11,10 @@ from html_pages import links_of
 from live_service import POINTS
 from openapi_spec_validator import OpenAPIV30SpecValidator
 
+from service.driver.webhooks import Sender
 from service.jobs import Fault, JobFailure, JobStatus, Subscriber
 from service.routes.landing import CONFORMANCE
+from service.settings import ServiceSettings
 
 OGC = "http://www.opengis.net/def/rel/ogc/1.0/"
 PROBLEM = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
@@ -32,8 +35,7 @@ def requirement(*names: str) -> Callable[[Callable[[runs.Service], None]], Calla
     return add
 
 
-HOOK = "https://192.88.99.1/hook"
-"""A public address; nothing is sent, since no driver runs."""
+SUBSCRIBER = {f"{name}_uri": f"https://8.8.8.8/{name}" for name in ("success", "in_progress", "failed")}
 CONTEXT: dict[str, str] = {}
 """Ids that the checks use."""
 
@@ -46,11 +48,11 @@ def context(service: runs.Service) -> None:
     CONTEXT["upload"] = sent.json()["uploadID"]
     # before any job waits: a driver would claim that one first
     CONTEXT["finished"] = service.finished()
+    CONTEXT["reported"] = service.finished(subscriber=Subscriber(**SUBSCRIBER, base="http://127.0.0.1"))
+    reported = service.running(subscriber=Subscriber(**SUBSCRIBER))
+    service.store.fail(reported, JobFailure(fault=Fault.INPUT, detail="tile.laz is empty"))
+    CONTEXT["reported as failed"] = reported.job_id
     CONTEXT["raw"] = service.finished(response="raw", outputs=("report",))
-    asked = Subscriber(success_uri=f"{HOOK}/done", in_progress_uri=f"{HOOK}/runs", failed_uri=f"{HOOK}/failed")
-    subscribed = service.running(subscriber=asked)
-    service.store.fail(subscribed, JobFailure(fault=Fault.INPUT, detail="tile.laz is empty"))
-    CONTEXT["subscribed"] = subscribed.job_id
     CONTEXT["failed"] = service.failed(JobFailure(fault=Fault.INPUT, detail="tile.laz is empty"))
 
 
@@ -351,6 +353,31 @@ def job_limit(service: runs.Service) -> None:
     assert service.client.get("/jobs?limit=0").status_code == 400
 
 
+# --- callback
+
+
+@requirement("callback/job-callback")
+def callback(service: runs.Service) -> None:
+    uris = {"successUri": SUBSCRIBER["success_uri"], "failedUri": SUBSCRIBER["failed_uri"]}
+    assert accepted(execute(service, subscriber=uris))["request"]["subscriber"] == uris
+    sent: list[tuple[str, dict]] = []
+
+    def send(url: str, *, body: bytes, **_rest: object) -> tuple[int, None]:
+        sent.append((url, json.loads(body)))
+        return 200, None
+
+    sender = Sender(service.store, service.folder, ServiceSettings(state=service.folder.root), name="d", send=send)
+    while (parcel := service.store.webhooks.claim("d", lease_s=60.0)) is not None:
+        sender.deliver(parcel)
+    results = service.client.get(f"/jobs/{CONTEXT['reported']}/results").json()
+    assert [body for url, body in sent if url == SUBSCRIBER["success_uri"]] == [results]
+    failed = [body for url, body in sent if url == SUBSCRIBER["failed_uri"]]
+    assert [(body["jobID"], body["status"]) for body in failed] == [(CONTEXT["reported as failed"], "failed")]
+    started = [body for url, body in sent if url == SUBSCRIBER["in_progress_uri"]]
+    assert {body["status"] for body in started} == {"running"}
+    assert {body["jobID"] for body in started} == {CONTEXT["reported"], CONTEXT["reported as failed"]}
+
+
 # --- dismissal
 
 
@@ -360,16 +387,6 @@ def dismissal(service: runs.Service) -> None:
     answer = service.client.delete(f"/jobs/{job_id}")
     assert (answer.status_code, answer.json()["status"]) == (200, "dismissed")
     problem(service.client.delete(f"/jobs/{NONE}"), 404, "no-such-job")
-
-
-# --- callback
-
-
-@requirement("callback/job-callback")
-def callback(service: runs.Service) -> None:
-    accepted(execute(service, subscriber={"successUri": HOOK, "inProgressUri": HOOK, "failedUri": HOOK}))
-    found = service.client.get("/webhooks/deliveries", params={"job": CONTEXT["subscribed"]}).json()["deliveries"]
-    assert {delivery["url"] for delivery in found} == {f"{HOOK}/runs", f"{HOOK}/failed"}
 
 
 @pytest.mark.parametrize("name", list(CHECKS))

@@ -201,6 +201,15 @@ def test_jobs_that_end_while_a_driver_drains_are_reported(bench: Bench, receiver
     assert sent.job_id == job.job_id
 
 
+def test_a_sender_takes_the_next_message_as_soon_as_its_receiver_is_free(bench: Bench, receiver: Receiver) -> None:
+    bench.store.webhooks.create(receiver.url, events=[EventType.ACCEPTED], base=BASE)
+    # all are written before a driver looks for the first time; it would look again after an hour
+    for _ in range(20):
+        bench.submit()
+    bench.driver(poll_s=3600.0)
+    assert len(all_are(bench, DeliveryState.DELIVERED)) == 20
+
+
 def test_a_fault_with_one_message_does_not_end_the_sender(
     bench: Bench, receiver: Receiver, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

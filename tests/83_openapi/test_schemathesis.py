@@ -23,6 +23,7 @@ from schemathesis.specs.openapi.checks import positive_data_acceptance
 
 from pipeline.schedule import Cron
 from service.schedules import Definition
+from service.webhooks import EventType
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "80_service"))
 
@@ -62,6 +63,10 @@ class Ids:
         name = base64.b64encode(b"points.xyz").decode()
         self._tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "5", "Upload-Metadata": f"filename {name}"}
         self._schedules = itertools.cycle([self._schedule() for _ in range(3)])
+        self._webhooks = itertools.cycle([self._webhook() for _ in range(3)])
+        self._waiting()
+        listed = service.client.get("/webhooks/deliveries").json()["deliveries"]
+        self._deliveries = itertools.cycle([one["deliveryID"] for one in listed])
 
     def _schedule(self) -> str:
         asked = finished_runs.JobRequest(tiles=(finished_runs.InputReference(kind="upload", value=self._upload),))
@@ -74,6 +79,12 @@ class Ids:
             return self._upload
         assert made.status_code == 201, made.text
         return str(made.headers["location"].rpartition("/")[2])
+
+    def _webhook(self) -> str:
+        events = [EventType.ACCEPTED]
+        # there is no driver here that would send
+        made, _ = self._service.store.webhooks.create("https://8.8.8.8/", events=events, base="http://127.0.0.1")
+        return made.endpoint_id
 
     def _execute(self) -> dict[str, Any]:
         return {"inputs": {"tiles": [{"href": f"/uploads/{self._upload}"}], "crs": "EPSG:28992"}}
@@ -101,6 +112,13 @@ class Ids:
                 del case.body["processID"]
         if "scheduleID" in parameters:
             parameters["scheduleID"] = self._schedule() if case.method == "DELETE" else next(self._schedules)
+        if "webhookID" in parameters:
+            parameters["webhookID"] = self._webhook() if case.method == "DELETE" else next(self._webhooks)
+        if "deliveryID" in parameters:
+            parameters["deliveryID"] = next(self._deliveries)
+        is_webhook = case.path.startswith("/webhooks") and mode is GenerationMode.POSITIVE
+        if is_webhook and isinstance(case.body, dict) and "url" in case.body:
+            case.body["url"] = "https://8.8.8.8/hook"
         if "processID" in parameters:
             parameters["processID"] = process
         if mode is GenerationMode.POSITIVE and "method" in (case.query or {}):
