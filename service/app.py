@@ -15,6 +15,7 @@ from service.arrivals import Arrivals
 from service.compression import Compressed
 from service.files import StateFolder
 from service.guard import Guard
+from service.input_policy import check_hosts
 from service.methods import HeadAsGet, check_query
 from service.metrics import Measured, Metrics
 from service.rate_limits import RateLimiter
@@ -116,10 +117,11 @@ def start(settings: ServiceSettings, store: JobStore) -> None:
     Raises
     ------
     StartUpError
-        Other machines can reach the address, and there are no keys.
+        Other machines can reach the address, and there are no keys; or a listed host is not one.
     StoreError
         The database does not answer.
     """
+    check_hosts(settings)
     StateFolder(settings.state).make()
     store.migrate()
     store.fill_ballast(settings.reserve_bytes)

@@ -70,8 +70,21 @@ def checked_crs(text: str, *, path: str) -> pyproj.CRS:
     return parse_crs(text, path=path)
 
 
-def origin_of(entry: str) -> Origin:
-    """The origin of an entry of `input_hosts`.
+def check_hosts(settings: ServiceSettings) -> None:
+    """Check the entries of `input_hosts` and `webhook_hosts` when a process starts.
+
+    Raises
+    ------
+    StartUpError
+        One of them is not a host.
+    """
+    for setting in ("input_hosts", "webhook_hosts"):
+        for entry in getattr(settings, setting):
+            origin_of(entry, setting)
+
+
+def origin_of(entry: str, setting: str = "input_hosts") -> Origin:
+    """The origin of an entry of a setting.
 
     Raises
     ------
@@ -89,7 +102,7 @@ def origin_of(entry: str) -> Origin:
     except (httpx.InvalidURL, ValueError):
         origin = None
     if origin is None or url.userinfo or url.raw_path not in {b"", b"/"} or url.fragment or "*" in entry:
-        raise StartUpError(f"input_hosts has {entry!r}: write a host, host:port or http://host:port")
+        raise StartUpError(f"{setting} has {entry!r}: write a host, host:port or http://host:port")
     return origin
 
 

@@ -20,6 +20,7 @@ import anyio
 import anyio.to_thread
 import httpcore
 import httpx
+from anyio.lowlevel import RunVar
 
 from service.errors import TargetRefusedError
 from service.input_policy import LONGEST_URL, PORTS, origin_of, shown
@@ -31,8 +32,12 @@ CONNECT_S = 10.0
 """Seconds for the connection to one address."""
 LOOK_UP_S = 2.0
 """Seconds that a submission waits for the look-up of a name; without an answer the driver checks it later."""
+LOOK_UPS = 4
+"""Threads that look up names; a submission that finds none free in time is not checked until it is sent."""
 _SMALLEST_S = 0.01
 _LARGEST_PORT = 65_535
+
+_limiter: RunVar[anyio.CapacityLimiter] = RunVar("look_ups")
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
@@ -91,11 +96,23 @@ async def check_receiver(text: str, settings: ServiceSettings) -> None:
         return
     with anyio.move_on_after(LOOK_UP_S):
         try:
-            found = await anyio.to_thread.run_sync(_addresses, url.host, _port(url), abandon_on_cancel=True)
+            found = await anyio.to_thread.run_sync(
+                _addresses, url.host, _port(url), abandon_on_cancel=True, limiter=_look_ups()
+            )
         except OSError:
             return
         for address in found:
             _check_address(url, address)
+
+
+def _look_ups() -> anyio.CapacityLimiter:
+    """Limits the look-ups of one event loop: names that are answered slowly must not take the threads of requests."""
+    try:
+        return _limiter.get()
+    except LookupError:
+        made = anyio.CapacityLimiter(LOOK_UPS)
+        _limiter.set(made)
+        return made
 
 
 def is_public(address: Address) -> bool:

@@ -25,6 +25,7 @@ from service.driver.shared_cluster import SharedCluster
 from service.driver.webhooks import Sender
 from service.errors import LeaseLostError, StoreError
 from service.files import StateFolder
+from service.input_policy import check_hosts
 from service.settings import ServiceSettings
 from service.store import JobStore
 
@@ -358,8 +359,9 @@ def run_driver(settings: ServiceSettings, *, name: str | None = None, parent_pip
     Raises
     ------
     StartUpError
-        The database URL cannot be used.
+        The database URL cannot be used, or a listed host is not one.
     """
+    check_hosts(settings)
     configure(as_json=settings.log_json)
     driver = Driver(settings, name=name, parent_pipe=parent_pipe)
     with _signals(driver):

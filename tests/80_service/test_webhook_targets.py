@@ -16,8 +16,11 @@ from live_service import DEADLINE_S
 from webhook_receiver import receiving
 
 from service import webhook_targets
-from service.errors import TargetRefusedError
+from service.app import start
+from service.driver import run_driver
+from service.errors import StartUpError, TargetRefusedError
 from service.settings import ServiceSettings
+from service.store import JobStore
 from service.webhook_targets import SendError, check_receiver, checked_receiver, is_public, post
 
 PUBLIC = "93.184.216.34"
@@ -163,6 +166,40 @@ def test_a_listed_receiver_gets_the_message_as_it_is() -> None:
     assert (message.path, message.body) == ("/a%20b?c=d", b"{}")
     assert message.headers["host"] == receiver.url.removeprefix("http://")
     assert message.headers["content-type"] == "application/json"
+
+
+@pytest.mark.parametrize("setting", ["webhook_hosts", "input_hosts"])
+def test_a_listed_host_that_is_none_stops_the_service_and_its_driver_at_the_start(setting: str, tmp_path) -> None:
+    values = ServiceSettings(state=tmp_path, **{setting: ("https://hooks.example/path",)})
+    for begin in (
+        lambda: run_driver(values, parent_pipe=None),
+        lambda: start(values, JobStore(f"sqlite:///{tmp_path / 'a.db'}")),
+    ):
+        with pytest.raises(StartUpError, match=f"{setting} has 'https://hooks.example/path'"):
+            begin()
+
+
+def test_names_that_are_answered_slowly_do_not_hold_up_submissions(names, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(webhook_targets, "LOOK_UP_S", 0.05)
+    answered = threading.Event()
+
+    def look_up(*_: Any) -> list[Any]:
+        answered.wait(DEADLINE_S)
+        return []
+
+    monkeypatch.setattr(webhook_targets, "_addresses", look_up)
+
+    async def submissions() -> None:
+        async with anyio.create_task_group() as group:
+            for number in range(30):
+                group.start_soon(check_receiver, f"https://slow{number}.example/", settings())
+        # the threads of requests are free, though the look-ups are not over
+        limiter = anyio.to_thread.current_default_thread_limiter()
+        assert limiter.borrowed_tokens == 0
+        assert not answered.is_set()
+        answered.set()
+
+    anyio.run(submissions)
 
 
 def test_redirects_are_not_followed_and_proxies_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
