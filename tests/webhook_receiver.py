@@ -48,6 +48,9 @@ class Receiver:
     accepted: list[Received] = field(default_factory=list)
     """Those that were answered with 2xx."""
 
+    cut: list[tuple[int, int]] = field(default_factory=list)
+    """Bytes that came and bytes that were announced, of messages that ended early."""
+
     @property
     def origin(self) -> str:
         """An entry of `webhook_hosts`."""
@@ -74,7 +77,13 @@ def receiving(answer: Answer | None = None) -> Iterator[Receiver]:
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
-            body = self.rfile.read(int(self.headers["content-length"]))
+            length = int(self.headers["content-length"])
+            body = self.rfile.read(length)
+            if len(body) < length:
+                # the sender was killed before it had sent all
+                receiver.cut.append((len(body), length))
+                self.close_connection = True
+                return
             message = Received(self.path, {name.lower(): value for name, value in self.headers.items()}, body)
             receiver.received.append(message)
             status = receiver.answer(message)

@@ -20,10 +20,13 @@ from service.multipart import Form
 from service.routes.writing import Writer
 from service.store import JobStore, Patience
 
-KEPT_HEADERS = ("location", "etag", "cache-control", "content-type", "preference-applied")
+KEPT_HEADERS = (
+    *("location", "etag", "cache-control", "content-type", "preference-applied"),
+    *("upload-offset", "upload-expires", "content-location"),
+)
 """Headers of an answer that are kept with it."""
 
-NAMING = ("content-disposition", "x-filename")
+NAMING = ("content-disposition", "x-filename", "upload-length", "upload-metadata")
 """Headers that decide what a request makes."""
 
 FREE_S = 1.0

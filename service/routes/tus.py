@@ -7,6 +7,7 @@ import binascii
 import datetime as dt
 import hashlib
 import re
+from collections.abc import AsyncIterator
 from email.utils import format_datetime
 from http import HTTPStatus
 from typing import Annotated, Any
@@ -17,7 +18,8 @@ from service.arrivals import ALGORITHMS, Arrivals, Part, State
 from service.errors import RequestError
 from service.problems import MEDIA_TYPE
 from service.routes.answers import problems, reference
-from service.routes.bound import Base, Settings_, Submitter, visitor
+from service.routes.bound import Base, Settings_, Store, Submitter, visitor
+from service.routes.submission import Submitting
 from service.routes.uploads import UploadId
 from service.wire.problems import Problem
 
@@ -133,8 +135,9 @@ async def capabilities(request: Request, settings: Settings_) -> Response:
 async def begin(
     request: Request,
     base: Base,
+    store: Store,
+    submitting: Submitting,
     arriving: Arriving,
-    caller: Submitter,
     upload_metadata: Metadata,
     upload_length: Annotated[int, Header(ge=0, description="Bytes of the whole file.", examples=[1170107])],
     upload_checksum: Checksum = None,
@@ -145,20 +148,25 @@ async def begin(
     """
     known = _metadata(upload_metadata)
     has_body = request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
-    part = _part(request, 0, upload_checksum) if has_body else None
-    state = await arriving.create(
-        known.get("filename", ""),
-        upload_length,
-        sha256=_digest(known.get("sha256")),
-        metadata=upload_metadata,
-        owner=caller.key_id,
-    )
-    if part is not None:
-        state = await arriving.append(state.upload_id, part, owner=caller.owner)
-    elif upload_length == 0:
-        state = await arriving.state(state.upload_id, owner=caller.owner)
-    headers = _state_headers(state, base) | {"Location": f"{base}/uploads/tus/{state.upload_id}"}
-    return Response(status_code=HTTPStatus.CREATED, headers=headers)
+    owner = submitting.caller.owner
+    async with submitting as submission:
+        part = _part(request, submission.body(), 0, upload_checksum) if has_body else None
+        state = await arriving.create(
+            known.get("filename", ""),
+            upload_length,
+            sha256=_digest(known.get("sha256")),
+            metadata=upload_metadata,
+            owner=submission.caller.key_id,
+        )
+        if part is not None:
+            state = await arriving.append(state.upload_id, part, owner=owner)
+        elif upload_length == 0:
+            state = await arriving.state(state.upload_id, owner=owner)
+        headers = _state_headers(state, base) | {"Location": f"{base}/uploads/tus/{state.upload_id}"}
+        answer = Response(status_code=HTTPStatus.CREATED, headers=headers)
+        if "idempotency-key" not in request.headers:
+            return answer
+        return await submission.make(store.add_uploads, lambda _: answer)
 
 
 @router.head(
@@ -210,7 +218,8 @@ async def append(
 
     The last bytes finish the upload: the file is examined as by `POST /uploads`, and a file that is refused is removed.
     """
-    state = await arriving.append(upload_id, _part(request, upload_offset, upload_checksum), owner=caller.owner)
+    part = _part(request, aiter(request.stream()), upload_offset, upload_checksum)
+    state = await arriving.append(upload_id, part, owner=caller.owner)
     return Response(status_code=HTTPStatus.NO_CONTENT, headers=_state_headers(state, base))
 
 
@@ -238,7 +247,7 @@ def _state_headers(state: State, base: str) -> dict[str, str]:
     return headers
 
 
-def _part(request: Request, at: int, checksum: str | None) -> Part:
+def _part(request: Request, stream: AsyncIterator[bytes], at: int, checksum: str | None) -> Part:
     """The bytes that a request sends."""
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type != BYTES:
@@ -247,7 +256,7 @@ def _part(request: Request, at: int, checksum: str | None) -> Part:
         )
     length = request.headers.get("content-length", "")
     return Part(
-        stream=aiter(request.stream()),
+        stream=stream,
         offset=at,
         length=int(length) if length.isascii() and length.isdigit() else None,
         checksum=_checksum(checksum),

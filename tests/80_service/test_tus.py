@@ -67,6 +67,21 @@ def test_the_first_bytes_may_come_with_the_creation(client: httpx.Client, local_
     assert client.get(whole.headers["content-location"]).json()["sha256"] == hashlib.sha256(CONTENT).hexdigest()
 
 
+@pytest.mark.parametrize("first", [0, 1000])
+def test_a_creation_that_is_sent_again_under_its_key_makes_one_upload(
+    client: httpx.Client, local_service: Any, first: int
+) -> None:
+    headers = {**PATCH, **creation(), "Idempotency-Key": "one"}
+    answers = [client.post("/uploads/tus", headers=headers, content=CONTENT[:first]) for _ in range(2)]
+    assert [answer.status_code for answer in answers] == [201, 201]
+    assert answers[0].headers["location"] == answers[1].headers["location"]
+    assert answers[0].headers["upload-offset"] == answers[1].headers["upload-offset"] == str(first)
+    assert len(names_in(local_service)) == 1
+    other = client.post("/uploads/tus", headers={**headers, "Upload-Length": "5000"}, content=CONTENT[:first])
+    assert other.status_code == 422
+    assert len(names_in(local_service)) == 1
+
+
 def test_head_repeats_what_was_promised_and_must_not_be_cached(client: httpx.Client) -> None:
     asked = {"Upload-Metadata": metadata("Straße.laz", other="kept")}
     answer = client.head(begin(client, **asked), headers=TUS)

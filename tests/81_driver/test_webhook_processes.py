@@ -40,7 +40,17 @@ class Trap:
         return self._answer(message)
 
 
-def test_a_driver_that_is_killed_while_it_sends_loses_no_message(programs: Programs, tmp_path: Path) -> None:
+@pytest.fixture(params=["sqlite", "postgres"])
+def database(request: pytest.FixtureRequest) -> dict[str, str]:
+    """The variable that names the database; none for SQLite in the state folder."""
+    if request.param == "sqlite":
+        return {}
+    return {"GABLEWORK_DATABASE_URL": request.getfixturevalue("postgres_url")}
+
+
+def test_a_driver_that_is_killed_while_it_sends_loses_no_message(
+    programs: Programs, tmp_path: Path, database: dict[str, str]
+) -> None:
     trap = Trap()
     with receiving(trap) as receiver:
         environment = {
@@ -51,6 +61,7 @@ def test_a_driver_that_is_killed_while_it_sends_loses_no_message(programs: Progr
             "GABLEWORK_WEBHOOK_HOSTS": json.dumps([receiver.origin]),
             "GABLEWORK_WEBHOOK_PAUSE_S": "0.0001",
             "OPENBLAS_NUM_THREADS": "1",
+            **database,
         }
         state = tmp_path / "state"
         command = [sys.executable, "-m", "service.cli", "serve", "--json", "--port", "0", "--state", str(state)]
@@ -99,6 +110,7 @@ def test_a_driver_that_is_killed_while_it_sends_loses_no_message(programs: Progr
         assert {one["jobID"] for one in sent if "webhookID" not in one} == jobs
         for message in receiver.received:
             secret = made["secret"] if message.path == "/all" else own
-            assert message.verify(secret) is not None
-        print(f"{len(sent)} deliveries, {len(receiver.received)} attempts, {len(lost)} lost with their driver")
+            assert message.verify(secret) is not None, message
+        cut = len(receiver.cut)
+        print(f"{len(sent)} deliveries, {len(receiver.received)} attempts, {len(lost)} lost, {cut} cut short")
     assert served.stop() == 0
