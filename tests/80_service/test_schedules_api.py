@@ -87,7 +87,7 @@ def test_the_request_that_a_schedule_shows_makes_the_same_schedule_again(local_s
         ({"paused": "yes"}, "use true or false"),
         ({"title": 5}, "use a text"),
         ({"title": "x" * 501}, "at most 500 characters"),
-        ({"processID": "echo"}, "use one of reconstruct, compare"),
+        ({"processID": "paint"}, "use one of reconstruct, compare"),
         ({"colour": "red"}, '"colour" is not a member: use title, cron'),
         ({"execute": []}, "execute is []: use an object"),
         ({"execute": {"inputs": {}}}, "execute: tiles is missing"),
