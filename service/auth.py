@@ -7,6 +7,7 @@ everything. As soon as there is a key, every client needs one, even after the la
 from __future__ import annotations
 
 import dataclasses
+import datetime as dt
 import hmac
 import threading
 import time
@@ -111,14 +112,20 @@ def _memory_of(table: KeyTable) -> _Memory:
 
 
 def authenticate(
-    authorization: str | None, store: KeyTable, settings: ServiceSettings, *, now_s: float | None = None
+    authorization: str | None,
+    store: KeyTable,
+    settings: ServiceSettings,
+    *,
+    now_s: float | None = None,
+    at: dt.datetime | None = None,
 ) -> Principal:
-    """The principal of a request, from its header (None without one). `now_s` is a monotonic time.
+    """The principal of a request, from its header (None without one). `now_s` is a monotonic time, `at` one of day.
 
     Raises
     ------
     UnauthorizedError
-        A key is needed and none was sent, or it is malformed, unknown or revoked. The message never repeats it.
+        A key is needed and none was sent, or it is malformed, unknown, revoked or expired. The message does not
+        repeat it.
     """
     memory = _memory_of(store)
     now_s = time.monotonic() if now_s is None else now_s
@@ -132,8 +139,9 @@ def authenticate(
         raise UnauthorizedError(f"the header Authorization holds no key. {FIX}")
     digest = digest_of(secret)
     key = memory.key(digest, store, now_s)
-    if key is None or not hmac.compare_digest(key.digest, digest):
+    if key is None or not any(hmac.compare_digest(known, digest) for known in (key.digest, key.old_digest or "")):
         raise UnauthorizedError(f"the key is not known. {FIX}")
-    if key.revoked_at is not None:
-        raise UnauthorizedError(f"the key {key.name!r} was revoked. {FIX}")
+    fault = key.fault(digest, dt.datetime.now(dt.UTC) if at is None else at)
+    if fault is not None:
+        raise UnauthorizedError(f"the key {key.name!r} {fault}. {FIX}")
     return Principal(key_id=key.key_id, scopes=key.scopes)

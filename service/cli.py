@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import datetime as dt
 import functools
 import sys
 from collections.abc import Iterator, Sequence
@@ -20,6 +21,7 @@ from pipeline.errors import RunError, SettingsError
 from pipeline.runtime.isolation.start_up import start_own_process
 
 if TYPE_CHECKING:
+    from service.keys import Key
     from service.settings import ServiceSettings
     from service.store import JobStore
 
@@ -42,6 +44,11 @@ ServiceWorkers = Annotated[
 ]
 Scheduler = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use instead of the embedded cluster.")
+]
+
+KeyId = Annotated[str, typer.Argument(metavar="ID", help="Id of the key, as in `gablework keys list`.")]
+Days = Annotated[
+    float | None, typer.Option(metavar="N", min=0.001, max=36_500.0, help="Days from now after which it expires.")
 ]
 
 _STANDARD_INPUT = 0
@@ -212,12 +219,35 @@ def _opened(state: str | None, database_url: str | None) -> Iterator[JobStore]:
         yield store
 
 
+def _known(store: JobStore, key_id: str) -> Key:
+    """The key of an id.
+
+    Raises
+    ------
+    SettingsError
+        There is none.
+    """
+    made = {key.key_id: key for key in store.keys()}
+    if key_id not in made:
+        raise SettingsError([f"there is no key {key_id!r}: `gablework keys list` shows all {len(made)}"])
+    return made[key_id]
+
+
+def _days(number: float | None) -> dt.timedelta | None:
+    return None if number is None else dt.timedelta(days=number)
+
+
+def _day(at: dt.datetime | None) -> str | None:
+    return None if at is None else at.isoformat(timespec="seconds")
+
+
 @keys.command(name="create")
 def create_key(
     name: Annotated[str, typer.Option(metavar="TEXT", help="Your own name for the key.")],
     scope: Annotated[
         str, typer.Option(metavar="SCOPE", help="read, submit or admin; each includes those before it.")
     ] = "submit",
+    days: Days = None,
     state: State = None,
     database_url: DatabaseUrl = None,
     as_json: AsJson = False,
@@ -229,10 +259,38 @@ def create_key(
         if scope not in list(Scope):
             raise SettingsError([f"scope is {scope!r}: use one of {', '.join(Scope)}"])
         with _opened(state, database_url) as store:
-            key, secret = new_key(name, Scope(scope), now=store.now())
+            key, secret = new_key(name, Scope(scope), now=store.now(), lasting=_days(days))
             store.add_key(key)
         console.say(secret)
-        console.document({"id": key.key_id, "name": name, "scopes": sorted(key.scopes), "key": secret})
+        shown = {"id": key.key_id, "name": name, "scopes": sorted(key.scopes), "key": secret}
+        console.document(shown | {"expires": _day(key.expires_at)})
+
+
+@keys.command(name="rotate")
+def rotate_key(
+    key_id: KeyId,
+    grace_hours: Annotated[
+        float, typer.Option(metavar="HOURS", min=0.0, max=8760.0, help="Hours for which the old secret still works.")
+    ] = 24.0,
+    days: Days = None,
+    state: State = None,
+    database_url: DatabaseUrl = None,
+    as_json: AsJson = False,
+) -> None:
+    """Give a key a new secret and show it once; jobs, uploads and schedules of the key stay."""
+    with Console(as_json=as_json) as console, _service_errors():
+        from service.keys import rotated
+
+        with _opened(state, database_url) as store:
+            key = _known(store, key_id)
+            if key.revoked_at is not None:
+                raise SettingsError([f"the key {key_id!r} was revoked: make another one"])
+            grace = dt.timedelta(hours=grace_hours)
+            key, secret = rotated(key, now=store.now(), grace=grace, lasting=_days(days))
+            store.rotate_key(key)
+        console.say(secret)
+        times = {"oldUntil": key.old_until and key.old_until.isoformat(timespec="seconds")}
+        console.document({"id": key_id, "key": secret, "expires": _day(key.expires_at)} | times)
 
 
 @keys.command(name="list")
@@ -247,7 +305,8 @@ def list_keys(state: State = None, database_url: DatabaseUrl = None, as_json: As
                 "name": key.name,
                 "scopes": sorted(key.scopes),
                 "created": key.created_at.isoformat(timespec="seconds"),
-                "revoked": None if key.revoked_at is None else key.revoked_at.isoformat(timespec="seconds"),
+                "expires": _day(key.expires_at),
+                "revoked": _day(key.revoked_at),
             }
             for key in found
         ]
@@ -255,25 +314,32 @@ def list_keys(state: State = None, database_url: DatabaseUrl = None, as_json: As
             console.say("there are no keys")
         console.table(
             "Keys",
-            ["id", "name", "scopes", "created", "revoked"],
-            [[row["id"], row["name"], ", ".join(row["scopes"]), row["created"], row["revoked"] or ""] for row in rows],
+            ["id", "name", "scopes", "created", "expires", "revoked"],
+            [
+                [
+                    row["id"],
+                    row["name"],
+                    ", ".join(row["scopes"]),
+                    row["created"],
+                    row["expires"] or "",
+                    row["revoked"] or "",
+                ]
+                for row in rows
+            ],
         )
         console.document({"keys": rows})
 
 
 @keys.command(name="revoke")
 def revoke_key(
-    key_id: Annotated[str, typer.Argument(metavar="ID", help="Id of the key, as in `gablework keys list`.")],
+    key_id: KeyId,
     state: State = None,
     database_url: DatabaseUrl = None,
     as_json: AsJson = False,
 ) -> None:
     """Revoke a key. It is refused from now on; its jobs stay."""
     with Console(as_json=as_json) as console, _service_errors(), _opened(state, database_url) as store:
-        made = store.keys()
-        if key_id not in {key.key_id for key in made}:
-            raise SettingsError([f"there is no key {key_id!r}: `gablework keys list` shows all {len(made)}"])
-        store.revoke_key(key_id)
+        store.revoke_key(_known(store, key_id).key_id)
         console.say(f"revoked {key_id}")
         console.document({"revoked": key_id})
 

@@ -66,19 +66,58 @@ class Key:
     created_at: dt.datetime
     """With a time zone."""
     revoked_at: dt.datetime | None = None
-    """When it was revoked; None if it is valid."""
+    """When it was revoked; None if it was not."""
+    expires_at: dt.datetime | None = None
+    """When it expires; None for never."""
+    old_digest: str | None = None
+    """Digest of the secret before the last rotation; None without one."""
+    old_until: dt.datetime | None = None
+    """How long that secret is accepted beside the new one."""
 
     def __post_init__(self) -> None:
         if not self.scopes:
             raise ValueError(f"the key {self.name!r} has no scope: choose from {', '.join(Scope)}")
         object.__setattr__(self, "scopes", frozenset().union(*(Scope(scope).included for scope in self.scopes)))
 
+    def fault(self, digest: str, now: dt.datetime) -> str | None:
+        """Why a secret with this digest, that of this key, is refused; None if it is accepted."""
+        if self.revoked_at is not None:
+            return "was revoked"
+        if self.expires_at is not None and self.expires_at <= now:
+            return f"expired on {self.expires_at:%Y-%m-%d}"
+        if digest == self.old_digest and (self.old_until is None or self.old_until <= now):
+            return "was rotated, and its old secret is no longer accepted"
+        return None
 
-def new_key(name: str, scope: Scope, *, now: dt.datetime) -> tuple[Key, str]:
+
+def new_key(name: str, scope: Scope, *, now: dt.datetime, lasting: dt.timedelta | None = None) -> tuple[Key, str]:
     """Make a key with a scope and those before it: the stored record, and the key itself, which is shown once."""
     secret = PREFIX + secrets.token_urlsafe(32)
-    key = Key(key_id=uuid.uuid4().hex, name=name, digest=digest_of(secret), scopes=scope.included, created_at=now)
+    key = Key(
+        key_id=uuid.uuid4().hex,
+        name=name,
+        digest=digest_of(secret),
+        scopes=scope.included,
+        created_at=now,
+        expires_at=None if lasting is None else now + lasting,
+    )
     return key, secret
+
+
+def rotated(key: Key, *, now: dt.datetime, grace: dt.timedelta, lasting: dt.timedelta | None = None) -> tuple[Key, str]:
+    """The key with a new secret, and that secret; the old one is accepted for `grace` longer.
+
+    With `lasting` it expires so long after now; otherwise its end stays.
+    """
+    secret = PREFIX + secrets.token_urlsafe(32)
+    changed = dataclasses.replace(
+        key,
+        digest=digest_of(secret),
+        old_digest=key.digest,
+        old_until=now + grace,
+        expires_at=key.expires_at if lasting is None else now + lasting,
+    )
+    return changed, secret
 
 
 def digest_of(secret: str) -> str:

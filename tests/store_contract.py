@@ -1,5 +1,6 @@
 """What the store does on every database: the same tests for SQLite and PostgreSQL."""
 
+import dataclasses
 import datetime as dt
 import os
 import subprocess
@@ -26,7 +27,7 @@ from service.errors import (
     UploadInUseError,
 )
 from service.jobs import Fault, InputReference, Job, JobEvent, JobFailure, JobRequest, JobStatus, Upload
-from service.keys import Scope, digest_of, new_key
+from service.keys import Scope, digest_of, new_key, rotated
 from service.store import JobFilter, JobStore
 from service.store.changes import MAX_KEPT
 from service.store.tables import METADATA
@@ -581,6 +582,19 @@ class StoreContract(DatabaseContract):
         assert found.revoked_at is not None
         store.revoke_key(key.key_id)
         assert store.keys() == [found]
+        assert not store.has_keys()
+
+    def test_a_rotated_key_is_found_by_both_secrets_and_an_expired_one_counts_as_none(self, store: JobStore) -> None:
+        now = store.now()
+        first, old = new_key("a", Scope.SUBMIT, now=now)
+        store.add_key(first)
+        key, new = rotated(first, now=now, grace=dt.timedelta(hours=1), lasting=dt.timedelta(days=1))
+        store.rotate_key(key)
+        for secret in (old, new):
+            assert store.key_by_digest(digest_of(secret)) == key
+        assert store.keys() == [key]
+        assert store.has_keys()
+        store.rotate_key(dataclasses.replace(key, expires_at=now - dt.timedelta(days=1)))
         assert not store.has_keys()
 
     # --- many at once

@@ -429,7 +429,7 @@ class JobStore:
             keys.add(connection, key)
 
     def key_by_digest(self, digest: str) -> Key | None:
-        """The key with this digest, even if it is revoked; None if there is none."""
+        """The key with this digest, new or old, even if it is refused; None if there is none."""
         with self._database.read() as connection:
             return keys.by_digest(connection, digest)
 
@@ -438,12 +438,17 @@ class JobStore:
         with self._database.read() as connection:
             return keys.every(connection)
 
+    def rotate_key(self, key: Key) -> None:
+        """Store the new secret of a key."""
+        with self._database.write() as connection:
+            keys.rotate(connection, key)
+
     def revoke_key(self, key_id: str) -> None:
         """Revoke a key; one that does not exist is ignored."""
         with self._database.write() as connection:
             keys.revoke(connection, key_id, self._database.now(connection))
 
     def has_keys(self) -> bool:
-        """Whether there is a key that is not revoked."""
+        """Whether there is a key that is neither revoked nor expired."""
         with self._database.read() as connection:
-            return keys.any_valid(connection)
+            return keys.any_valid(connection, self._database.now(connection))

@@ -22,13 +22,15 @@ def add(connection: Connection, key: Key) -> None:
             scopes=sorted(key.scopes),
             created_at=key.created_at,
             revoked_at=key.revoked_at,
+            expires_at=key.expires_at,
         )
     )
 
 
 def by_digest(connection: Connection, digest: str) -> Key | None:
-    """The key with this digest, also if it is revoked; None if there is none."""
-    row = connection.execute(sa.select(KEYS).where(KEYS.c.digest == storable(digest))).one_or_none()
+    """The key with this digest, or with this one before its rotation, also if it is refused; None if there is none."""
+    held = sa.or_(KEYS.c.digest == storable(digest), KEYS.c.old_digest == storable(digest))
+    row = connection.execute(sa.select(KEYS).where(held)).one_or_none()
     return None if row is None else key_of(row)
 
 
@@ -43,6 +45,14 @@ def revoke(connection: Connection, key_id: str, now: dt.datetime) -> None:
     connection.execute(sa.update(KEYS).where(one).values(revoked_at=now))
 
 
-def any_valid(connection: Connection) -> bool:
-    """Whether there is a key that is not revoked."""
-    return connection.execute(sa.select(KEYS.c.key_id).where(KEYS.c.revoked_at.is_(None)).limit(1)).first() is not None
+def rotate(connection: Connection, key: Key) -> None:
+    """Store the new secret of a key."""
+    values = {name: getattr(key, name) for name in ("digest", "old_digest", "old_until", "expires_at")}
+    connection.execute(sa.update(KEYS).where(KEYS.c.key_id == key.key_id).values(**values))
+
+
+def any_valid(connection: Connection, now: dt.datetime) -> bool:
+    """Whether there is a key that is neither revoked nor expired."""
+    lasting = sa.or_(KEYS.c.expires_at.is_(None), KEYS.c.expires_at > now)
+    valid = sa.select(KEYS.c.key_id).where(KEYS.c.revoked_at.is_(None), lasting)
+    return connection.execute(valid.limit(1)).first() is not None

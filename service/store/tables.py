@@ -130,6 +130,10 @@ KEYS = sa.Table(
     sa.Column("scopes", sa.JSON, nullable=False),
     sa.Column("created_at", UtcTime, nullable=False),
     sa.Column("revoked_at", UtcTime),
+    sa.Column("expires_at", UtcTime),
+    sa.Column("old_digest", sa.String(64)),
+    sa.Column("old_until", UtcTime),
+    sa.Index("keys_by_old_digest", "old_digest", unique=True),
 )
 """One row per key; the key itself is not stored."""
 

@@ -18,6 +18,7 @@ from pipeline.schedule import Entry, Outcome, ScheduleState, enter, look
 from service.errors import ForbiddenError, ScheduleBusyError, ServiceError
 from service.schedules import Schedule, ScheduleRun, Trigger
 from service.store import schedules
+from service.store.records import key_of
 from service.store.slot_book import SlotBook
 from service.store.submissions import check_queue, insert
 from service.store.tables import KEYS, SCHEDULES
@@ -118,10 +119,13 @@ def _submit(connection: Connection, schedule: Schedule, now: dt.datetime, limits
     """
     owner = schedule.owner
     if owner is not None:
-        key = connection.execute(sa.select(KEYS.c.name, KEYS.c.revoked_at).where(KEYS.c.key_id == owner)).one_or_none()
-        if key is not None and key.revoked_at is not None:
+        row = connection.execute(sa.select(KEYS).where(KEYS.c.key_id == owner)).one_or_none()
+        key = None if row is None else key_of(row)
+        fault = None if key is None else key.fault(key.digest, now)
+        if key is not None and fault is not None:
             raise ForbiddenError(
-                f"the key {key.name!r} that made this schedule was revoked: make the schedule again with another key"
+                f"the key {key.name!r} that made this schedule {fault}: make the schedule again with another key, or "
+                "rotate this one if it expired"
             )
     limits.lock(connection)
     check_queue(connection, owner, max_queued=limits.max_queued, max_queued_per_key=limits.max_queued_per_key)

@@ -10,7 +10,7 @@ import pytest
 from service import auth
 from service.auth import TRUST_S, Principal, authenticate
 from service.errors import ForbiddenError, UnauthorizedError
-from service.keys import Key, Scope, new_key
+from service.keys import Key, Scope, new_key, rotated
 from service.settings import ServiceSettings
 
 NOW = dt.datetime(2026, 3, 1, tzinfo=dt.UTC)
@@ -28,7 +28,7 @@ class FakeTable:
 
     def key_by_digest(self, digest: str) -> Key | None:
         self.asked += 1
-        return next((key for key in self.held if key.digest == digest), None)
+        return next((key for key in self.held if digest in (key.digest, key.old_digest)), None)
 
     def revoke(self, key: Key) -> None:
         self.held = [dataclasses.replace(one, revoked_at=NOW) if one == key else one for one in self.held]
@@ -135,6 +135,31 @@ def test_a_revoked_key_works_no_longer_than_some_seconds() -> None:
     with pytest.raises(UnauthorizedError, match="was revoked"):
         authenticate(bearer(secret), table, settings(), now_s=TRUST_S)
     assert TRUST_S <= 5.0
+
+
+def test_a_key_is_accepted_until_it_expires() -> None:
+    key, secret = new_key("a", Scope.READ, now=NOW, lasting=dt.timedelta(days=2))
+    table = FakeTable(key)
+    just_before = NOW + dt.timedelta(days=2, microseconds=-1)
+    assert authenticate(bearer(secret), table, settings(), at=just_before).key_id == key.key_id
+    with pytest.raises(UnauthorizedError, match="'a' expired on 2026-03-03"):
+        authenticate(bearer(secret), table, settings(), at=NOW + dt.timedelta(days=2))
+
+
+def test_the_old_secret_of_a_rotated_key_works_for_a_while() -> None:
+    first, old = new_key("a", Scope.READ, now=NOW, lasting=dt.timedelta(days=9))
+    key, new = rotated(first, now=NOW, grace=dt.timedelta(hours=3))
+    assert (key.key_id, key.expires_at) == (first.key_id, first.expires_at)
+    table = FakeTable(key)
+    for secret in (old, new):
+        assert authenticate(bearer(secret), table, settings(), at=NOW).key_id == key.key_id
+    later = NOW + dt.timedelta(hours=3)
+    assert authenticate(bearer(new), table, settings(), at=later).key_id == key.key_id
+    with pytest.raises(UnauthorizedError, match="old secret is no longer accepted"):
+        authenticate(bearer(old), table, settings(), at=later)
+    longer, _ = rotated(key, now=NOW, grace=dt.timedelta(0), lasting=dt.timedelta(days=30))
+    assert longer.expires_at == NOW + dt.timedelta(days=30)
+    assert longer.old_digest == key.digest
 
 
 def test_services_in_one_process_do_not_share_their_keys() -> None:

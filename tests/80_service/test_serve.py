@@ -272,7 +272,14 @@ def test_keys_are_made_listed_and_revoked(tmp_path: Path) -> None:
     listed = invoke("keys", "list", *state, "--json").stdout
     assert made["key"] not in listed
     assert [key["id"] for key in json.loads(listed)["keys"]] == [made["id"]]
+    turned = json.loads(invoke("keys", "rotate", made["id"], "--days", "2", *state, "--json").stdout)
+    assert turned["id"] == made["id"]
+    assert turned["key"].startswith("gw_")
+    assert turned["key"] != made["key"]
+    assert turned["oldUntil"] < turned["expires"]
+    assert json.loads(invoke("keys", "list", *state, "--json").stdout)["keys"][0]["expires"] == turned["expires"]
     assert invoke("keys", "revoke", made["id"], *state).exit_code == 0
+    assert invoke("keys", "rotate", made["id"], *state).exit_code == 2
     assert json.loads(invoke("keys", "list", *state, "--json").stdout)["keys"][0]["revoked"] is not None
     unknown = invoke("keys", "revoke", "0" * 32, *state)
     assert unknown.exit_code == 2
