@@ -227,7 +227,8 @@ def _known(store: JobStore, key_id: str) -> Key:
     SettingsError
         There is none.
     """
-    made = {key.key_id: key for key in store.keys()}
+    found = store.keys()
+    made = {key.key_id: key for key in found}
     if key_id not in made:
         raise SettingsError([f"there is no key {key_id!r}: `gablework keys list` shows all {len(made)}"])
     return made[key_id]
@@ -312,20 +313,11 @@ def list_keys(state: State = None, database_url: DatabaseUrl = None, as_json: As
         ]
         if not rows:
             console.say("there are no keys")
+        times = ("created", "expires", "revoked")
         console.table(
             "Keys",
-            ["id", "name", "scopes", "created", "expires", "revoked"],
-            [
-                [
-                    row["id"],
-                    row["name"],
-                    ", ".join(row["scopes"]),
-                    row["created"],
-                    row["expires"] or "",
-                    row["revoked"] or "",
-                ]
-                for row in rows
-            ],
+            ["id", "name", "scopes", *times],
+            [[row["id"], row["name"], ", ".join(row["scopes"]), *(row[at] or "" for at in times)] for row in rows],
         )
         console.document({"keys": rows})
 
