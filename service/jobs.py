@@ -213,6 +213,8 @@ class Job:
     """Counts, digest and timings of the run, once successful."""
     schedule_id: str | None = None
     """The schedule that made it; it may be removed by now."""
+    keep: bool = False
+    """Whether it is kept, whatever its age and size."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

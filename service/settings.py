@@ -66,6 +66,18 @@ class ServiceSettings(BaseSettings):
     max_body_bytes: int = Field(default=2**20, gt=0, description="Maximum bytes of the body of other requests.")
     max_points: int = Field(default=500_000_000, gt=0, description="Maximum number of points of all inputs of one job.")
     max_inputs: int = Field(default=1000, gt=0, description="Maximum number of input files of one job.")
+    job_days: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=36_500.0,
+        description="Days after which a job that is over is removed with its results; 0 for never. Kept jobs stay.",
+    )
+    max_results_bytes: int = Field(
+        default=0,
+        ge=0,
+        description="Maximum bytes of all jobs' files: beyond it the jobs that ended first are removed; 0 for no limit. "
+        "Kept jobs stay.",
+    )
     upload_days: float = Field(
         default=7.0, gt=0.0, le=36_500.0, description="Days after which an upload that no job needs is removed."
     )

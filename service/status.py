@@ -37,6 +37,7 @@ def status_info(job: Job, base: str, *, with_request: bool = True) -> StatusInfo
         priority=job.priority or None,
         scheduleID=job.schedule_id,
         attempt=job.attempt or None,
+        keep=job.keep,
         summary=None if job.summary is None else dict(job.summary),
         exception=None if job.failure is None else failure_document(job.failure, f"/jobs/{job.job_id}"),
         request=execute_request(job.request, base, job.priority) if with_request else None,

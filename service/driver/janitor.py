@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import datetime as dt
 import logging
+import os
 import re
 import shutil
 import time
 from pathlib import Path
 
 from service.driver import finished_work
-from service.errors import UploadInUseError
+from service.errors import NoSuchJobError, UploadInUseError
 from service.files import StateFolder, is_id
 from service.jobs import JobStatus
 from service.resumable import remove_expired
+from service.settings import ServiceSettings
 from service.store import JobStore
 from service.uploads import STALE_S, remove_file, remove_leftovers
 
@@ -21,7 +25,7 @@ LOG = logging.getLogger("gablework.driver")
 _ATTEMPT = re.compile(r"attempt-([0-9]+)")
 
 
-def tidy(store: JobStore, folder: StateFolder) -> list[Path]:
+def tidy(store: JobStore, folder: StateFolder, settings: ServiceSettings) -> list[Path]:
     """Remove the files that jobs and uploads left behind, and old answers; set room aside for the database again.
 
     Several drivers may do so at once.
@@ -32,15 +36,48 @@ def tidy(store: JobStore, folder: StateFolder) -> list[Path]:
         The records of jobs and uploads.
     folder : StateFolder
         Their files.
+    settings : ServiceSettings
+        How long jobs are kept.
 
     Returns
     -------
     list of Path
         The removed folders.
     """
-    removed = [*tidy_jobs(store, folder), *tidy_uploads(store, folder)]
+    removed = [*retire_jobs(store, folder, settings), *tidy_jobs(store, folder), *tidy_uploads(store, folder)]
     store.forget_answers()
     store.fill_ballast(folder.reserve_bytes)
+    return removed
+
+
+def retire_jobs(store: JobStore, folder: StateFolder, settings: ServiceSettings) -> list[Path]:
+    """Remove jobs that are over for `job_days`, then those that ended first until all files are small enough.
+
+    Kept jobs stay. Their files and those of unfinished jobs count, too.
+    """
+    over = store.finished() if settings.job_days or settings.max_results_bytes else []
+    retired = []
+    if settings.job_days:
+        end = store.now() - dt.timedelta(days=settings.job_days)
+        retired = [job_id for job_id, finished_at in over if finished_at <= end]
+    if settings.max_results_bytes:
+        sizes = {path.name: _size_of(path) for path in _entries(folder.jobs)}
+        size = sum(sizes.values()) - sum(sizes.get(job_id, 0) for job_id in retired)
+        for job_id, _ in over[len(retired) :]:
+            if size <= settings.max_results_bytes:
+                break
+            size -= sizes.get(job_id, 0)
+            retired.append(job_id)
+    removed = []
+    for job_id in retired:
+        # another driver, or its client, may have removed it meanwhile
+        with contextlib.suppress(NoSuchJobError):
+            store.remove(job_id)
+            shutil.rmtree(folder.job(job_id), ignore_errors=True)
+            removed.append(folder.job(job_id))
+            LOG.info(
+                "job %s is removed with its results: it is over for long, or the limit of bytes is reached", job_id
+            )
     return removed
 
 
@@ -103,6 +140,16 @@ def _entries(folder: Path) -> list[Path]:
         return list(folder.iterdir())
     except FileNotFoundError:
         return []
+
+
+def _size_of(folder: Path) -> int:
+    """Bytes of all files in a folder."""
+    size = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                size += os.lstat(os.path.join(place, name)).st_size  # noqa: PTH118 - folders have thousands of files
+    return size
 
 
 def _is_stale(path: Path, now_s: float) -> bool:

@@ -309,7 +309,7 @@ class Driver:
     def _tidy(self) -> None:
         while True:
             try:
-                removed = tidy(self._store, self._shop.folder)
+                removed = tidy(self._store, self._shop.folder, self._settings)
                 while self._store.webhooks.forget(self._settings.webhook_log_days):
                     continue
             except (StoreError, OSError) as error:

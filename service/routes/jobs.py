@@ -28,7 +28,7 @@ from service.store import JobFilter
 from service.wire.base import page_links, respond
 from service.wire.execute import RETRY_EXAMPLES, Execute, Retry, wanted
 from service.wire.faults import sentences, shortened
-from service.wire.jobs import JobForm, JobList, StatusInfo
+from service.wire.jobs import JobChanges, JobForm, JobList, StatusInfo
 from service.wire.queries import JobQuery, interval
 
 router = APIRouter(tags=["jobs"], route_class=PageRoute)
@@ -222,6 +222,19 @@ async def retry(
         execute = (changes or Retry()).applied_to(execute_request(before.request, base, before.priority))
         draft = process_named(before.request.process_id).draft(execute, submission.settings)
         return await submission.submit(draft, lambda job: job_made(job, base))
+
+
+@router.patch(
+    "/jobs/{jobID}",
+    summary="Keep a job",
+    responses={200: document(StatusInfo, "The job.", STATUS_EXAMPLE | {"keep": True}), **problems(400, 404)},
+)
+async def change(
+    job_id: JobId, changes: JobChanges, base: Base, store: Store, write: Write, caller: Submitter
+) -> Response:
+    """Keep a job with its results, whatever its age and size, or no longer."""
+    found = await write(lambda: store.keep(job_id, keep=changes.keep, owner=caller.owner))
+    return respond(status_info(found, base))
 
 
 @router.delete(

@@ -162,6 +162,24 @@ class JobStore:
             submissions.dismiss(connection, job_id, owner, self._database.now(connection))
             return queries.get(connection, job_id, owner)
 
+    def keep(self, job_id: str, *, keep: bool, owner: str | None = None) -> Job:
+        """Keep a job, whatever its age and size, or no longer.
+
+        Raises
+        ------
+        NoSuchJobError
+            It does not exist, or belongs to another key than `owner`.
+        """
+        with self._database.write() as connection:
+            found = queries.get(connection, job_id, owner)
+            submissions.keep(connection, found.job_id, keep=keep)
+            return queries.get(connection, job_id, owner)
+
+    def finished(self) -> builtins.list[tuple[str, dt.datetime]]:
+        """Ids and ends of the jobs that are over and not kept, oldest first."""
+        with self._database.read() as connection:
+            return queries.finished(connection)
+
     def remove(self, job_id: str) -> None:
         """Delete a job that is over, with its events; the caller removes its folder.
 

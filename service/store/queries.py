@@ -46,6 +46,16 @@ class JobFilter:
     """Number of jobs to skip."""
 
 
+def finished(connection: Connection) -> list[tuple[str, dt.datetime]]:
+    """Ids and ends of the jobs that are over and not kept, oldest first."""
+    over = [status.value for status in JobStatus if status.is_over]
+    wanted = sa.select(JOBS.c.job_id, JOBS.c.finished_at).where(
+        JOBS.c.status.in_(over), JOBS.c.keep.is_(sa.false()), JOBS.c.finished_at.is_not(None)
+    )
+    found = connection.execute(wanted.order_by(JOBS.c.finished_at, JOBS.c.job_id)).all()
+    return [(row.job_id, row.finished_at) for row in found]
+
+
 def no_such_job(job_id: str) -> NoSuchJobError:
     """The error that names the job."""
     return NoSuchJobError(f"there is no job {job_id[:64]!r}")

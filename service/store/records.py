@@ -43,6 +43,7 @@ def job_of(row: sa.Row[Any]) -> Job:
         failure=None if row.fault is None else JobFailure(fault=Fault(row.fault), detail=row.fault_detail or ""),
         summary=row.summary,
         schedule_id=row.schedule_id,
+        keep=row.keep,
     )
 
 

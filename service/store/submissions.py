@@ -139,6 +139,11 @@ def dismiss(connection: Connection, job_id: str, owner: str | None, now: dt.date
         connection.execute(sa.update(JOBS).where(JOBS.c.job_id == job_id).values(**asked))
 
 
+def keep(connection: Connection, job_id: str, *, keep: bool) -> None:
+    """Keep a job, or no longer."""
+    connection.execute(sa.update(JOBS).where(JOBS.c.job_id == job_id).values(keep=keep))
+
+
 def remove(connection: Connection, job_id: str) -> None:
     """Delete a job that is over, with its events.
 

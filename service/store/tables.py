@@ -67,6 +67,7 @@ JOBS = sa.Table(
     sa.Column("summary", sa.JSON(none_as_null=True)),
     sa.Column("last_event", sa.Integer, nullable=False),
     sa.Column("schedule_id", sa.String(32)),
+    sa.Column("keep", sa.Boolean, nullable=False, server_default=sa.false()),
 )
 """One row per job. `duration_ms` is set when a job that was started is over; `last_event` counts its events.
 

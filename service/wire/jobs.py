@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, WithJsonSchema
 
-from service.wire.base import Answer, Link, OneOf, Time
+from service.wire.base import Answer, Link, OneOf, Request, Time
 from service.wire.execute import Execute
 from service.wire.problems import Problem
 
@@ -34,10 +34,17 @@ class StatusInfo(Answer):
     priority: int | None = None
     scheduleID: str | None = Field(None, description="The schedule that made the job; it may be gone.")
     attempt: int | None = None
+    keep: bool = Field(False, description="Whether the job is kept, whatever its age and size.")
     summary: dict[str, Any] | None = None
     exception: Problem | None = None
     request: Execute | None = None
     links: list[Link]
+
+
+class JobChanges(Request):
+    """What can be changed about a job."""
+
+    keep: bool = Field(description="Whether the job is kept, whatever its age and size.")
 
 
 class JobList(Answer):

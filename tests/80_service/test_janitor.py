@@ -5,10 +5,12 @@ import os
 import time
 
 from driver_bench import Bench
+from processes import wait_for
 from store_contract import upload
 
 from service.driver.janitor import tidy, tidy_jobs
 from service.jobs import Fault, Job, JobFailure
+from service.store import JobFilter
 
 
 def test_the_janitor_removes_what_no_job_needs_and_nothing_else(bench: Bench) -> None:
@@ -64,7 +66,7 @@ def test_the_janitor_removes_uploads_whose_time_is_over(bench: Bench) -> None:
         folder = bench.folder.upload(name * 32)
         folder.mkdir()
         os.utime(folder, (time.time() - age_s,) * 2)
-    removed = tidy(bench.store, bench.folder)
+    removed = tidy(bench.store, bench.folder, bench.settings)
     assert {path.name for path in removed} == {"a" * 32, "c" * 32}
     assert {path.name for path in bench.folder.uploads.iterdir()} == {"b" * 32, "d" * 32}
     assert bench.store.upload_ids() == {"b" * 32}
@@ -73,4 +75,53 @@ def test_the_janitor_removes_uploads_whose_time_is_over(bench: Bench) -> None:
 def test_the_janitor_works_without_any_folder(bench: Bench) -> None:
     with contextlib.suppress(FileNotFoundError):
         bench.folder.jobs.rmdir()
-    assert tidy(bench.store, bench.folder) == []
+    assert tidy(bench.store, bench.folder, bench.settings) == []
+
+
+# --- old jobs
+
+
+def over(bench: Bench, size: int, *, keep: bool = False) -> str:
+    """The id of a job that failed, with a file of so many bytes."""
+    job = bench.submit()
+    held = bench.store.claim("a", lease_s=60.0, max_attempts=3)
+    assert held.job_id == job.job_id
+    bench.store.succeed(held, message="", summary={})
+    bench.store.keep(job.job_id, keep=keep)
+    place = bench.folder.outputs(job.job_id, 1)
+    place.mkdir(parents=True)
+    (place / "file").write_bytes(b"x" * size)
+    wait_for(lambda: bench.store.now() > bench.store.get(job.job_id).finished_at, "a later time")
+    return job.job_id
+
+
+def left(bench: Bench) -> set[str]:
+    listed = {job.job_id for job in bench.store.list(JobFilter())}
+    assert {path.name for path in bench.folder.jobs.iterdir()} == listed
+    return listed
+
+
+def test_jobs_stay_unless_a_limit_is_set(bench: Bench) -> None:
+    job_id = over(bench, 1000)
+    assert tidy(bench.store, bench.folder, bench.settings) == []
+    assert left(bench) == {job_id}
+
+
+def test_jobs_that_are_over_for_too_long_are_removed_but_not_those_that_are_kept(bench: Bench) -> None:
+    old, kept = over(bench, 10), over(bench, 10, keep=True)
+    waiting = bench.submit().job_id
+    bench.folder.job(waiting).mkdir()
+    settings = bench.settings.model_copy(update={"job_days": 1e-9})
+    assert tidy(bench.store, bench.folder, settings) == [bench.folder.job(old)]
+    assert left(bench) == {kept, waiting}
+    bench.store.keep(kept, keep=False)
+    tidy(bench.store, bench.folder, settings)
+    assert left(bench) == {waiting}
+    assert tidy(bench.store, bench.folder, bench.settings.model_copy(update={"job_days": 1.0})) == []
+
+
+def test_the_jobs_that_ended_first_make_room_for_the_others(bench: Bench) -> None:
+    first, kept, second, third = over(bench, 400), over(bench, 300, keep=True), over(bench, 200), over(bench, 100)
+    for most, expected in ((1000, {first, kept, second, third}), (600, {kept, second, third}), (350, {kept})):
+        tidy(bench.store, bench.folder, bench.settings.model_copy(update={"max_results_bytes": most}))
+        assert left(bench) == expected

@@ -406,3 +406,27 @@ def test_another_try_whose_upload_is_gone_says_so(local_service) -> None:
     answer = retried(local_service, job_id)
     assert answer.status_code == 400
     assert tile.value in answer.json()["detail"]
+
+
+# --- kept jobs
+
+
+def test_a_job_is_kept_until_its_client_says_otherwise(local_service) -> None:
+    job_id = ended(local_service)
+    place = f"/jobs/{job_id}"
+    assert "keep" not in local_service.client.get(place).json()
+    for keep in (True, False):
+        answer = local_service.client.patch(place, json={"keep": keep})
+        assert (answer.status_code, answer.json().get("keep", False)) == (200, keep)
+        assert local_service.store.get(job_id).keep is keep
+    for body in ({}, {"keep": "yes"}, {"keep": True, "colour": 1}):
+        assert local_service.client.patch(place, json=body).status_code == 400
+    assert local_service.client.patch(f"/jobs/{'0' * 32}", json={"keep": True}).status_code == 404
+
+
+def test_only_its_own_key_keeps_a_job(starting) -> None:
+    service = starting()
+    owner, other = service.key(Scope.SUBMIT), service.key(Scope.SUBMIT)
+    job_id = send(service, ("a.xyz", POINTS), headers=owner, crs="EPSG:28992").json()["jobID"]
+    assert service.client.patch(f"/jobs/{job_id}", json={"keep": True}, headers=other).status_code == 404
+    assert service.client.patch(f"/jobs/{job_id}", json={"keep": True}, headers=owner).status_code == 200

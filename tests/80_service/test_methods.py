@@ -26,7 +26,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     ("path", "allowed"),
     [
         ("/jobs", "GET, HEAD, OPTIONS, POST"),
-        (f"/jobs/{'0' * 32}", "DELETE, GET, HEAD, OPTIONS"),
+        (f"/jobs/{'0' * 32}", "DELETE, GET, HEAD, OPTIONS, PATCH"),
         (f"/schedules/{'0' * 32}", "DELETE, GET, HEAD, OPTIONS, PATCH"),
         ("/processes/reconstruct/execution", "OPTIONS, POST"),
     ],
