@@ -75,8 +75,8 @@ class ServiceSettings(BaseSettings):
     max_results_bytes: int = Field(
         default=0,
         ge=0,
-        description="Maximum bytes of all jobs' files: beyond it the jobs that ended first are removed; 0 for no limit. "
-        "Kept jobs stay.",
+        description="Maximum bytes of the files of all jobs: beyond it those that ended first are removed; 0 for no "
+        "limit. Kept jobs stay.",
     )
     upload_days: float = Field(
         default=7.0, gt=0.0, le=36_500.0, description="Days after which an upload that no job needs is removed."

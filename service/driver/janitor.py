@@ -75,9 +75,7 @@ def retire_jobs(store: JobStore, folder: StateFolder, settings: ServiceSettings)
             store.remove(job_id)
             shutil.rmtree(folder.job(job_id), ignore_errors=True)
             removed.append(folder.job(job_id))
-            LOG.info(
-                "job %s is removed with its results: it is over for long, or the limit of bytes is reached", job_id
-            )
+            LOG.info("job %s is removed with its results, as its age or the size of all jobs demands", job_id)
     return removed
 
 
