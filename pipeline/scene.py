@@ -137,7 +137,7 @@ def _vertices(
         preferred = np.where(building, 3, np.where(points.classification == GROUND_CLASS, 1, 2)).astype(np.int8)
         preferred[excluded] = 0
     several = points.return_count > 1
-    chosen = highest_per_cell(
+    chosen, cell = highest_per_cell(
         points.x_mm,
         points.y_mm,
         points.z_mm,
@@ -155,7 +155,8 @@ def _vertices(
     kind[building[chosen]] = VertexKind.BUILDING
     planar = planarity(x, y, z, kind == VertexKind.OBJECT, settings.vegetation)
     stands = used & (height_mm >= round(1000 * settings.ground.tolerance_m))
-    planar[_has_floor(points, height_mm, stands, chosen, planar == 0, settings)] = 1
+    floor = lowest_below(points.x_mm, points.y_mm, points.z_mm, stands, chosen, cell, settings.vegetation.level_m)
+    planar[_has_floor(points, height_mm, floor, planar == 0, settings)] = 1
     kind[crowns(x, y, z, planar, several[chosen], settings.vegetation)] = VertexKind.CROWN
     return SceneVertices(x_mm=x, y_mm=y, z_mm=z, height_mm=height_mm[chosen], kind=kind, planar=planar)
 
@@ -163,20 +164,17 @@ def _vertices(
 def _has_floor(
     points: WindowPoints,
     height_mm: IntArray,
-    stands: BoolArray,
-    chosen: IntArray,
+    floor: IntArray,
     rough: BoolArray,
     settings: SceneSettings,
 ) -> BoolArray:
     """Which rough vertices (m,) stand on an even floor, as railings, plants and furniture on a roof do.
 
-    `chosen` (m,) are the points that became the vertices, `stands` (n,) marks the points above the ground. The floor is
-    the lowest of them in each cell. It is as even as a scanner measures; the lowest points in a crown are as rough as
-    the highest. Floors of beds and hedges lie lower than roofs.
+    `floor` (m,) are the lowest points above the ground in the vertices' cells. A floor is as even as a scanner
+    measures; the lowest points in a crown are as rough as the highest. Floors of beds and hedges lie lower than roofs.
     """
     vegetation = settings.vegetation
     x, y, z = points.x_mm, points.y_mm, points.z_mm
-    floor = lowest_below(x, y, z, stands, chosen, settings.surfaces.thinning_m, vegetation.level_m)
     wanted = rough & (height_mm[floor] >= round(1000 * settings.candidates.min_height_m))
     even: BoolArray = planarity(x[floor], y[floor], z[floor], wanted, vegetation, vegetation.smooth_m) > 0
     return even

@@ -281,7 +281,7 @@ def leafiness(evidence: PointEvidence, among: BoolArray, tall: BoolArray, vegeta
     index = np.flatnonzero(among)
     x, y, z = evidence.x_mm[index], evidence.y_mm[index], evidence.z_mm[index]
     all_of_them = np.ones(len(index), np.bool_)
-    chosen = highest_per_cell(x, y, z, np.zeros(len(index), np.int8), all_of_them, CELL_M)
+    chosen, _ = highest_per_cell(x, y, z, np.zeros(len(index), np.int8), all_of_them, CELL_M)
     flat = planarity(x[chosen], y[chosen], z[chosen], np.ones(len(chosen), np.bool_), vegetation)
     values = np.zeros((len(index), 4), np.int64)
     values[:, 0] = 1

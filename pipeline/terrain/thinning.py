@@ -26,16 +26,20 @@ def _highest_per_cell(
     used: BoolArray,
     cell_mm: int,
     among_equals: KindArray,
-) -> IntArray:
-    """Kernel: the point of each cell that is preferred most, highest, southernmost, westernmost, first among equals."""
+) -> tuple[IntArray, IntArray]:
+    """Kernel: the point of each cell that is preferred most, highest, southernmost, westernmost, first among equals.
+
+    Returns (m,) points by the number of their cell, and (n,) the number of each point's cell, -1 where it is not used.
+    """
     n = x_mm.size
     size = 2
     while size < 2 * n:
         size *= 2
     mask = size - 1
     keys = np.full(size, -1, np.int64)
-    holder = np.full(size, -1, np.int64)
-    filled = np.empty(n, np.int64)
+    numbers = np.empty(size, np.int64)
+    chosen = np.empty(n, np.int64)
+    cell = np.full(n, -1, np.int64)
     count = 0
     column0, row0 = 0, 0
     if n > 0:
@@ -47,13 +51,13 @@ def _highest_per_cell(
         s = slot_of_key(key, mask)
         while keys[s] != -1 and keys[s] != key:
             s = (s + 1) & mask
-        j = holder[s]
-        if j < 0:
-            keys[s] = key
-            holder[s] = i
-            filled[count] = s
+        if keys[s] == -1:
+            keys[s], numbers[s] = key, count
+            chosen[count], cell[i] = i, count
             count += 1
             continue
+        cell[i] = numbers[s]
+        j = chosen[cell[i]]
         if preferred[i] != preferred[j]:
             better = preferred[i] > preferred[j]
         elif z_mm[i] != z_mm[j]:
@@ -65,11 +69,8 @@ def _highest_per_cell(
         else:
             better = among_equals[i] > among_equals[j]
         if better:
-            holder[s] = i
-    chosen = np.empty(count, np.int64)
-    for k in range(count):
-        chosen[k] = holder[filled[k]]
-    return chosen
+            chosen[cell[i]] = i
+    return chosen[:count].copy(), cell
 
 
 def highest_per_cell(
@@ -80,8 +81,8 @@ def highest_per_cell(
     used: BoolArray,
     cell_m: float,
     among_equals: KindArray | None = None,
-) -> IntArray:
-    """Indices of one point per cell, ordered by (x, y).
+) -> tuple[IntArray, IntArray]:
+    """Indices of one point per cell, ordered by (x, y), and the cell of each point.
 
     Parameters
     ----------
@@ -101,60 +102,48 @@ def highest_per_cell(
     -------
     (m,) int64
         At most one index per cell, so all (x, y) differ; the order does not depend on that of the points.
+    (n,) int64
+        The cell of each point as an index into the first array; -1 where the point is not used.
     """
     tie = preferred if among_equals is None else among_equals
-    chosen = _highest_per_cell(x_mm, y_mm, z_mm, preferred, used, round(cell_m * 1000), tie)
-    if len(chosen) == 0:
-        return np.empty(0, np.int64)
-    x, y = x_mm[chosen], y_mm[chosen]
+    found, cell = _highest_per_cell(x_mm, y_mm, z_mm, preferred, used, round(cell_m * 1000), tie)
+    if len(found) == 0:
+        return found, cell
+    x, y = x_mm[found], y_mm[found]
     # one sort of one whole number in place of two; all are different
-    result: IntArray = chosen[np.argsort(((x - x.min()) << _BITS) | (y - y.min()))]
-    return result
+    order = np.argsort(((x - x.min()) << _BITS) | (y - y.min()))
+    place = np.full(len(found) + 1, -1, np.int64)
+    place[order] = np.arange(len(found))
+    chosen: IntArray = found[order]
+    of_point: IntArray = place[cell]
+    return chosen, of_point
 
 
 @kernel
 def _lowest_below(
-    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, used: BoolArray, chosen: IntArray, cell_mm: int, level_mm: int
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, used: BoolArray, chosen: IntArray, cell: IntArray, level_mm: int
 ) -> IntArray:
     """Kernel of `lowest_below`."""
-    size = 2
-    while size < 2 * chosen.size:
-        size *= 2
-    mask = size - 1
-    holder = np.full(size, -1, np.int64)
     lowest = chosen.copy()
-    for k in range(chosen.size):
-        i = chosen[k]
-        s = slot_of_key(((x_mm[i] // cell_mm) << _BITS) ^ (y_mm[i] // cell_mm), mask)
-        while holder[s] >= 0:
-            s = (s + 1) & mask
-        holder[s] = k
     for i in range(x_mm.size):
         if not used[i]:
             continue
-        column, row = x_mm[i] // cell_mm, y_mm[i] // cell_mm
-        s = slot_of_key((column << _BITS) ^ row, mask)
-        while holder[s] >= 0:
-            top = chosen[holder[s]]
-            if x_mm[top] // cell_mm == column and y_mm[top] // cell_mm == row:
-                j = lowest[holder[s]]
-                lower = z_mm[i] < z_mm[j]
-                if z_mm[i] == z_mm[j]:
-                    lower = y_mm[i] < y_mm[j] or (y_mm[i] == y_mm[j] and x_mm[i] < x_mm[j])
-                if lower and z_mm[i] >= z_mm[top] - level_mm:
-                    lowest[holder[s]] = i
-                break
-            s = (s + 1) & mask
+        k = cell[i]
+        j = lowest[k]
+        if z_mm[i] > z_mm[j] or z_mm[i] < z_mm[chosen[k]] - level_mm:
+            continue
+        if z_mm[i] < z_mm[j] or y_mm[i] < y_mm[j] or (y_mm[i] == y_mm[j] and x_mm[i] < x_mm[j]):
+            lowest[k] = i
     return lowest
 
 
 def lowest_below(
-    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, used: BoolArray, chosen: IntArray, cell_m: float, level_m: float
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, used: BoolArray, chosen: IntArray, cell: IntArray, level_m: float
 ) -> IntArray:
     """Index of the lowest used point in the cell of each chosen one, no more than `level_m` below it, (m,) int64.
 
-    The chosen point itself where no used one lies lower. Cells are those of `highest_per_cell`; of points equally low
-    the southernmost counts, then the westernmost.
+    The chosen point itself where no used one lies lower. `chosen` (m,) and `cell` (n,) are those of `highest_per_cell`,
+    and each used point has a cell; of points equally low the southernmost counts, then the westernmost.
     """
-    found: IntArray = _lowest_below(x_mm, y_mm, z_mm, used, chosen, round(cell_m * 1000), round(level_m * 1000))
+    found: IntArray = _lowest_below(x_mm, y_mm, z_mm, used, chosen, cell, round(level_m * 1000))
     return found

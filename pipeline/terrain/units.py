@@ -276,7 +276,7 @@ def units_of(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSetti
         return one
     if max(int(np.ptp(x_mm)), int(np.ptp(y_mm))) >= MAX_WINDOW_MM:
         return one
-    chosen = highest_per_cell(x_mm, y_mm, z_mm, np.zeros(n, np.int8), np.ones(n, np.bool_), THINNING_M)
+    chosen, _ = highest_per_cell(x_mm, y_mm, z_mm, np.zeros(n, np.int8), np.ones(n, np.bool_), THINNING_M)
     cell_mm = round(THINNING_M * 1000)
     # whole cells are left out, so that the lattice keeps its place
     x0, y0 = int(x_mm.min()) // cell_mm * cell_mm, int(y_mm.min()) // cell_mm * cell_mm

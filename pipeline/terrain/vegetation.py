@@ -223,6 +223,8 @@ def planarity(
             level_mm=round(settings.level_m * 1000),
         )
         _planar(x_mm, y_mm, z_mm, wanted, windows, verdict)
+        if not (wanted & (verdict < 0)).any():
+            break
     return verdict
 
 

@@ -14,7 +14,11 @@ Points = npt.NDArray[np.int64]
 
 def thinned(points: Points, preferred: BoolArray, used: BoolArray, cell_m: float = 0.5) -> npt.NDArray[np.int64]:
     x, y, z = (np.ascontiguousarray(points[:, k]) for k in range(3))
-    return highest_per_cell(x, y, z, preferred, used, cell_m)
+    chosen, cell = highest_per_cell(x, y, z, preferred, used, cell_m)
+    assert (cell[~used] == -1).all()
+    np.testing.assert_array_equal(np.unique(cell[used]), np.arange(len(chosen)))
+    np.testing.assert_array_equal(cell[chosen], np.arange(len(chosen)))
+    return chosen
 
 
 def slow_twin(points: Points, preferred: BoolArray, used: BoolArray, cell_mm: int) -> list[tuple[int, int, int]]:
@@ -87,7 +91,7 @@ def test_of_points_at_one_place_the_greater_among_equals_is_chosen_whatever_thei
     for used, expected in ((np.array([True, True, True, False, False]), (7, 1)), (everything, (9, 0))):
         for order in (np.arange(5), np.array([1, 0, 2, 4, 3]), np.array([2, 4, 0, 3, 1])):
             x, y, z = (np.ascontiguousarray(points[order, k]) for k in range(3))
-            (chosen,) = highest_per_cell(x, y, z, nothing, used[order], 0.5, rank[order])
+            (chosen,), _ = highest_per_cell(x, y, z, nothing, used[order], 0.5, rank[order])
             assert (z[chosen], rank[order][chosen]) == expected
 
 
@@ -127,9 +131,10 @@ def test_the_lowest_of_each_cell_is_that_of_a_walk_over_all_points(
 ) -> None:
     points, stands, used = as_arrays(members)
     points = points[np.random.default_rng(seed).permutation(len(points))]
-    chosen = thinned(points, np.zeros(len(points), np.bool_), used, cell_m)
+    stands &= used
     x, y, z = (np.ascontiguousarray(points[:, k]) for k in range(3))
-    lowest = lowest_below(x, y, z, stands, chosen, cell_m, 0.002)
+    chosen, of_point = highest_per_cell(x, y, z, np.zeros(len(points), np.bool_), used, cell_m)
+    lowest = lowest_below(x, y, z, stands, chosen, of_point, 0.002)
     cell_mm = round(cell_m * 1000)
     for top, found in zip(chosen.tolist(), lowest.tolist(), strict=True):
         cell = x[top] // cell_mm, y[top] // cell_mm
