@@ -75,13 +75,13 @@ class Location:
     crs: str
     """Code and name of the CRS."""
     longitude_latitude: tuple[float, float] | None
-    """Degrees, WGS 84; None if the coordinates are no place on Earth in this CRS."""
+    """Degrees, WGS 84; None if this CRS puts the coordinates nowhere on Earth."""
     area: AreaOfUse | None
     """None if no registry knows the area of the CRS."""
 
     @property
     def outside_km(self) -> float:
-        """Distance from the area of use: 0 inside or without a known area, infinity for no place on Earth."""
+        """Distance from the area of use: 0 inside or without a known area, infinity if not on Earth."""
         if self.longitude_latitude is None:
             return math.inf
         return 0.0 if self.area is None else self.area.distance_km(*self.longitude_latitude)
@@ -94,8 +94,11 @@ class Location:
     @property
     def problem(self) -> str:
         """Half a sentence that names the CRS, the place and the area."""
-        off = "" if math.isinf(self.outside_km) else f", {self.outside_km:.0f} km from the area of use"
-        return f"in {self.crs} the tile would lie at {self}{off}: that CRS is made for {self.area}"
+        if self.longitude_latitude is None:
+            lies = "would not lie on Earth"
+        else:
+            lies = f"would lie at {self}, {self.outside_km:.0f} km from the area of use"
+        return f"in {self.crs} the tile {lies}: that CRS is made for {self.area}"
 
     @property
     def fix(self) -> str:
@@ -105,7 +108,7 @@ class Location:
     def __str__(self) -> str:
         """The place, to a hundredth of a degree."""
         if self.longitude_latitude is None:
-            return "no place on Earth"
+            return "not on Earth"
         longitude, latitude = self.longitude_latitude
         return f"{degrees_of(latitude, 'NS')}, {degrees_of(longitude, 'EW')}"
 

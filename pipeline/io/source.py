@@ -218,7 +218,7 @@ class Source:
 
         A piece has at least one and at most `chunk_size` points, which bounds the memory. Raises UnreadableInputError
         if the data end or break before the promised count, InconsistentInputError if a coordinate is NaN or infinite,
-        or if more than single points are no place on Earth.
+        or if many points do not lie on Earth.
         """
         if chunk_size < 1:
             raise SettingsError([f"chunk_size is {chunk_size}: use 1 or more"])
@@ -246,10 +246,10 @@ class Source:
             self._judge_off_earth(n_read)
 
     def _judge_off_earth(self, n_read: int) -> None:
-        """Warn of single points that are no place on Earth; refuse a file with many of them."""
+        """Warn of single points that do not lie on Earth; refuse a file with many of them."""
         count = self._dropped["off_earth"]
         x, y, z = self._first_off_earth
-        problem = f"{count} of {n_read} points are no place on Earth, such as x {x:.10g}, y {y:.10g}, z {z:.10g}"
+        problem = f"{count} of {n_read} points do not lie on Earth, such as x {x:.10g}, y {y:.10g}, z {z:.10g}"
         if count > max(1, MOST_STRAYS * n_read):
             raise InconsistentInputError(str(self._path), problem, "Check the columns, the scale and the units")
         self._warnings.append(f"{problem}: left out")

@@ -1,4 +1,4 @@
-"""Gross errors of coordinates: single points that are no place on Earth, and bounds that single points spoil.
+"""Gross errors of coordinates: single points that do not lie on Earth, and bounds that single points spoil.
 
 Points that are only far away are left to the outlier filter, which judges them by their neighbours.
 """
@@ -32,7 +32,7 @@ _PER_PIECE = 2_000
 
 
 def off_earth(xyz: FloatArray, factors: FloatArray) -> BoolArray | None:
-    """(n,) bool, True for points whose coordinates are no place on Earth; None if there are none.
+    """(n,) bool, True for points that do not lie on Earth; None if there are none.
 
     `factors` are the metres per unit of the three axes.
     """

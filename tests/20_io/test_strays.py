@@ -31,7 +31,7 @@ def test_one_point_off_the_earth_is_left_out_and_named(tmp_path, points, stray, 
 def test_many_points_off_the_earth_are_a_wrong_scale_and_refused(tmp_path, points):
     xyz = points(500)
     np.savetxt(tmp_path / "a.xyz", xyz * [1.0, 1.0, 1e6], fmt="%.2f")
-    with pytest.raises(InconsistentInputError, match=r"49\d of 500 points are no place on Earth.*Check the columns"):
+    with pytest.raises(InconsistentInputError, match=r"49\d of 500 points do not lie on Earth.*Check the columns"):
         list(open_source(tmp_path / "a.xyz").chunks())
 
 
