@@ -22,7 +22,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 UV := $(BIN)/uv --no-progress
 COMPILE := $(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml --extra postgres --extra s3
+	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml --extra otel --extra postgres --extra s3
 
 KERNEL_SOURCES := $(shell grep -rl --include='*.py' kernel pipeline | LC_ALL=C sort)
 KERNEL_LIST := pipeline/compiler/kernels.json
@@ -103,7 +103,7 @@ check: $(VENV)/.test-stamp
 	$(BIN)/lint-imports --no-cache
 
 # More processes than processors, as tests wait for processes, sockets and files; the slow ones wait most of their time.
-# A file stays in one process, the longest come first (tests/conftest.py).
+# A file stays in one process, the longest come first, and all of the browser share one (tests/conftest.py).
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder --durations=15
 
 # A third of the examples of hypothesis; CI draws all.

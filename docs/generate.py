@@ -71,7 +71,11 @@ def commands(group: Any | None = None, prefix: str = "") -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, command in (group or typer.main.get_command(app)).commands.items():
         words = f"{prefix}{name}"
-        found |= commands(command, f"{words} ") if hasattr(command, "commands") else {words: command}
+        is_group = hasattr(command, "commands")
+        if is_group:
+            found |= commands(command, f"{words} ")
+        if not is_group or command.invoke_without_command:
+            found[words] = command
     return dict(sorted(found.items()))
 
 

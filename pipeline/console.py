@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import typer
 
-from pipeline.errors import InputError, RunError, SettingsError
+from pipeline.errors import InputError, RemoteError, RunError, SettingsError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -51,21 +51,28 @@ class ExitCode(IntEnum):
     INPUT = 3
     RUN_DIRECTORY = 4
     INTERNAL = 5
+    SERVICE = 6
+    DISMISSED = 7
     INTERRUPTED = 130
 
 
 EXIT_CODES: Mapping[ExitCode, str] = {
     ExitCode.DONE: "Done. Single buildings may still have failed: each has a record with its reason.",
     ExitCode.TILES_FAILED: (
-        "The run finished, but at least one tile failed; all other tiles are complete. Or: the building of a replay "
-        "failed again."
+        "The run or job finished, but at least one tile failed or has no points; all other tiles are complete. Or: the "
+        "building of a replay failed again."
     ),
     ExitCode.USAGE: "The command line or a setting is wrong; nothing was done.",
     ExitCode.INPUT: "An input cannot be used; the message names the file, the value and the fix.",
     ExitCode.RUN_DIRECTORY: (
         "A run directory or work folder cannot be written, read or resumed; or a batch's plan cannot work."
     ),
-    ExitCode.INTERNAL: "A fault of gablework itself; the traceback is printed.",
+    ExitCode.INTERNAL: "A fault of gablework itself; the traceback is printed, or is in the log of the service.",
+    ExitCode.SERVICE: (
+        "A service does not answer, refuses the key or the request, or had to give up the job for lack of workers or "
+        "room."
+    ),
+    ExitCode.DISMISSED: "The job was dismissed.",
     ExitCode.INTERRUPTED: "Interrupted from the keyboard.",
 }
 """The meaning of each code, for the reference docs."""
@@ -84,6 +91,7 @@ def exit_code_of(error: BaseException) -> ExitCode:
         (SettingsError, ExitCode.USAGE),
         (InputError, ExitCode.INPUT),
         (RunError, ExitCode.RUN_DIRECTORY),
+        (RemoteError, ExitCode.SERVICE),
     )
     return next((code for kind, code in table if isinstance(error, kind)), ExitCode.INTERNAL)
 
@@ -101,6 +109,8 @@ class Console:
         Everything on standard error is one JSON object per line, like with `GABLEWORK_LOG_JSON=1`.
     clock : callable
         Seconds, monotonic; replaced in tests.
+    code_of : callable
+        The exit code of an exception.
     """
 
     def __init__(
@@ -110,8 +120,10 @@ class Console:
         quiet: bool = False,
         log_json: bool = False,
         clock: Callable[[], float] = time.monotonic,
+        code_of: Callable[[BaseException], ExitCode] = exit_code_of,
     ) -> None:
         self.as_json = as_json
+        self._code_of = code_of
         self.quiet = quiet
         self._clock = clock
         self._bars: Progress | None = None
@@ -145,7 +157,7 @@ class Console:
         with self._logs:
             if error is None or isinstance(error, SystemExit | typer.Exit | typer.Abort | typer.BadParameter):
                 return
-            code = exit_code_of(error)
+            code = self._code_of(error)
             self._show_error(error, code)
             raise typer.Exit(code) from error
 
@@ -155,7 +167,8 @@ class Console:
         """Show an event of a run."""
         if event.kind == "warning":
             self.warn(event.message, stage=event.stage)
-        elif self.quiet:
+        elif self.quiet or event.kind == "detail":
+            # its own lines are in the worker's log, and its counts in the progress
             return
         elif self._log_json:
             self._log(event)
@@ -273,11 +286,13 @@ class Console:
 
     def _show_error(self, error: BaseException, code: ExitCode) -> None:
         message = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
+        # a fault of a service elsewhere has its traceback there
+        is_ours = code is ExitCode.INTERNAL and not isinstance(error, RemoteError)
         if self._log_json:
             from pipeline.runtime.monitoring.logs import LOG
 
-            LOG.error(message, exc_info=error if code is ExitCode.INTERNAL else None)
-        elif code is ExitCode.INTERNAL:
+            LOG.error(message, exc_info=error if is_ours else None)
+        elif is_ours:
             traceback.print_exception(error, file=sys.stderr)
         if self.as_json:
             detail: dict[str, Any] = {"type": type(error).__name__, "exit_code": int(code), "message": message}

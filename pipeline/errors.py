@@ -12,6 +12,7 @@ GableworkError
 │   ├── RunCancelledError        the user cancelled the run
 │   └── ClusterError             the scheduler does not answer, or was lost while the run was under way
 │       └── VersionMismatchError     client, scheduler and workers do not run the same versions
+├── RemoteError           a service elsewhere: no answer, a refusal, or a job of it that failed
 └── BuildingError         one building could not be modelled; becomes its record's status and reason
 ```
 """
@@ -134,6 +135,10 @@ class ClusterError(RunError):
 
 class VersionMismatchError(ClusterError):
     """Client, scheduler and workers do not run the same versions of what matters."""
+
+
+class RemoteError(GableworkError):
+    """A service elsewhere does not answer or refuses a request, or a job of it has failed."""
 
 
 class BuildingError(GableworkError):

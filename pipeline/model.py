@@ -384,6 +384,62 @@ class LodModel:
     """Closed solids, one for each solid of the record's model, in the same order."""
 
 
+class DecisionKind(StrEnum):
+    """What was decided while a building was modelled."""
+
+    CHECK = "check"
+    FORM = "form"
+    LEVEL = "level"
+
+
+class Outcome(StrEnum):
+    """How a check, a form or a level of detail ended."""
+
+    MET = "met"
+    MISSED = "missed"
+    CHOSEN = "chosen"
+    OUTDONE = "outdone"
+    INVALID = "invalid"
+    UNDRAWABLE = "undrawable"
+    WITHDRAWN = "withdrawn"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Decision:
+    """A check, a form or a level of detail on the way to a model; nan and None where a figure was not needed."""
+
+    kind: DecisionKind
+    """A figure against its limit, a form of the roof that was tried, or a level of detail that was asked for."""
+    name: str
+    """Name of the figure, the form or the level."""
+    outcome: Outcome
+    """How it ended."""
+    detail: str = ""
+    """How the form was drawn, or why it was refused."""
+    value: float = math.nan
+    """The figure of a check."""
+    limit: float = math.nan
+    """The least value that meets the check."""
+    n_faces: int | None = None
+    """Roof faces."""
+    n_planes: int | None = None
+    """Roof planes with a face."""
+    levelled_share: float = math.nan
+    """Share of the plan whose faces were made level, since their planes left the points."""
+    explained_share: float = math.nan
+    """Share of the roof points near the faces, vertically."""
+    bic_margin: float = math.nan
+    """By how much the information criterion is below that of the form that competed; negative where it is above."""
+    validity_codes: tuple[int, ...] = ()
+    """Codes of the faults of the solids."""
+
+    @classmethod
+    def check(cls, name: str, value: float, limit: float, detail: str = "") -> Decision:
+        """A figure that has to reach a limit."""
+        outcome = Outcome.MET if value >= limit else Outcome.MISSED
+        return cls(kind=DecisionKind.CHECK, name=name, outcome=outcome, detail=detail, value=value, limit=limit)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BuildingResult:
     """Outcome of a candidate. Every candidate has one, also one that failed: the defaults are those without a model."""
@@ -439,5 +495,7 @@ class BuildingResult:
     """As the candidate's."""
     walls: WallOutline | None = None
     """The walls beneath the footprint; None where it was given, or where no wall is asked for or seen."""
+    decisions: tuple[Decision, ...] = ()
+    """What was checked and tried, in this order; empty where the building ended its process."""
     coarser: tuple[LodModel, ...] = ()
     """Models at the coarser requested levels of detail, the finest first; none beside a fallback block."""

@@ -22,7 +22,10 @@ from pipeline.methods import ReconstructSettings, method_named
 from pipeline.model import (
     BuildingResult,
     Candidate,
+    Decision,
+    DecisionKind,
     LodModel,
+    Outcome,
     Plane,
     PreparedCloud,
     Reason,
@@ -40,8 +43,9 @@ from pipeline.roof.block import block_forms, block_plane
 from pipeline.roof.floor_cut import cut_at_floor
 from pipeline.roof.flush_walls import unite_flush_walls
 from pipeline.roof.footprint import hull_of_points, outline
-from pipeline.roof.forms import UNDRAWABLE, FaceForm, arranged_forms, template_forms, traced_forms
+from pipeline.roof.forms import UNDRAWABLE, FaceForm, arranged_forms, template_forms, traced_forms, undrawable
 from pipeline.roof.lower_lods import LodParts, lower_lods
+from pipeline.roof.named_form import BLOCK, PRIMITIVE, NamedForm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPlan, RoofPoints, level_unsupported_faces, partition_roof, roof_points, walls_of
 from pipeline.roof.primitives import primitive_partition
@@ -71,6 +75,8 @@ class _Building:
     settings: ReconstructSettings
     roof: RoofPoints
     """The roof points, without labels."""
+    decisions: list[Decision]
+    """Grows with what is checked and tried."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -83,6 +89,10 @@ class _Model(LodParts):
     """By how much its faces were better than those that they competed with; nan where they did not."""
     is_levelled: bool = False
     """True where a large part of its faces had to be made level."""
+    levelled_share: float = 0.0
+    """Share of the plan whose faces had to be made level."""
+    cleaned: str = ""
+    """What was changed on the drawn faces."""
 
 
 def reconstruct_building(candidate: Candidate, method: str, settings: ReconstructSettings) -> BuildingResult:
@@ -102,17 +112,19 @@ def reconstruct_building(candidate: Candidate, method: str, settings: Reconstruc
     """
     entry = method_named(method)
     segment, is_arranged = settings.segmentation(entry), settings.arranges(entry)
+    decisions: list[Decision] = []
     try:
         cloud = prepare_cloud(candidate, settings.roof.max_points)
-        roof = roof_points(cloud, settings.roof)
-        building = _Building(candidate=candidate, method=method, settings=settings, roof=roof)
-        return _reconstruct(building, cloud, segment, is_arranged=is_arranged)
+        roof = roof_points(cloud, settings.roof, decisions)
+        building = _Building(candidate=candidate, method=method, settings=settings, roof=roof, decisions=decisions)
+        result = _reconstruct(building, cloud, segment, is_arranged=is_arranged)
     except BuildingError as error:
-        return failed_building(candidate, method, error.reason, error.detail)
+        result = failed_building(candidate, method, error.reason, error.detail)
     except MemoryError:
         raise
     except Exception as error:  # noqa: BLE001 - the record holds it, with its place
-        return failed_building(candidate, method, Reason.INTERNAL_ERROR, _describe(error))
+        result = failed_building(candidate, method, Reason.INTERNAL_ERROR, _describe(error))
+    return dataclasses.replace(result, decisions=tuple(decisions))
 
 
 def _describe(error: Exception) -> str:
@@ -132,26 +144,33 @@ def _reconstruct(
     try:
         segmentation, lack = _segmented(cloud, segment, building.roof)
         roof = dataclasses.replace(building.roof, labels=segmentation.labels[building.roof.index])
+        building.decisions.extend(_checks(building, segmentation, roof))
         if lack is not None:
             if not is_arranged:
                 raise lack
             forms: Iterator[FaceForm] = template_forms(roof, lack, settings.roof)
         elif segmentation.faces is not None:
-            forms = iter([partial(primitive_partition, segmentation.faces)])
+            forms = iter([NamedForm(PRIMITIVE, partial(primitive_partition, segmentation.faces))])
         elif is_arranged:
             roof = with_shaded_points(roof, cloud, segmentation.planes)
-            forms = arranged_forms(roof, segmentation.planes, settings.roof, settings.plan)
+            forms = arranged_forms(roof, segmentation.planes, settings.roof, settings.plan, building.decisions)
         else:
             plan = partition_roof(roof, segmentation.planes, settings.roof)
             forms = traced_forms(plan, roof, settings.roof)
         model, codes = _first_valid(
-            (partial(_own_model, building, segmentation, roof, form) for form in forms), building
+            (
+                NamedForm(form.name, partial(_own_model, building, segmentation, roof, form), form.detail)
+                for form in forms
+            ),
+            building,
         )
         if model is not None:
             if too_few := _too_few_points(building, model, lack):
+                _withdraw(building)
                 return failed_building(building.candidate, building.method, Reason.TOO_FEW_POINTS, too_few)
             if record := _delivered(building, model):
                 return record
+            _withdraw(building)
         codes_met = ", ".join(map(str, codes)) or "none"
         fallback = BuildingError(Reason.INVALID_SOLID, f"validity codes {codes_met}: no form of the solid passes")
     except BuildingError as error:
@@ -180,40 +199,92 @@ def _segmented(
     return segmentation, None
 
 
-def _first_valid(models: Iterable[Callable[[], _Model]], building: _Building) -> tuple[_Model | None, tuple[int, ...]]:
+def _checks(building: _Building, segmentation: Segmentation, roof: RoofPoints) -> Iterator[Decision]:
+    """The figures that decide which forms are tried, each with its limit."""
+    n_points, coarsest_m = len(roof.labels), building.settings.roof.templates_spacing_m
+    yield Decision.check("planes_found", len(segmentation.planes), 1)
+    # one point is enough
+    yield Decision.check("points_on_planes_share", np.count_nonzero(roof.labels >= 0) / n_points, 1 / n_points)
+    yield Decision.check(
+        "point_spacing_m", roof.spacing_m, coarsest_m, "templates compete where points are as far apart"
+    )
+
+
+def _withdraw(building: _Building) -> None:
+    """Mark that the form that was chosen is not delivered."""
+    for k in range(len(building.decisions)):
+        entry = building.decisions[k]
+        if entry.kind is DecisionKind.FORM and entry.outcome is Outcome.CHOSEN:
+            building.decisions[k] = dataclasses.replace(entry, outcome=Outcome.WITHDRAWN)
+
+
+def _first_valid(models: Iterable[NamedForm[_Model]], building: _Building) -> tuple[_Model | None, tuple[int, ...]]:
     """The first model that is valid throughout, or None and the codes of all faults.
 
     A model with a large face made level waits: it is taken unless a later one explains more roof points. Of those the
     first is taken whose faces stay near the points, else the one that explains most.
     """
+    decisions = building.decisions
     codes: set[int] = set()
     waiting: _Model | None = None
-    share = 0.0
+    share, at = 0.0, -1
     remaining = iter(models)
     while True:
         try:
             form = next(remaining, None)
-        except UNDRAWABLE:
+        except UNDRAWABLE as error:
+            decisions.append(undrawable("further", error))
             if not codes and waiting is None:
                 raise
             form = None  # the forms before it say more about the building
         if form is None:
+            if waiting is not None:
+                decisions[at] = dataclasses.replace(decisions[at], outcome=Outcome.CHOSEN)
             return waiting, () if waiting is not None else tuple(sorted(codes))
         try:
             model = form()
-        except UNDRAWABLE:
+        except UNDRAWABLE as error:
+            decisions.append(undrawable(form.name, error, form.detail))
             continue
         faults = {code for part in model.parts for code in check_solid(part.solid)}
         codes |= faults
         if not model.parts or faults:
+            decisions.append(_tried(form, model, Outcome.INVALID, codes=tuple(sorted(faults))))
             continue
         if waiting is None and not model.is_levelled:
+            decisions.append(_tried(form, model, Outcome.CHOSEN))
             return model, ()
         explained = _explained_share(building, model)
+        decisions.append(_tried(form, model, Outcome.OUTDONE, explained=explained))
         if waiting is None or explained > share:
-            waiting, share = model, explained
+            waiting, share, at = model, explained, len(decisions) - 1
             if not model.is_levelled and _stays_near(model.parts, building.roof):
+                decisions[at] = dataclasses.replace(decisions[at], outcome=Outcome.CHOSEN)
                 return model, ()
+
+
+def _tried(
+    form: NamedForm[_Model],
+    model: _Model,
+    outcome: Outcome,
+    *,
+    explained: float = math.nan,
+    codes: tuple[int, ...] = (),
+) -> Decision:
+    """The entry of a form that was drawn."""
+    faces = [face.plane for part in model.parts for face in part.faces]
+    return Decision(
+        kind=DecisionKind.FORM,
+        name=form.name,
+        outcome=outcome,
+        detail="; ".join(filter(None, (form.detail, model.cleaned, "" if faces else "no roof face is left"))),
+        n_faces=len(faces),
+        n_planes=len(set(faces)),
+        levelled_share=model.levelled_share,
+        explained_share=explained,
+        bic_margin=model.bic_margin,
+        validity_codes=codes,
+    )
 
 
 def _own_model(building: _Building, segmentation: Segmentation, roof: RoofPoints, form: FaceForm) -> _Model:
@@ -236,20 +307,41 @@ def _own_model(building: _Building, segmentation: Segmentation, roof: RoofPoints
         )
     level, extended = level_unsupported_faces(drawn, roof, planes, ground_z_m, settings)
     cut, cut_planes = cut_at_floor(level, extended, ground_z_m + settings.min_clearance_m)
+    all_parts = solid_parts(cut, cut_planes, ground_z_m)
+    parts = large_parts(all_parts, settings.min_part_area_m2)
+    levelled_share = _levelled_share(drawn, level)
     return _Model(
         lod="2.2",
-        parts=large_parts(solid_parts(cut, cut_planes, ground_z_m), settings.min_part_area_m2),
+        parts=parts,
         planes=cut_planes,
         roof_type=segmentation.roof_type,
         bic_margin=margin,
-        is_levelled=_is_much_changed(drawn, level),
+        is_levelled=levelled_share > _MUCH_LEVELLED,
+        levelled_share=levelled_share,
+        cleaned=_cleaned(drawn, level, cut, len(all_parts) - len(parts)),
     )
 
 
-def _is_much_changed(drawn: RoofPartition, level: RoofPartition) -> bool:
-    """Whether faces of more than a small share of the plan have another plane."""
+def _levelled_share(drawn: RoofPartition, level: RoofPartition) -> float:
+    """Share of the area whose faces got another plane when they were made level; 0 without faces."""
     areas = shapely.area(np.array(drawn.polygons, object))
-    return bool(areas[drawn.labels != level.labels].sum() > _MUCH_LEVELLED * areas.sum())
+    changed_m2, whole_m2 = float(areas[drawn.labels != level.labels].sum()), float(areas.sum())
+    return changed_m2 / whole_m2 if whole_m2 > 0.0 else 0.0
+
+
+def _cleaned(drawn: RoofPartition, level: RoofPartition, cut: RoofPartition, left_out: int) -> str:
+    """What was changed on the drawn faces, in words."""
+    made_level = int(np.count_nonzero(drawn.labels != level.labels))
+    return "; ".join(
+        filter(
+            None,
+            (
+                f"{made_level} faces made level" if made_level else "",
+                "cut at the floor" if cut is not level else "",
+                f"{left_out} small parts left out" if left_out else "",
+            ),
+        )
+    )
 
 
 def _stays_near(parts: Sequence[SolidPart], roof: RoofPoints) -> bool:
@@ -277,6 +369,7 @@ def _too_few_points(building: _Building, model: _Model, lack: BuildingError | No
     if not are_few and (lack is None or not building.roof.spacing_m < settings.templates_spacing_m):
         return ""
     share = _explained_share(building, model)
+    building.decisions.append(Decision.check("explained_share", share, _FEW_EXPLAINED))
     if share >= _FEW_EXPLAINED:
         return ""
     if lack is not None and not are_few:
@@ -301,6 +394,7 @@ def _delivered(building: _Building, model: _Model) -> BuildingResult | None:
         model, building.roof.points, building.candidate.ground_z_m, settings.roof, settings.lods,
         lambda solid: not check_solid(solid),
     )  # fmt: skip
+    building.decisions.extend(_levels(settings.lods, models))
     if not models or models[0].lod != settings.lods[-1]:
         return None
     finest, *coarser = models
@@ -310,26 +404,41 @@ def _delivered(building: _Building, model: _Model) -> BuildingResult | None:
     return dataclasses.replace(_record(building, model), coarser=tuple(_lod_model(one) for one in coarser))
 
 
-def _blocks(building: _Building, plan: RoofPlan | None) -> Iterator[Callable[[], _Model]]:
+def _levels(lods: Sequence[str], models: Sequence[LodParts]) -> Iterator[Decision]:
+    """Which of the levels of detail that were asked for were reached, the finest first."""
+    reached = {model.lod: model for model in models}
+    for lod in reversed(lods):
+        faces = [face.plane for part in reached[lod].parts for face in part.faces] if lod in reached else None
+        yield Decision(
+            kind=DecisionKind.LEVEL,
+            name=lod,
+            outcome=Outcome.UNDRAWABLE if faces is None else Outcome.CHOSEN,
+            detail="no form of its solids is valid" if faces is None else "",
+            n_faces=None if faces is None else len(faces),
+            n_planes=None if faces is None else len(set(faces)),
+        )
+
+
+def _blocks(building: _Building, plan: RoofPlan | None) -> Iterator[NamedForm[_Model]]:
     """Blocks on the footprint, else on the partition's outline; behind them those on the points' outline."""
     roof, settings, ground_z_m = building.roof, building.settings.roof, building.candidate.ground_z_m
     plane = block_plane(roof.points, ground_z_m, settings.block_height_percentile)
     if plan is None and roof.footprint_mm is not None:
-        outlines = [roof.footprint_mm]
+        outlines = [("the footprint", roof.footprint_mm)]
     else:
         if plan is None:
             unlabelled = dataclasses.replace(roof, labels=np.zeros(len(roof.points), np.int32))
             plan = partition_roof(unlabelled, [plane], settings)
-        outlines = [plan.outline_mm]
+        outlines = [("the outline", plan.outline_mm)]
         if plan.raw is not None:
-            outlines.append(outline(plan.raw))
+            outlines.append(("the raw outline", outline(plan.raw)))
     hull = hull_of_points(roof.points)
     if hull is not None:
-        outlines.append(MultiPolygon([shapely.transform(hull, lambda xy: np.rint(xy * 1e3))]))
+        outlines.append(("the points' hull", MultiPolygon([shapely.transform(hull, lambda xy: np.rint(xy * 1e3))])))
     tolerance = settings.simplification_spacings * roof.spacing_m
-    for footprint in outlines:
+    for words, footprint in outlines:
         for form in block_forms(footprint, plane, ground_z_m, tolerance, settings.min_part_area_m2):
-            yield partial(_block_model, form, plane)
+            yield NamedForm(BLOCK, partial(_block_model, form, plane), f"on {words}")
 
 
 def _block_model(form: Callable[[], list[SolidPart]], plane: Plane) -> _Model:

@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.model import BoolArray, ByteArray, IntArray, LabelArray
 from pipeline.terrain.facets import SceneVertices, VertexKind
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
-from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above, lowest_per_cell
 from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.point_assignment import Allowed, ScenePoints
 from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
@@ -80,13 +80,6 @@ def lattice_of(window: Window) -> tuple[int, int, int, int]:
     return column0, row0, columns, rows
 
 
-def _occupied(points: WindowPoints, kept: BoolArray, lattice: tuple[int, int, int, int]) -> BoolArray:
-    column0, row0, columns, rows = lattice
-    filled = np.zeros((rows, columns), np.bool_)
-    filled[points.y_mm[kept] // CELL_MM - row0, points.x_mm[kept] // CELL_MM - column0] = True
-    return filled
-
-
 def terrain_of(
     points: WindowPoints,
     window: Window,
@@ -111,7 +104,8 @@ def terrain_of(
         trusted=classes.ground,
         wanted=None if wanted is None else lattice_of(wanted),
     )
-    return terrain, kept, _occupied(points, kept, lattice)
+    occupied: BoolArray = lowest_per_cell(points.x_mm, points.y_mm, points.z_mm, kept, *lattice) != NO_DATA
+    return terrain, kept, occupied
 
 
 def _is_last(points: WindowPoints) -> BoolArray:

@@ -25,6 +25,8 @@ from service.routes import (
     health,
     jobs,
     landing,
+    log,
+    points,
     processes,
     results,
     schedules,
@@ -33,10 +35,12 @@ from service.routes import (
     webhooks,
 )
 from service.routes.events import Streams
+from service.routes.polling import PolledJobs
 from service.routes.replay import ReplayedError, replayed
 from service.routes.writing import writing
 from service.settings import ServiceSettings
 from service.store import JobStore
+from service.traces import telemetry
 
 ROUTERS: tuple[APIRouter, ...] = (
     landing.router,
@@ -45,10 +49,12 @@ ROUTERS: tuple[APIRouter, ...] = (
     tus.router,
     jobs.router,
     events.router,
+    log.router,
     schedules.router,
     webhooks.router,
     results.router,
     buildings.router,
+    points.router,
     health.router,
 )
 """All routes, in the order of the documentation."""
@@ -86,13 +92,15 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
         redirect_slashes=False,
         generate_unique_id_function=lambda route: route.name,
         separate_input_output_schemas=False,
-        dependencies=[Depends(check_query)],
+        dependencies=[Depends(check_query)],  # a further one must be added to `routes.polling`, too
+        telemetry=telemetry(),
     )
     app.state.settings = settings
     app.state.store = kept
     app.state.folder = folder
     app.state.limiter = RateLimiter(settings)
     app.state.streams = streams
+    app.state.polled_jobs = PolledJobs(kept, settings.database_wait_s)
     app.state.writing = writing(settings)
     app.state.metrics = metrics
     app.state.arrivals = Arrivals(kept, app.state.folder, settings)

@@ -30,7 +30,7 @@ from service.jobs import Upload
 from service.resumable import Promise, Unfinished
 from service.settings import ServiceSettings
 from service.store import JobStore
-from service.uploads import BLOCK_BYTES, WRITERS, check_digest, check_size, examined, remove_file
+from service.uploads import BLOCK_BYTES, WRITERS, check_digest, check_size, examined, make_way, remove_file
 
 SILENT_S = 3.0
 """Seconds without a byte after which a client that sends counts as gone if another request wants the upload: longer
@@ -330,6 +330,7 @@ class Arrivals:
                     if len(waiting) >= BLOCK_BYTES:
                         block, waiting = bytes(waiting), bytearray()
                         await self._run(functools.partial(write, block))
+                        await make_way()
         finally:
             if waiting:
                 with anyio.CancelScope(shield=True):

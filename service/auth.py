@@ -20,6 +20,8 @@ from service.settings import ServiceSettings
 
 TRUST_S = 2.0
 """Seconds for which an answer of the key table is reused; a revoked key works at most this long."""
+_MOMENT_S = 0.5
+"""Seconds for which an answer must still be trusted for `needs_table`: the caller authenticates soon after."""
 REMEMBERED = 4096
 """Maximum number of keys in memory."""
 FIX = "Send the header `Authorization: Bearer gw_…` with a key from `gablework keys create --name NAME`"
@@ -92,6 +94,17 @@ class _Memory:
                 self._keys[digest] = (key, now_s)
         return key
 
+    def holds(self, digest: str | None, now_s: float) -> bool:
+        """Whether it is known, without the table, whose a key is; without a key, whether keys are used."""
+        is_used, since_s = self._has_keys
+        if not is_used and now_s - since_s >= TRUST_S:
+            return False
+        if digest is None or not is_used:
+            return True
+        with self._lock:
+            held = self._keys.get(digest)
+        return held is not None and now_s - held[1] < TRUST_S
+
     def has_keys(self, table: KeyTable, now_s: float) -> bool:
         """Whether a key was ever made; a yes is final."""
         held, since_s = self._has_keys
@@ -109,6 +122,19 @@ _memories_lock = threading.Lock()
 def _memory_of(table: KeyTable) -> _Memory:
     with _memories_lock:
         return _memories.setdefault(table, _Memory())
+
+
+def needs_table(authorization: str | None, store: KeyTable) -> bool:
+    """Whether `authenticate` may ask the key table in the next moment; otherwise it takes no time."""
+    secret = _secret_of(authorization)
+    return not _memory_of(store).holds(None if secret is None else digest_of(secret), time.monotonic() + _MOMENT_S)
+
+
+def _secret_of(authorization: str | None) -> str | None:
+    """The key in a header; None if it holds none."""
+    scheme, _, secret = (authorization or "").strip().partition(" ")
+    secret = secret.strip()
+    return secret if scheme.lower() == "bearer" and looks_like_key(secret) else None
 
 
 def authenticate(
@@ -133,9 +159,8 @@ def authenticate(
         return KEYLESS
     if authorization is None:
         raise UnauthorizedError(f"this service needs a key. {FIX}")
-    scheme, _, secret = authorization.strip().partition(" ")
-    secret = secret.strip()
-    if scheme.lower() != "bearer" or not looks_like_key(secret):
+    secret = _secret_of(authorization)
+    if secret is None:
         raise UnauthorizedError(f"the header Authorization holds no key. {FIX}")
     digest = digest_of(secret)
     key = memory.key(digest, store, now_s)

@@ -6,8 +6,10 @@ import contextlib
 import copy
 import datetime as dt
 import functools
+import os
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -19,6 +21,7 @@ from pipeline.cli.options import TlsCa, TlsCert, TlsKey, count_or_auto
 from pipeline.console import Console
 from pipeline.errors import RunError, SettingsError
 from pipeline.runtime.isolation.start_up import start_own_process
+from service import client_commands
 
 if TYPE_CHECKING:
     from service.keys import Key
@@ -26,6 +29,9 @@ if TYPE_CHECKING:
     from service.store import JobStore
 
 keys = typer.Typer(help="Manage the keys that identify clients.", no_args_is_help=True, rich_markup_mode=None)
+for _command in (client_commands.submit, client_commands.watch, client_commands.fetch, client_commands.request):
+    app.command()(_command)
+app.add_typer(client_commands.jobs, name="jobs")
 app.add_typer(keys, name="keys")
 
 State = Annotated[
@@ -53,6 +59,8 @@ Days = Annotated[
 
 _STANDARD_INPUT = 0
 """File descriptor of the pipe that `serve` holds open for its driver."""
+_NICENESS = 10
+"""Of a driver beside the API on the same processors: answers go before models."""
 
 
 @contextlib.contextmanager
@@ -198,9 +206,60 @@ def drive(
             tls_cert=tls_cert,
             tls_key=tls_key,
         )
+        if with_parent:
+            os.nice(_NICENESS)
         code = run_driver(settings, name=name, parent_pipe=_STANDARD_INPUT if with_parent else None)
         if code:
             raise typer.Exit(code)
+
+
+# --- backups ---------------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def backup(
+    to: Annotated[str, typer.Option(metavar="DIR", help="Folder of the backup: new, or of an earlier backup.")],
+    state: State = None,
+    database_url: DatabaseUrl = None,
+    as_json: AsJson = False,
+) -> None:
+    """Copy database, results and uploads of a service while it runs; a further backup copies only what is new."""
+    with Console(as_json=as_json) as console, _service_errors():
+        from service.backup import back_up
+        from service.files import StateFolder
+        from service.store import JobStore
+
+        settings = _settings(state=state, database_url=database_url)
+        with JobStore(settings.database) as store:
+            report = back_up(store, StateFolder(settings.state), Path(to), console.status)
+        for name in report.missing:
+            console.warn(f"{name} is in the database and not in the state folder: the backup does not have it")
+        console.say(f"{to} holds the service of {report.made:%Y-%m-%d %H:%M:%S} UTC: {report.sentence}")
+        console.document({"backup": to, **report.as_dict()})
+
+
+@app.command()
+def restore(
+    source: Annotated[str, typer.Argument(metavar="BACKUP", help="Folder that `gablework backup` made.")],
+    state: State = None,
+    database_url: DatabaseUrl = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make a service from a backup, in an empty state folder and a new database; jobs that ran wait again."""
+    with Console(as_json=as_json) as console, _service_errors():
+        from service.backup import restore as restore_service
+        from service.files import StateFolder
+
+        settings = _settings(state=state, database_url=database_url)
+        folder = StateFolder(settings.state)
+        report, freed = restore_service(Path(source), folder, settings.database, console.status)
+        for name in report.missing:
+            console.warn(f"{name} was lost before the backup was made: the restored service does not have it")
+        console.say(
+            f"{settings.state} holds the service of {report.made:%Y-%m-%d %H:%M:%S} UTC: {report.sentence}; "
+            f"{freed} running jobs wait again"
+        )
+        console.document({"state": str(settings.state), "waitingAgain": freed, **report.as_dict()})
 
 
 # --- keys ------------------------------------------------------------------------------------------------------------

@@ -31,6 +31,7 @@ ServiceError
 ├── LeaseLostError           a driver's claim on a job has passed to another
 ├── StoreError               the database does not answer, or is not migrated
 │   ├── StoreBusyError       others hold its locks for too long
+│   ├── StoreNewerError      a newer version has migrated it
 │   └── StoreFullError       its disk is full
 └── StartUpError             settings with which the service must not start
 ```
@@ -226,6 +227,10 @@ class ChangedMeanwhileError(ServiceError):
 
 class StoreError(ServiceError):
     """The database does not answer, or its tables are not those of this version; may pass."""
+
+
+class StoreNewerError(StoreError):
+    """The database is of a newer version, which may have migrated it while this process ran."""
 
 
 class StoreBusyError(StoreError):

@@ -11,6 +11,8 @@ from pathlib import Path
 
 from service.disk import Disk
 
+SO_FAR = "so-far"
+"""Name of the folder of an attempt with the buildings that it has modelled so far."""
 _ID = re.compile(r"[0-9a-f]{32}")
 _log = logging.getLogger("gablework.service")
 
@@ -90,6 +92,10 @@ class StateFolder:
     def comparison(self, job_id: str, attempt: int) -> Path:
         """The folder of a comparison: one run directory per method, and the files made from them."""
         return self.attempt(job_id, attempt) / "comparison"
+
+    def so_far(self, job_id: str, attempt: int) -> Path:
+        """The buildings that the attempt has modelled so far, for readers, while it runs."""
+        return self.attempt(job_id, attempt) / SO_FAR
 
     def outputs(self, job_id: str, attempt: int) -> Path:
         """The outputs, assembled for download."""

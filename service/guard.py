@@ -1,4 +1,4 @@
-"""Checks before all routes: the host and origin of a request, and the size of its body; headers for browsers.
+"""Checks before all routes: host and origin of a request, encoding and size of its body; headers for browsers.
 
 A service on loopback without keys trusts every client that reaches it, but must not trust web pages in a browser on
 the same machine. Therefore the `Host` must be one of ours (else a page could give its own name to this address, "DNS
@@ -16,7 +16,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import TooLargeError
-from service.problems import FOREIGN, KINDS, answer
+from service.problems import ENCODED, FOREIGN, KINDS, answer
 from service.settings import ServiceSettings
 
 STREAMED = frozenset({("POST", "/jobs"), ("POST", "/uploads"), ("POST", "/uploads/tus"), ("PATCH", "/uploads/tus/*")})
@@ -31,11 +31,22 @@ READING = frozenset({"GET", "HEAD", "OPTIONS"})
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 """Names of this machine."""
 
-PAGE_POLICY = (
-    "default-src 'self'; img-src 'self' data: blob:; worker-src 'self' blob:; object-src 'none'; base-uri 'none'; "
-    "form-action 'self'; frame-ancestors 'none'"
+_PAGE_POLICY = (
+    "default-src 'self'; img-src 'self' data: blob:{tiles}; worker-src 'self' blob:; object-src 'none'; "
+    "base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
 )
-"""Content security policy of the web page."""
+
+
+def page_policy(tile_origin: str | None) -> str:
+    """Content security policy of the web page.
+
+    Parameters
+    ----------
+    tile_origin : str or None
+        The only other origin from which the page may load pictures: tiles beneath its map.
+    """
+    return _PAGE_POLICY.format(tiles="" if tile_origin is None else f" {tile_origin}")
+
 
 DATA_POLICY = "default-src 'none'; frame-ancestors 'none'"
 """Content security policy of all other answers, unless a route sets its own: a browser runs nothing from a file."""
@@ -49,6 +60,7 @@ class Guard:
         self.settings = settings
         public = urlsplit(settings.public_url or "")
         self._public_origin = f"{public.scheme}://{public.netloc}".lower() if public.netloc else None
+        self._page_policy = page_policy(settings.map_origin)
         self._hosts = LOOPBACK | {settings.host.lower()} | ({public.hostname} if public.hostname else set())
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -59,10 +71,15 @@ class Guard:
         headers = Headers(scope=scope)
         path = scope["path"].removeprefix(scope.get("root_path", ""))
         own = {"Tus-Resumable": "1.0.0"} if path == TUS or path.startswith(f"{TUS}/") else {}
-        guarded_send = functools.partial(self._send, send, own)
+        guarded_send = functools.partial(self._send, send, own, self._page_policy)
         refusal = self._foreign(scope["method"], scope.get("scheme", "http"), headers)
         if refusal is not None:
             await answer(FOREIGN, refusal, scope["path"])(scope, receive, guarded_send)
+            return
+        encoding = headers.get("content-encoding", "identity").strip().lower()
+        if encoding != "identity":
+            packed = f"Content-Encoding is {encoding[:40]!r}: send the body as it is"
+            await answer(ENCODED, packed, scope["path"])(scope, receive, guarded_send)
             return
         if not STREAMED.isdisjoint({(scope["method"], path), (scope["method"], f"{path.rpartition('/')[0]}/*")}):
             await self.app(scope, receive, guarded_send)
@@ -93,7 +110,7 @@ class Guard:
         return None
 
     @staticmethod
-    async def _send(send: Send, own: Mapping[str, str], message: Message) -> None:
+    async def _send(send: Send, own: Mapping[str, str], page_policy: str, message: Message) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
             headers.update(own)
@@ -101,7 +118,7 @@ class Guard:
             headers["X-Content-Type-Options"] = "nosniff"
             headers["Referrer-Policy"] = "no-referrer"
             # a page among the results may do less than the service's own
-            headers.setdefault("Content-Security-Policy", PAGE_POLICY if is_page else DATA_POLICY)
+            headers.setdefault("Content-Security-Policy", page_policy if is_page else DATA_POLICY)
             headers["Cross-Origin-Resource-Policy"] = "same-origin"
         await send(message)
 

@@ -39,6 +39,14 @@ class JobStatus(StrEnum):
         return self in {JobStatus.SUCCESSFUL, JobStatus.FAILED, JobStatus.DISMISSED}
 
 
+class LogLevel(StrEnum):
+    """How serious a line of a log is, in ascending order."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
 class Fault(StrEnum):
     """Kind of failure of a job; decides the HTTP status of its results."""
 
@@ -116,6 +124,8 @@ class JobRequest:
     """Side of the cells of rasters in the CRS's units; None for the default. Only for `classify`."""
     meshes: str = "building"
     """building or tile: one OBJ file for each; glb: one GLB file per tile; or none."""
+    points: bool = False
+    """Whether the points are delivered, too, as 3D Tiles. Only for `reconstruct`."""
     licence: str | None = None
     """Licence of the source data."""
     outputs: tuple[str, ...] | None = None
@@ -215,6 +225,20 @@ class Job:
     """The schedule that made it; it may be removed by now."""
     keep: bool = False
     """Whether it is kept, whatever its age and size."""
+    traceparent: str | None = None
+    """The span of the request that made it, as the header of that name; None without traces."""
+    watched_at: dt.datetime | None = None
+    """When a client last read the buildings that it had so far; not written every time."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Wishes:
+    """What clients want from the driver of a running job."""
+
+    dismissal: bool
+    """It must stop."""
+    watched_at: dt.datetime | None
+    """As in `Job`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -234,6 +258,37 @@ class JobEvent:
     progress: int = 0
     """0 to 100 over the whole job."""
     message: str = ""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NewLogLine:
+    """A line for the log of a job, before the store numbers it."""
+
+    level: LogLevel = LogLevel.INFO
+    stage: str = ""
+    """The stage of the run; empty if there is none."""
+    message: str
+    """One or more sentences, without paths of the machine."""
+    facts: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """tile, building, reason, seconds, done, total, failed: plain JSON values."""
+    age_s: float = 0.0
+    """Seconds since it happened."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LogLine:
+    """A line of the log of a job."""
+
+    number: int
+    """Counts up within the job, from 1."""
+    at: dt.datetime
+    level: LogLevel
+    attempt: int
+    """The attempt; 0 before the first one."""
+    stage: str
+    message: str
+    facts: Mapping[str, Any]
+    """As in `NewLogLine`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

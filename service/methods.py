@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -53,7 +54,7 @@ def allowed_methods(routes: Iterable[BaseRoute], scope: Scope) -> list[str]:
 
 
 async def check_query(request: Request) -> None:
-    """Refuse query parameters that the path does not have.
+    """Refuse query parameters that the path does not have, and two values of one that has one value.
 
     Raises
     ------
@@ -67,17 +68,24 @@ async def check_query(request: Request) -> None:
     if known is None:
         return
     takes = f"use {', '.join(known)}" if known else "this path has no query parameters"
-    unknown = [name for name in dict.fromkeys(request.query_params) if name not in known]
-    if unknown:
-        raise RequestError([f"query {shortened(name)} is not known: {takes}" for name in unknown])
+    given = Counter(name for name, _ in request.query_params.multi_items())
+    faults = [f"query {shortened(name)} is not known: {takes}" for name in given if name not in known]
+    twice = [name for name, n in given.items() if n > 1 and known.get(name)]
+    faults += [f"query {name} is given {given[name]} times: give it once" for name in twice]
+    if faults:
+        raise RequestError(faults)
 
 
 @functools.lru_cache(maxsize=8)
-def _query_names(app: FastAPI) -> Mapping[tuple[str, str], list[str]]:
-    """Names of the query parameters of every documented operation, by path and method."""
+def _query_names(app: FastAPI) -> Mapping[tuple[str, str], dict[str, bool]]:
+    """The query parameters of every documented operation, by path and method, and whether each has one value."""
     paths: Mapping[str, Mapping[str, Any]] = app.openapi()["paths"]
     return {
-        (path, method): [given["name"] for given in operation.get("parameters", ()) if given["in"] == "query"]
+        (path, method): {
+            given["name"]: given["schema"].get("type") != "array"
+            for given in operation.get("parameters", ())
+            if given["in"] == "query"
+        }
         for path, item in paths.items()
         for method, operation in item.items()
     }

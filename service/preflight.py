@@ -24,6 +24,7 @@ from typing import IO, Any
 
 from pipeline.errors import CrsError, EmptyInputError, InputError, UnreadableInputError
 from pipeline.io.area_of_use import Location
+from pipeline.io.crs import LARGEST_COORDINATE
 from pipeline.io.formats import recognise_format
 from service.errors import TooLargeError
 from service.vectors import VECTOR_SUFFIXES, examine_vector
@@ -143,8 +144,8 @@ def outside_area(location: Location | None) -> str | None:
 def _check_facts(path: Path, count: int, bounds: Iterable[float], max_points: int) -> None:
     """Refuse too many points, and bounds that are not numbers."""
     _check_count(path, count, max_points)
-    if not all(map(math.isfinite, bounds)):
-        raise UnreadableInputError(str(path), f"the bounds {tuple(bounds)} are not numbers", REFUSED)
+    if not all(abs(bound) < LARGEST_COORDINATE for bound in bounds):
+        raise UnreadableInputError(str(path), f"no place on Earth has the bounds {tuple(map(float, bounds))}", REFUSED)
 
 
 def _points(kind: str, count: int, **known: Any) -> dict[str, Any]:

@@ -101,6 +101,9 @@ KINDS: Mapping[type[Exception], Kind] = {
     errors.QuotaError: Kind(status=507, type_uri=f"{OWN}quota-exceeded", title="The uploads of the key are too large"),
     errors.UploadInUseError: Kind(status=409, type_uri=f"{OWN}upload-in-use", title="The upload is still needed"),
     errors.StoreBusyError: Kind(status=503, type_uri=f"{OWN}database-busy", title="The database is busy", retry=True),
+    errors.StoreNewerError: Kind(
+        status=503, type_uri=f"{OWN}database-newer", title="The service is being updated", retry=True
+    ),
     errors.StoreFullError: Kind(status=507, type_uri=f"{OWN}no-space", title="The disk is full", retry=True),
     errors.UploadBusyError: Kind(
         status=423, type_uri=f"{OWN}upload-busy", title="Another request sends it", retry=True
@@ -128,6 +131,8 @@ KINDS: Mapping[type[Exception], Kind] = {
 _STORE: Mapping[str, str] = {
     "database-away": "The database does not answer; nothing was lost, try again.",
     "database-busy": "Others hold the locks of the database; nothing was written, try again.",
+    "database-newer": "A newer version has migrated the database, and this process is of an older one; nothing was "
+    "read or written. Its operator must end it.",
     "no-space": "The disk of the database is full; nothing was written. Its operator must make room, then try again.",
 }
 """Sentences for clients, by the word of the kind: a database's own message can hold its address."""
@@ -137,6 +142,9 @@ INTERNAL = Kind(status=500, type_uri=f"{OWN}internal", title="A fault of the ser
 
 FOREIGN = Kind(status=403, type_uri=f"{OWN}foreign-origin", title="The request comes from another site")
 """A request from a page of another site, or with a foreign host name, to a service without keys."""
+
+ENCODED = Kind(status=415, type_uri="about:blank", title=HTTPStatus(415).phrase)
+"""A body that is compressed on the way."""
 
 FAILURES: Mapping[Fault, Kind] = {
     Fault.INPUT: Kind(status=422, type_uri=f"{OWN}job-failed-input", title="An input could not be used"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import threading
 import time
 
 from limits import RateLimitItem, parse_many
@@ -37,6 +38,8 @@ class RateLimiter:
         if any(limit.amount < 1 for limit in self._limits):
             raise StartUpError(f"rate_limit is {settings.rate_limit!r}: allow at least 1 request")
         self._strategy = SlidingWindowCounterRateLimiter(MemoryStorage())
+        # two threads at once may start the same timer of the storage, which then raises
+        self._counting = threading.Lock()
 
     def check(self, client: str) -> None:
         """Count one request of a key (by its id), or of an address if there is no key.
@@ -48,7 +51,9 @@ class RateLimiter:
         """
         client = _counted_as(client)
         for limit in self._limits:
-            if not self._strategy.hit(limit, client):
+            with self._counting:
+                is_within = self._strategy.hit(limit, client)
+            if not is_within:
                 reset_at = self._strategy.get_window_stats(limit, client).reset_time
                 raise TooManyRequestsError(
                     f"more than {limit.amount} requests in {limit.get_expiry()} s: wait, or poll less often",

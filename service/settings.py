@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 import ipaddress
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
+from urllib.parse import urlsplit
 
 import platformdirs
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.errors import StartUpError
@@ -140,6 +142,20 @@ class ServiceSettings(BaseSettings):
         default=30.0, gt=0.0, le=36_500.0, description="Days after which a finished delivery is removed from the log."
     )
 
+    # the web page
+    map_tiles: str | None = Field(
+        default=None,
+        description="URL of tiles beneath the map of the web page: https, with {z}, {x} and {y} in Web Mercator, such "
+        "as https://tiles.example.org/{z}/{x}/{y}.png. None by default: the page then loads nothing from elsewhere.",
+    )
+    map_credit: str = Field(
+        default="",
+        max_length=200,
+        validate_default=True,
+        description="Owners of these tiles, as the map credits them; needed with `map_tiles`.",
+    )
+    map_max_zoom: int = Field(default=19, ge=0, le=24, description="Finest level of these tiles.")
+
     # the driver and its cluster
     scheduler: str | None = Field(default=None, description="Address of a Dask scheduler; default an embedded cluster.")
     tls_ca: str | None = Field(
@@ -176,6 +192,35 @@ class ServiceSettings(BaseSettings):
     building_memory_bytes: int = Field(
         default=4 * _GIB, ge=_GIB // 2, description="Resident memory at which a building's work is stopped."
     )
+
+    @field_validator("map_tiles")
+    @classmethod
+    def _tiles(cls, value: str | None) -> str | None:
+        """A template that can be used, and whose origin is safe in a header."""
+        if value is None:
+            return None
+        example = "give one such as https://tiles.example.org/{z}/{x}/{y}.png"
+        if re.fullmatch(r"https://[A-Za-z0-9.-]+(:[0-9]{1,5})?/[!#-;=?-~]*", value) is None:
+            raise ValueError(f"{value[:80]!r} is not an https URL of plain characters: {example}")
+        missing = [name for name in ("{z}", "{x}", "{y}") if value.count(name) != 1]
+        if missing or len(re.findall("[{}]", value)) != 6:
+            raise ValueError(f"{value[:80]!r} does not have {{z}}, {{x}} and {{y}} once each, and no other: {example}")
+        return value
+
+    @field_validator("map_credit")
+    @classmethod
+    def _credit(cls, value: str, info: ValidationInfo) -> str:
+        """Tiles need a credit."""
+        if info.data.get("map_tiles") is not None and not value.strip():
+            raise ValueError("map_tiles is set: name the owners of these tiles")
+        return value
+
+    @property
+    def map_origin(self) -> str | None:
+        """The origin of the tiles beneath the map; None without them."""
+        if self.map_tiles is None:
+            return None
+        return "https://" + urlsplit(self.map_tiles).netloc.lower()
 
     @property
     def database(self) -> str:

@@ -55,13 +55,16 @@ def _links(job: Job, base: str, *, with_request: bool) -> list[Link]:
     place = f"{base}/jobs/{job.job_id}"
     links = [
         link(place, "self" if with_request else "monitor", "This job"),
-        link(f"{place}/events?f=json", f"{RELATIONS}log", "Its events as a list"),
+        link(f"{place}/log", f"{RELATIONS}log", "Its log"),
+        link(f"{place}/events?f=json", "events", "Its events as a list"),
         link(f"{place}/events?f=sse", "events", "Its events as a stream", "text/event-stream"),
     ]
     if with_request:
         links.insert(1, link(place, "monitor", "This job"))
     if job.schedule_id is not None:
         links.append(link(f"{base}/schedules/{job.schedule_id}", "schedule", "The schedule that made it"))
+    if job.status is JobStatus.RUNNING and job.request.process_id == "reconstruct":
+        links.append(link(f"{place}/buildings", "items", "The buildings so far", "application/geo+json"))
     if job.status is JobStatus.SUCCESSFUL:
         links.append(link(f"{place}/results", f"{RELATIONS}results", "The results"))
         if job.request.has_buildings:
@@ -106,6 +109,7 @@ def execute_request(request: JobRequest, base: str, priority: int) -> Execute:
         "settings": dict(request.settings) or None,
         "rasterCell": request.raster_cell,
         "meshes": request.meshes if request.has_buildings else None,
+        "points": request.points or None,
         "licence": request.licence,
         "title": request.title,
         "priority": priority or None,

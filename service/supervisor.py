@@ -30,8 +30,8 @@ from service.store import JobStore
 MIN_PAUSE_S = 0.5
 """Seconds before a driver that died is started again, the first time."""
 
-LONGEST_PAUSE_S = 30.0
-"""Maximum seconds before it is started again, if it dies repeatedly."""
+LONGEST_PAUSE_S = 5.0
+"""Maximum seconds before it is started again, if it dies repeatedly; meanwhile no job goes on."""
 
 STEADY_S = 60.0
 """Seconds after which a driver counts as steady: if it dies, the pauses begin anew."""
@@ -46,7 +46,7 @@ def pause_s(deaths: int) -> float:
     """Seconds before the next start after a number of deaths in a row.
 
     >>> [pause_s(n) for n in (1, 2, 3, 10)]
-    [0.5, 1.0, 2.0, 30.0]
+    [0.5, 1.0, 2.0, 5.0]
     """
     return min(LONGEST_PAUSE_S, MIN_PAUSE_S * 2.0 ** min(deaths - 1, 10))
 

@@ -19,6 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Protocol
 
+from pipeline.runtime.monitoring import tracing
 from service.disk import FULL
 from service.errors import NoSpaceError, RequestError, TooLargeError
 from service.filenames import clean_filename
@@ -31,6 +32,10 @@ BLOCK_BYTES = 1 << 18
 """Bytes that are hashed and written at once."""
 WRITERS = 4
 """Threads that write uploads: few, so that the other requests keep theirs."""
+_LONG_TURN_S = 0.002
+"""Seconds of a turn of the event loop beyond which uploads make way."""
+_PAUSE_TURNS = 10.0
+"""Length of an upload's pause, in turns."""
 TEMPORARY = ".tmp-"
 STALE_S = 24 * 3600.0
 """Seconds without a byte after which a temporary folder counts as left behind by a dead process."""
@@ -128,6 +133,7 @@ async def receive(
         The file cannot be used.
     """
     loop, upload_id, name = asyncio.get_running_loop(), uuid.uuid4().hex, clean_filename(filename)
+    made = tracing.begin("upload", upload_id=upload_id)
     sink = None
     try:
         sink = await loop.run_in_executor(_writers, _Sink, folder, upload_id, name)
@@ -136,11 +142,13 @@ async def receive(
             size += len(block)
             check_size(name, size, settings.max_upload_bytes)
             await loop.run_in_executor(_writers, sink.write, block)
+            await make_way()
         found = await loop.run_in_executor(_writers, sink.sync)
         check_digest(name, found, sha256)
         upload = await examined(sink.path, upload_id, found, store=store, settings=settings, owner=owner)
         await loop.run_in_executor(_writers, sink.keep, upload, store)
     except BaseException as fault:
+        tracing.failed(made, type(fault).__name__)
         if sink is not None:
             discarded = _writers.submit(sink.discard)
             if isinstance(fault, Exception):
@@ -148,6 +156,10 @@ async def receive(
         if isinstance(fault, OSError) and fault.errno in FULL:
             raise NoSpaceError(f"there is no room on the disk for {name}: free some, or try later") from fault
         raise
+    else:
+        tracing.note(made, size_bytes=size)
+    finally:
+        tracing.end(made)
     return upload
 
 
@@ -205,6 +217,20 @@ async def _blocks(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
             held, size = [], 0
     if held:
         yield b"".join(held)
+
+
+async def make_way() -> None:
+    """Let short requests go first: where many uploads arrive at once, each pauses between its blocks.
+
+    A turn of the event loop takes as long as all that is ready in it. With dozens of uploads a short request, which
+    needs several turns, would wait for them all several times.
+    """
+    loop = asyncio.get_running_loop()
+    began_s = loop.time()
+    await asyncio.sleep(0.0)
+    turn_s = loop.time() - began_s
+    if turn_s > _LONG_TURN_S:
+        await asyncio.sleep(_PAUSE_TURNS * turn_s)
 
 
 def remove_file(upload_id: str, folder: StateFolder) -> None:

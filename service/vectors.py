@@ -8,6 +8,7 @@ are accepted by path only.
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 import sqlite3
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from urllib.parse import quote
 import numpy as np
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
+from pipeline.io.crs import parse_crs
 from service.errors import TooLargeError
 from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES, PARQUET_SUFFIXES
 
@@ -33,6 +35,8 @@ STEPS_LIMIT = 50_000_000
 """Steps of the database engine for one statement, about a second."""
 VALUE_LIMIT = 2**24
 """Maximum number of bytes of one value in a GeoPackage."""
+PARSED_BYTES = 2**25
+"""GeoJSON up to this size is parsed; of larger files a job says what is in them."""
 HEAD_BYTES = 65_536
 BLOCK_BYTES = 1 << 20
 
@@ -54,10 +58,10 @@ def examine_vector(path: Path) -> dict[str, Any]:
 
     Raises
     ------
-    UnreadableInputError
+    UnreadableInputError, CrsError
         Not the format that its name says, damaged, or built to harm.
     EmptyInputError
-        No features.
+        No features, or no polygons.
     TooLargeError
         More bytes than allowed.
     """
@@ -195,11 +199,59 @@ def _geojson(path: Path, head: bytes) -> dict[str, Any]:
         raise UnreadableInputError(str(path), f"truncated: {depth} brackets are not closed", FIX)
     if member[1] == b"FeatureCollection" and count == 0:
         raise EmptyInputError(str(path), "the collection has no features", FIX)
+    if path.stat().st_size <= PARSED_BYTES:
+        _check_polygons(path)
     named = CRS_NAME.search(text)
     name = named[1].decode() if named else "WGS 84 (CRS84)"
     code = re.search(r"EPSG:(?:[\d.]*:)?(\d{4,6})$", name)
     crs = {"name": name, "epsg": int(code[1]) if code else None}
+    if code:
+        parse_crs(f"EPSG:{code[1]}", path=str(path))
     return _facts("geojson", max(count, 1), None, crs, [])
+
+
+def _check_polygons(path: Path) -> None:
+    """Refuse GeoJSON that is not JSON, or has no polygon with a ring; its depth is known to be small."""
+
+    def refuse(word: str) -> None:
+        raise ValueError(f"{word} is not a number of JSON")
+
+    try:
+        document = json.loads(path.read_bytes(), parse_constant=refuse)
+    except ValueError as fault:
+        raise UnreadableInputError(str(path), f"cannot be read as JSON ({str(fault)[:160]})", FIX) from fault
+    found = document["features"] if isinstance(document.get("features"), list) else [document]
+    if not any(_has_ring(one) for one in found):
+        raise EmptyInputError(str(path), f"none of its {len(found)} features is a polygon with a ring", FIX)
+
+
+def _has_ring(found: Any) -> bool:
+    """Whether a feature or a geometry has a ring of at least four positions."""
+    if not isinstance(found, dict):
+        return False
+    parts: Any = found.get("coordinates")
+    match found.get("type"):
+        case "Feature":
+            return _has_ring(found.get("geometry"))
+        case "GeometryCollection":
+            members = found.get("geometries")
+            return isinstance(members, list) and any(map(_has_ring, members))
+        case "Polygon":
+            return _is_ringed(parts)
+        case "MultiPolygon":
+            return isinstance(parts, list) and any(map(_is_ringed, parts))
+        case _:
+            return False
+
+
+def _is_ringed(rings: Any) -> bool:
+    """Whether the first of a polygon's rings has four positions or more, all of numbers."""
+    if not isinstance(rings, list) or not rings or not isinstance(rings[0], list):
+        return False
+    return len(rings[0]) >= 4 and all(
+        isinstance(place, list) and len(place) >= 2 and all(type(value) in {int, float} for value in place)
+        for place in rings[0]
+    )
 
 
 def _levels(path: Path) -> Iterator[tuple[tuple[int, int, int], int]]:

@@ -40,10 +40,10 @@ REQUIRED_PROGRAMS = "GABLEWORK_REQUIRE_PROGRAMS"
 """Environment variable of .ci/run: 1 makes a test that needs PostgreSQL or Chromium fail where it would skip."""
 
 LONGEST_FIRST = (
+    "84_web",
     "82_cluster/test_batch_faults.py",
     "82_cluster/test_faults.py",
     "03_compiler/test_wheel.py",
-    "84_web/test_page.py",
     "82_cluster/test_batch_store_faults.py",
     "82_cluster/test_workers.py",
     "81_driver/test_driver_processes.py",
@@ -67,13 +67,29 @@ LONGEST_FIRST = (
     "55_runtime/test_replay.py",
     "55_runtime/test_run.py",
 )
-"""Files of tests that take longest. They begin first, so that no process works on one of them alone at the end."""
+"""Tests that take longest. They begin first, so that no process works on one of them alone at the end."""
+
+TOGETHER = ("tests/84_web",)
+"""Folders whose tests share one process: a browser without a graphics card leaves little time for a second one."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Bring the longest files to the front; pytest-xdist hands out whole files in this order."""
+    """Bring the longest tests to the front; pytest-xdist hands them out in this order."""
     places = {Path(__file__).parent / name: place for place, name in enumerate(LONGEST_FIRST)}
-    items.sort(key=lambda item: places.get(item.path, len(places)))
+    items.sort(key=lambda item: min(places.get(path, len(places)) for path in (item.path, item.path.parent)))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """Give each process whole files, and those that belong `TOGETHER` to one."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = str(super()._split_scope(nodeid))
+            return next((folder for folder in TOGETHER if file.startswith(f"{folder}/")), file)
+
+    return Scheduling(config, log)
 
 
 def pytest_configure() -> None:

@@ -20,25 +20,32 @@ class Gate:
         parts = urlsplit(url)
         self._upstream = (parts.hostname, parts.port)
         self._changed = threading.Condition()
-        self._left: float = float("inf")
+        self._left: dict[bool, float] = {False: float("inf"), True: float("inf")}
         self._is_shut = False
         self._links: list[socket.socket] = []
         self.passed_bytes = 0
         """Bytes of clients that were passed on."""
+        self.passed_back_bytes = 0
+        """Bytes of the service that were passed back."""
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
         threading.Thread(target=self._accept, daemon=True).start()
 
-    def allow(self, count: float) -> None:
-        """Pass on so many more bytes of clients, then hold back what comes."""
+    def allow(self, count: float, *, back: bool = False) -> None:
+        """Pass on so many more bytes of clients, or back to them, then hold back what comes."""
         with self._changed:
-            self._left = count
+            self._left[back] = count
             self._changed.notify_all()
 
-    def wait_until_used_up(self, deadline_s: float) -> None:
+    def wait_until_used_up(self, deadline_s: float, *, back: bool = False) -> None:
         """Wait until the allowance is used up."""
         with self._changed:
-            assert self._changed.wait_for(lambda: self._left == 0, deadline_s), "the client sent too little"
+            assert self._changed.wait_for(lambda: self._left[back] == 0, deadline_s), "too few bytes came"
+
+    def lead_to(self, url: str) -> None:
+        """Lead new connections to another service."""
+        parts = urlsplit(url)
+        self._upstream = (parts.hostname, parts.port)
 
     def cut(self) -> None:
         """End all connections."""
@@ -56,6 +63,9 @@ class Gate:
 
     def close(self) -> None:
         """End everything."""
+        with contextlib.suppress(OSError):
+            # wakes the thread that accepts
+            self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         self.cut()
 
@@ -75,26 +85,29 @@ class Gate:
             threading.Thread(target=self._pass_back, args=(service, client), daemon=True).start()
 
     def _pass_on(self, client: socket.socket, service: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            while piece := client.recv(65_536):
-                while piece:
-                    with self._changed:
-                        self._changed.wait_for(lambda: self._left > 0 or client not in self._links)
-                        if client not in self._links:
-                            return
-                        count = int(min(self._left, len(piece)))
-                        self._left -= count
-                        self.passed_bytes += count
-                        self._changed.notify_all()
-                    service.sendall(piece[:count])
-                    piece = piece[count:]
-            service.shutdown(socket.SHUT_WR)
+        self._pass(client, service, client, back=False)
 
     def _pass_back(self, service: socket.socket, client: socket.socket) -> None:
+        self._pass(service, client, client, back=True)
+
+    def _pass(self, source: socket.socket, sink: socket.socket, client: socket.socket, *, back: bool) -> None:
         with contextlib.suppress(OSError):
-            while piece := service.recv(65_536):
-                client.sendall(piece)
-            client.shutdown(socket.SHUT_WR)
+            while piece := source.recv(65_536):
+                while piece:
+                    with self._changed:
+                        self._changed.wait_for(lambda: self._left[back] > 0 or client not in self._links)
+                        if client not in self._links:
+                            return
+                        count = int(min(self._left[back], len(piece)))
+                        self._left[back] -= count
+                        if back:
+                            self.passed_back_bytes += count
+                        else:
+                            self.passed_bytes += count
+                        self._changed.notify_all()
+                    sink.sendall(piece[:count])
+                    piece = piece[count:]
+            sink.shutdown(socket.SHUT_WR)
 
 
 @contextlib.contextmanager

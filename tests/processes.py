@@ -143,7 +143,14 @@ class Program:
             self._seen.update(psutil.Process(self.pid).children(recursive=True))
         return [child for child in self._seen if lives(child)]
 
-    def wait_for(self, condition: Callable[[], Value | None], what: str, deadline_s: float = LONG_S) -> Value:
+    def wait_for(
+        self,
+        condition: Callable[[], Value | None],
+        what: str,
+        deadline_s: float = LONG_S,
+        *,
+        interval_s: float = 0.02,
+    ) -> Value:
         """Like `wait_for`, but fails at once where the program has ended."""
 
         def alive_and_true() -> Value | None:
@@ -152,7 +159,7 @@ class Program:
                 pytest.fail(f"{self.name} ended with {self.process.returncode}, waited for {what}:\n{self.tail()}")
             return value
 
-        return wait_for(alive_and_true, f"{what} of {self.name}", deadline_s)
+        return wait_for(alive_and_true, f"{what} of {self.name}", deadline_s, interval_s=interval_s)
 
     def wait_for_port(self, port: int) -> None:
         """Wait until a program listens on a port of the loopback."""

@@ -250,6 +250,19 @@ class StoreContract(DatabaseContract):
         assert titles == ["4", "3", "2", "1", "0"]
         assert [job.request.title for job in store.list(JobFilter(limit=2, offset=1))] == ["3", "2"]
 
+    def test_words_are_searched_in_title_id_and_process(self, store: JobStore) -> None:
+        delft = submit(store, title="Delft West, 2 tiles")
+        echo = submit(store, process_id="echo", title="100 % of 5_000")
+        bare = submit(store)
+        assert ids(store, words=["west", "DELFT"]) == {delft.job_id}
+        assert ids(store, words=["west", "echo"]) == set()
+        assert ids(store, words=["Echo"]) == {echo.job_id}
+        assert ids(store, words=[bare.job_id[3:12].upper()]) == {bare.job_id}
+        # the signs of patterns are plain signs
+        assert ids(store, words=["0 % o"]) == ids(store, words=["5_0"]) == {echo.job_id}
+        assert ids(store, words=["5__"]) == ids(store, words=["a\0b"]) == set()
+        assert store.matching(JobFilter(words=["t"], limit=1)) == len(ids(store, words=["t"]))
+
     def test_lists_are_filtered_by_status_process_and_time(self, store: JobStore) -> None:
         first = submit(store)
         until(lambda: store.now() > first.created_at)
@@ -339,7 +352,7 @@ class StoreContract(DatabaseContract):
         again = store.claim("next", lease_s=LONG_S, max_attempts=3)
         assert (again.job_id, again.attempt, again.lost_attempts) == (first.job_id, 2, 1)
         assert any("driver dead ended" in event.message for event in store.events(first.job_id))
-        assert store.still_held(other) is False
+        assert store.still_held(other).dismissal is False
 
     def test_the_same_driver_with_an_older_attempt_can_write_no_more(self, store: JobStore) -> None:
         first = running(store, "a", lease_s=SOON_S)

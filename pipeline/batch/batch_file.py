@@ -55,6 +55,7 @@ class OutputTable(Parameters):
     meshes: str = parameter(
         "building", "One OBJ per building, one OBJ per tile, one GLB per tile, or none.", choices=MESHES
     )
+    points: bool = parameter(False, "Also write the points as 3D Tiles, with their distances to the models.")
     overwrite: bool = parameter(False, "Replace an existing run that does not belong to this batch.")
     report: bool = parameter(True, "Write run.html, the page about the run, when it is over.")
 
@@ -225,6 +226,7 @@ class Batch:
                 building_memory_bytes=round(self.cluster.building_memory_gib * 2**30),
             ),
             meshes=self.output.meshes,
+            points=self.output.points,
             licence=self.inputs.licence or None,
             overwrite=self.output.overwrite,
         )

@@ -42,6 +42,8 @@ _RANGE = 2.0
 """Factor by which machines and scenes differ, either way."""
 _RESULT_BYTES = 12_000
 """Bytes per building in a run directory, with meshes; 7 to 12 kB measured."""
+_POINT_BYTES = 25.0
+"""Bytes per point in a run directory with points; 24 are its attributes."""
 _KEPT_BYTES = 12_000
 """Bytes per building in the work folder."""
 _SPLIT_SHARE = 1.0
@@ -139,7 +141,7 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
         + work.tiles * side * side * _TERRAIN_BYTES
         + buildings * _KEPT_BYTES
     )
-    out_bytes = buildings * _RESULT_BYTES
+    out_bytes = buildings * _RESULT_BYTES + (round(work.points * _POINT_BYTES) if batch.output.points else 0)
     work_free, out_free = _free(batch.work_folder), _free(batch.out)
     worker_bytes = int(RATES.process_gib * 2**30) + plan.window_bytes
     refusals = [

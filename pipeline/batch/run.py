@@ -88,7 +88,7 @@ def _run_with_status(
     except BaseException as error:
         status.end("failed", as_keys(f"{type(error).__name__}: {error}".removesuffix(": ")))
         raise
-    status.end("incomplete" if summary.failed_tiles else "finished", f"digest {summary.digest}")
+    status.end("finished" if summary.is_complete else "incomplete", f"digest {summary.digest}")
     if batch.output.report:
         _write_report(summary, on_event)
     return summary

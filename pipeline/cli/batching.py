@@ -56,7 +56,7 @@ def run(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> None:
         summary = run_batch(read_batch(file), console.on_event)
         show_summary(console, summary)
         console.document(dataclasses.asdict(summary))
-        if summary.failed_tiles:
+        if not summary.is_complete:
             raise typer.Exit(ExitCode.TILES_FAILED)
 
 

@@ -37,6 +37,7 @@ from pipeline.cli.options import (
     TlsKey,
     Truth,
     VerticalUnit,
+    WithPoints,
     Workers,
 )
 from pipeline.console import Console, ExitCode
@@ -80,6 +81,7 @@ def reconstruct(
     tls_key: TlsKey = None,
     scratch: Scratch = None,
     meshes: Meshes = "building",
+    points: WithPoints = False,
     licence: Licence = None,
     overwrite: Overwrite = False,
     isolate: Annotated[bool | None, Isolate] = None,
@@ -122,13 +124,14 @@ def reconstruct(
                 building_memory_bytes=round(building_memory * 2**30),
             ),
             meshes=meshes,
+            points=points,
             licence=licence,
             overwrite=overwrite,
         )
         summary = run(request, console.on_event)
         show_summary(console, summary)
         console.document(dataclasses.asdict(summary))
-        if summary.failed_tiles:
+        if not summary.is_complete:
             raise typer.Exit(ExitCode.TILES_FAILED)
 
 
@@ -294,7 +297,7 @@ def compare(
         for path in made.written:
             console.say(f"wrote {path}")
         console.document(facts | {"out": made.summary.out, "written": [str(path) for path in made.written]})
-        if any(run.failed_tiles for run in made.summary.runs.values()):
+        if not all(run.is_complete for run in made.summary.runs.values()):
             raise typer.Exit(ExitCode.TILES_FAILED)
 
 
@@ -382,5 +385,7 @@ def show_summary(console: Console, summary: RunSummary) -> None:
     console.say(f"{points} points, tiles: {tiles}, peak memory of a process: {largest:.2f} GiB")
     for tile in summary.failed_tiles:
         console.warn(f"tile {tile} failed")
+    for tile in summary.tiles_without_points:
+        console.warn(f"tile {tile} has no points")
     console.say(f"content sha256 {summary.digest}")
     console.say(f"results are in {summary.run_dir}")

@@ -118,6 +118,9 @@ Meshes = Annotated[
     Literal["building", "tile", "glb", "none"],
     typer.Option(help="One OBJ per building, one OBJ per tile, one GLB per tile, or none."),
 ]
+WithPoints = Annotated[
+    bool, typer.Option("--points", help="Also write the points as 3D Tiles, with their distances to the models.")
+]
 Licence = Annotated[
     str | None, typer.Option(metavar="TEXT", help="Licence of the source data, written into the results.")
 ]

@@ -14,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
+import io
 import os
 import pickle
 import threading
@@ -25,7 +26,7 @@ import llvmlite.binding as llvm
 import numba
 from numba.core import cgutils, codegen, compiler, config, event, registry, serialize, sigutils
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.environment import Environment
+from numba.core.environment import Environment, _rebuild_env
 from numba.core.runtime import _nrt_python
 from numba.core.targetconfig import ConfigStack
 from numba.core.typing import templates
@@ -182,6 +183,28 @@ def _set_environments(library: Any, full: Iterable[Any], empty: Iterable[str]) -
             library.codegen.set_env(name, _NOTHING)
 
 
+def _environment_with(module: str, constants: list[Any], name: str) -> Any:
+    """The environment of a name, with the constants of a file if it has none yet.
+
+    numba takes an environment that this process knows as it is. It may come from a file that only kernels called, which
+    another process has since made callable from Python; without the constants a call would end in a SystemError.
+    """
+    found = _rebuild_env(module, constants, name)
+    if not found.consts:
+        found.consts[:] = constants
+    return found
+
+
+class _FactsReader(pickle.Unpickler):
+    """Reads the facts of a stored kernel."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """The object of a name; ours where numba makes environments."""
+        if (module, name) == (_rebuild_env.__module__, _rebuild_env.__name__):
+            return _environment_with
+        return super().find_class(module, name)
+
+
 class _Library(codegen.JITCodeLibrary):
     """Code that is only linked until its address is needed."""
 
@@ -316,7 +339,8 @@ class KernelDispatcher(registry.CPUDispatcher):
         stored = store.load(name, self._fingerprint(), runnable=for_python)
         if stored is None:
             return False
-        fndesc, environment, signature, reload_init, environments, defined = pickle.loads(stored.facts)  # noqa: S301
+        facts = _FactsReader(io.BytesIO(stored.facts)).load()
+        fndesc, environment, signature, reload_init, environments, defined = facts
         for initialise in reload_init:
             initialise()
         if not for_python:

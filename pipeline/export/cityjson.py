@@ -25,13 +25,17 @@ _NOT_ATTRIBUTES = ("building_id", "geometry", *SHAPE_COLUMNS)
 
 
 def cityjson_lines(
-    rows: Sequence[tuple[BuildingResult, Mapping[str, Any]]], reference: SpatialReference, title: str
+    rows: Sequence[tuple[BuildingResult, Mapping[str, Any]]],
+    reference: SpatialReference,
+    title: str,
+    corner: Sequence[float] | None = None,
 ) -> Iterable[str]:
     """The lines of a CityJSONSeq file, in the units of the reference and, with an EPSG code, its referenceSystem.
 
     Vertices are integers: the transform's scale is 0.001 in metres (finer in other units, to keep 1 mm), its
-    translation whole units at the lower corner of all solids. The record of each building (`building_row`) becomes its
-    attributes; buildings without a solid are features without geometry.
+    translation whole units at the lower corner of all solids. For lines that continue a file it is that file's, which
+    is given as `corner`. The record of each building (`building_row`) becomes its attributes; buildings without a solid
+    are features without geometry.
     """
     digits = (
         decimals(reference.horizontal_unit_m),
@@ -44,7 +48,7 @@ def cityjson_lines(
     corners = [xyz for solids in placed for xyz in solids]
     low = np.min([xyz.min(axis=0) for xyz in corners], axis=0) if corners else np.zeros(3)
     high = np.max([xyz.max(axis=0) for xyz in corners], axis=0) if corners else np.zeros(3)
-    translate = [math.floor(v) for v in low]
+    translate = [math.floor(v) for v in (low if corner is None else corner)]
     metadata: dict[str, Any] = {"title": title}
     code = epsg_code(reference)
     if code is not None:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import struct
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -21,12 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.compiler import kernel
+from pipeline.export.glb_container import INDICES, VERSION, VERTICES, container
 from pipeline.model import FloatArray, IntArray
 from pipeline.triangulation.faces import DONE, triangulate_rings
 from pipeline.triangulation.projection import area_vector
 
-VERSION = "2.0"
-"""Version of glTF."""
 MATERIALS: Mapping[str, tuple[float, float, float]] = {
     "RoofSurface": (0.50, 0.09, 0.06),
     "WallSurface": (0.71, 0.66, 0.58),
@@ -39,10 +37,7 @@ PLANE_ID = "_PLANE_ID"
 Float32Array = npt.NDArray[np.float32]
 
 _MM = 1000
-_MAGIC, _CONTAINER_VERSION = 0x46546C67, 2
-_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 _FLOAT, _UNSIGNED_INT = 5126, 5125
-_VERTICES, _INDICES = 34962, 34963
 _AXES = (
     "metres from origin_m: x easting, y elevation, z minus northing; "
     "easting = (origin_m[0] + x) / horizontal_unit_m, northing = (origin_m[1] - z) / horizontal_unit_m, "
@@ -259,7 +254,7 @@ class _Scene:
         views, start = [], 0
         for view in self._views:
             span = {"buffer": 0, "byteOffset": start, "byteLength": view.size}
-            layout = {"target": _INDICES} if view.stride is None else {"byteStride": view.stride, "target": _VERTICES}
+            layout = {"target": INDICES} if view.stride is None else {"byteStride": view.stride, "target": VERTICES}
             views.append({**span, **layout})
             start += view.size
         root = {"name": title, "children": list(range(1, len(self._nodes) + 1)), "extras": dict(place)}
@@ -274,7 +269,7 @@ class _Scene:
             "bufferViews": views,
             "buffers": [{"byteLength": start}],
         }
-        return _container(document, b"".join(piece for view in self._views for piece in view.pieces))
+        return container(document, (piece for view in self._views for piece in view.pieces))
 
 
 class _View:
@@ -296,20 +291,3 @@ def _material(name: str, colour: Sequence[float]) -> dict[str, Any]:
         "name": name,
         "pbrMetallicRoughness": {"baseColorFactor": [*colour, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0},
     }
-
-
-def _container(document: Mapping[str, Any], binary: bytes) -> bytes:
-    """The GLB container: a header of twelve bytes, a chunk of JSON and one of binary data, each padded to four."""
-    text = json.dumps(document, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    binary += b"\0" * (-len(binary) % 4)
-    size = 12 + 8 + len(text) + 8 + len(binary)
-    return b"".join(
-        (
-            struct.pack("<III", _MAGIC, _CONTAINER_VERSION, size),
-            struct.pack("<II", len(text), _JSON_CHUNK),
-            text,
-            struct.pack("<II", len(binary), _BINARY_CHUNK),
-            binary,
-        )
-    )

@@ -10,6 +10,7 @@ from typing import Any
 
 from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
+from pipeline.export.decisions import decision_rows, decisions_path, decisions_table
 from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.glb import glb_bytes
@@ -91,7 +92,7 @@ def write_tile(
     meshes: str = "building",
     put: Put | None = None,
 ) -> TileFiles:
-    """Publish one tile's buildings, planes, rejected objects, meshes and city objects.
+    """Publish one tile's buildings, planes, rejected objects, decisions, meshes and city objects.
 
     Every file is put atomically and depends on the arguments only, so a task may run twice, also at the same time.
     Tables without rows are written, too. Buildings and rejected objects come in any order.
@@ -152,6 +153,8 @@ def _tile_files(
     lines = list(cityjson_lines(list(zip(results, rows, strict=True)), reference, f"buildings of tile {tile_key}"))
     yield from mesh_files(tile_key, results, lines, context, meshes)
     yield f"cityjson/tile={tile_key}/part-0.city.jsonl", "".join(f"{line}\n" for line in lines).encode()
+    decisions = decisions_table(row for result in results for row in decision_rows(result))
+    yield decisions_path(tile_key), parquet_bytes(decisions)
     tables = {
         "planes": [row for result in results for row in plane_rows(result, context)],
         "rejected": [rejected_row(entry, context) for entry in rejected],

@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 
 from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
+from pipeline.export.decisions import DECISIONS, decision_rows, decisions_path, decisions_table
 from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.obj import obj_text
@@ -81,8 +82,12 @@ def updated_tile(
     }
     for name, fresh_rows in added.items():
         path = f"{name}/tile={tile_key}/part-0.parquet"
-        kept = [row for row in _rows(root / path, name) if row[KEYS[name][0]] not in names]
+        kept = [row for row in _rows(root / path, SCHEMAS[name]) if row[KEYS[name][0]] not in names]
         files[path] = parquet_bytes(geo_table(name, [*kept, *fresh_rows], context.reference.projjson))
+    path = decisions_path(tile_key)
+    kept = [row for row in _rows(root / path, DECISIONS) if row["building_id"] not in names]
+    tried = [row for result in results for row in decision_rows(result)]
+    files[path] = parquet_bytes(decisions_table([*kept, *tried]))
     return TileUpdate(files=files, gone=tuple(gone))
 
 
@@ -93,10 +98,10 @@ def _text(path: Path) -> str:
         raise RunError(f"{path} cannot be read: {error}. Run the whole again") from error
 
 
-def _rows(path: Path, name: str) -> list[dict[str, Any]]:
+def _rows(path: Path, schema: pa.Schema) -> list[dict[str, Any]]:
     """The rows of a table's file."""
     try:
-        table = pq.ParquetFile(path).read(columns=SCHEMAS[name].names)
+        table = pq.ParquetFile(path).read(columns=schema.names)
     except (OSError, pa.ArrowException) as error:
         raise RunError(f"{path} cannot be read: {error}. Run the whole again") from error
     rows: list[dict[str, Any]] = table.to_pylist()

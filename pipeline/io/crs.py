@@ -33,6 +33,10 @@ EPSG_UNITS_M = {9001: 1.0, 9002: INTERNATIONAL_FOOT_M, 9003: US_SURVEY_FOOT_M}
 """Metres per unit, by the EPSG codes that GeoTIFF keys use."""
 
 
+LARGEST_COORDINATE = 1e12
+"""Bound of coordinates, far beyond every CRS; keeps differences finite."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SpatialReference:
     """Where coordinates live and in which units."""

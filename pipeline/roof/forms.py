@@ -7,26 +7,29 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import shapely
 from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
-from pipeline.model import Plane
+from pipeline.model import Decision, DecisionKind, Outcome, Plane
 from pipeline.roof.footprint import simpler_outlines
+from pipeline.roof.named_form import ARRANGEMENT, TEMPLATES, NamedForm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPlan, RoofPoints, arranged_faces, drawn_outline, partition_roof, plan_forms
 from pipeline.roof.settings import ArrangementSettings, RoofSettings
 from pipeline.roof.templates.fitting import MAX_POINTS, RankedFaces, Templates, fit_templates, margin_of_templates
 from pipeline.roof.voids import without_voids
 
-FaceForm = Callable[[], RoofPartition | RankedFaces]
+FaceForm = NamedForm[RoofPartition | RankedFaces]
 """Draws roof faces, over the planes of the segmentation or over planes of their own."""
 
 UNDRAWABLE = (BuildingError, shapely.errors.GEOSException)
 """Raised by a form that cannot be drawn."""
+
+_SIMPLER = "within a simpler outline"
 
 _WIDER_CLEARANCES = (2.5, 4.0)
 """Times the usual distances between an arrangement's vertices. Not settings: tried only where the usual distances made
@@ -34,24 +37,30 @@ no valid solid."""
 
 
 def arranged_forms(
-    roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettings, costs: ArrangementSettings
+    roof: RoofPoints,
+    planes: Sequence[Plane],
+    settings: RoofSettings,
+    costs: ArrangementSettings,
+    decisions: list[Decision],
 ) -> Iterator[FaceForm]:
     """The arrangement; behind it coarser ones and the traced faces, drawn only where no solid of it is valid.
 
     Where points are few, templates compete with the arrangement: the better go first, worse ones last of all. Given
-    outlines of many short edges are made simpler before faces are traced: those are drawn back to be valid.
+    outlines of many short edges are made simpler before faces are traced: those are drawn back to be valid. What lost
+    a competition without being drawn is added to `decisions`.
     """
     outline_mm = drawn_outline(roof, settings)
     if roof.footprint_mm is not None:
         outline_mm = without_voids(outline_mm, roof.points, roof.spacing_m, settings)
-    first, last = _competing_forms(roof, planes, outline_mm, settings, costs)
+    first, last = _competing_forms(roof, planes, outline_mm, settings, costs, decisions)
     yield from first
     # many planes that meet nearly in one point: with more room between its vertices the solid is valid
     for clearance in _WIDER_CLEARANCES:
-        yield partial(arranged_faces, roof, planes, outline_mm, costs, clearance)
+        wider = partial(arranged_faces, roof, planes, outline_mm, costs, clearance)
+        yield NamedForm(ARRANGEMENT, wider, f"vertices {clearance:g} times as far apart")
     if roof.footprint_mm is not None:
         for simpler in simpler_outlines(outline_mm):
-            yield from _competing_forms(roof, planes, simpler, settings, costs)[0]
+            yield from _competing_forms(roof, planes, simpler, settings, costs, decisions, _SIMPLER)[0]
     try:
         plan = partition_roof(roof, planes, settings)
     except BuildingError:
@@ -67,7 +76,9 @@ def traced_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> It
     yield from plan_forms(plan, roof, settings)
     if roof.footprint_mm is not None:
         for simpler in simpler_outlines(plan.outline_mm):
-            yield from plan_forms(dataclasses.replace(plan, outline_mm=simpler), roof, settings)
+            simpler_plan = dataclasses.replace(plan, outline_mm=simpler)
+            for form in plan_forms(simpler_plan, roof, settings):
+                yield dataclasses.replace(form, detail=f"{form.detail}, {_SIMPLER}")
 
 
 def template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSettings) -> Iterator[FaceForm]:
@@ -79,11 +90,11 @@ def template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSettings
         templates = fit_templates(roof.points, outline_mm)
     except UNDRAWABLE:
         raise lack from None
-    yield templates.faces
+    yield NamedForm(TEMPLATES, templates.faces)
     if roof.footprint_mm is not None:
         for simpler in simpler_outlines(outline_mm):
             with contextlib.suppress(*UNDRAWABLE):
-                yield fit_templates(roof.points, simpler).faces
+                yield NamedForm(TEMPLATES, fit_templates(roof.points, simpler).faces, _SIMPLER)
 
 
 def _competing_forms(
@@ -92,22 +103,42 @@ def _competing_forms(
     outline_mm: MultiPolygon,
     settings: RoofSettings,
     costs: ArrangementSettings,
+    decisions: list[Decision],
+    within: str = "",
 ) -> tuple[tuple[FaceForm, ...], tuple[FaceForm, ...]]:
     """The arrangement within an outline and, where points are few, the templates: what goes first, what last."""
     arranged = partial(arranged_faces, roof, planes, outline_mm, costs)
     if roof.spacing_m < settings.templates_spacing_m or len(roof.points) > MAX_POINTS:
-        return (arranged,), ()
+        return (NamedForm(ARRANGEMENT, arranged, within),), ()
     templates: Templates | None = None
-    with contextlib.suppress(*UNDRAWABLE):
+    try:
         templates = fit_templates(roof.points, outline_mm)
+    except UNDRAWABLE as error:
+        decisions.append(undrawable(TEMPLATES, error))
     if templates is None:
-        return (arranged,), ()
+        return (NamedForm(ARRANGEMENT, arranged, within),), ()
     try:
         drawn = arranged()
-    except UNDRAWABLE:
-        return (templates.faces,), ()
+    except UNDRAWABLE as error:
+        decisions.append(undrawable(ARRANGEMENT, error))
+        return (NamedForm(TEMPLATES, templates.faces, within),), ()
     drawn_planes = drawn.planes or tuple(planes)
     margin = margin_of_templates(roof.points, templates, drawn, drawn_planes)
     own = RankedFaces(partition=drawn, planes=drawn_planes, labels=roof.labels, bic_margin=-margin)
-    form = partial(templates.faces, margin)
-    return ((form, lambda: own), ()) if margin > 0.0 else ((lambda: own,), (form,))
+    form: FaceForm = NamedForm(TEMPLATES, partial(templates.faces, margin), within)
+    own_form: FaceForm = NamedForm(ARRANGEMENT, lambda: own, within)
+    beaten = (ARRANGEMENT, -margin) if margin > 0.0 else (TEMPLATES, margin)
+    decisions.append(
+        Decision(
+            kind=DecisionKind.FORM, name=beaten[0], outcome=Outcome.OUTDONE, detail=within, bic_margin=beaten[1],
+            n_faces=len(drawn.polygons) if margin > 0.0 else None,
+        )
+    )  # fmt: skip
+    return ((form, own_form), ()) if margin > 0.0 else ((own_form,), (form,))
+
+
+def undrawable(name: str, error: Exception, detail: str = "") -> Decision:
+    """The entry of a form that cannot be drawn."""
+    why = error.detail if isinstance(error, BuildingError) else str(error)
+    words = f"{detail}: {why}" if detail else why
+    return Decision(kind=DecisionKind.FORM, name=name, outcome=Outcome.UNDRAWABLE, detail=words)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -13,7 +13,17 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import BuildingError
 from pipeline.geometry import spacing_over_area_m
-from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Plane, PreparedCloud, Reason, WallOutline
+from pipeline.model import (
+    BoolArray,
+    Decision,
+    FloatArray,
+    IntArray,
+    LabelArray,
+    Plane,
+    PreparedCloud,
+    Reason,
+    WallOutline,
+)
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.borders import straighten_borders
 from pipeline.roof.eaves import straighten
@@ -21,6 +31,7 @@ from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
 from pipeline.roof.facades import FacadePoints, walls_beneath
 from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, outline, polygons_of
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
+from pipeline.roof.named_form import TRACED, NamedForm
 from pipeline.roof.partition import (
     OUTSIDE,
     MinAreas,
@@ -64,8 +75,8 @@ class RoofPoints:
     """Points that show the walls beneath; None where no wall is asked for."""
 
 
-def roof_points(cloud: PreparedCloud, settings: RoofSettings) -> RoofPoints:
-    """Select the roof points of a candidate, in its order, without labels.
+def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[Decision] | None = None) -> RoofPoints:
+    """Select the roof points of a candidate, in its order, without labels; their number is added to `decisions`.
 
     Raises BuildingError `too_few_points` or `no_footprint`.
     """
@@ -77,6 +88,8 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings) -> RoofPoints:
     name, fewest = "min_points", settings.min_points
     if candidate.footprint is not None and settings.min_points_in_footprint < fewest:
         name, fewest = "min_points_in_footprint", settings.min_points_in_footprint
+    if decisions is not None:
+        decisions.append(Decision.check("roof_points", len(index), fewest))
     if len(index) < fewest:
         raise BuildingError(Reason.TOO_FEW_POINTS, f"{len(index)} roof points, fewer than {name} = {fewest}")
     footprint = None if candidate.footprint is None else footprint_in_mm(candidate.footprint)
@@ -249,6 +262,13 @@ class PlanForm:
     unite_mm: float
     """Clipped vertices closer than this are one."""
 
+    @property
+    def words(self) -> str:
+        """How it differs from others."""
+        drawn_back = f", drawn back {self.shrink_mm:g} mm" if self.shrink_mm else ""
+        borders = "straight borders" if self.straight else f"borders simplified {self.simplification:g} times"
+        return f"{borders}{drawn_back}, vertices within {self.unite_mm:g} mm united"
+
 
 FORMS = (
     PlanForm(straight=True, simplification=1.0, shrink_mm=0.0, unite_mm=10.0),
@@ -270,16 +290,17 @@ RAW_FORMS = (
 """The same for faces up to the raw outline."""
 
 
-def plan_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> Iterator[Callable[[], RoofPartition]]:
+def plan_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> Iterator[NamedForm[RoofPartition]]:
     """Ways to draw the final plan, the best first; each raises `no_partition` where it cannot be drawn."""
     clipped = plan.raw is None or settings.straight_eaves
     if clipped:
         for form in FORMS:
-            yield partial(draw_clipped, plan, roof, settings, form)
+            yield NamedForm(TRACED, partial(draw_clipped, plan, roof, settings, form), form.words)
     if plan.raw is not None:
         for form in RAW_FORMS if clipped else (FORMS[0], *RAW_FORMS):
             tolerance = form.simplification * settings.simplification_spacings * roof.spacing_m
-            yield partial(simplify_partition, plan.raw, tolerance)
+            raw = partial(simplify_partition, plan.raw, tolerance)
+            yield NamedForm(TRACED, raw, f"up to the raw outline, {form.words}")
 
 
 def draw_clipped(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings, form: PlanForm) -> RoofPartition:

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from uuid import uuid4
 
@@ -29,7 +29,7 @@ from pipeline.runtime.stages.given_footprints import given_footprints
 from pipeline.runtime.stages.ingest import ingest, part_of
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use
 from pipeline.runtime.stages.join import join
-from pipeline.runtime.stages.label import LabelTask, label, neighbourhood
+from pipeline.runtime.stages.label import LabelTask, by_tile, label, neighbourhood
 from pipeline.runtime.stages.rasters import (
     RASTERS,
     MosaicTask,
@@ -39,7 +39,7 @@ from pipeline.runtime.stages.rasters import (
     with_neighbours,
     write_mosaic,
 )
-from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, RejectedSite
+from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import split
 from pipeline.runtime.stages.write_classified import (
     ClassifiedFile,
@@ -227,8 +227,8 @@ def _label_all(
     """The classes of all tiles' points, in scratch; buildings may be `given` by footprints."""
     grid = context.plan.grid
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
-    buildings = _by_tile(joined.candidates)
-    decks = _by_tile([site for site in joined.rejected if site.verdict.reason is Reason.BRIDGE])
+    buildings = by_tile(joined.candidates)
+    decks = by_tile([site for site in joined.rejected if site.verdict.reason is Reason.BRIDGE])
     tasks = [
         LabelTask(
             tile=tile,
@@ -244,15 +244,6 @@ def _label_all(
         for near in [tuple(grid.tiles_over(neighbourhood(tile, grid, settings.scene)))]
     ]
     context.map("classify", label, tasks)
-
-
-def _by_tile(sites: Iterable[CandidateSite | RejectedSite]) -> dict[Tile, list[PointRange]]:
-    """The ranges of the points of sites, by their tiles."""
-    ranges: dict[Tile, list[PointRange]] = {}
-    for site in sites:
-        for part in site.ranges:
-            ranges.setdefault(part.tile, []).append(part)
-    return ranges
 
 
 def _write_all(

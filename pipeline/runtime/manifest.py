@@ -108,6 +108,8 @@ class RunManifest:
     """Keys of the tiles on the lattice, sorted."""
     failed_tiles: tuple[str, ...] = ()
     """Keys of the tiles that could not be published."""
+    tiles_without_points: tuple[str, ...] = ()
+    """Keys of the tiles whose points were requested and could not be written; the status does not depend on them."""
     counts: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """candidates, ok, fallback, failed, rejected, planes, points and the like."""
     timings_s: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -167,7 +169,7 @@ class RunManifest:
                     values[name] = dt.datetime.fromisoformat(values[name])
             values["inputs"] = tuple(_input_file(entry) for entry in values.get("inputs", ()))
             values["slowest"] = tuple(SlowBuilding(**entry) for entry in values.get("slowest", ()))
-            for name in ("tiles", "failed_tiles", "warnings"):
+            for name in ("tiles", "failed_tiles", "tiles_without_points", "warnings"):
                 values[name] = tuple(values.get(name, ()))
             return cls(**values)
         except (KeyError, TypeError, ValueError) as error:

@@ -50,6 +50,8 @@ class RunRequest:
     that strangers name."""
     meshes: str = "building"
     """One OBJ per building, one per tile, or none."""
+    points: bool = False
+    """Also write the points as 3D Tiles, with their distances to the models."""
     licence: str | None = None
     """Licence of the source data, in the user's words."""
     overwrite: bool = False
@@ -111,6 +113,7 @@ def request_record(request: RunRequest) -> dict[str, object]:
         "vertical_unit": request.vertical_unit,
         "bbox": None if request.bbox is None else list(request.bbox),
         "meshes": request.meshes,
+        "points": request.points,
     }
 
 

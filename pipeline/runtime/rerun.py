@@ -21,6 +21,7 @@ from pathlib import Path
 import shapely
 
 from pipeline.errors import RunError
+from pipeline.export.point_files import FOLDER as POINTS_FOLDER
 from pipeline.export.tile_update import updated_tile
 from pipeline.io import LocalStorage
 from pipeline.model import Reason
@@ -67,6 +68,7 @@ AROUND_M = 30.0
 this does not suffice all tiles are split."""
 _NEW = "new"
 """Folder of scratch for the files that will replace those of the run."""
+_POINTS_GONE = "the points are removed, since they showed the models before the rerun: run again with --points"
 _QUARANTINED = (Reason.INTERNAL_ERROR, Reason.CRASHED, Reason.TIMED_OUT, Reason.OUT_OF_MEMORY)
 
 
@@ -176,6 +178,8 @@ def _rerun(
         for outcome in found.outcomes:
             if outcome.warning:
                 progress.warn("join", outcome.warning)
+        if earlier.manifest.request.get("points"):
+            progress.warn("publish", _POINTS_GONE)
         models = reconstruct(context, wanted.settings, found.again)
         modelled = list(models.each())
         new = LocalStorage(root=Path(context.scratch.root, _NEW))
@@ -382,7 +386,7 @@ def _written(
     # readers see that the directory changes, also after a power cut
     changing = dataclasses.replace(earlier.manifest, status=RunStatus.RUNNING, content_sha256=None)
     write_manifest(root, changing, storage.put)
-    storage.clear((PAGE,))
+    storage.clear((PAGE, POINTS_FOLDER))
     try:
         for tile, update in prepared.items():
             for path in update.digests:
@@ -447,10 +451,17 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
         inputs.append(input_file(request.overrides))
     warnings = [text for text in earlier.manifest.warnings if not text.startswith(WARNING)]
     warnings.extend(outcome.warning for outcome in found.outcomes if outcome.warning)
+    if earlier.manifest.request.get("points"):
+        warnings.append(_POINTS_GONE)
     return dataclasses.replace(
         earlier.manifest,
-        request={**earlier.manifest.request, "overrides": request_record(request)["overrides"]},
+        request={
+            **earlier.manifest.request,
+            "overrides": request_record(request)["overrides"],
+            "points": False,
+        },
         inputs=tuple(inputs),
+        tiles_without_points=(),
         counts=dict(counts),
         slowest=_slowest(earlier, found, modelled),
         warnings=tuple(warnings),

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from pipeline import __version__
 from pipeline.errors import RunCancelledError, RunError
+from pipeline.export.point_files import FOLDER as POINTS_FOLDER
 from pipeline.io import SpatialReference, Storage, is_url, shown, storage_at
 from pipeline.methods import ReconstructSettings
 from pipeline.runtime.cluster.serial_executor import Executor
@@ -57,7 +58,7 @@ FOOTPRINTS = "footprints.json"
 OVERRIDES = "overrides.json"
 """File of the run directory with the outcome of each entry of the overrides."""
 
-_RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state", QUARANTINE)
+_RESULTS = ("buildings", "planes", "rejected", "decisions", "meshes", "cityjson", "state", QUARANTINE)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,6 +87,13 @@ class RunSummary:
     """What was odd but usable."""
     failed_tiles: tuple[str, ...] = ()
     """Tiles that could not be published."""
+    tiles_without_points: tuple[str, ...] = ()
+    """Tiles whose points were requested and could not be written."""
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every tile has all that was requested."""
+        return not self.failed_tiles and not self.tiles_without_points
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -212,7 +220,7 @@ def run_variants(
         )
         # all checks passed: only now are results of an earlier run removed
         for one in runs:
-            one.begin(footprints, resources.work)
+            one.begin(footprints, resources.work, points=request.points)
         for path in outdated:
             path.unlink(missing_ok=True)
         try:
@@ -287,8 +295,20 @@ def _model(context: RunContext, request: RunRequest, found: _Candidates, runs: S
     for one, part, settings in own:
         output = RunOutput(run_dir=one.run_dir, meshes=request.meshes)
         one.published = publish(part, settings, found.splits, found.joined, one.models, output)
+        if request.points:
+            one.without_points = _write_points(part, settings, found, one, given=request.footprints is not None)
     for one in runs:
         one.counted = Counted.of(one.models, each=several)
+
+
+def _write_points(
+    context: RunContext, settings: RunSettings, found: _Candidates, one: _VariantRun, *, given: bool
+) -> tuple[str, ...]:
+    """Write the points of a variant over its models; the keys of tiles that failed."""
+    from pipeline.runtime.stages.points import PointsOutput, write_points  # loads kernels, which few drivers need
+
+    output = PointsOutput(run_dir=one.run_dir, splits=found.splits, ingested=found.ingested, given=given)
+    return write_points(context, settings, found.joined, one.models, output)
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -302,6 +322,8 @@ class _VariantRun:
     models: Models = dataclasses.field(init=False)
     published: list[Published] = dataclasses.field(init=False)
     counted: Counted = dataclasses.field(init=False)
+    without_points: tuple[str, ...] = ()
+    """Keys of tiles whose points could not be written."""
 
     @classmethod
     def of(
@@ -336,11 +358,12 @@ class _VariantRun:
         """The run directory's storage."""
         return storage_at(self.run_dir)
 
-    def begin(self, footprints: GivenFootprints | None, work: str | None) -> None:
+    def begin(self, footprints: GivenFootprints | None, work: str | None, *, points: bool) -> None:
         """Remove an earlier run, except what the work folder knows; readers see that the directory changes."""
         known = work is not None and _is_of_work(self.run_dir, work)
         write_manifest(self.run_dir, self.manifest, self.storage.put)
-        self.storage.clear((PAGE,) if known else (*_RESULTS, FOOTPRINTS, OVERRIDES, PAGE))
+        outdated = (PAGE,) if points else (PAGE, POINTS_FOLDER)
+        self.storage.clear(outdated if known else (*_RESULTS, POINTS_FOLDER, FOOTPRINTS, OVERRIDES, PAGE))
         if footprints is not None:
             put_json(self.run_dir, FOOTPRINTS, footprints.report)
 
@@ -376,6 +399,7 @@ class _VariantRun:
             inputs=inputs,
             tiles=tuple(outcome.tile.key for outcome in self.published),
             failed_tiles=failed_tiles,
+            tiles_without_points=self.without_points,
             counts=counts,
             timings_s={name: round(seconds, 3) for name, seconds in timings.items()},
             peak_memory_bytes=self.progress.peaks,
@@ -396,6 +420,7 @@ class _VariantRun:
             peak_memory_bytes=self.progress.peaks,
             warnings=manifest.warnings,
             failed_tiles=failed_tiles,
+            tiles_without_points=self.without_points,
         )
         return VariantOutcome(summary=summary, seconds=self.counted.seconds)
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -16,9 +17,11 @@ from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.expected import Expected
 from pipeline.runtime.isolation.isolated_items import IsolationLimits
+from pipeline.runtime.monitoring import tracing
 from pipeline.runtime.monitoring.events import Watch, never
 from pipeline.runtime.monitoring.logs import about
 from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.monitoring.tracing import Part
 from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.scratch.folder import Scratch
@@ -39,6 +42,8 @@ class ProgressUnits(Generic[Brief]):
     """Units of a task, by its brief."""
     failed: Callable[[Brief], int] = lambda _: 0
     """How many of them failed."""
+    parts: Callable[[Brief], Iterable[Part]] = lambda _: ()
+    """Parts of a task that get spans of their own in a trace."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -114,7 +119,7 @@ class RunContext:
                     new = measured.result
                     found[new.place] = new.brief
                     on_new(new.brief)
-                    self.progress.measured(measured)
+                    self.progress.measured(measured, functools.partial(units.parts, new.brief))
                     counter.add(units.done(new.brief), units.failed(new.brief))
         return {place: found[place] for place in tasks}
 
@@ -154,7 +159,9 @@ def run_context(
         folder = str(Path(opened.root, "dask"))
         engine = executor or executor_for(resources, local_directory=folder, work=work, loads=loads)
         starting = time.perf_counter()
-        with about(run=opened.name), _watching(opened, cancelled) as was_cancelled, engine:
+        # the driver of a service has a span already
+        traced = tracing.span("run") if tracing.current() is None else contextlib.nullcontext()
+        with traced, about(run=opened.name), _watching(opened, cancelled) as was_cancelled, engine:
             progress.watch = Watch(cancelled=was_cancelled, stop=opened.cancel, listener=progress.listener)
             engine.prepare("plan", progress.watch)
             progress.timings["start workers"] = time.perf_counter() - starting

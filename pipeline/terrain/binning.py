@@ -32,9 +32,11 @@ def points_by_cell(
     n = x.size
     column0, row0 = x.min() // cell, y.min() // cell
     columns, rows = x.max() // cell - column0 + 1, y.max() // cell - row0 + 1
-    keys = np.full(n, -1, np.int32)
+    # quotients of whole numbers below 2^52 are exact when rounded down, and floats are divided several at a time
+    west, south, side = column0 * cell, row0 * cell, float(cell)
+    keys = np.empty(n, np.int32)
     for i in range(n):
-        if used[i]:
-            keys[i] = (y[i] // cell - row0) * columns + x[i] // cell - column0
+        c, r = np.int32((x[i] - west) / side), np.int32((y[i] - south) / side)
+        keys[i] = r * columns + c if used[i] else -1
     start, members = counting_sort(keys, columns * rows)
     return start, members, column0, row0, columns, rows

@@ -17,7 +17,7 @@ from pipeline.model import BoolArray, IntArray
 from pipeline.terrain.hierarchical_filter import hierarchical_ground
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, lowest_per_cell, without_pits
 from pipeline.terrain.morphological import morphological_ground
-from pipeline.terrain.planar_fitting import MIN_CELLS, plane_around, plane_sums
+from pipeline.terrain.planar_fitting import MIN_CELLS, plane_around, plane_sums, sum_within
 from pipeline.terrain.rejoining import FEWEST_SIDES, meeting_sides
 from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.support import NEAR_CELLS
@@ -62,9 +62,9 @@ def _draw(
                 r0, r1 = max(r - half, 0), min(r + half, rows - 1) + 1
                 c0, c1 = max(c - half, 0), min(c + half, columns - 1) + 1
                 # about the cell itself, in whole numbers: the same wherever the window begins
-                east = (sums[r1, c1, 1] - sums[r0, c1, 1] - sums[r1, c0, 1] + sums[r0, c0, 1] - n * c) / n
-                north = (sums[r1, c1, 2] - sums[r0, c1, 2] - sums[r1, c0, 2] + sums[r0, c0, 2] - n * r) / n
-                mean = (sums[r1, c1, 3] - sums[r0, c1, 3] - sums[r1, c0, 3] + sums[r0, c0, 3]) / n
+                east = (sum_within(sums, r0, r1, c0, c1, 1) - n * c) / n
+                north = (sum_within(sums, r0, r1, c0, c1, 2) - n * r) / n
+                mean = sum_within(sums, r0, r1, c0, c1, 3) / n
                 slack = max_slope * CELL_MM * math.sqrt(east * east + north * north)
                 level = min(max(level, mean - slack), mean + slack)
             terrain[r, c] = np.int32(round(level))

@@ -48,6 +48,12 @@ def plane_sums(elevation: Elevations, used: BoolArray) -> Sums:
     return sums
 
 
+@kernel(inline="always")
+def sum_within(sums: Sums, r0: int, r1: int, c0: int, c1: int, k: int) -> int:
+    """One of the sums over the rows from r0 and the columns from c0, up to but without r1 and c1."""
+    return int(sums[r1, c1, k] - sums[r0, c1, k] - sums[r1, c0, k] + sums[r0, c0, k])
+
+
 @kernel
 def plane_around(sums: Sums, r: int, c: int, half: int) -> tuple[int, float, float, float, bool]:
     """The plane through the used cells of the square of 2 half + 1 cells around a cell.
@@ -66,26 +72,27 @@ def plane_around(sums: Sums, r: int, c: int, half: int) -> tuple[int, float, flo
     rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
     r0, r1 = max(r - half, 0), min(r + half, rows - 1) + 1
     c0, c1 = max(c - half, 0), min(c + half, columns - 1) + 1
-    n = sums[r1, c1, 0] - sums[r0, c1, 0] - sums[r1, c0, 0] + sums[r0, c0, 0]
+    n = sum_within(sums, r0, r1, c0, c1, 0)
     if n == 0:
         return 0, 0.0, 0.0, 0.0, False
-    m = np.empty(9, np.int64)
-    for k in range(9):
-        m[k] = sums[r1, c1, k] - sums[r0, c1, k] - sums[r1, c0, k] + sums[r0, c0, k]
+    # not in an array of nine: making one took a third of the time
+    mx = sum_within(sums, r0, r1, c0, c1, 1)
+    my = sum_within(sums, r0, r1, c0, c1, 2)
+    mz = sum_within(sums, r0, r1, c0, c1, 3)
     # moments about the cell (r, c), exact
-    sx = m[1] - n * c
-    sy = m[2] - n * r
-    mean = m[3] / n
+    sx = mx - n * c
+    sy = my - n * r
+    mean = mz / n
     if n >= MIN_CELLS:
-        xx = m[4] - 2 * c * m[1] + n * c * c
-        xy = m[5] - c * m[2] - r * m[1] + n * c * r
-        yy = m[6] - 2 * r * m[2] + n * r * r
+        xx = sum_within(sums, r0, r1, c0, c1, 4) - 2 * c * mx + n * c * c
+        xy = sum_within(sums, r0, r1, c0, c1, 5) - c * my - r * mx + n * c * r
+        yy = sum_within(sums, r0, r1, c0, c1, 6) - 2 * r * my + n * r * r
         vxx, vxy, vyy = xx - sx * sx / n, xy - sx * sy / n, yy - sy * sy / n
         det = vxx * vyy - vxy * vxy
         if det > MIN_SPREAD * (vxx + vyy) * (vxx + vyy):
             # about the centroid; z about its mean to keep the float products small
-            vxz = (m[7] - c * m[3]) - sx * mean
-            vyz = (m[8] - r * m[3]) - sy * mean
+            vxz = (sum_within(sums, r0, r1, c0, c1, 7) - c * mz) - sx * mean
+            vyz = (sum_within(sums, r0, r1, c0, c1, 8) - r * mz) - sy * mean
             a, b = solve_plane_moments(vxx, vxy, vyy, vxz, vyz)
             return n, mean - (a * sx + b * sy) / n, a, b, True
     return n, mean, sx / n, sy / n, False
@@ -148,10 +155,10 @@ def leaning_planes(elevation: Elevations, used: BoolArray, half: int, widest: in
             while side < widest:
                 r0, r1 = max(r - side, 0), min(r + side, rows - 1) + 1
                 c0, c1 = max(c - side, 0), min(c + side, columns - 1) + 1
-                n = sums[r1, c1, 0] - sums[r0, c1, 0] - sums[r1, c0, 0] + sums[r0, c0, 0]
+                n = sum_within(sums, r0, r1, c0, c1, 0)
                 if n >= half:
-                    east = sums[r1, c1, 1] - sums[r0, c1, 1] - sums[r1, c0, 1] + sums[r0, c0, 1] - n * c
-                    north = sums[r1, c1, 2] - sums[r0, c1, 2] - sums[r1, c0, 2] + sums[r0, c0, 2] - n * r
+                    east = sum_within(sums, r0, r1, c0, c1, 1) - n * c
+                    north = sum_within(sums, r0, r1, c0, c1, 2) - n * r
                     if max(abs(east), abs(north)) <= MAX_LEAN * side * n:
                         break
                 side = min(2 * side, widest)

@@ -35,20 +35,23 @@ def _highest_per_cell(
     size = 2
     while size < 2 * n:
         size *= 2
+    column0, row0, columns, rows = 0, 0, 0, 0
+    if n > 0:
+        column0, row0 = x_mm.min() // cell_mm, y_mm.min() // cell_mm
+        columns, rows = x_mm.max() // cell_mm - column0 + 1, y_mm.max() // cell_mm - row0 + 1
+    # a lattice that is no larger than the table of a hash is the table: neighbours in space are neighbours in memory
+    is_lattice = columns * rows <= size
     mask = size - 1
-    keys = np.full(size, -1, np.int64)
-    numbers = np.empty(size, np.int64)
+    keys = np.full(columns * rows if is_lattice else size, -1, np.int64)
+    numbers = np.empty(keys.size, np.int64)
     chosen = np.empty(n, np.int64)
     cell = np.full(n, -1, np.int64)
     count = 0
-    column0, row0 = 0, 0
-    if n > 0:
-        column0, row0 = x_mm.min() // cell_mm, y_mm.min() // cell_mm
     for i in range(n):
         if not used[i]:
             continue
-        key = ((x_mm[i] // cell_mm - column0) << _BITS) | (y_mm[i] // cell_mm - row0)
-        s = slot_of_key(key, mask)
+        key = (x_mm[i] // cell_mm - column0) * rows + y_mm[i] // cell_mm - row0
+        s = key if is_lattice else slot_of_key(key, mask)
         while keys[s] != -1 and keys[s] != key:
             s = (s + 1) & mask
         if keys[s] == -1:

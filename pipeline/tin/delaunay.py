@@ -30,18 +30,16 @@ def _hilbert_keys(xy_mm: IntArray, x_min: int, y_min: int, shift: int) -> npt.ND
     for i in range(n):
         a = (xy_mm[i, 0] - x_min) >> shift
         b = (xy_mm[i, 1] - y_min) >> shift
-        key = 0
-        side = 1 << (_HILBERT_BITS - 1)
-        while side > 0:
-            right = 1 if a & side else 0
-            upper = 1 if b & side else 0
+        key = np.int64(0)
+        # without branches, several points at a time are worked on
+        for bit in range(_HILBERT_BITS - 1, -1, -1):
+            right = (a >> bit) & 1
+            upper = (b >> bit) & 1
             key = (key << 2) | ((3 * right) ^ upper)
-            if upper == 0:
-                if right == 1:
-                    a = ~a
-                    b = ~b
-                a, b = b, a
-            side >>= 1
+            mirrored = -(right & (1 - upper))
+            a, b = a ^ mirrored, b ^ mirrored
+            swapped = (a ^ b) & (upper - 1)
+            a, b = a ^ swapped, b ^ swapped
         keys[i] = (np.uint64(key) << np.uint64(32)) | np.uint64(i)
     return keys
 

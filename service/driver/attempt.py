@@ -14,6 +14,7 @@ from pipeline.errors import RunCancelledError
 from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables, parse_variants
+from pipeline.runtime.monitoring import tracing
 from pipeline.runtime.monitoring.events import Event, Listener
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.run import RunSummary, run
@@ -28,6 +29,7 @@ from service.driver.messages import (
     outcome,
 )
 from service.driver.shared_cluster import SharedCluster
+from service.driver.so_far import shown_while_watched
 from service.errors import RequestError
 from service.fetching import Fetched, gather
 from service.files import StateFolder
@@ -36,6 +38,9 @@ from service.outputs import write_classification_outputs, write_comparison_outpu
 from service.outputs.kinds import RASTERS
 from service.settings import ServiceSettings
 from service.store import JobStore
+
+_NAMED = 10
+"""Inputs that the log of a job names."""
 
 
 class Run(Protocol):
@@ -186,16 +191,18 @@ def perform(held: LeasedJob, shop: DriverParts) -> tuple[str, dict[str, Any]]:
     scrub.name(f"{folder.root}/", "/state/")
     held.record(Event(kind="stage", stage="inputs"))
     target = folder.inputs(job.job_id, job.attempt)
-    tiles, outlines = shop.tools.gather(
-        job.request,
-        store=shop.store,
-        folder=folder,
-        settings=shop.settings,
-        target=target,
-        cancelled=held.cancelled,
-    )
+    with tracing.span("stage inputs", stage="inputs"):
+        tiles, outlines = shop.tools.gather(
+            job.request,
+            store=shop.store,
+            folder=folder,
+            settings=shop.settings,
+            target=target,
+            cancelled=held.cancelled,
+        )
     for fetched in [*tiles, *([] if outlines is None else [outlines])]:
         scrub.name(str(fetched.path), fetched.path.name)
+    _note_inputs(held, tiles)
     work = begin(held, shop, tiles, outlines)
     shop.cluster.wait_until_there(held)
     held.record(Event(kind="stage", stage="plan"))
@@ -205,6 +212,15 @@ def perform(held: LeasedJob, shop: DriverParts) -> tuple[str, dict[str, Any]]:
     _check(held)
     shutil.rmtree(target, ignore_errors=True)
     return done
+
+
+def _note_inputs(held: LeasedJob, tiles: Sequence[Fetched]) -> None:
+    """Say in the job's log which program runs on what."""
+    if tiles:
+        names = ", ".join(tile.path.name for tile in tiles[:_NAMED])
+        more = f" and {len(tiles) - _NAMED} more" if len(tiles) > _NAMED else ""
+        inputs = f"{names}{more}, {sum(tile.points or 0 for tile in tiles)} points"
+        held.note(f"gablework {__version__} on {inputs}", stage="inputs")
 
 
 _Work = Callable[[Executor], tuple[str, dict[str, Any]]]
@@ -218,8 +234,11 @@ def _reconstruct(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], o
     request = run_request(job.request, tiles, outlines, run_dir, shop.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
-        summary = shop.tools.run(request, held.record, executor, held.cancelled)
-        shop.tools.write_outputs(Path(request.out), out_dir, job.request.outputs, _outputs_begin(held))
+        with shown_while_watched(held, run_dir, folder.so_far(job.job_id, job.attempt)):
+            summary = shop.tools.run(request, held.record, executor, held.cancelled)
+        begin = _outputs_begin(held)
+        with tracing.span("stage outputs", stage="outputs"):
+            shop.tools.write_outputs(Path(request.out), out_dir, job.request.outputs, begin)
         return outcome(summary), digest_of(summary, held.scrub, __version__)
 
     return work
@@ -233,7 +252,9 @@ def _compare(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outli
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
         summary = shop.tools.compare(request, held.record, executor, held.cancelled)
-        shop.tools.write_comparison(place, list(summary.runs), out_dir, job.request.outputs, _outputs_begin(held))
+        begin = _outputs_begin(held)
+        with tracing.span("stage outputs", stage="outputs"):
+            shop.tools.write_comparison(place, list(summary.runs), out_dir, job.request.outputs, begin)
         return comparison_outcome(summary), comparison_digest(summary, held.scrub, __version__)
 
     return work
@@ -248,7 +269,8 @@ def _classify(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outl
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
         summary = shop.tools.classify(request, held.record, executor, held.cancelled)
         begin = _outputs_begin(held)
-        shop.tools.write_classification(summary, out_dir, job.request.outputs, begin, held.scrub)
+        with tracing.span("stage outputs", stage="outputs"):
+            shop.tools.write_classification(summary, out_dir, job.request.outputs, begin, held.scrub)
         return classification_outcome(summary), classification_digest(summary, held.scrub, __version__)
 
     return work
@@ -309,6 +331,7 @@ def run_request(
         bbox=request.bbox,
         resources=settings.resources,
         meshes=request.meshes,
+        points=request.points,
         licence=request.licence,
     )
 

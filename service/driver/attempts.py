@@ -11,12 +11,13 @@ from collections.abc import Callable
 from typing import Any
 
 from pipeline.errors import ClusterError, GableworkError, RunCancelledError
+from service import traces
 from service.driver.attempt import DriverParts, perform
 from service.driver.failures import FULL_BYTES, NO_SPACE_PAUSE_S, failure_of, has_no_space, is_tried_again, pause_s
 from service.driver.finished_work import leave, take_over
 from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.errors import LeaseLostError, NoSpaceError, ServiceError, StoreError
-from service.jobs import JobStatus
+from service.jobs import JobStatus, LogLevel
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 15.0
@@ -50,11 +51,13 @@ class Attempts:
             try:
                 if held.cancelled():
                     raise RunCancelledError("the job was cancelled")  # noqa: TRY301
-                found = take_over(self._shop.folder, held.job)
-                message, summary = perform(held, self._shop) if found is None else found
+                with traces.attempt(held.job, self._name):
+                    found = take_over(self._shop.folder, held.job)
+                    message, summary = perform(held, self._shop) if found is None else found
             except BaseException as error:  # noqa: BLE001 - every exception must end the job, not the driver
                 self._end_early(held, error)
                 return
+            held.end_stage()
             done = self._settle(
                 held,
                 lambda: self._shop.store.succeed(held.job, message=message, summary=summary),
@@ -95,6 +98,7 @@ class Attempts:
         facts: dict[str, Any] = {**held.facts, "reference": reference}
         expected = isinstance(error, GableworkError | ServiceError)
         LOG.warning("the attempt failed: %s", error, extra=facts, exc_info=None if expected else error)
+        held.note(f"the attempt failed: {type(error).__name__} (reference {reference})", level=LogLevel.WARNING)
         if isinstance(error, ClusterError) and held.engine is not None:
             self._shop.cluster.replace(held.engine)
         self._forget(held)
@@ -120,11 +124,11 @@ class Attempts:
     def _settle(self, held: LeasedJob, write: Callable[[], None], status: JobStatus) -> bool | None:
         """Write the outcome of an attempt, as soon as the database answers; False if the lease is lost.
 
-        If the answer to a commit was lost, the job already has this status at this attempt. None if the driver
-        must end before the outcome is known: the job goes back to the queue when its lease has ended, and the next
-        driver finds what was done.
+        If the answer to a commit was lost, the job already has this status at this attempt; its span, which the store
+        makes after a commit, is then made here. None if the driver must end before the outcome is known: the job goes
+        back to the queue when its lease has ended, and the next driver finds what was done.
         """
-        pause, is_last = FIRST_PAUSE_S, False
+        pause, is_last, is_repeated = FIRST_PAUSE_S, False, False
         while True:
             try:
                 try:
@@ -132,13 +136,16 @@ class Attempts:
                         held.write()
                     write()
                 except LeaseLostError as error:
-                    known = self._shop.store.attempts([held.job.job_id])
-                    if known.get(held.job.job_id) == (status, held.job.attempt):
+                    known = self._shop.store.attempts([held.job.job_id]).get(held.job.job_id)
+                    if is_repeated and known is not None and known[0].is_over and known[1] == held.job.attempt:
+                        traces.job_ended(held.job, known[0])
+                    if known == (status, held.job.attempt):
                         return True
                     LOG.warning("the attempt does not count: %s", error, extra=held.facts)
                     return False
             except StoreError as error:
                 LOG.warning("the end of the attempt cannot be written yet: %s", error, extra=held.facts)
+                is_repeated = True
                 if is_last:
                     return None
                 if self._ending.is_set():

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 from service.disk import Disk
 from service.driver.leased_job import LOG, LeasedJob, Stop
+from service.jobs import LogLevel
 
 LOOK_S = 0.5
 """Seconds between two looks. Two workers that write 200 MB/s each use less than half of the reserve in this time."""
@@ -47,5 +48,6 @@ class DiskWatch:
             held = self._held()
             if held and not any(one.stopped_for is not None for one in held):
                 LOG.warning("the job is stopped: the disk is full except for its reserve", extra=held[-1].facts)
+                held[-1].note("stopped: the disk is full except for its reserve", level=LogLevel.WARNING)
                 held[-1].stop(Stop.NO_SPACE)
         return not is_short

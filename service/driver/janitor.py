@@ -22,6 +22,8 @@ from service.uploads import STALE_S, remove_file, remove_leftovers
 
 LOG = logging.getLogger("gablework.driver")
 
+SO_FAR_S = 60.0
+"""Seconds for which the buildings that a job had so far stay readable after they last changed."""
 _ATTEMPT = re.compile(r"attempt-([0-9]+)")
 
 
@@ -96,6 +98,9 @@ def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
             removed.append(folder.job(job_id))
             continue
         status, attempt = known[job_id]
+        if status is JobStatus.SUCCESSFUL and _is_old(folder.so_far(job_id, attempt), SO_FAR_S):
+            # a reader may have begun before the job was over
+            removed.append(folder.so_far(job_id, attempt))
         # a job that waits or failed needs no attempt, one that runs or succeeded only its last
         last = attempt if status in {JobStatus.ACCEPTED, JobStatus.FAILED} else attempt - 1
         for path in _entries(folder.job(job_id)):
@@ -121,7 +126,7 @@ def tidy_uploads(store: JobStore, folder: StateFolder) -> list[Path]:
         remove_file(upload.upload_id, folder)
         removed.append(folder.upload(upload.upload_id))
     now_s = time.time()
-    stale = [p for p in _entries(folder.uploads) if is_id(p.name) and _is_stale(p, now_s)]
+    stale = [p for p in _entries(folder.uploads) if is_id(p.name) and _is_old(p, STALE_S)]
     known = store.upload_ids() if stale else set()
     for path in stale:
         if path.name not in known:
@@ -150,9 +155,9 @@ def _size_of(folder: Path) -> int:
     return size
 
 
-def _is_stale(path: Path, now_s: float) -> bool:
-    """Whether a folder is a day old: it would have its record by now."""
+def _is_old(path: Path, seconds: float) -> bool:
+    """Whether a folder exists and its entries last changed longer ago than that."""
     try:
-        return now_s - path.stat().st_mtime > STALE_S
+        return time.time() - path.stat().st_mtime > seconds
     except FileNotFoundError:
         return False

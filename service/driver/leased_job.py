@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import threading
 import time
 from enum import IntEnum
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring.events import Event
+from service.driver.job_log import AttemptLog
 from service.driver.messages import Scrubber
 from service.driver.progress import CLASSIFY_WEIGHTS, WEIGHTS, WORDS, percent
 from service.errors import LeaseLostError, StoreError
-from service.jobs import Job, JobEvent
+from service.jobs import Job, JobEvent, LogLevel
 from service.store import JobStore
 
 LOG = logging.getLogger("gablework.driver")
 
 _FLUSH_S = 0.5
 """Minimum seconds between two writes of progress."""
+_WATCHED_S = 60.0
+"""Seconds for which a job counts as watched after a client read its buildings."""
 _MAX_PENDING = 500
 """Maximum number of events that wait while the database does not answer; the oldest are dropped first."""
 
@@ -83,6 +87,8 @@ class LeasedJob:
         self._renewed_s = claimed_s
         self._renewed_at_s = time.time()
         self._written_s = claimed_s
+        self._watched_at = job.watched_at
+        self._watched_s: float | None = None
         self._lock = threading.Lock()
         self._writing = threading.Lock()
         self._stop: Stop | None = None
@@ -92,8 +98,10 @@ class LeasedJob:
         self._progress = 0
         self._weights = CLASSIFY_WEIGHTS if job.request.process_id == "classify" else WEIGHTS
         self._waited = False
+        self._is_silent = False
         self._pulse = threading.Thread(target=self._keep, name=f"lease-{job.job_id[:8]}", daemon=True)
         self.scrub = Scrubber()
+        self._log = AttemptLog(self.scrub, WORDS)
         self.engine: Engine | None = None
         """The workers that run the attempt; None before it runs."""
 
@@ -125,6 +133,11 @@ class LeasedJob:
         """Whether the lease is overdue by the wall clock, which also counts the time that the machine slept."""
         return not self.cancelled() and time.time() - self._renewed_at_s > self._lease_s / 2.0
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether clients read the buildings that it has so far, since the attempt began."""
+        return self._watched_s is not None and time.monotonic() - self._watched_s < _WATCHED_S
+
     def wait(self, seconds: float) -> bool:
         """Wait, at most until the attempt must end; returns whether it must."""
         return self._stopped.wait(seconds)
@@ -139,33 +152,48 @@ class LeasedJob:
     def record(self, event: Event) -> None:
         """Take an event of the run. Another thread writes it soon, and the run never waits for that."""
         with self._lock:
-            shown = self._job_event(event)
+            self._log.hear(event)
+            shown = None if event.kind == "detail" else self._job_event(event)
             if shown is None:
                 return
             if shown.kind == "progress":
                 self._pending = [e for e in self._pending if (e.kind, e.stage) != ("progress", shown.stage)]
             self._pending = [*self._pending, shown][-_MAX_PENDING:]
 
+    def note(self, message: str, *, level: LogLevel = LogLevel.INFO, **facts: Any) -> None:
+        """Add a line to the job's log."""
+        with self._lock:
+            self._log.say(message, level=level, **facts)
+
+    def end_stage(self) -> None:
+        """Note in the job's log how its last stage ended."""
+        with self._lock:
+            self._log.end_stage()
+
     def write(self) -> None:
-        """Write the events that wait.
+        """Write the events and the lines of the log that wait.
 
         Raises
         ------
         LeaseLostError
             The job is no longer held.
         StoreError
-            The database does not answer; the events continue to wait.
+            The database does not answer; they continue to wait.
         """
         with self._writing:
             with self._lock:
                 pending, self._pending = self._pending, []
-            if not pending:
+                lines = self._log.take()
+            if not pending and not lines:
                 return
+            now_s = time.monotonic()
+            aged = [dataclasses.replace(line, age_s=max(0.0, now_s - said_s)) for said_s, line in lines]
             try:
-                self._store.record(self.job, pending)
+                self._store.record(self.job, pending, aged)
             except StoreError:
                 with self._lock:
                     self._pending = [*pending, *self._pending][-_MAX_PENDING:]
+                    self._log.put_back(lines)
                 raise
             self._written_s = time.monotonic()
 
@@ -213,15 +241,24 @@ class LeasedJob:
                 if not self.cancelled():
                     silent_s = time.monotonic() - self._renewed_s
                     LOG.warning("no heartbeat for %.0f s: %s", silent_s, error, extra=self.facts)
+                    if not self._is_silent:
+                        self.note("the database does not answer", level=LogLevel.WARNING)
+                    self._is_silent = True
+            else:
+                self._is_silent = False
 
     def _look(self) -> None:
-        """Renew the lease if that is due, otherwise check for a dismissal."""
+        """Renew the lease if that is due, otherwise check for a dismissal and for readers."""
         now_s = time.monotonic()
         if now_s - self._renewed_s >= self._lease_s / 3.0 - self._poll_s:
             wanted = self._store.renew(self.job, lease_s=self._lease_s)
             self._renewed_s, self._renewed_at_s = now_s, time.time()
         else:
-            wanted = self._store.still_held(self.job)
+            wishes = self._store.still_held(self.job)
+            wanted = wishes.dismissal
+            # by change: the clocks of database and driver may differ
+            if wishes.watched_at != self._watched_at:
+                self._watched_at, self._watched_s = wishes.watched_at, now_s
         if wanted:
             self.stop(Stop.DISMISSED)
 

@@ -63,6 +63,9 @@ def outcome(summary: RunSummary) -> str:
         count = len(summary.failed_tiles)
         sentence += f"; {count} {'tile' if count == 1 else 'tiles'} could not be published: "
         sentence += "its buildings are missing" if count == 1 else "their buildings are missing"
+    if summary.tiles_without_points:
+        count = len(summary.tiles_without_points)
+        sentence += f"; the points of {count} {'tile' if count == 1 else 'tiles'} could not be written"
     if summary.warnings:
         sentence += f"; {len(summary.warnings)} {'warning' if len(summary.warnings) == 1 else 'warnings'}"
     return sentence
@@ -127,6 +130,7 @@ def digest_of(summary: RunSummary, scrub: Scrubber, engine_version: str) -> dict
         "roof_types": dict(summary.roof_types),
         "counts": dict(summary.counts),
         "failed_tiles": list(summary.failed_tiles),
+        "tiles_without_points": list(summary.tiles_without_points),
         **_measured(summary, scrub),
     }
 

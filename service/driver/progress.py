@@ -13,12 +13,14 @@ WEIGHTS = MappingProxyType(
         "split": 28,
         "join": 2,
         "outline": 4,
-        "reconstruct": 39,
+        "reconstruct": 33,
         "publish": 4,
+        "octree": 6,
         "outputs": 8,
     }
 )
-"""The stages of a job in their order, with their share of the time in percent; measured on city blocks."""
+"""The stages of a job in their order, with their share of the time in percent; measured on city blocks. A job without
+points skips the stage octree."""
 
 CLASSIFY_WEIGHTS = MappingProxyType(
     {
@@ -46,6 +48,7 @@ WORDS = MappingProxyType(
         "outline": "touching buildings are outlined together",
         "reconstruct": "buildings are modelled",
         "publish": "tiles are written",
+        "octree": "points are arranged for viewing",
         "classify": "points are classified",
         "write": "files are written",
         "rasters": "rasters are drawn",
@@ -82,7 +85,7 @@ def percent(stage: str, done: int, total: int, weights: Mapping[str, int] = WEIG
     Examples
     --------
     >>> percent("inputs", 0, 1), percent("reconstruct", 0, 80), percent("reconstruct", 40, 80), percent("outputs", 3, 3)
-    (0, 49, 68, 99)
+    (0, 49, 65, 99)
     """
     if stage not in weights:
         return 0

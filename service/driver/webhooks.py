@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 
 from pipeline import __version__
+from pipeline.runtime.monitoring import tracing
 from service.driver.attempts import FIRST_PAUSE_S, LONGEST_PAUSE_S
 from service.errors import LeaseLostError, NoSuchOutputError, StoreError, TargetRefusedError
 from service.files import StateFolder
@@ -16,6 +17,7 @@ from service.outputs import read_catalogue
 from service.settings import ServiceSettings
 from service.status import results_document, status_info
 from service.store import JobStore
+from service.traces import of_job
 from service.webhook_targets import SEND_S, SendError, post
 from service.webhooks import EventType, Parcel, Result, RetryPolicy, signed_headers
 from service.wire.webhooks import Message
@@ -109,7 +111,13 @@ class Sender:
         delivery = parcel.delivery
         facts = {**self._facts, "job": delivery.job_id, "delivery": delivery.delivery_id}
         try:
-            result = self._attempt(parcel, began_s)
+            parent = of_job(parcel.job)
+            with tracing.span("webhook", kind="client", parent=parent, delivery_id=delivery.delivery_id) as made:
+                result = self._attempt(parcel, began_s)
+                tracing.note(made, event=delivery.event.value, attempt=delivery.attempts)
+                tracing.note(made, http__response__status_code=result.status)
+                if not result.is_success:
+                    tracing.failed(made, "not delivered")
         except Exception:
             LOG.exception("delivery %s met an unexpected fault", delivery.delivery_id, extra=facts)
             result = Result(duration_ms=_since_ms(began_s), error="an unexpected fault of the service; its log has it")
@@ -146,6 +154,9 @@ class Sender:
             "User-Agent": f"gablework/{__version__}",
             **signed_headers(parcel.secrets, delivery.delivery_id, int(parcel.sent_at.timestamp()), raw),
         }
+        here = tracing.current()
+        if here is not None:
+            headers["traceparent"] = here.traceparent
         try:
             status, retry_after = self._send(delivery.url, headers=headers, body=raw, settings=self._settings)
         except TargetRefusedError as error:

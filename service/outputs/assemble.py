@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.export.point_files import FOLDER as POINTS_FOLDER
+from pipeline.export.point_files import TILESET
 from service.outputs.catalogue import NAME as CATALOGUE_NAME
 from service.outputs.catalogue import Catalogue, StoredOutput
 from service.outputs.kinds import OUTPUTS, chosen
@@ -48,6 +50,12 @@ class RunTile:
     def table(self, name: str) -> str:
         """Its file of a table."""
         return f"{name}/tile={self.key}/part-0.parquet"
+
+    @property
+    def decisions(self) -> str | None:
+        """Its file of decisions; None in a run that recorded none."""
+        name = self.table("decisions")
+        return name if name in self.files else None
 
     @property
     def meshes(self) -> list[str]:
@@ -107,12 +115,32 @@ def write_outputs(
         # the run was requested without meshes
         names.discard("meshes")
         (out_dir / OUTPUTS["meshes"].filename).unlink(missing_ok=True)
+    if not ("tileset" in names and _write_tileset(run_dir, out_dir / OUTPUTS["tileset"].filename)):
+        # the request left out the points
+        names.discard("tileset")
+        (out_dir / OUTPUTS["tileset"].filename).unlink(missing_ok=True)
     stored = {}
     for kind in chosen(names):
         path = out_dir / kind.filename
         stored[kind.output_id] = StoredOutput(size_bytes=path.stat().st_size, sha256=sha256_of(path))
     catalogue = Catalogue(outputs=stored, crs=to_wgs84.crs, n_buildings=tally.buildings)
     storage.put(CATALOGUE_NAME, catalogue.to_json().encode())
+
+
+def _write_tileset(run_dir: Path, path: Path) -> bool:
+    """Write the root tileset of the points for its place among the results; False if there is none."""
+    root = run_dir / POINTS_FOLDER / TILESET
+    if not root.is_file():
+        return False
+    tileset = json.loads(root.read_bytes())
+    waiting = [tileset["root"]]
+    for node in waiting:
+        if "content" in node:
+            # from jobs/ID/results/tileset to jobs/ID/points
+            node["content"]["uri"] = f"../points/{node['content']['uri']}"
+        waiting.extend(node.get("children", ()))
+    path.write_text(json.dumps(tileset, separators=(",", ":"), ensure_ascii=False), encoding="utf-8")
+    return True
 
 
 def _manifest(run_dir: Path) -> Mapping[str, Any]:
@@ -226,6 +254,10 @@ class _Sinks:
         for plane in tables["planes"].drop_columns(["geometry", "bbox"]).to_pylist():
             planes.setdefault(plane.pop("building_id"), []).append(plane)
             self.tally.planes += 1
+        decisions: dict[str, list[dict[str, Any]]] = {}
+        if tile.decisions is not None:
+            for entry in read_tile(self._run_dir / tile.decisions).to_pylist():
+                decisions.setdefault(entry.pop("building_id"), []).append(entry)
         self.tally.count_rejected(tables["rejected"].column("reason").to_pylist())
         rows = [{**row, "tile": tile.key} for row in tables["buildings"].drop_columns(list(SHAPE_COLUMNS)).to_pylist()]
         for feature in feature_texts(rows, self._to_wgs84):
@@ -236,6 +268,7 @@ class _Sinks:
                 native=feature.native,
                 city=places[feature.building_id],
                 planes=planes.get(feature.building_id, ()),
+                decisions=decisions.get(feature.building_id, ()),
                 bounds=feature.bounds,
                 bounds_deg=feature.bounds_deg,
             )

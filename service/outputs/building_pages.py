@@ -64,7 +64,9 @@ class BuildingQuery:
     limit: int = 100
     """Maximum number of buildings of the page."""
     offset: int = 0
-    """Number of buildings before it, in the order of their ids."""
+    """Number of buildings before it."""
+    by_arrival: bool = False
+    """In the order in which they were modelled, so that a list that grows does so at its end; else by building_id."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
@@ -86,12 +88,14 @@ class BuildingPage:
     matched: int
     """Buildings that fit the request, on all pages."""
     parts: tuple[FeaturePart, ...]
-    """Those of this page, by building_id."""
+    """Those of this page, in the order of the query."""
     path: Path
     """The file of features."""
 
     def features(self) -> Iterator[bytes]:
         """The features as GeoJSON texts."""
+        if not self.parts:
+            return
         with self.path.open("rb") as stream:
             for part in self.parts:
                 stream.seek(part.start)
@@ -213,10 +217,11 @@ def building_page(out_dir: Path, query: BuildingQuery) -> BuildingPage:
         where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
         (matched,) = connection.execute(f"SELECT count(*) FROM {source}{where}", values).fetchone()  # noqa: S608
         native = "native" if query.native else "NULL"
+        order, by = ("key.place", "at") if query.by_arrival else ("key.building_id", "id")
         found = connection.execute(
             f"SELECT start, size, geometry_start, geometry_size, {native} FROM building JOIN"  # noqa: S608 - our own words
-            f" (SELECT key.building_id AS id, key.place AS at FROM {source}{where} ORDER BY 1 LIMIT ? OFFSET ?)"
-            " ON building.place = at ORDER BY id",
+            f" (SELECT key.building_id AS id, key.place AS at FROM {source}{where} ORDER BY {order}"
+            f" LIMIT ? OFFSET ?) ON building.place = at ORDER BY {by}",
             (*values, query.limit, query.offset),
         ).fetchall()
     parts = tuple(

@@ -88,6 +88,15 @@ class Catalogue:
         return NoSuchOutputError(f"the request left out {output_id}, or the job had nothing for it; it has: {there}")
 
 
+NOTHING_YET = Catalogue(
+    # any coordinates may be asked for: they are not known to be unknown
+    outputs={},
+    crs=ResultsCrs(name=None, uri=None, to_wgs84="", accuracy_m=None),
+    n_buildings=0,
+)
+"""The catalogue of a job that runs and shows no buildings yet."""
+
+
 def run_outputs(out_dir: Path, label: str) -> Path:
     """The folder of outputs of one run of a comparison, below those of the comparison."""
     return out_dir / "runs" / label

@@ -86,6 +86,15 @@ _OF_A_RUN = (
         schema=_binary(ZIP),
     ),
     OutputKind(
+        output_id="tileset",
+        title="Points as 3D Tiles",
+        description="The tileset over the points of the run, if the request asked for them: 3D Tiles 1.1 in the CRS of "
+        "the tiles. Each point has its class, its building, its roof plane and its vertical distance to the model.",
+        media_type="application/json",
+        filename="tileset.json",
+        schema={"type": "object", "contentMediaType": "application/json"},
+    ),
+    OutputKind(
         output_id="cityjson",
         title="Buildings as CityJSONSeq",
         description="CityJSON 2.0 as text lines: one line of metadata, then one feature per building with the record "

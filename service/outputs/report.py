@@ -107,6 +107,7 @@ def report(
         "tiles": {
             "planned": len(manifest["tiles"]) + len(set(failed_tiles) - set(manifest["tiles"])),
             "failed": [{"tile": tile, "reason": clean(why)} for tile, why in sorted(failed_tiles.items())],
+            "without_points": list(manifest.get("tiles_without_points", ())),
         },
         "counts": dict(manifest["counts"]),
         "warnings": [clean(warning) for warning in manifest["warnings"]],

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from pipeline.export.building_points import building_points
+from pipeline.export.point_files import FOLDER, TILESET
 from service.errors import NoSuchBuildingError, NoSuchOutputError
 from service.outputs.building_index import FEATURES_NAME
 from service.outputs.building_pages import GONE, opened_index
@@ -89,6 +91,29 @@ def stored_building(out_dir: Path, building_id: str, *, native: bool = False) ->
     )
 
 
+def building_decisions(out_dir: Path, building_id: str) -> list[dict[str, Any]]:
+    """What was checked and tried for one building, in this order; empty if its process ended before.
+
+    Raises
+    ------
+    NoSuchBuildingError
+        No building has this id.
+    NoSuchOutputError
+        The outputs are gone, or were made by a version that recorded no decisions.
+    """
+    with opened_index(out_dir) as connection:
+        (recorded,) = connection.execute("SELECT count(*) FROM sqlite_master WHERE name = 'decision'").fetchone()
+        if not recorded:
+            raise NoSuchOutputError("this job was made by a version that recorded no decisions: submit it again")
+        row = connection.execute(
+            "SELECT entries FROM key LEFT JOIN decision USING (place) WHERE building_id = ?", (building_id,)
+        ).fetchone()
+    if row is None:
+        raise NoSuchBuildingError(f"the results of this job hold no building {building_id[:80]!r}")
+    entries: list[dict[str, Any]] = [] if row[0] is None else json.loads(zlib.decompress(row[0]))
+    return entries
+
+
 def building_obj(run_dir: Path, building: StoredBuilding, lod: str | None = None) -> Iterator[str]:
     """The lines of a building's OBJ, also if one file holds a whole tile; in the record's level of detail or `lod`.
 
@@ -145,6 +170,33 @@ def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str, lod: str | 
     return path
 
 
+def points_of_building(run_dir: Path, building: StoredBuilding) -> bytes:
+    """The points from which a building was modelled, as a GLB file.
+
+    Raises
+    ------
+    NoSuchBuildingError
+        The job was requested without points, or their files are gone.
+    """
+    name, folder = building.building_id, run_dir / FOLDER
+    if not (folder / TILESET).is_file():
+        raise NoSuchBuildingError(f"the results hold no points, so none of building {name}: request points")
+    try:
+        found = building_points(lambda path: (folder / path).read_bytes(), building.tile, name)
+    except FileNotFoundError:
+        raise NoSuchBuildingError(
+            f"points of building {name} are missing in the results: submit the job again"
+        ) from None
+    if found is None:
+        raise NoSuchBuildingError(f"building {name} has no points")
+    return found
+
+
+def cityjson_path(run_dir: Path, tile: str) -> Path:
+    """The CityJSONSeq file of a tile."""
+    return run_dir / "cityjson" / f"tile={tile}" / "part-0.city.jsonl"
+
+
 def building_cityjson(run_dir: Path, building: StoredBuilding) -> dict[str, Any]:
     """A complete CityJSON document of one building: its objects, vertices, transform and extent.
 
@@ -153,7 +205,7 @@ def building_cityjson(run_dir: Path, building: StoredBuilding) -> dict[str, Any]
     NoSuchBuildingError
         Its file is gone.
     """
-    path = run_dir / "cityjson" / f"tile={building.tile}" / "part-0.city.jsonl"
+    path = cityjson_path(run_dir, building.tile)
     try:
         with path.open("rb") as stream:
             document: dict[str, Any] = json.loads(stream.readline())

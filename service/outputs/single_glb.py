@@ -6,12 +6,11 @@ used by two buildings.
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
 from typing import Any, BinaryIO
 
-_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+from pipeline.export.glb_container import container, read_document
+
 _INDEX_BYTES = 4
 
 
@@ -24,12 +23,9 @@ def cut_glb(path: Path, building_id: str) -> bytes | None:
         The tile's file is gone.
     """
     with path.open("rb") as stream:
-        stream.seek(_HEADER.size)
-        size, _ = _CHUNK.unpack(stream.read(_CHUNK.size))
-        document: dict[str, Any] = json.loads(stream.read(size))
-        stream.seek(_CHUNK.size, 1)
+        document, start = read_document(stream)
         node = next((node for node in document["nodes"] if node["name"] == building_id and "mesh" in node), None)
-        return None if node is None else _of_node(document, node, stream, stream.tell())
+        return None if node is None else _of_node(document, node, stream, start)
 
 
 def _of_node(document: dict[str, Any], node: dict[str, Any], stream: BinaryIO, start: int) -> bytes:
@@ -70,15 +66,4 @@ def _of_node(document: dict[str, Any], node: dict[str, Any], stream: BinaryIO, s
         "bufferViews": views,
         "buffers": [{"byteLength": size}],
     }
-    text = json.dumps(alone, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    binary = b"".join(piece for group in pieces for piece in group)  # all components have four bytes
-    return b"".join(
-        (
-            _HEADER.pack(b"glTF", 2, _HEADER.size + 2 * _CHUNK.size + len(text) + len(binary)),
-            _CHUNK.pack(len(text), b"JSON"),
-            text,
-            _CHUNK.pack(len(binary), b"BIN\0"),
-            binary,
-        )
-    )
+    return container(alone, (piece for group in pieces for piece in group))  # all components have four bytes

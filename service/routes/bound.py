@@ -11,7 +11,7 @@ from typing import Annotated
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
-from service.auth import Principal, authenticate
+from service.auth import Principal, authenticate, needs_table
 from service.errors import UnauthorizedError
 from service.files import StateFolder
 from service.keys import Scope
@@ -49,8 +49,7 @@ async def _limiter(request: Request) -> RateLimiter:
 
 
 async def _base_url(request: Request) -> str:
-    settings: ServiceSettings = request.app.state.settings
-    return (settings.public_url or str(request.base_url)).rstrip("/")
+    return base_url_of(request)
 
 
 Settings_ = Annotated[ServiceSettings, Depends(_settings)]
@@ -66,6 +65,12 @@ Base = Annotated[str, Depends(_base_url)]
 """The service's own URL without a final slash, for links."""
 
 
+def base_url_of(request: Request) -> str:
+    """The service's own URL without a final slash, for links."""
+    settings: ServiceSettings = request.app.state.settings
+    return (settings.public_url or str(request.base_url)).rstrip("/")
+
+
 def address_of(request: Request) -> str:
     """The client's address, for the limit of requests."""
     return "unknown" if request.client is None else request.client.host
@@ -76,15 +81,24 @@ async def visitor(request: Request, limiter: Annotated[RateLimiter, Depends(_lim
     limiter.check(address_of(request))
 
 
-def caller(
-    request: Request,
-    settings: Settings_,
-    store: Store,
-    limiter: Annotated[RateLimiter, Depends(_limiter)],
-    credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
-) -> Principal:
-    """The caller; the request counts against its key, or its address without a key."""
-    del credentials  # only for the OpenAPI document
+def is_remembered(request: Request) -> bool:
+    """Whether `principal_of` knows the caller without the database."""
+    return not needs_table(request.headers.get("authorization"), request.app.state.store)
+
+
+def principal_of(request: Request) -> Principal:
+    """The caller; the request counts against its key, or its address without a key. It may ask the database.
+
+    Raises
+    ------
+    UnauthorizedError
+        A key is needed, and none was sent or it is not valid.
+    TooManyRequestsError
+        The caller has used up its requests.
+    """
+    store: JobStore = request.app.state.store
+    settings: ServiceSettings = request.app.state.settings
+    limiter: RateLimiter = request.app.state.limiter
     try:
         principal = authenticate(request.headers.get("authorization"), store, settings)
     except UnauthorizedError:
@@ -93,6 +107,14 @@ def caller(
         raise
     limiter.check(principal.key_id or address_of(request))
     return principal
+
+
+def caller(
+    request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+) -> Principal:
+    """The caller; see `principal_of`."""
+    del credentials  # only for the OpenAPI document
+    return principal_of(request)
 
 
 Caller = Annotated[Principal, Depends(caller)]

@@ -1,4 +1,8 @@
-"""Buildings of a finished job: pages of GeoJSON, and each one as a record, a mesh or a city object."""
+"""Buildings of a job: pages of GeoJSON, and each one as a record, a mesh or a city object.
+
+They can be read while the job runs: then pages are in the order in which the buildings were modelled, and say that the
+list is not complete.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +17,12 @@ from fastapi.responses import StreamingResponse
 from pydantic import AfterValidator
 
 from pipeline.model import Reason, RoofType, Status
+from service.errors import NoSuchBuildingError, ResultNotReadyError
+from service.outputs.building_index import FEATURES_NAME
 from service.outputs.building_pages import (
     MAX_LIMIT,
     MAX_OFFSET,
+    BuildingPage,
     BuildingQuery,
     CoordinateChoice,
     building_page,
@@ -27,17 +34,19 @@ from service.outputs.kinds import CITYJSON, GEOJSON, GLB, OBJ
 from service.outputs.single_building import (
     StoredBuilding,
     building_cityjson,
+    building_decisions,
     building_glb,
     building_obj,
+    points_of_building,
     stored_building,
 )
-from service.routes.answers import JOB_ID, header, problems, reference
+from service.routes.answers import JOB_ID, document, header, problems, reference
 from service.routes.bound import Base
-from service.routes.finished_jobs import FinishedJob, FinishedRun
+from service.routes.finished_jobs import FinishedJob, FinishedRun, ReadableRun
 from service.routes.negotiation import preferred
 from service.routes.results import FAILED
-from service.wire.base import link
-from service.wire.buildings import CityJson, Feature, FeaturePage
+from service.wire.base import link, respond
+from service.wire.buildings import CityJson, Decision, Decisions, Feature, FeaturePage
 from service.wire.queries import words
 
 router = APIRouter(tags=["results"])
@@ -66,8 +75,32 @@ _PAGE_EXAMPLE = {
     "type": "FeatureCollection",
     "numberMatched": 154,
     "numberReturned": 1,
+    "complete": True,
     "links": [{"href": f"http://127.0.0.1:8000/jobs/{JOB_ID}/buildings?limit=1", "rel": "self", "type": GEOJSON}],
     "features": [_FEATURE_EXAMPLE],
+}
+_DECISIONS_EXAMPLE = {
+    "building_id": "3givd2mvtyerfjxv2yytjbmi",
+    "decisions": [
+        {"step": 0, "kind": "check", "name": "roof_points", "outcome": "met", "detail": "", "value": 412, "limit": 10},
+        {
+            "step": 1,
+            "kind": "form",
+            "name": "arrangement",
+            "outcome": "chosen",
+            "detail": "",
+            "n_faces": 2,
+            "n_planes": 2,
+            "levelled_share": 0.0,
+        },
+    ],
+    "links": [
+        {
+            "href": f"http://127.0.0.1:8000/jobs/{JOB_ID}/buildings/3givd2mvtyerfjxv2yytjbmi/decisions",
+            "rel": "self",
+            "type": "application/json",
+        }
+    ],
 }
 _CRS_HEADER = header("Content-Crs", "CRS of the coordinates; absent if it has no URI.")
 
@@ -81,6 +114,9 @@ _Coordinates = Annotated[
 ]
 
 
+_BuildingId = Annotated[
+    str, Path(alias="buildingID", description="As in the lists.", examples=["3givd2mvtyerfjxv2yytjbmi"])
+]
 _Statuses = Annotated[list[str] | None, AfterValidator(words(list(Status)))]
 _RoofTypes = Annotated[list[str] | None, AfterValidator(words(list(RoofType)))]
 _Reasons = Annotated[list[str] | None, AfterValidator(words(list(Reason)))]
@@ -112,7 +148,7 @@ class _Asked:
     limit: Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Maximum number of buildings of the page.")] = 100
     offset: Annotated[int, Query(ge=0, le=MAX_OFFSET, description="Number of buildings before the page.")] = 0
 
-    def query(self, known: ResultsCrs) -> BuildingQuery:
+    def query(self, known: ResultsCrs, *, by_arrival: bool) -> BuildingQuery:
         """The query, in the coordinates of the results."""
         bbox_native = checked_choice(self.bbox_crs, known, "bbox-crs")
         return BuildingQuery(
@@ -124,6 +160,7 @@ class _Asked:
             reasons=tuple(self.reason or ()),
             limit=self.limit,
             offset=self.offset,
+            by_arrival=by_arrival,
         )
 
     def again(self, label: str | None, start: int) -> str:
@@ -147,19 +184,24 @@ class _Asked:
     response_class=StreamingResponse,
     responses={
         200: {
-            "description": "A page of buildings, sorted by building_id. One without an outline has a null geometry.",
+            "description": "A page of buildings, sorted by building_id. One without an outline has a null geometry. "
+            "While the job runs, these are the buildings so far, in the order in which they were modelled: `complete` "
+            "is false.",
             "content": {GEOJSON: {"schema": reference(FeaturePage), "example": _PAGE_EXAMPLE}},
             "headers": _CRS_HEADER,
         },
         **problems(400, 404, 406, *FAILED),
     },
 )
-def buildings(request: Request, finished: FinishedRun, base: Base, asked: Annotated[_Asked, Depends()]) -> Response:
-    """List buildings by window, status, roof type and reason, in pages."""
+def buildings(request: Request, finished: ReadableRun, base: Base, asked: Annotated[_Asked, Depends()]) -> Response:
+    """List buildings by window, status, roof type and reason, in pages; also those that a running job has so far."""
     preferred(request.headers.get("accept"), [GEOJSON])
     known = finished.catalogue.crs
-    query = asked.query(known)
-    page = building_page(finished.out_dir, query)
+    query = asked.query(known, by_arrival=not finished.is_complete)
+    if finished.has_buildings_yet:
+        page = building_page(finished.out_dir, query)
+    else:
+        page = BuildingPage(matched=0, parts=(), path=finished.out_dir / FEATURES_NAME)
     collection = f"{base}/jobs/{finished.job.job_id}"
     limit, offset = asked.limit, asked.offset
 
@@ -172,8 +214,9 @@ def buildings(request: Request, finished: FinishedRun, base: Base, asked: Annota
         links.append(at(offset + limit, "next", "The next buildings"))
     if offset > 0:
         links.append(at(max(0, offset - limit), "prev", "The buildings before"))
-    members = {**_crs_members(known, native=query.native), "links": links}
-    return StreamingResponse(page.chunks(members), media_type=GEOJSON, headers=_headers(known, native=query.native))
+    members = {**_state(finished), **_crs_members(known, native=query.native), "links": links}
+    headers = _headers(finished, native=query.native)
+    return StreamingResponse(page.chunks(members), media_type=GEOJSON, headers=headers)
 
 
 @router.get(
@@ -196,11 +239,9 @@ def buildings(request: Request, finished: FinishedRun, base: Base, asked: Annota
 )
 def building(
     request: Request,
-    finished: FinishedRun,
+    finished: ReadableRun,
     base: Base,
-    building_id: Annotated[
-        str, Path(alias="buildingID", description="As in the lists.", examples=["3givd2mvtyerfjxv2yytjbmi"])
-    ],
+    building_id: _BuildingId,
     wanted: Annotated[
         Literal["json", "obj", "glb", "cityjson"] | None,
         Query(alias="f", description="Overrides the header Accept."),
@@ -215,10 +256,9 @@ def building(
     media_type = (
         preferred(request.headers.get("accept"), list(_FORMATS.values())) if wanted is None else _FORMATS[wanted]
     )
-    known = finished.catalogue.crs
-    native = checked_choice(crs, known, "crs")
-    found = stored_building(finished.out_dir, building_id, native=native)
-    headers = _headers(known, native=native or media_type != GEOJSON)
+    native = checked_choice(crs, finished.catalogue.crs, "crs")
+    found = _found(finished, building_id, media_type, native=native)
+    headers = _headers(finished, native=native or media_type != GEOJSON)
     if media_type == OBJ:
         lines = building_obj(finished.run_dir, found, lod)
         content = "".join(f"{line}\n" for line in lines).encode()
@@ -235,6 +275,84 @@ def building(
     return Response(content, media_type=media_type, headers=headers)
 
 
+@router.get(
+    "/jobs/{jobID}/buildings/{buildingID}/points",
+    summary="Points of one building",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "The points from which the building was modelled, each with class, roof plane and vertical "
+            "distance to the model, in the form of the nodes of the points' octree.",
+            "content": {GLB: {"schema": {"type": "string", "format": "binary"}}},
+        },
+        **problems(400, 404, 406, *FAILED),
+    },
+)
+def points(
+    request: Request,
+    finished: FinishedRun,
+    building_id: _BuildingId,
+) -> Response:
+    """The points of one building as GLB, if the job was requested with points."""
+    preferred(request.headers.get("accept"), [GLB])
+    found = stored_building(finished.out_dir, building_id)
+    content = points_of_building(finished.run_dir, found)
+    headers = {
+        "Cache-Control": "private, no-cache",
+        "Vary": "Accept",
+        "Content-Disposition": f'inline; filename="{found.building_id}-points.glb"',
+    }
+    return Response(content, media_type=GLB, headers=headers)
+
+
+@router.get(
+    "/jobs/{jobID}/buildings/{buildingID}/decisions",
+    summary="What was tried for one building",
+    response_class=Response,
+    responses={
+        200: document(Decisions, "The checks, forms and levels of detail, in their order.", _DECISIONS_EXAMPLE),
+        **problems(400, 404, *FAILED),
+    },
+)
+def decisions(finished: FinishedRun, base: Base, building_id: _BuildingId) -> Response:
+    """The figures that decided on a building's model, each with its limit, and the forms that were tried."""
+    entries = building_decisions(finished.out_dir, building_id)
+    place = f"{base}/jobs/{finished.job.job_id}/buildings/{building_id}"
+    answer = Decisions(
+        building_id=building_id,
+        decisions=[Decision(**entry) for entry in entries],
+        links=[
+            link(finished.address(f"{place}/decisions"), "self", "These decisions"),
+            link(finished.address(place), "up", "The building", GEOJSON),
+        ],
+    )
+    return respond(answer, headers={"Cache-Control": "private, no-cache"})
+
+
+def _found(finished: FinishedJob, building_id: str, media_type: str, *, native: bool) -> StoredBuilding:
+    """The building of a job.
+
+    Raises
+    ------
+    NoSuchBuildingError
+        No building of the job has this id.
+    ResultNotReadyError
+        The job runs, and has not modelled the building or not written its mesh yet.
+    """
+    later = f"while job {finished.job.job_id} runs ({finished.job.progress} %)"
+    if not finished.is_complete and media_type in {OBJ, GLB}:
+        raise ResultNotReadyError(f"there are no meshes {later}: use f=cityjson, or ask again when it is over")
+    try:
+        if finished.has_buildings_yet:
+            return stored_building(finished.out_dir, building_id, native=native)
+        raise NoSuchBuildingError(building_id)  # noqa: TRY301
+    except NoSuchBuildingError:
+        if finished.is_complete:
+            raise
+        problem = f"there is no building {building_id[:80]!r} {later}: it may come, ask again later"
+        raise ResultNotReadyError(problem) from None
+
+
 def _feature(found: StoredBuilding, finished: FinishedJob, base: str, *, native: bool) -> dict[str, Any]:
     """The building's feature with its planes and links."""
     collection = f"{base}/jobs/{finished.job.job_id}"
@@ -243,6 +361,7 @@ def _feature(found: StoredBuilding, finished: FinishedJob, base: str, *, native:
         link(finished.address(place), "self", "This building", GEOJSON),
         link(finished.address(f"{collection}/buildings"), "collection", "The buildings", GEOJSON),
         link(finished.address(place, f="cityjson"), "alternate", "As CityJSON", CITYJSON),
+        link(finished.address(f"{place}/decisions"), "related", "What was checked and tried"),
     ]
     if found.mesh_path is not None:
         kind = found.mesh_path.rpartition(".")[2]
@@ -260,10 +379,18 @@ def _crs_members(crs: ResultsCrs, *, native: bool) -> dict[str, Any]:
     return {"coordRefSys": crs.uri or crs.name} if native else {}
 
 
-def _headers(crs: ResultsCrs, *, native: bool) -> dict[str, str]:
-    uri = crs.uri if native else _CRS84
+def _state(finished: FinishedJob) -> dict[str, Any]:
+    """Whether the list is complete; if not, how far the job is."""
+    if finished.is_complete:
+        return {"complete": True}
+    return {"complete": False, "progress": finished.job.progress, "attempt": finished.job.attempt}
+
+
+def _headers(finished: FinishedJob, *, native: bool) -> dict[str, str]:
+    uri = finished.catalogue.crs.uri if native else _CRS84
     return {
-        "Cache-Control": "private, no-cache",
+        # the next answer of a running job is another one
+        "Cache-Control": "private, no-cache" if finished.is_complete else "no-store",
         "Vary": "Accept",
         **({} if uri is None else {"Content-Crs": f"<{uri}>"}),
     }

@@ -1,26 +1,37 @@
-"""Jobs with results: where the results are, or why there are none; for a comparison also those of one run."""
+"""Jobs with results: where the results are, or why there are none; for a comparison also those of one run.
+
+A job that still runs has no results, but its buildings can be read as they are modelled.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import datetime as dt
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import urlencode
 
 from fastapi import Depends, Query
 
-from service.errors import NoSuchOutputError, RequestError, ResultNotReadyError
+from service.errors import NoSuchOutputError, RequestError, ResultNotReadyError, StoreError
+from service.files import StateFolder
 from service.jobs import Job, JobStatus
 from service.outputs import Catalogue, read_catalogue, run_outputs
+from service.outputs.catalogue import NOTHING_YET
 from service.outputs.comparison import RUNS
 from service.problems import JobFailedError
 from service.routes.bound import Folder, Reader, Store
 from service.routes.jobs import JobId
+from service.store import JobStore
+
+_WATCHED_AGAIN_S = 10.0
+"""Seconds after which it is noted again that a client reads the buildings of a running job."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FinishedJob:
-    """A job that was successful."""
+    """A job that was successful, or the buildings of one that still runs."""
 
     job: Job
     """As stored."""
@@ -32,6 +43,13 @@ class FinishedJob:
     """The list of the outputs."""
     label: str | None = None
     """The requested run of a comparison; None for the whole comparison, and for other jobs."""
+    is_complete: bool = True
+    """Whether the job is over; if not, there are only the buildings that it has modelled so far."""
+
+    @property
+    def has_buildings_yet(self) -> bool:
+        """Whether there is an index of buildings."""
+        return self.catalogue is not NOTHING_YET
 
     def run(self, label: str) -> FinishedJob:
         """One run of a comparison, as if it were a job of its own."""
@@ -52,7 +70,10 @@ class FinishedJob:
 
 def _finished(job_id: JobId, store: Store, folder: Folder, caller: Reader) -> FinishedJob:
     """The job with its results; refused if it is not successful or its files are gone."""
-    job = store.get(job_id, owner=caller.owner)
+    return _results_of(store.get(job_id, owner=caller.owner), folder)
+
+
+def _results_of(job: Job, folder: StateFolder) -> FinishedJob:
     if job.status is JobStatus.FAILED and job.failure is not None:
         raise JobFailedError(job.failure)
     if job.status is JobStatus.DISMISSED:
@@ -84,8 +105,35 @@ def _results(finished: _Finished, label: _Label = None) -> FinishedJob:
     return finished if label is None else finished.run(label)
 
 
-def _buildings(finished: _Finished, label: _Label = None) -> FinishedJob:
+def _so_far(job: Job, store: JobStore, folder: StateFolder) -> FinishedJob:
+    """The buildings of a job that runs; its driver shows them while clients read."""
+    watched_at, now = job.watched_at, dt.datetime.now(dt.UTC)
+    if watched_at is None or abs((now - watched_at).total_seconds()) > _WATCHED_AGAIN_S:
+        # a database that cannot be written now must not prevent reading
+        with contextlib.suppress(StoreError):
+            store.watch(job.job_id)
+    place = folder.so_far(job.job_id, job.attempt)
+    try:
+        catalogue = read_catalogue(place)
+    except NoSuchOutputError:
+        catalogue = NOTHING_YET
+    return FinishedJob(job=job, out_dir=place, run_dir=place, catalogue=catalogue, is_complete=False)
+
+
+def _buildings(job_id: JobId, store: Store, folder: Folder, caller: Reader, label: _Label = None) -> FinishedJob:
     """The run of the buildings: by default the first one of a comparison."""
+    job = store.get(job_id, owner=caller.owner)
+    if job.status is JobStatus.RUNNING and job.request.process_id == "reconstruct":
+        return _run_of(_so_far(job, store, folder), label)
+    return _run_of(_results_of(job, folder), label)
+
+
+def _run(finished: _Finished, label: _Label = None) -> FinishedJob:
+    """The same of a job that is over."""
+    return _run_of(finished, label)
+
+
+def _run_of(finished: FinishedJob, label: str | None) -> FinishedJob:
     if not finished.job.request.has_buildings:
         process_id = finished.job.request.process_id
         raise NoSuchOutputError(f"a job of the process {process_id} has no buildings: see /jobs/{{jobID}}/results")
@@ -97,5 +145,8 @@ def _buildings(finished: _Finished, label: _Label = None) -> FinishedJob:
 Finished = Annotated[FinishedJob, Depends(_results)]
 """The job of the path with its results; of a comparison those of one run, if it is named."""
 
-FinishedRun = Annotated[FinishedJob, Depends(_buildings)]
+FinishedRun = Annotated[FinishedJob, Depends(_run)]
 """The job of the path with the results of one run."""
+
+ReadableRun = Annotated[FinishedJob, Depends(_buildings)]
+"""The job of the path with the buildings of one run, also of a job that has not modelled all of them yet."""

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import Response
 from prometheus_client import CONTENT_TYPE_LATEST
 
-from service.errors import StoreError
+from service.errors import StoreError, StoreNewerError
 from service.files import StateFolder
 from service.metrics import Metrics
 from service.routes.answers import document
@@ -81,6 +81,8 @@ def _disk(folder: StateFolder) -> str:
 def _database(store: JobStore) -> str:
     try:
         store.check()
+    except StoreNewerError:
+        return "is of a newer version, to which this process must be updated"
     except StoreError:
         return "does not answer, or is not migrated"
     return "ok"

@@ -21,6 +21,7 @@ from service.processes import process_named
 from service.routes.answers import JOB_ID, JOB_MADE, STATUS_EXAMPLE, document, problems, reference
 from service.routes.bound import Base, Folder, Reader, Store, Submitter
 from service.routes.html import PageRoute, in_either_form
+from service.routes.polling import StatusRoute, job_status
 from service.routes.submission import Submission, Submitting
 from service.routes.writing import Write
 from service.status import execute_request, job_made, status_info
@@ -137,7 +138,7 @@ def _words(text: str) -> list[str]:
 
 def _value(name: str, text: str, faults: list[str]) -> Any:
     """A field's value: settings, subscriber, numbers and permissions (true, false) are JSON, anything else is text."""
-    if name not in {"settings", "subscriber", "bbox", "priority", "allowOutsideAreaOfUse"}:
+    if name not in {"settings", "subscriber", "bbox", "priority", "allowOutsideAreaOfUse", "points"}:
         return text.strip()
     if name == "bbox" and not text.strip().startswith(("[", "{")):
         text = f"[{text}]"
@@ -156,7 +157,7 @@ def _value(name: str, text: str, faults: list[str]) -> Any:
     summary="List jobs",
     dependencies=[in_either_form],
     responses={
-        200: document(JobList, "The jobs, newest first.", {"jobs": [STATUS_EXAMPLE], "links": []}),
+        200: document(JobList, "The jobs, newest first.", {"jobs": [STATUS_EXAMPLE], "numberMatched": 1, "links": []}),
         **problems(400),
     },
 )
@@ -164,12 +165,14 @@ def jobs(base: Base, store: Store, caller: Reader, query: Annotated[JobQuery, Qu
     """List the jobs that this key may see."""
     created_from, created_to = interval(query.datetime)
     found: list[Job] = []
+    matched = 0
     if not query.type or "process" in query.type:
         criteria = JobFilter(
             owner=caller.owner,
             statuses=[JobStatus(word) for word in query.status or ()],
             process_ids=query.processID or [],
             schedule_id=query.scheduleID,
+            words=(query.q or "").split(),
             created_from=created_from,
             created_to=created_to,
             min_duration_s=query.minDuration,
@@ -178,28 +181,33 @@ def jobs(base: Base, store: Store, caller: Reader, query: Annotated[JobQuery, Qu
             offset=query.offset,
         )
         found = store.list(criteria)
+        matched = store.matching(criteria)
     given = [
         *((name, word) for name in ("type", "processID", "status") for word in getattr(query, name) or ()),
-        *((name, getattr(query, name)) for name in ("scheduleID", "datetime", "minDuration", "maxDuration")),
+        *((name, getattr(query, name)) for name in ("scheduleID", "q", "datetime", "minDuration", "maxDuration")),
     ]
     links = page_links(f"{base}/jobs", given, len(found), query.limit, query.offset)
     listed = [status_info(job, base, with_request=False) for job in found[: query.limit]]
-    return respond(JobList(jobs=listed, links=links))
+    return respond(JobList(jobs=listed, numberMatched=matched, links=links))
 
 
 # --- one job ---------------------------------------------------------------------------------------------------------
 
 
-@router.get(
+def job(job_id: JobId, base: Base, store: Store, caller: Reader) -> Response:
+    """Status and progress of a job."""
+    return job_status(store.get(job_id, owner=caller.owner), base)
+
+
+router.add_api_route(
     "/jobs/{jobID}",
+    job,
+    methods=["GET"],
     summary="Status of a job",
     dependencies=[in_either_form],
     responses={200: document(StatusInfo, "Its status.", STATUS_EXAMPLE), **problems(404)},
+    route_class_override=StatusRoute,
 )
-def job(job_id: JobId, base: Base, store: Store, caller: Reader) -> Response:
-    """Status and progress of a job."""
-    found = store.get(job_id, owner=caller.owner)
-    return respond(status_info(found, base), headers={"Cache-Control": "no-store"})
 
 
 @router.post(

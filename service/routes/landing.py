@@ -11,8 +11,9 @@ from fastapi import APIRouter, Depends, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse
 
 from service.routes.answers import document, problems
-from service.routes.bound import Base, visitor
+from service.routes.bound import Base, Settings_, visitor
 from service.routes.html import Format, PageRoute, in_either_form, wants_html
+from service.settings import ServiceSettings
 from service.wire.base import RELATIONS, link, respond
 from service.wire.landing import Conformance, LandingPage
 
@@ -44,9 +45,9 @@ _JSON_OR_PAGE["content"]["text/html"] = {"schema": {"type": "string"}}
     summary="Landing page",
     responses={200: _JSON_OR_PAGE, **problems(400, 406)},
 )
-def landing(request: Request, base: Base, wanted: Format = None) -> Response:
+def landing(request: Request, base: Base, settings: Settings_, wanted: Format = None) -> Response:
     """Links to everything: JSON for machines, the web page for browsers."""
-    return web_page() if wants_html(request, wanted) else _for_machines(base)
+    return web_page(settings) if wants_html(request, wanted) else _for_machines(base)
 
 
 def _for_machines(base: str) -> Response:
@@ -68,13 +69,19 @@ def _for_machines(base: str) -> Response:
     return respond(page, headers={"Vary": "Accept"})
 
 
-def web_page() -> Response:
+def web_page(settings: ServiceSettings) -> Response:
     """The web page, or one that says how to build it."""
     page = VIEWER / "index.html"
     headers = {"Vary": "Accept", "Cache-Control": "no-cache"}
-    if page.is_file():
+    if not page.is_file():
+        return HTMLResponse(UNBUILT, headers=headers)
+    if settings.map_tiles is None:
         return FileResponse(page, media_type="text/html", headers=headers)
-    return HTMLResponse(UNBUILT, headers=headers)
+    # the page reads there what lies beneath its map
+    given = {"map-tiles": settings.map_tiles, "map-credit": settings.map_credit, "map-max-zoom": settings.map_max_zoom}
+    entries = "".join(f'<meta name="{name}" content="{escape(str(value))}">' for name, value in given.items())
+    text = page.read_text(encoding="utf-8").replace("</head>", f"{entries}</head>", 1)
+    return HTMLResponse(text, headers=headers)
 
 
 UNBUILT = """<!doctype html>

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path as FilePath
 from typing import Annotated, Any
 
@@ -91,18 +92,22 @@ def results(
     return respond(found, headers=headers)
 
 
-def _file_answers() -> dict[int | str, dict[str, Any]]:
-    """Answers of the path of a file: one media type per output."""
-    content: dict[str, dict[str, Any]] = {}
-    for kind in KINDS.values():
-        value = {"type": "object"} if kind.schema["type"] == "object" else {"type": "string", "format": "binary"}
-        content[kind.media_type] = {"schema": value}
-    headers = {
-        **header("ETag", "The sha256."),
-        **header("Accept-Ranges", "Ranges of bytes are served."),
-        **header("Content-Disposition", "A name to save it under."),
-    }
-    part = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+def file_answers(documents: Mapping[str, bool], **described: str) -> dict[int | str, dict[str, Any]]:
+    """Answers of the path of a file.
+
+    Parameters
+    ----------
+    documents : mapping
+        By its media types, whether a file of that type is a JSON object.
+    described : str
+        Descriptions of its headers, with _ in place of -.
+    """
+    binary = {"schema": {"type": "string", "format": "binary"}}
+    content = {kind: {"schema": {"type": "object"}} if is_object else binary for kind, is_object in documents.items()}
+    headers = header("Accept-Ranges", "Ranges of bytes are served.")
+    for name, description in described.items():
+        headers |= header(name.replace("_", "-"), description)
+    part = {"application/octet-stream": binary}
     return {
         200: {"description": "The file.", "content": content, "headers": headers},
         206: {"description": "The requested range of bytes.", "content": {**content, **part}},
@@ -115,7 +120,11 @@ def _file_answers() -> dict[int | str, dict[str, Any]]:
     "/jobs/{jobID}/results/{outputID}",
     summary="One output as a file",
     response_class=Response,
-    responses=_file_answers(),
+    responses=file_answers(
+        {kind.media_type: kind.schema["type"] == "object" for kind in KINDS.values()},
+        ETag="The sha256.",
+        Content_Disposition="A name to save it under.",
+    ),
 )
 def result(
     request: Request,
@@ -133,16 +142,23 @@ def result(
     is_page = kind.media_type == HTML
     if is_page:
         headers["Content-Security-Policy"] = SANDBOX
-    if _is_known(request.headers.get("if-none-match", ""), etag):
-        return Response(status_code=304, headers=headers)
-    _check_range(request, stored.size_bytes)
-    return FileResponse(
+    return sent_file(
+        request,
         path,
+        stored.size_bytes,
         media_type=kind.media_type,
         headers=headers,
         filename=_saved_name(finished.job.job_id, finished.label, path),
         content_disposition_type="inline" if is_page else "attachment",
     )
+
+
+def sent_file(request: Request, path: FilePath, size: int, *, headers: Mapping[str, str], **options: Any) -> Response:
+    """A file of so many bytes, or a range of it, unless the client has it; `headers` hold its ETag."""
+    if is_known(request.headers.get("if-none-match", ""), headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    _check_range(request, size)
+    return FileResponse(path, headers=headers, **options)
 
 
 def _saved_name(job_id: str, label: str | None, path: FilePath) -> str:
@@ -156,10 +172,10 @@ def _saved_name(job_id: str, label: str | None, path: FilePath) -> str:
     return "-".join(part for part in ("gablework", job_id[:8], label, path.name) if part is not None)
 
 
-def _is_known(if_none_match: str, etag: str) -> bool:
+def is_known(if_none_match: str, etag: str) -> bool:
     """Whether a client already has the file.
 
-    >>> _is_known('W/"a", "b"', '"b"'), _is_known("*", '"b"'), _is_known("", '"b"')
+    >>> is_known('W/"a", "b"', '"b"'), is_known("*", '"b"'), is_known("", '"b"')
     (True, True, False)
     """
     tags = [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]

@@ -146,6 +146,9 @@ async def begin(
 
     When all bytes have arrived, the upload is an ordinary one with the same id: `/uploads/{uploadID}`.
     """
+    concatenation = request.headers.get("upload-concat")
+    if concatenation is not None:
+        raise RequestError([f"Upload-Concat is {concatenation[:40]!r}: send the file as one upload"])
     known = _metadata(upload_metadata)
     has_body = request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
     owner = submitting.caller.owner

@@ -5,11 +5,10 @@ from __future__ import annotations
 import base64
 import binascii
 import re
-from http import HTTPStatus
 from typing import Annotated, Any
 from urllib.parse import unquote
 
-from fastapi import APIRouter, Depends, Header, HTTPException, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from python_multipart.multipart import parse_options_header
 from starlette.concurrency import run_in_threadpool
 
@@ -36,7 +35,7 @@ FILE_FIELD = "file"
 MAX_PARTS = 20
 FORM_SLACK_BYTES = 65_536
 """Bytes that a form may have in addition to the file."""
-DIGEST = re.compile(r"(?:^|,)\s*sha-256\s*=\s*:([A-Za-z0-9+/=]*):", re.IGNORECASE)
+DIGEST = re.compile(r"(?:^|,)\s*sha-256\s*=\s*:?([^:,]*):?", re.IGNORECASE)
 
 EXAMPLE: dict[str, Any] = {
     "uploadID": UPLOAD_ID,
@@ -152,11 +151,6 @@ async def send(
     The answer has the content of the file's header. `usable: false` comes with `problems` that a job can still fix,
     such as a missing projected CRS.
     """
-    encoding = request.headers.get("content-encoding", "identity").strip().lower()
-    if encoding != "identity":
-        raise HTTPException(
-            HTTPStatus.UNSUPPORTED_MEDIA_TYPE, f"Content-Encoding is {encoding[:40]!r}: send the file as it is"
-        )
     slack_bytes = FORM_SLACK_BYTES if is_form(request) else 0
     _check_length(request, submitting.settings, slack_bytes=slack_bytes)
     async with submitting as submission:

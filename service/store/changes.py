@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
+from service import traces
 from service.errors import LeaseLostError
 from service.files import is_id
-from service.jobs import Job, JobEvent, JobStatus
+from service.jobs import Job, JobEvent, JobStatus, LogLevel, NewLogLine
+from service.store import logs
+from service.store.database import after_commit
 from service.store.outbox import announce
 from service.store.policies import duration_ms
 from service.store.records import job_of, storable
@@ -69,13 +73,14 @@ def _row(connection: Connection, job_id: str, *, locked: bool) -> sa.Row[Any] | 
 def move(
     connection: Connection, row: sa.Row[Any], status: JobStatus, *, now: dt.datetime, message: str, **values: Any
 ) -> None:
-    """Change the status of a locked job, with an event and its webhooks."""
+    """Change the status of a locked job, with an event and its webhooks; the end of a job makes its span."""
     message = storable(message)
     ends: dict[str, Any] = {}
     if status is not JobStatus.RUNNING:
         ends = {"lease_owner": None, "lease_until": None}
     if status.is_over:
         ends |= {"finished_at": now, "duration_ms": duration_ms(job_of(row), now), "dismiss_requested": False}
+        after_commit(connection, partial(traces.job_ended, job_of(row), status))
     progress = values.get("progress", row.progress)
     changed = {"status": status.value, "message": message, "updated_at": now, "last_event": row.last_event + 1}
     connection.execute(sa.update(JOBS).where(JOBS.c.job_id == row.job_id).values(**changed, **ends, **values))
@@ -93,7 +98,17 @@ def move(
             message=message,
         )
     )
+    line = NewLogLine(level=_level(row, status), message=f"{status.value}: {message}", stage="")
+    logs.append(connection, row, [line], now, attempt=values.get("attempt", row.attempt))
     announce(connection, row, EVENT_OF[status], now)
+
+
+def _level(row: sa.Row[Any], status: JobStatus) -> LogLevel:
+    """How serious a change of status is: a job that goes back to the queue met something."""
+    if status is JobStatus.FAILED:
+        return LogLevel.ERROR
+    is_back = status is JobStatus.ACCEPTED and row.status == JobStatus.RUNNING.value
+    return LogLevel.WARNING if is_back else LogLevel.INFO
 
 
 def append(connection: Connection, row: sa.Row[Any], events: Sequence[JobEvent], now: dt.datetime) -> None:

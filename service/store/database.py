@@ -7,9 +7,9 @@ import datetime as dt
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import sqlalchemy as sa
 from sqlalchemy import event, exc
@@ -17,19 +17,23 @@ from sqlalchemy.engine import URL, Connection, Engine
 
 from service import migrations
 from service.disk import Ballast, Disk
-from service.errors import StartUpError, StoreBusyError, StoreError, StoreFullError
+from service.errors import StartUpError, StoreBusyError, StoreError, StoreFullError, StoreNewerError
 from service.files import keep_private, make_private_file
 from service.store.patience import CURRENT
 
 _EPOCH = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
 _EPOCH_JULIAN = 2440587.5
 _WRITES = "gablework_writes"
+_AFTER = "gablework_after"
 _POOL_SIZE = 10
 WAIT_S = 30.0
 """Seconds that a transaction waits for locks, and for a connection, if its store is given no other number."""
 _ANSWER_S = 10.0
 """Seconds for PostgreSQL's answer to a statement that waits for no lock; the socket gets five more."""
 _RETRY_S = 0.01
+_LOOK_S = 1.0
+"""Seconds for which readers trust that no newer version has migrated the database; a transaction that writes looks."""
+_REVISION = sa.text("SELECT version_num FROM alembic_version")
 _LOCK_MIGRATIONS = 0x6761626C01
 LOCK_SUBMISSIONS = 0x6761626C02
 LOCK_SECRETS = 0x6761626C03
@@ -68,6 +72,8 @@ class Database:
         self.is_sqlite = self._url.get_backend_name() == "sqlite"
         make = _sqlite_engine if self.is_sqlite else _postgresql_engine
         self.engine = make(self._url, wait_s)
+        self._is_migrated = False
+        self._looked_s = 0.0
         # SQLite's own wait is a sleep of growing length; threads of one process queue here in order
         self._one_writer = threading.Lock() if self.is_sqlite else None
 
@@ -77,6 +83,19 @@ class Database:
         if self.is_sqlite:
             return f"the SQLite database {Path(self._url.database or '').name}"
         return f"the PostgreSQL database {self._url.database or ''} at {self._url.host or 'a local socket'}"
+
+    @property
+    def path(self) -> Path | None:
+        """The file of a SQLite database; None for another."""
+        return Path(self._url.database or "").absolute() if self.is_sqlite else None
+
+    @contextlib.contextmanager
+    def closing(self) -> Iterator[Self]:
+        """Close the connections at the end."""
+        try:
+            yield self
+        finally:
+            self.engine.dispose()
 
     @property
     def folder(self) -> Path:
@@ -108,7 +127,29 @@ class Database:
             The database does not answer.
         """
         with self._faults_in_our_words(), self.engine.begin() as connection:
+            if time.monotonic() - self._looked_s > _LOOK_S:
+                self._check_not_migrated_since(connection)
             yield connection
+
+    @contextlib.contextmanager
+    def read_steadily(self) -> Iterator[Connection]:
+        """A long transaction that only reads and sees the database as it is at its beginning.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer.
+        """
+        with self._faults_in_our_words(), self.engine.connect() as connection:
+            if self.is_sqlite:
+                # its readers see one state anyway
+                with connection.begin():
+                    yield connection
+                return
+            with connection.execution_options(isolation_level="REPEATABLE READ").begin():
+                connection.exec_driver_sql("SET LOCAL statement_timeout = 0")
+                connection.exec_driver_sql("SET LOCAL idle_in_transaction_session_timeout = 0")
+                yield connection
 
     @contextlib.contextmanager
     def write(self, *, wait_s: float | None = None) -> Iterator[Connection]:
@@ -132,15 +173,19 @@ class Database:
         if wait_s is None:
             wait_s = self._wait_s if patience is None else patience.left_s()
         until_s = time.monotonic() + wait_s
+        after: list[Callable[[], None]] = []
         with self._faults_in_our_words(), self._alone(wait_s), self.engine.connect() as connection:
             left_ms = max(1, round(1e3 * (until_s - time.monotonic())))
-            connection.execution_options(**{_WRITES: left_ms})
+            connection.execution_options(**{_WRITES: left_ms, _AFTER: after})
             with connection.begin():
                 if not self.is_sqlite:
                     _limit(connection, left_ms)
+                self._check_not_migrated_since(connection)
                 yield connection
                 if patience is not None:
                     patience.commit()
+        for action in after:
+            action()
 
     @contextlib.contextmanager
     def _alone(self, wait_s: float) -> Iterator[None]:
@@ -179,9 +224,12 @@ class Database:
             self._check_not_newer(found)
             if found != migrations.head():
                 migrations.upgrade(connection)
+        self._is_migrated = True
 
-    def check(self) -> None:
+    def check(self, *, any_known: bool = False) -> None:
         """Check that the database answers and has the tables of this version.
+
+        With `any_known` the tables of an earlier version are accepted, too.
 
         Raises
         ------
@@ -193,7 +241,7 @@ class Database:
         with self.read() as connection:
             found = migrations.current(connection)
         self._check_not_newer(found)
-        if found != migrations.head():
+        if found != migrations.head() and not (any_known and found is not None):
             raise StoreError(
                 f"{self.public_name} has the tables of revision {found or 'none'}, this version needs "
                 f"{migrations.head()}: start the service or a driver once, they migrate it"
@@ -215,10 +263,25 @@ class Database:
         now: dt.datetime = connection.execute(sa.select(sa.func.clock_timestamp())).scalar_one()
         return now.astimezone(dt.UTC)
 
+    def _check_not_migrated_since(self, connection: Connection) -> None:
+        """Refuse a database that a newer version migrated while this process ran: this one may misread it.
+
+        Raises
+        ------
+        StoreNewerError
+            It did.
+        """
+        if self._is_migrated:
+            found = connection.execute(_REVISION).scalar()
+            if found != migrations.head():
+                self._check_not_newer(found)
+            self._looked_s = time.monotonic()
+
     def _check_not_newer(self, found: str | None) -> None:
         if found is not None and found not in migrations.known():
-            raise StoreError(
-                f"{self.public_name} is of a newer version of gablework (revision {found}): update this one"
+            raise StoreNewerError(
+                f"{self.public_name} is of a newer version of gablework (revision {found}, this version knows "
+                f"{migrations.head()}): update this one, or restore a backup that was made before the update"
             )
 
     @contextlib.contextmanager
@@ -250,6 +313,11 @@ class Database:
         if passes or isinstance(error, exc.OperationalError | exc.InterfaceError):
             return StoreError(f"{self.public_name} does not answer: {cause}")
         return None
+
+
+def after_commit(connection: Connection, action: Callable[[], None]) -> None:
+    """Call something once the transaction of `Database.write` is committed; not if it is rolled back."""
+    connection.get_execution_options()[_AFTER].append(action)
 
 
 def _parsed(url: str) -> URL:

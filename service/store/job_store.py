@@ -4,18 +4,32 @@ from __future__ import annotations
 
 import builtins
 import datetime as dt
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Self
 
 from service.deliveries import Claim, Delivery, StoredAnswer
-from service.jobs import Job, JobEvent, JobFailure, JobRequest, JobStatus, Upload
+from service.jobs import Job, JobEvent, JobFailure, JobRequest, JobStatus, LogLevel, LogLine, NewLogLine, Upload, Wishes
 from service.keys import Key
-from service.store import changes, claims, idempotency, keys, queries, submissions, uploads, webhook_deliveries
+from service.store import (
+    changes,
+    claims,
+    copies,
+    idempotency,
+    keys,
+    logs,
+    queries,
+    submissions,
+    uploads,
+    webhook_deliveries,
+)
 from service.store.database import LOCK_SUBMISSIONS, WAIT_S, Database
 from service.store.delivering import creating
 from service.store.queries import JobFilter
 from service.store.schedule_store import ScheduleStore
 from service.store.webhook_store import WebhookStore
+
+_WATCH_WAIT_S = 0.2
 
 
 class JobStore:
@@ -77,6 +91,41 @@ class JobStore:
             It does not answer, or has other tables.
         """
         self._database.check()
+
+    def copy_to(self, path: Path) -> None:
+        """Copy the database into a new SQLite file, as it is at one moment; others may write meanwhile.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer, or has other tables.
+        """
+        copies.copy_database(self._database, path)
+
+    def load(self, path: Path) -> None:
+        """Copy all rows of a SQLite file, which has this version's tables, into this database; its tables are empty.
+
+        Raises
+        ------
+        StoreError
+            A database does not answer; nothing is copied then.
+        """
+        copies.load_database(path, self._database)
+
+    @property
+    def path(self) -> Path | None:
+        """The file of a SQLite database; None for another."""
+        return self._database.path
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no table has a row."""
+        return copies.is_empty(self._database)
+
+    def free_running(self, made_at: dt.datetime) -> int:
+        """Give all running jobs of a copy back to the queue, without counting the attempt; returns their number."""
+        with self._database.write() as connection:
+            return copies.free_running(connection, self._database.now(connection), made_at)
 
     def fill_ballast(self, reserve_bytes: int) -> None:
         """Set room aside for a SQLite database, if the reserve stays free; it is used when the disk is full."""
@@ -143,10 +192,20 @@ class JobStore:
         with self._database.read() as connection:
             return queries.get(connection, job_id, owner)
 
+    def existing(self, job_ids: Collection[str]) -> dict[str, Job]:
+        """Those of some jobs that exist, by id."""
+        with self._database.read() as connection:
+            return queries.existing(connection, job_ids)
+
     def list(self, criteria: JobFilter) -> list[Job]:
         """The jobs that fit, newest first."""
         with self._database.read() as connection:
             return queries.listed(connection, criteria, self._database.now(connection))
+
+    def matching(self, criteria: JobFilter) -> int:
+        """Number of the jobs that fit, on all pages."""
+        with self._database.read() as connection:
+            return queries.matching(connection, criteria, self._database.now(connection))
 
     def dismiss(self, job_id: str, *, owner: str | None = None) -> Job:
         """Stop a job. A waiting job is dismissed at once; the driver of a running job is asked to stop.
@@ -175,6 +234,14 @@ class JobStore:
             submissions.keep(connection, found.job_id, keep=keep)
             return queries.get(connection, job_id, owner)
 
+    def watch(self, job_id: str) -> None:
+        """Note that a client reads the buildings that a running job has so far.
+
+        It waits for locks of others only a moment: reading must not wait for writing.
+        """
+        with self._database.write(wait_s=_WATCH_WAIT_S) as connection:
+            submissions.watch(connection, job_id, self._database.now(connection))
+
     def finished(self) -> builtins.list[tuple[str, dt.datetime]]:
         """Ids and ends of the jobs that are over and not kept, oldest first."""
         with self._database.read() as connection:
@@ -197,6 +264,33 @@ class JobStore:
         """A job's events with a higher number than `after`, in order; none for a job that does not exist."""
         with self._database.read() as connection:
             return queries.events(connection, job_id, after, limit)
+
+    def log(
+        self,
+        job_id: str,
+        *,
+        after: int = 0,
+        before: int | None = None,
+        level: LogLevel = LogLevel.INFO,
+        limit: int = 100,
+    ) -> builtins.list[LogLine]:
+        """Lines of a job's log, in order: the newest, or the first ones after a number; none without such a job.
+
+        Parameters
+        ----------
+        job_id : str
+            The job.
+        after : int
+            Only lines with a higher number.
+        before : int, optional
+            Only lines with a lower number.
+        level : LogLevel
+            Only lines that are as serious, or more.
+        limit : int
+            Maximum number of lines.
+        """
+        with self._database.read() as connection:
+            return logs.listed(connection, job_id, after=after, before=before, level=level, limit=limit)
 
     def counts(self) -> dict[JobStatus, int]:
         """Jobs by status; every status is there."""
@@ -263,8 +357,8 @@ class JobStore:
             until = self._database.now(connection) + dt.timedelta(seconds=lease_s)
             return claims.renew(connection, job, until=until)
 
-    def still_held(self, job: Job) -> bool:
-        """Whether a job that is held must be dismissed; only reads, and takes no lock.
+    def still_held(self, job: Job) -> Wishes:
+        """What clients want from a job that is held; only reads, and takes no lock.
 
         Raises
         ------
@@ -272,10 +366,13 @@ class JobStore:
             The job is no longer held.
         """
         with self._database.read() as connection:
-            return bool(changes.held_row(connection, job).dismiss_requested)
+            row = changes.held_row(connection, job)
+            return Wishes(dismissal=bool(row.dismiss_requested), watched_at=row.watched_at)
 
-    def record(self, job: Job, events: Sequence[JobEvent]) -> None:
-        """Append events; progress, stage and message of the job follow. The store gives numbers and times.
+    def record(self, job: Job, events: Sequence[JobEvent], lines: Sequence[NewLogLine] = ()) -> None:
+        """Append events and lines of the log; progress, stage and message of the job follow the events.
+
+        The store gives numbers and times.
 
         Raises
         ------
@@ -284,7 +381,9 @@ class JobStore:
         """
         with self._database.write() as connection:
             row = changes.lock_held(connection, job)
-            changes.append(connection, row, events, self._database.now(connection))
+            now = self._database.now(connection)
+            changes.append(connection, row, events, now)
+            logs.append(connection, row, lines, now, attempt=job.attempt)
 
     def succeed(self, job: Job, *, message: str, summary: Mapping[str, Any]) -> None:
         """End a job with success.

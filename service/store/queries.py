@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any
 
 import sqlalchemy as sa
@@ -17,7 +17,7 @@ from service.jobs import Job, JobEvent, JobStatus
 from service.store.records import event_of, job_of, storable
 from service.store.tables import EVENTS, JOBS
 
-_ASKED_AT_ONCE = 500
+_ASKED_AT_ONCE = 512
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,6 +32,8 @@ class JobFilter:
     """Only these; empty for all."""
     schedule_id: str | None = None
     """Only jobs of this schedule."""
+    words: Collection[str] = ()
+    """Only jobs with each of these in title, id or process; case does not matter."""
     created_from: dt.datetime | None = None
     """Created at this time or later; with a time zone."""
     created_to: dt.datetime | None = None
@@ -69,16 +71,52 @@ def get(connection: Connection, job_id: str, owner: str | None) -> Job:
     NoSuchJobError
         It does not exist, or belongs to another key.
     """
-    row = connection.execute(sa.select(JOBS).where(JOBS.c.job_id == job_id)).one_or_none() if is_id(job_id) else None
-    if row is None or (owner is not None and row.owner != owner):
+    return seen_by(owner, existing(connection, [job_id]).get(job_id), job_id)
+
+
+def seen_by(owner: str | None, job: Job | None, job_id: str) -> Job:
+    """A job, if there is one and the owner may see it; None as owner sees all.
+
+    Raises
+    ------
+    NoSuchJobError
+        Otherwise.
+    """
+    if job is None or (owner is not None and job.owner != owner):
         raise no_such_job(job_id)
-    return job_of(row)
+    return job
+
+
+def existing(connection: Connection, job_ids: Collection[str]) -> dict[str, Job]:
+    """Those of some jobs that exist, by id."""
+    found: dict[str, Job] = {}
+    for some in _in_portions(job_ids):
+        rows = connection.execute(sa.select(JOBS).where(JOBS.c.job_id.in_(some)))
+        found |= {row.job_id: job_of(row) for row in rows}
+    return found
+
+
+def _in_portions(job_ids: Iterable[str]) -> Iterator[list[str]]:
+    """Those that are ids, as many at a time as a statement may name.
+
+    The last is repeated up to the next power of two: connections keep the statements, and there are few of them then.
+    """
+    asked = iter([job_id for job_id in job_ids if is_id(job_id)])
+    while some := list(itertools.islice(asked, _ASKED_AT_ONCE)):
+        length = 1 << (len(some) - 1).bit_length()
+        yield some + some[-1:] * (length - len(some))
 
 
 def listed(connection: Connection, criteria: JobFilter, now: dt.datetime) -> list[Job]:
     """The jobs that fit, newest first."""
     chosen = sa.select(JOBS).where(*conditions(criteria, now)).order_by(JOBS.c.created_at.desc(), JOBS.c.job_id.desc())
     return [job_of(row) for row in connection.execute(chosen.limit(criteria.limit).offset(criteria.offset))]
+
+
+def matching(connection: Connection, criteria: JobFilter, now: dt.datetime) -> int:
+    """Number of the jobs that fit, on all pages."""
+    chosen = sa.select(sa.func.count()).select_from(JOBS).where(*conditions(criteria, now))
+    return int(connection.execute(chosen).scalar_one())
 
 
 def conditions(criteria: JobFilter, now: dt.datetime) -> list[sa.ColumnElement[bool]]:
@@ -92,6 +130,9 @@ def conditions(criteria: JobFilter, now: dt.datetime) -> list[sa.ColumnElement[b
         found.append(JOBS.c.process_id.in_([storable(name) for name in criteria.process_ids]))
     if criteria.schedule_id is not None:
         found.append(JOBS.c.schedule_id == storable(criteria.schedule_id))
+    texts = (JOBS.c.request["title"].as_string(), JOBS.c.job_id, JOBS.c.process_id)
+    words = [storable(word) for word in criteria.words]
+    found += [sa.or_(*(text.icontains(word, autoescape=True) for text in texts)) for word in words]
     if criteria.created_from is not None:
         found.append(JOBS.c.created_at >= criteria.created_from)
     if criteria.created_to is not None:
@@ -124,10 +165,9 @@ def counts(connection: Connection) -> dict[JobStatus, int]:
 def attempts(connection: Connection, job_ids: Sequence[str]) -> dict[str, tuple[JobStatus, int]]:
     """Status and number of the latest attempt of those jobs that exist."""
     found: dict[str, tuple[JobStatus, int]] = {}
-    asked = iter([job_id for job_id in job_ids if is_id(job_id)])
-    while some := list(itertools.islice(asked, _ASKED_AT_ONCE)):
-        known = sa.select(JOBS.c.job_id, JOBS.c.status, JOBS.c.attempt).where(JOBS.c.job_id.in_(some))
-        found |= {row.job_id: (JobStatus(row.status), row.attempt) for row in connection.execute(known)}
+    for some in _in_portions(job_ids):
+        wanted = sa.select(JOBS.c.job_id, JOBS.c.status, JOBS.c.attempt).where(JOBS.c.job_id.in_(some))
+        found |= {row.job_id: (JobStatus(row.status), row.attempt) for row in connection.execute(wanted)}
     return found
 
 

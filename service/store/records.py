@@ -6,7 +6,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from service.jobs import Fault, Job, JobEvent, JobFailure, JobRequest, JobStatus, Upload
+from service.jobs import Fault, Job, JobEvent, JobFailure, JobRequest, JobStatus, LogLevel, LogLine, Upload
 from service.keys import Key, Scope
 
 
@@ -44,6 +44,8 @@ def job_of(row: sa.Row[Any]) -> Job:
         summary=row.summary,
         schedule_id=row.schedule_id,
         keep=row.keep,
+        watched_at=row.watched_at,
+        traceparent=row.traceparent,
     )
 
 
@@ -59,6 +61,19 @@ def event_of(row: sa.Row[Any]) -> JobEvent:
         total=row.total,
         progress=row.progress,
         message=row.message,
+    )
+
+
+def log_line_of(row: sa.Row[Any]) -> LogLine:
+    """A row of `job_log`."""
+    return LogLine(
+        number=row.number,
+        at=row.at,
+        level=LogLevel(row.level),
+        attempt=row.attempt,
+        stage=row.stage,
+        message=row.message,
+        facts=row.facts or {},
     )
 
 

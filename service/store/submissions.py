@@ -9,14 +9,16 @@ from collections.abc import Sequence
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
+from pipeline.runtime.monitoring import tracing
 from service.errors import NoSuchUploadError, QueueFullError, ResultNotReadyError
-from service.jobs import JobRequest, JobStatus
+from service.jobs import JobRequest, JobStatus, NewLogLine
+from service.store import logs
 from service.store.changes import lock_job, move
 from service.store.outbox import announce
 from service.store.policies import lease_expired
 from service.store.queries import no_such_job
 from service.store.records import job_of, storable
-from service.store.tables import EVENTS, JOB_UPLOADS, JOBS, UPLOADS
+from service.store.tables import EVENTS, JOB_UPLOADS, JOBS, LOG_LINES, UPLOADS
 from service.webhooks import EventType
 
 
@@ -76,6 +78,7 @@ def insert(
             lost_attempts=0,
             last_event=1,
             schedule_id=schedule_id,
+            traceparent=None if (submitted := tracing.current()) is None else submitted.traceparent,
         )
     )
     connection.execute(
@@ -97,6 +100,7 @@ def insert(
     if needed:
         connection.execute(sa.insert(JOB_UPLOADS), [{"job_id": job_id, "upload_id": name} for name in needed])
     made = connection.execute(sa.select(JOBS).where(JOBS.c.job_id == job_id)).one()
+    logs.append(connection, made, [NewLogLine(message="accepted: waits for a driver")], now, attempt=0)
     announce(connection, made, EventType.ACCEPTED, now)
     return job_id
 
@@ -144,8 +148,13 @@ def keep(connection: Connection, job_id: str, *, keep: bool) -> None:
     connection.execute(sa.update(JOBS).where(JOBS.c.job_id == job_id).values(keep=keep))
 
 
+def watch(connection: Connection, job_id: str, now: dt.datetime) -> None:
+    """Note that a client reads what a job has so far."""
+    connection.execute(sa.update(JOBS).where(JOBS.c.job_id == job_id).values(watched_at=now))
+
+
 def remove(connection: Connection, job_id: str) -> None:
-    """Delete a job that is over, with its events.
+    """Delete a job that is over, with its events and its log.
 
     Raises
     ------
@@ -159,5 +168,5 @@ def remove(connection: Connection, job_id: str) -> None:
         raise no_such_job(job_id)
     if not JobStatus(row.status).is_over:
         raise ResultNotReadyError(f"job {job_id} is {row.status}: dismiss it first, then it can be removed")
-    for table in (EVENTS, JOB_UPLOADS, JOBS):
+    for table in (EVENTS, LOG_LINES, JOB_UPLOADS, JOBS):
         connection.execute(sa.delete(table).where(table.c.job_id == job_id))

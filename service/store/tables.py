@@ -68,8 +68,12 @@ JOBS = sa.Table(
     sa.Column("last_event", sa.Integer, nullable=False),
     sa.Column("schedule_id", sa.String(32)),
     sa.Column("keep", sa.Boolean, nullable=False, server_default=sa.false()),
+    sa.Column("watched_at", UtcTime),
+    sa.Column("last_log_line", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("traceparent", sa.String(55)),
 )
-"""One row per job. `duration_ms` is set when a job that was started is over; `last_event` counts its events.
+"""One row per job. `duration_ms` is set when a job that was started is over; `last_event` counts its events,
+`last_log_line` the lines of its log.
 
 `schedule_id` is not a foreign key: a job stays when its schedule is removed, and still names it.
 """
@@ -95,6 +99,20 @@ EVENTS = sa.Table(
     sa.Column("message", sa.Text, nullable=False),
 )
 """One row per event of a job."""
+
+LOG_LINES = sa.Table(
+    "job_log",
+    METADATA,
+    sa.Column("job_id", sa.String(32), sa.ForeignKey("jobs.job_id", ondelete="CASCADE"), primary_key=True),
+    sa.Column("number", sa.Integer, primary_key=True),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("level", sa.String(16), nullable=False),
+    sa.Column("attempt", sa.Integer, nullable=False),
+    sa.Column("stage", sa.String(64), nullable=False),
+    sa.Column("message", sa.Text, nullable=False),
+    sa.Column("facts", sa.JSON(none_as_null=True)),
+)
+"""One row per line of a job's log."""
 
 UPLOADS = sa.Table(
     "uploads",

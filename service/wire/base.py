@@ -103,7 +103,7 @@ class Request(BaseModel):
     NOUN: ClassVar[str] = "a member"
     """The word for its members in faults."""
     HINTS: ClassVar[Mapping[str, str]] = {}
-    """The fix for a member that is missing, or has too few or too many entries."""
+    """The fix for a member that is missing, has too few or too many entries, or belongs elsewhere."""
 
     @classmethod
     def prepared(cls, given: Any) -> Any:
@@ -123,7 +123,10 @@ class Request(BaseModel):
     def _explanation(cls, fault: Any) -> InitErrorDetails:
         kind, context, message = fault["type"], fault.get("ctx", {}), fault["msg"]
         if kind == "extra_forbidden":
-            kind, message = "unknown", f"is not {cls.NOUN}: use {', '.join(cls.model_fields)}"
+            fix = f"use {', '.join(cls.model_fields)}"
+            if len(fault["loc"]) == 1:
+                fix = cls.HINTS.get(fault["loc"][0], fix)
+            kind, message = "unknown", f"is not {cls.NOUN}: {fix}"
         elif kind in {"missing", "too_short", "too_long"} and len(fault["loc"]) == 1:
             context = context | {"fix": hint} if (hint := cls.HINTS.get(fault["loc"][0])) else context
         if kind == "unknown" or "fix" in context:

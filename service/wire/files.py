@@ -77,12 +77,18 @@ class OutlinesByValue(Request):
     encoding: Literal["base64"]
 
 
+def _referenced(given: Mapping[str, Any]) -> InputReference:
+    if "value" in given:
+        raise ValueError("use an href or a value, not both")
+    return ByReference.model_validate(given).href
+
+
 def points(given: Any) -> Source:
     """A point cloud by reference or by value."""
     if not isinstance(given, Mapping):
         return _points(_decoded(given), None)
     if "href" in given:
-        return ByReference.model_validate(given).href
+        return _referenced(given)
     sent = PointsByValue.model_validate(given)
     return _points(sent.value, sent.mediaType)
 
@@ -106,7 +112,7 @@ def outlines(given: Any) -> Source:
             raise ValueError("use one file")
         given = given[0]
     if isinstance(given, Mapping) and "href" in given:
-        return ByReference.model_validate(given).href
+        return _referenced(given)
     if isinstance(given, Mapping) and "value" in given:
         if given.get("encoding") == "base64":
             content = OutlinesByValue.model_validate(given).value

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, WithJsonSchema, field_validator
 
 from pipeline.errors import CrsError
-from pipeline.io.crs import UNITS_M, horizontal_unit_of
+from pipeline.io.crs import LARGEST_COORDINATE, UNITS_M, horizontal_unit_of
 from service.drafts import Draft, Inline
 from service.input_policy import checked_crs
 from service.run_settings import DEFAULTS, VARIANTS, choices, settings_faults, settings_schema
@@ -20,9 +20,6 @@ from service.wire.files import Outlines, PointClouds
 
 MAX_METHODS = 8
 """Maximum number of methods of one comparison."""
-
-LARGEST_COORDINATE = 1e12
-"""Bound of a rectangle's coordinates, far beyond every CRS; keeps differences finite."""
 
 GIVEN_BY = (
     "By reference (href): an upload of this service, a path below one of its input folders, or a URL at one of its "
@@ -284,6 +281,11 @@ class ReconstructInputs(BuildingInputs):
         "Levels of detail",
         "LoD1.2 (blocks), LoD1.3 (level parts), LoD2.2 (roof faces), or several; records describe the finest.",
     )
+    points: bool = Field(
+        False,
+        title="Points",
+        description="Also deliver the points as 3D Tiles, with their classes and their distances to the models.",
+    )
     settings: RunSettings = _settings()
 
     @field_validator("settings")
@@ -292,8 +294,8 @@ class ReconstructInputs(BuildingInputs):
         return _completed(settings, info, "method", "preset", "lods", "classes")
 
     def of_process(self) -> dict[str, Any]:
-        """The settings, too."""
-        return super().of_process() | {"settings": self.settings}
+        """Points and settings, too."""
+        return super().of_process() | {"points": self.points, "settings": self.settings}
 
 
 Variant = Annotated[str, OneOf(*VARIANTS)]
@@ -319,6 +321,7 @@ class CompareInputs(BuildingInputs):
     HINTS: ClassVar[Mapping[str, str]] = {
         **BuildingInputs.HINTS,
         "methods": f"give 2 to {MAX_METHODS} of {', '.join(VARIANTS)}",
+        "points": "they show the distances to the models of one method; submit reconstruct with points once per method",
     }
 
     methods: Annotated[list[Variant], BeforeValidator(_as_list), AfterValidator(_distinct)] = Field(

@@ -51,6 +51,7 @@ class JobList(Answer):
     """A page of jobs."""
 
     jobs: list[StatusInfo]
+    numberMatched: int = Field(ge=0, description="Number of jobs on all pages.")
     links: list[Link]
 
 
@@ -72,6 +73,25 @@ class EventList(Answer):
     """A page of events."""
 
     events: list[Event]
+    links: list[Link]
+
+
+class JobLogLine(Answer):
+    """A line of the log of a job."""
+
+    number: int = Field(ge=1, description="Counts up within the job.")
+    at: Time
+    level: Annotated[str, OneOf("info", "warning", "error")]
+    attempt: int = Field(ge=0, description="0 before the first one.")
+    stage: str
+    message: str
+    facts: dict[str, Any] = Field(description="For example tile, building, reason, seconds, done, total, failed.")
+
+
+class JobLog(Answer):
+    """A page of the log of a job."""
+
+    lines: list[JobLogLine]
     links: list[Link]
 
 
@@ -109,6 +129,7 @@ class JobForm(Answer):
     classes: str | None = None
     settings: str | None = Field(None, description="JSON.")
     meshes: str | None = None
+    points: bool | None = Field(None, description="Whether to deliver the points, too, as 3D Tiles.")
     licence: str | None = None
     title: str | None = None
     priority: int | None = None

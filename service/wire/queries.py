@@ -97,6 +97,9 @@ class JobQuery(Page):
         None, description=f"Only jobs with these: {', '.join(JobStatus)}."
     )
     scheduleID: str | None = Field(None, description="Only jobs of this schedule.")
+    q: Annotated[str | None, Field(max_length=200)] = Field(
+        None, description="Only jobs with each of these words in title, id or process; case does not matter."
+    )
     datetime: Annotated[str | None, AfterValidator(_is_interval)] = Field(
         None, description="Time of creation: an RFC 3339 time, or `a/b`, `../b`, `a/..`."
     )
@@ -118,3 +121,13 @@ class EventQuery(BaseModel):
     f: Literal["json", "sse"] | None = Field(None, description="Overrides the header Accept.")
     after: int = Field(0, ge=0, le=2**31 - 1, description="Only events with a higher id.")
     limit: int = Field(500, ge=1, le=500, description="Maximum number of events of a list.")
+
+
+class LogQuery(BaseModel):
+    """Which lines of a log, and how."""
+
+    f: Literal["json", "text"] | None = Field(None, description="Overrides the header Accept.")
+    after: int = Field(0, ge=0, le=2**31 - 1, description="Only lines with a higher number; the first ones of them.")
+    before: int | None = Field(None, ge=1, le=2**31 - 1, description="Only lines with a lower number.")
+    level: Literal["info", "warning", "error"] = Field("info", description="Only lines as serious as this, or more.")
+    limit: int = Field(100, ge=1, le=2000, description="Maximum number of lines: the newest, unless `after` is given.")

@@ -21,6 +21,7 @@ def modules_after(statement: str) -> set[str]:
     [
         ("pipeline.reconstruct", HEAVY),
         ("service.cli", HEAVY | SCIENCE),
+        ("service.client", HEAVY | SCIENCE | {"pydantic", "starlette", "sqlalchemy"}),
         ("pipeline.settings", HEAVY | SCIENCE),
         ("pipeline.runtime.run", {"dask", "distributed", "matplotlib", "psutil", "pythonjsonlogger"}),
         ("service.app, service.run_settings", HEAVY - {"geopandas", "pyarrow", "fastapi"} | {"numba", "scipy"}),

@@ -119,4 +119,5 @@ def test_the_supported_pythons_are_reported_alike() -> None:
 def test_the_files_of_tests_that_begin_first_are_there(pytestconfig: pytest.Config) -> None:
     conftest = pytestconfig.pluginmanager.get_plugin(str(ROOT / "tests" / "conftest.py"))
     assert conftest is not None
-    assert [name for name in conftest.LONGEST_FIRST if not (ROOT / "tests" / name).is_file()] == []
+    assert [name for name in conftest.LONGEST_FIRST if not (ROOT / "tests" / name).exists()] == []
+    assert [name for name in conftest.TOGETHER if not (ROOT / name).is_dir()] == []

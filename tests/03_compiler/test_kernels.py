@@ -241,6 +241,24 @@ def test_a_kernel_loaded_while_a_kernel_between_is_compiled_can_be_called_from_p
 
 
 @pytest.mark.slow
+def test_a_loaded_kernel_that_another_process_then_makes_callable_can_be_called_from_python(sources: Sources) -> None:
+    sources.run(f"result = caller.first_of_halves({VALUES})")
+    assert not sources.stored()["caller.halves"].machine_code
+
+    def also(addend: float) -> str:
+        """Compile one more caller, which loads the kernel without constants."""
+        made = f"kernel(lambda values: caller.halves(values)[0][0] + {addend})"
+        return f"from pipeline.compiler import kernel; also = {made}({VALUES})"
+
+    call = f"caller.halves({VALUES})[0].sum()"
+    # the file keeps the name of the kernel's constants and now has them
+    other = f"import numpy as np, caller; {also(2.0)}; {call}"
+    meanwhile = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {other!r}], check=True)"
+    assert sources.run(f"{also(1.0)}; {meanwhile}; result = [also, {call}]")[0] == [2.0, 7.0]
+    assert sources.stored()["caller.halves"].machine_code
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["cut", "empty", "other"])
 def test_a_kernel_with_a_damaged_file_is_compiled_again(sources: Sources, damage: str) -> None:
     sources.run(f"result = caller.total({VALUES})")

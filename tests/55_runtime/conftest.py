@@ -16,6 +16,7 @@ from pipeline.reconstruct import reconstruct_building
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
+from pipeline.runtime.monitoring.events import Listener, ignore
 from pipeline.runtime.monitoring.measurement import Measured, measure
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
@@ -80,7 +81,13 @@ def reconstruct(tmp_path: Path) -> Reconstruct:
     """Run serially into a fresh directory: `reconstruct(*paths, settings={...}, **fields)` of request or resources."""
     numbers = iter(range(1000))
 
-    def go(*paths: Path, settings: dict[str, Any] | None = None, executor: Any = None, **fields: Any) -> RunSummary:
+    def go(
+        *paths: Path,
+        settings: dict[str, Any] | None = None,
+        executor: Any = None,
+        on_event: Listener = ignore,
+        **fields: Any,
+    ) -> RunSummary:
         request = RunRequest(
             inputs=tuple(str(path) for path in paths),
             out=fields.pop("out", str(tmp_path / f"run-{next(numbers)}")),
@@ -88,7 +95,7 @@ def reconstruct(tmp_path: Path) -> Reconstruct:
             resources=Resources(**{"workers": 0} | {name: fields.pop(name) for name in RESOURCES & fields.keys()}),
             **fields,
         )
-        return run(request, executor=executor)
+        return run(request, on_event, executor)
 
     return go
 

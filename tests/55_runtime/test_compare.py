@@ -154,7 +154,7 @@ def test_no_building_is_charged_for_loading_its_method(
 ) -> None:
     loaded: list[str] = []
     # a clock that stands still but while a method is loaded
-    monkeypatch.setattr(model_batch, "time", SimpleNamespace(perf_counter=lambda: 100.0 * len(loaded)))
+    monkeypatch.setattr(model_batch, "time", SimpleNamespace(perf_counter=lambda: 100.0 * len(loaded), time=float))
     monkeypatch.setattr(model_batch, "load", loaded.append)
     load_once.cache_clear()
     try:

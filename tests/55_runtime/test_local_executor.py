@@ -16,7 +16,7 @@ from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.cluster.local_executor import LocalExecutor
 from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.manifest import read_manifest
-from pipeline.runtime.monitoring.events import Watch
+from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.monitoring.measurement import Measured, peak_of_process
 
 
@@ -100,7 +100,11 @@ def test_tasks_run_in_processes_of_their_own() -> None:
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_task_that_costs_its_child_is_tried_alone_and_then_counts(tmp_path: Path, count: int) -> None:
     tasks = [(str(tmp_path), number, 1 if number == 2 else 0) for number in range(5)]
-    assert sorted(results(LocalExecutor(count), chores.die_at_first, tasks)) == [0, 1, 2, 3, 4]
+    events: list[Event] = []
+    watch = Watch(listener=events.append)
+    assert sorted(results(LocalExecutor(count), chores.die_at_first, tasks, watch)) == [0, 1, 2, 3, 4]
+    assert {(event.kind, event.stage) for event in events} == {("detail", "test")}
+    assert all("tried alone" in event.message for event in events)
     assert len(list(tmp_path.glob("2.*"))) == 2
 
 

@@ -18,12 +18,14 @@ from hypothesis import strategies as st
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.scratch.outcomes import (
+    InParts,
     OutcomeTask,
     Place,
     brief_of,
     drop_outcomes,
     key_of,
     keys_of,
+    part_of,
     result_of,
     run_and_store,
     whole,
@@ -159,6 +161,28 @@ def test_an_outcome_is_stored_with_its_brief(tmp_path: Path) -> None:
         assert keys_of(work.scratch, "stage", "unit") == left
     with pytest.raises(RunCancelledError, match="is gone"):
         result_of(work.scratch, work.place)
+
+
+def in_parts(task: int) -> InParts:
+    return InParts(parts=("first" * task, "second" * task, "third" * task))
+
+
+def test_the_parts_of_a_result_are_read_alone(tmp_path: Path) -> None:
+    work = dataclasses.replace(outcome_task(tmp_path), function=in_parts, brief=lambda found: len(found.parts))
+    assert run_and_store(work).brief == 3
+    path = tmp_path / work.place.name
+    content = path.read_bytes()
+    for number, word in enumerate(("first", "second", "third")):
+        # with the other parts damaged
+        piece = pickle.dumps(word * 21, protocol=pickle.HIGHEST_PROTOCOL)
+        at = content.index(piece)
+        begin = content.index(pickle.dumps("first" * 21, protocol=pickle.HIGHEST_PROTOCOL))
+        path.write_bytes(content[:begin] + b"x" * (at - begin) + piece + b"x" * (len(content) - at - len(piece)))
+        assert part_of(work.scratch, work.place, number) == word * 21
+        assert brief_of(work.scratch, work.place) == 3
+    path.unlink()
+    with pytest.raises(RunCancelledError, match="is gone"):
+        part_of(work.scratch, work.place, 0)
 
 
 def test_a_full_disk_names_stage_place_and_fix(tmp_path: Path) -> None:

@@ -74,10 +74,10 @@ def test_a_candidate_with_too_few_points_for_a_model_is_rejected_unless_a_user_o
     victim = min(row["building_id"] for row in rows(whole.run_dir))
     real = pipeline.reconstruct.roof_points
 
-    def sparse(cloud: Any, settings: Any) -> Any:
+    def sparse(cloud: Any, settings: Any, decisions: Any = None) -> Any:
         if cloud.candidate.building_id == victim:
             raise BuildingError(Reason.TOO_FEW_POINTS, "on purpose")
-        return real(cloud, settings)
+        return real(cloud, settings, decisions)
 
     monkeypatch.setattr(pipeline.reconstruct, "roof_points", sparse)
     summary = reconstruct(suburb, out=str(tmp_path / "run"))

@@ -27,6 +27,7 @@ def manifest() -> RunManifest:
         source_licence="CC0, Kadaster",
         tiles=("x85_y447", "x86_y447"),
         failed_tiles=("x86_y447",),
+        tiles_without_points=("x85_y447",),
         counts={"candidates": 3, "ok": 2},
         timings_s={"ingest": 0.25},
         peak_memory_bytes={"driver": 1 << 30},

@@ -36,6 +36,7 @@ def test_a_tile_writes_the_designed_files_and_says_their_digests(
     assert sorted(reported.digests) == [
         "buildings/tile=x85_y447/part-0.parquet",
         "cityjson/tile=x85_y447/part-0.city.jsonl",
+        "decisions/tile=x85_y447/part-0.parquet",
         "meshes/x85_y447/gable.obj",
         "meshes/x85_y447/two_parts.obj",
         "planes/tile=x85_y447/part-0.parquet",

@@ -88,6 +88,14 @@ def test_the_slowest_are_listed_with_their_facts_and_lost_ones_without(street_ru
     assert "1 of 1 tiles could not be published" in found
 
 
+def test_a_tile_without_points_has_its_buildings(street_run: Path) -> None:
+    lattice = {"tile_size_m": 100.0, "origin_x_m": 0.0, "origin_y_m": 0.0}
+    change(street_run, tiles=("x850_y4471",), tiles_without_points=("x850_y4471",), warnings=(), lattice=lattice)
+    text, read = page_of(street_run)
+    assert "The points of 1 of 1 tiles could not be written ; this does not affect the buildings" in words(read)
+    assert "could not be published" not in text
+
+
 def test_a_failed_tile_is_on_the_map(street_run: Path) -> None:
     lattice = {"tile_size_m": 100.0, "origin_x_m": 0.0, "origin_y_m": 0.0}
     change(

@@ -34,7 +34,8 @@ def ascii_tile(folder: Path) -> Path:
 def test_the_commands_are_the_documented_ones() -> None:
     # the service mounts its own on the same application where it is loaded
     mounted = set(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
-    assert mounted - {"serve", "driver", "keys"} == set(COMMANDS)
+    of_service = {"serve", "driver", "keys", "backup", "restore", "submit", "watch", "fetch", "jobs", "request"}
+    assert mounted - of_service == set(COMMANDS)
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -117,7 +117,7 @@ def test_json_events_are_a_line_each(capsys: pytest.CaptureFixture[str]) -> None
     console.on_event(Event(kind="stage", stage="split", total=4))
     console.on_event(Event(kind="warning", message="no vertical unit"))
     events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
-    counts = {"done": 0, "total": 4, "kept": 0, "failed": 0}
+    counts = {"done": 0, "total": 4, "kept": 0, "failed": 0, "facts": {}}
     assert events[0] == {"kind": "stage", "stage": "split", "message": "", **counts}
     assert events[1] == {"kind": "warning", "message": "no vertical unit"}
 

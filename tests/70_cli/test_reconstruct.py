@@ -44,9 +44,9 @@ def test_the_run_directory_is_laid_out_as_documented(run: Run) -> None:
     folder, _, _ = run
     page = Path(__file__).resolve().parents[2] / "docs" / "run_directory.md"
     documented = {line.split("/")[0].split(" ")[0] for line in page.read_text().split("```")[1].splitlines() if line}
-    assert {entry.name for entry in folder.iterdir()} == documented - {"run.html"}
+    assert {entry.name for entry in folder.iterdir()} == documented - {"run.html", "points"}
     assert invoke("report", str(folder))[0] == 0
-    assert {entry.name for entry in folder.iterdir()} == documented
+    assert {entry.name for entry in folder.iterdir()} == documented - {"points"}
     (folder / "run.html").unlink()
     assert len(list(folder.glob("meshes/*/*.obj"))) == 1
 
@@ -164,23 +164,28 @@ def test_the_query_of_the_docs_finds_the_building(run: Run, monkeypatch: pytest.
     import duckdb
 
     page = Path(__file__).resolve().parents[2] / "docs" / "run_directory.md"
-    query = page.read_text().split("```sql")[1].split("```")[0]
+    query = page.read_text().split("```sql")[-1].split("```")[0]
     monkeypatch.chdir(run[0].parent)
     rows = duckdb.sql(query).fetchall()
     assert [row[1] for row in rows] == ["gable"]
     assert rows[0][4].startswith("x")
 
 
-def test_a_failed_tile_is_exit_code_1(scene: Path, run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("field", "said"), [("failed_tiles", "tile x1_y2 failed"), ("tiles_without_points", "tile x1_y2 has no points")]
+)
+def test_a_tile_that_lacks_something_is_exit_code_1(
+    scene: Path, run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, field: str, said: str
+) -> None:
     import pipeline.runtime.run as module
 
     whole = module.run
 
     def run_with_a_failed_tile(request: module.RunRequest, listener: Any) -> module.RunSummary:
-        return dataclasses.replace(whole(request, listener), failed_tiles=("x1_y2",))
+        return dataclasses.replace(whole(request, listener), **{field: ("x1_y2",)})
 
     monkeypatch.setattr(module, "run", run_with_a_failed_tile)
     words = ("--out", str(tmp_path / "run"), "--workers", "0")
     code, _, log = invoke("reconstruct", str(scene / "gable.laz"), *words)
     assert code == 1
-    assert "tile x1_y2 failed" in log
+    assert [line for line in log.splitlines() if "x1_y2" in line] == [f"warning: {said}"]

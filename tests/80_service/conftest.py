@@ -22,6 +22,7 @@ from service.store import JobStore
 sys.path.insert(0, str(Path(__file__).parent))
 
 import finished_runs as runs
+from client_site import Site
 
 OWN_URL = "http://127.0.0.1:8000"
 """What the tests call the service; a foreign name is refused."""
@@ -87,6 +88,14 @@ def starting(tmp_path: Path) -> Iterator[Starting]:
 def local_service(starting: Starting) -> LocalService:
     """A service on loopback, without keys."""
     return starting()
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    """A service behind a gate, for clients that are programs; its pauses are short."""
+    monkeypatch.setattr("service.client.patience.FIRST_PAUSE_S", 0.01)
+    with Site.opened(tmp_path) as opened:
+        yield opened
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyproj
 from markupsafe import escape
 from starlette.testclient import TestClient
@@ -20,8 +21,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "60_export"))
 
 import small_buildings as small
 
+from pipeline.export.point_glb import NO_BUILDING, NO_PLANE, NO_RESIDUAL, ModelledPoints, points_glb
+from pipeline.export.point_octree import OctreeNode
 from pipeline.export.records import RecordContext, RejectedObject
 from pipeline.export.tile import write_tile
+from pipeline.export.tileset import TilesetNode, root_tileset, tile_tileset
 from pipeline.model import BuildingResult, Reason
 from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, write_manifest
 from service.app import create_app
@@ -100,8 +104,10 @@ def write_run(
     failed_tile: str | None = None,
     status: RunStatus = RunStatus.FINISHED,
     coarser_lods: tuple[str, ...] = (),
+    points: bool = True,
+    tiles_without_points: tuple[str, ...] = (),
 ) -> Path:
-    """A run directory with these buildings a tile, and a rejected object in every tile."""
+    """A run directory with these buildings a tile, a rejected object in every tile, and the points of one building."""
     tiles = four_tiles() if tiles is None else tiles
     context = RecordContext(
         reference=reference(epsg),
@@ -126,6 +132,8 @@ def write_run(
         files = write_tile(run_dir, key, buildings, [shed], context, meshes=meshes)
         state = {"tile": key, "state": "done", "error": "", "files": dict(files.digests)}
         (run_dir / "state" / f"{key}.json").write_text(json.dumps(state))
+    for key, found in [entry for entry in tiles.items() if entry[1] and points][:1]:
+        write_points(run_dir / "points", key, found[0])
     if failed_tile is not None:
         state = {"tile": failed_tile, "state": "failed", "error": f"OSError: {run_dir}/scratch/a is gone", "files": {}}
         (run_dir / "state" / f"{failed_tile}.json").write_text(json.dumps(state))
@@ -146,6 +154,7 @@ def write_run(
         source_licence="CC0",
         tiles=tuple(sorted(tiles)),
         failed_tiles=() if failed_tile is None else (failed_tile,),
+        tiles_without_points=tiles_without_points,
         counts={"points": 640, "candidates": sum(map(len, tiles.values()))},
         timings_s={"split": 1.5, "total": 3.0},
         peak_memory_bytes={"node-7:99": 3_000_000, "node-8:1": 5_000_000},
@@ -154,6 +163,43 @@ def write_run(
     )
     write_manifest(run_dir, manifest)
     return run_dir
+
+
+def write_points(folder: Path, tile: str, building: BuildingResult) -> None:
+    """Four points of a building and one beside it, in one node of one tile."""
+    origin_mm = tuple(round(value * 1000) for value in building.origin)
+    points = ModelledPoints(
+        xyz_mm=np.array(
+            [[2_000, 3_000, 4_000], [2_500, 3_000, 4_100], [3_000, 3_100, 4_200], [9_000, 9_000, 10], [5, 6, 7]]
+        ),
+        point_class=np.array([6, 6, 6, 2, 6], np.uint8),
+        building=np.array([0, 0, 0, NO_BUILDING, 0], np.uint16),
+        plane=np.array([0, 0, 1, NO_PLANE, 1], np.uint16),
+        residual_mm=np.array([12, -7, 0, NO_RESIDUAL, 33], np.int16),
+        buildings=(building.building_id,),
+    )
+    place = {"origin_m": [value // 1000 for value in origin_mm]}
+    low, high = points.xyz_mm.min(axis=0), points.xyz_mm.max(axis=0)
+    node = OctreeNode(path="r", index=np.arange(5), low_mm=low, high_mm=high, spacing_m=0.0)
+    root = TilesetNode(
+        origin_mm=origin_mm,
+        low_mm=tuple((low + origin_mm).tolist()),
+        high_mm=tuple((high + origin_mm).tolist()),
+        error_m=8.0,
+        uri=f"{tile}/tileset.json",
+        points=5,
+    )
+    extras = {**place, "horizontal_unit_m": 1.0, "vertical_unit_m": 1.0, "crs": None, "n_points": 5}
+    index = {building.building_id: {"nodes": ["r"], "tiles": [tile]}}
+    files = {
+        f"{tile}/r.glb": points_glb(points, f"{tile}/r", place),
+        f"{tile}/tileset.json": tile_tileset([node], place),
+        f"{tile}/buildings.json": json.dumps(index).encode(),
+        "tileset.json": root_tileset(root, extras) or b"",
+    }
+    (folder / tile).mkdir(parents=True)
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
 
 
 LABELS = ("fuzzy-sart", "fuzzy-sart-faithful")
@@ -223,9 +269,9 @@ class Service:
 
 
 @contextlib.contextmanager
-def service(state: Path) -> Iterator[Service]:
-    """A service without keys."""
-    settings = ServiceSettings(state=state)
+def service(state: Path, database_url: str | None = None) -> Iterator[Service]:
+    """A service without keys; its database is a SQLite file, unless another is named."""
+    settings = ServiceSettings(state=state, database_url=database_url)
     with JobStore(settings.database) as store, TestClient(create_app(settings, store), "http://127.0.0.1") as client:
         # sizes and tags are those of the files themselves
         client.headers["Accept-Encoding"] = "identity"

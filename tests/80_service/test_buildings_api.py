@@ -1,7 +1,10 @@
 """Buildings by REST: pages by window and words against a slow twin, single buildings in four forms."""
 
+import contextlib
+import dataclasses
 import json
 import re
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -21,6 +24,7 @@ from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
 from pipeline.export.geoparquet import read_table
+from pipeline.model import Decision, DecisionKind, Outcome
 from service.errors import RequestError
 from service.outputs import building_pages, write_outputs
 from service.outputs.building_pages import BuildingQuery, building_page, parsed_bbox
@@ -324,6 +328,49 @@ def test_a_building_has_all_columns_and_its_planes(client: TestClient, job_id: s
     for media_type, href in links.items():
         assert client.get(href).headers["content-type"] == media_type
     assert set(links) == {"model/obj", "application/city+json"}
+
+
+def test_a_building_says_what_was_checked_and_tried(service: runs.Service, client: TestClient) -> None:
+    check = Decision(kind=DecisionKind.CHECK, name="roof_points", outcome=Outcome.MET, value=320, limit=10)
+    form = Decision(
+        kind=DecisionKind.FORM, name="traced", outcome=Outcome.INVALID, n_faces=2, bic_margin=0.5, validity_codes=(306,)
+    )
+    gable = dataclasses.replace(runs.placed(small.gable(), "gable", 0.0, 0.0), decisions=(check, form))
+    pent = runs.placed(small.pent(), "pent", 50.0, 0.0)
+    job = service.finished(lambda run_dir: runs.write_run(run_dir, {"x851_y4470": [gable, pent]}))
+    place = f"/jobs/{job}/buildings/{gable.building_id}"
+    found = client.get(f"{place}/decisions").json()
+    assert found["building_id"] == gable.building_id
+    assert found["decisions"] == [
+        {"step": 0, "kind": "check", "name": "roof_points", "outcome": "met", "detail": "", "value": 320, "limit": 10},
+        {
+            "step": 1,
+            "kind": "form",
+            "name": "traced",
+            "outcome": "invalid",
+            "detail": "",
+            "n_faces": 2,
+            "bic_margin": 0.5,
+            "validity_codes": [306],
+        },
+    ]
+    links = {link["rel"]: link["href"] for link in found["links"]}
+    assert links["self"].endswith(f"{place}/decisions")
+    (related,) = [link["href"] for link in client.get(place).json()["links"] if link["rel"] == "related"]
+    assert related == links["self"]
+    assert client.get(f"/jobs/{job}/buildings/{pent.building_id}/decisions").json()["decisions"] == []
+    missing = client.get(f"/jobs/{job}/buildings/{'a' * 24}/decisions")
+    assert "hold no building 'aaaa" in runs.problem(missing, 404, "no-such-building")
+
+
+def test_a_job_of_a_version_without_decisions_says_so(service: runs.Service, client: TestClient) -> None:
+    job = service.finished()
+    index = service.folder.outputs(job, 1) / "index.sqlite"
+    with contextlib.closing(sqlite3.connect(index)) as connection:
+        connection.execute("DROP TABLE decision")
+    answer = client.get(f"/jobs/{job}/buildings/{GABLE}/decisions")
+    assert "recorded no decisions: submit it again" in runs.problem(answer, 404, "no-such-output")
+    assert client.get(f"/jobs/{job}/buildings/{GABLE}").status_code == 200
 
 
 def test_the_form_is_chosen_by_f_or_by_the_header(client: TestClient, job_id: str) -> None:

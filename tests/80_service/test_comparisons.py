@@ -51,7 +51,7 @@ def test_it_takes_what_a_reconstruction_takes_but_several_methods(local_service)
     reconstruct, compared = (
         local_service.client.get(f"/processes/{name}").json() for name in ("reconstruct", "compare")
     )
-    assert set(compared["inputs"]) == set(reconstruct["inputs"]) - {"method", "preset", "lods"} | {"methods"}
+    assert set(compared["inputs"]) == set(reconstruct["inputs"]) - {"method", "preset", "lods", "points"} | {"methods"}
     for name in set(compared["inputs"]) - {"methods"}:
         assert compared["inputs"][name] == reconstruct["inputs"][name]
     assert compared["jobControlOptions"] == reconstruct["jobControlOptions"]
@@ -107,6 +107,7 @@ def test_jobs_are_listed_by_their_process(local_service) -> None:
         ({"methods": [TWO]}, "methods[0] is ["),
         ({"methods": [None, 7]}, "methods[1] is 7"),
         ({"methods": TWO, "method": "fuzzy-sart"}, '"method" is not an input'),
+        ({"methods": TWO, "points": True}, "submit reconstruct with points once per method"),
         ({"methods": TWO, "settings": {"preset": "faithful"}}, "settings.preset"),
         ({"methods": TWO, "settings": {"method": "fuzzy-sart"}}, "settings.method"),
         ({"methods": TWO, "settings": {"kmeans": {}}}, "settings has the table kmeans, which is not compared"),

@@ -25,7 +25,7 @@ from pipeline.errors import (
 )
 from pipeline.runtime.monitoring.logs import formatter
 from service.driver.failures import failure_of, is_tried_again, pause_s
-from service.driver.messages import Scrubber, outcome
+from service.driver.messages import Scrubber, digest_of, outcome
 from service.driver.progress import CLASSIFY_WEIGHTS, WEIGHTS, WORDS, percent
 from service.errors import (
     InputRefusedError,
@@ -182,6 +182,9 @@ def test_the_outcome_is_reported_honestly() -> None:
     assert outcome(worse) == (
         "1 building: 0 ok, 1 fallback, 0 failed; 1 tile could not be published: its buildings are missing; 1 warning"
     )
+    without = run_summary(statuses={"ok": 1}, rejected={}, tiles_without_points=("x1_y2", "x1_y3"))
+    assert outcome(without) == "1 building: 1 ok, 0 fallback, 0 failed; the points of 2 tiles could not be written"
+    assert digest_of(without, Scrubber(), "1.0")["tiles_without_points"] == ["x1_y2", "x1_y3"]
 
 
 # --- faults
@@ -249,7 +252,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "how_to" / "jobs.md"
 
 
 def test_the_page_draws_the_transitions_as_the_code_does() -> None:
-    (drawn,) = re.findall(r"```\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    drawn = re.findall(r"```\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
     assert drawn in service.jobs.__doc__
 
 

@@ -195,6 +195,20 @@ def test_jobs_are_filtered_by_status_and_process(local_service) -> None:
     assert listed(local_service, "?type=other") == []
 
 
+def test_jobs_are_searched_by_words_and_counted_on_all_pages(local_service) -> None:
+    made = [local_service.waiting(title=f"Delft & {part}").job_id for part in ("West", "Oost", "Noord")]
+    local_service.waiting()
+    assert listed(local_service, "?q=west%20DELFT") == [made[0]]
+    assert listed(local_service, f"?q={made[1][:12]}") == [made[1]]
+    assert listed(local_service, "?q=compare") == []
+    page = local_service.client.get("/jobs?q=delft%20%26&limit=2").json()
+    assert (page["numberMatched"], len(page["jobs"])) == (3, 2)
+    following = next(link["href"] for link in page["links"] if link["rel"] == "next")
+    rest = local_service.client.get(following).json()
+    assert [job["jobID"] for job in rest["jobs"]] == [made[0]]
+    assert local_service.client.get("/jobs?type=other").json()["numberMatched"] == 0
+
+
 def test_jobs_are_filtered_by_when_they_were_created(local_service) -> None:
     job = local_service.waiting()
     reported = local_service.client.get(f"/jobs/{job.job_id}").json()["created"]
@@ -229,6 +243,7 @@ def test_jobs_are_filtered_by_how_long_they_ran(local_service) -> None:
         "minDuration=-1",
         "minDuration=nan",
         "maxDuration=inf",
+        pytest.param(f"q={'q' * 201}", id="q of 201 signs"),
     ],
 )
 def test_a_filter_that_cannot_be_is_refused_by_its_name(local_service, query: str) -> None:

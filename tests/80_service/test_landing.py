@@ -1,5 +1,6 @@
 """The landing page, conformance, health and figures."""
 
+import html
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ from pipeline import __version__
 from service.errors import StartUpError
 from service.keys import Scope
 from service.routes import landing
+from service.settings import ServiceSettings
 from service.status import RELATIONS
 
 
@@ -35,6 +37,50 @@ def test_the_parameter_f_stands_above_the_header(local_service) -> None:
     assert local_service.client.get("/?f=html").headers["content-type"].startswith("text/html")
     assert local_service.client.get("/?f=xml").status_code == 400
     assert local_service.client.get("/", headers={"Accept": "image/png"}).status_code == 406
+
+
+def test_tiles_beneath_the_map_are_named_in_the_page_and_allowed_in_its_policy_alone(
+    starting, monkeypatch, tmp_path: Path
+) -> None:
+    (tmp_path / "index.html").write_text("<!doctype html><head><title>the page</title></head>")
+    monkeypatch.setattr(landing, "VIEWER", tmp_path)
+    plain = starting().client.get("/?f=html")
+    assert "https:" not in plain.headers["content-security-policy"]
+    assert "map-tiles" not in plain.text
+
+    tiles = "https://Tiles.example.org:8443/a/{z}/{x}/{y}.png?k=1&v=2"
+    client = starting(map_tiles=tiles, map_credit='© <Owners> & "others"', map_max_zoom=17).client
+    page = client.get("/?f=html")
+    policy = page.headers["content-security-policy"]
+    assert "img-src 'self' data: blob: https://tiles.example.org:8443;" in policy
+    assert policy.replace(" https://tiles.example.org:8443", "") == plain.headers["content-security-policy"]
+    assert f'<meta name="map-tiles" content="{html.escape(tiles)}">' in page.text
+    assert "© &lt;Owners&gt; &amp; &quot;others&quot;" in page.text
+    assert '<meta name="map-max-zoom" content="17">' in page.text
+    assert "tiles.example.org" not in client.get("/").headers["content-security-policy"]
+
+
+@pytest.mark.parametrize(
+    ("tiles", "fault"),
+    [
+        ("http://tiles.example.org/{z}/{x}/{y}.png", "https"),
+        ("https://tiles.example.org/{z}/{x}.png", "{y}"),
+        ("https://tiles.example.org/{z}/{x}/{y}/{s}.png", "no other"),
+        ("https://tiles.example.org; script-src */{z}/{x}/{y}.png", "plain characters"),
+        ("https://user@tiles.example.org/{z}/{x}/{y}.png", "plain characters"),
+        ('https://tiles.example.org/{z}/{x}/{y}.png">', "plain characters"),
+    ],
+)
+def test_tiles_that_cannot_be_used_are_refused_with_the_fix(tiles: str, fault: str) -> None:
+    with pytest.raises(ValueError, match="map_tiles") as refused:
+        ServiceSettings(map_tiles=tiles, map_credit="owners")
+    assert fault in str(refused.value)
+    assert "https://tiles.example.org/{z}/{x}/{y}.png" in str(refused.value)
+
+
+def test_tiles_need_a_credit() -> None:
+    with pytest.raises(ValueError, match="name the owners"):
+        ServiceSettings(map_tiles="https://tiles.example.org/{z}/{x}/{y}.png")
 
 
 def test_without_a_built_page_browsers_learn_how_to_build_it(starting, monkeypatch, tmp_path: Path) -> None:

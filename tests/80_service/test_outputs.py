@@ -38,7 +38,8 @@ TABLES = ("buildings", "planes", "rejected")
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of four tiles."""
-    return runs.write_run(tmp_path_factory.mktemp("run") / "run", failed_tile="x852_y4470")
+    folder = tmp_path_factory.mktemp("run") / "run"
+    return runs.write_run(folder, failed_tile="x852_y4470", tiles_without_points=("x850_y4470",))
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +142,11 @@ def test_what_an_unfinished_tile_left_is_in_no_output(tmp_path: Path) -> None:
     assert lost not in pq.read_table(tmp_path / "out/buildings.parquet")["building_id"].to_pylist()
     assert all(lost not in name for name in zipfile.ZipFile(tmp_path / "out/meshes.zip").namelist())
     report = json.loads(output_file(tmp_path / "out", "report").read_text())["tiles"]
-    assert report == {"planned": 4, "failed": [{"tile": "x851_y4470", "reason": "OSError: disk full"}]}
+    assert report == {
+        "planned": 4,
+        "failed": [{"tile": "x851_y4470", "reason": "OSError: disk full"}],
+        "without_points": [],
+    }
 
 
 def test_tiles_come_along_a_curve_that_keeps_neighbours_together(tmp_path: Path) -> None:
@@ -415,7 +420,7 @@ def test_the_report_names_inputs_and_warnings_without_the_servers_folders(run_di
     assert report["inputs"][0]["sha256"] == "ab" * 32
     assert report["warnings"] == ["tile.laz: no GPS time", "something else"]
     failed = {"tile": "x852_y4470", "reason": "OSError: scratch/a is gone"}
-    assert report["tiles"] == {"planned": 5, "failed": [failed]}
+    assert report["tiles"] == {"planned": 5, "failed": [failed], "without_points": ["x850_y4470"]}
     assert runs.SERVER_FOLDER not in text
     assert str(run_dir) not in text
     assert "node-7" not in text

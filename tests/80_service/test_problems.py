@@ -8,7 +8,7 @@ from service import errors
 from service.guard import DATA_POLICY
 from service.jobs import Fault, JobFailure
 from service.problems import FAILURES, INTERNAL, KINDS, JobFailedError, answer_error, kind_of
-from service.routes import jobs as jobs_routes
+from service.routes import polling
 
 FIELDS = {"type", "title", "status", "detail", "instance"}
 
@@ -95,7 +95,7 @@ def test_a_fault_of_ours_is_a_problem_document_without_a_trace(local_service, mo
     def break_down(*_: object, **__: object) -> None:
         raise RuntimeError("at /srv/secret")
 
-    monkeypatch.setattr(jobs_routes, "status_info", break_down)
+    monkeypatch.setattr(polling, "status_info", break_down)
     answer = local_service.client.get(f"/jobs/{local_service.waiting().job_id}")
     assert answer.status_code == 500
     assert answer.headers["content-type"] == "application/problem+json"

@@ -68,6 +68,29 @@ def test_threads_together_get_no_more_than_the_limit() -> None:
     assert sum(counts) == 100
 
 
+def test_one_thread_counts_at_a_time() -> None:
+    """The storage starts a timer on some hits, and a timer that two threads start raises."""
+    limits, both_inside = limiter("100/hour"), []
+    barrier = threading.Barrier(2)
+
+    class Strategy:
+        def hit(self, *_: object) -> bool:
+            try:
+                barrier.wait(0.2)
+                both_inside.append(True)
+            except threading.BrokenBarrierError:
+                barrier.reset()
+            return True
+
+    limits._strategy = Strategy()  # type: ignore[assignment]
+    threads = [threading.Thread(target=limits.check, args=("a",)) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert both_inside == []
+
+
 @pytest.mark.parametrize("text", ["", "many", "10", "0/minute", "-1/minute", "5/fortnight"])
 def test_a_notation_that_is_none_stops_the_start(text: str) -> None:
     with pytest.raises(StartUpError, match="rate_limit is"):

@@ -206,10 +206,13 @@ def paths(job_id: str) -> list[str]:
 
 
 def test_a_running_job_is_not_ready(service: runs.Service) -> None:
-    job_id = service.running().job_id
-    for path in paths(job_id):
+    results, report, buildings, building = paths(service.running().job_id)
+    for path in (results, report):
         detail = runs.problem(service.client.get(path), 404, f"{OGC}result-not-ready")
         assert "is running (0 %)" in detail
+    # its buildings can be read as they are modelled
+    assert service.client.get(buildings).json()["complete"] is False
+    assert "it may come" in runs.problem(service.client.get(building), 404, f"{OGC}result-not-ready")
 
 
 def test_a_dismissed_job_has_no_results(service: runs.Service) -> None:

@@ -1,9 +1,11 @@
 """`gablework serve`, `driver` and `keys` as processes: starting, refusing, restarting the driver, ending."""
 
 import contextlib
+import inspect
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -106,7 +108,7 @@ def test_a_process_imports_nothing_that_it_does_not_need(module: str, heavy: lis
 def test_the_next_start_waits_longer_after_every_death_but_not_for_ever() -> None:
     pauses = [pause_s(deaths) for deaths in range(1, 40)]
     assert pauses == sorted(pauses)
-    assert (pauses[0], pauses[-1]) == (0.5, 30.0)
+    assert (pauses[0], pauses[-1]) == (0.5, 5.0)
 
 
 def test_another_process_reads_the_same_settings_from_its_environment(tmp_path: Path, monkeypatch) -> None:
@@ -357,6 +359,8 @@ def test_serve_answers_and_ends_with_its_driver_on_sigterm(served) -> None:
     running = served()
     driver = running.driver()
     assert httpx.get(f"{running.url}/readyz").json()["checks"]["driver"] == "running"
+    service = psutil.Process(running.process.pid)
+    wait_for(lambda: driver.nice() > service.nice(), "a driver that lets answers go before models")
     running.process.send_signal(signal.SIGTERM)
     assert running.process.wait(LONG_S) == 0
     assert not driver.is_running()
@@ -420,3 +424,9 @@ def test_a_path_prefix_is_in_every_link(served, monkeypatch) -> None:
     for link in page["links"]:
         answer = httpx.get(f"{running.url}{link['href'].partition('/gable')[2]}")
         assert answer.status_code == 200, link
+
+
+def test_every_setting_is_read_somewhere() -> None:
+    """One that no line reads has no effect, or its variable is parsed elsewhere by other rules."""
+    source = "\n".join(path.read_text() for path in Path(inspect.getfile(ServiceSettings)).parent.rglob("*.py"))
+    assert [name for name in ServiceSettings.model_fields if re.search(rf"\.{name}\b", source) is None] == []

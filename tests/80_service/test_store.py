@@ -6,6 +6,7 @@ import sqlite3
 from pathlib import Path
 
 import pytest
+from copy_contract import CopyContract
 from delivery_contract import DeliveryContract
 from migrated import with_tables
 from schedule_store_contract import ScheduleStoreContract
@@ -27,6 +28,10 @@ class OnSqlite:
 
 class TestJobsOnSqlite(OnSqlite, StoreContract):
     """All of the contract of jobs, on a file."""
+
+
+class TestCopiesOnSqlite(OnSqlite, CopyContract):
+    """All of the contract of copies, on a file."""
 
 
 class TestSchedulesOnSqlite(OnSqlite, ScheduleStoreContract):

@@ -303,12 +303,19 @@ def test_abandoned_uploads_expire_and_those_in_use_do_not(starting: Any, monkeyp
     assert names_in(service) == [f".tus-{recent}"]
 
 
-def test_a_damaged_unfinished_upload_harms_no_other_and_is_removed(client: httpx.Client, local_service: Any) -> None:
+@pytest.mark.parametrize("is_absent", [False, True])
+def test_a_damaged_unfinished_upload_harms_no_other_and_is_removed(
+    client: httpx.Client, local_service: Any, is_absent: bool
+) -> None:
     folder = StateFolder(local_service.settings.state)
     url = begin(client)
     place = folder.uploads / f".tus-{url.rpartition('/')[2]}"
-    for name in ("promise.json", "progress.json"):
-        (place / name).write_bytes(b"")
+    if is_absent:
+        # a half copy, in a backup that an earlier version made
+        (place / "progress.json").unlink()
+    else:
+        for name in ("promise.json", "progress.json"):
+            (place / name).write_bytes(b"")
     assert client.head(url, headers=TUS).status_code == 404
     assert offset(client, begin(client)) == 0
     assert tidy_uploads(local_service.store, folder) == [place]

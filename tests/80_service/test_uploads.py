@@ -364,7 +364,7 @@ def test_a_digest_header_is_checked(client: httpx.Client, header: str) -> None:
 def test_an_encoded_body_is_refused_for_it_could_grow(client: httpx.Client, encoding: str) -> None:
     answer = client.post("/uploads?filename=a.laz", headers={"Content-Encoding": encoding}, content=las_bytes(10))
     assert answer.status_code == 415
-    assert "send the file as it is" in problem(answer)
+    assert "send the body as it is" in problem(answer)
 
 
 def test_the_answer_to_a_body_without_a_name_or_with_another_ending_names_what_is_accepted(
@@ -547,6 +547,30 @@ def test_a_small_file_does_not_wait_for_large_ones_that_are_read_through(
 
 def pieces_of_text(lines: int) -> bytes:
     return b"1.0 2.0 3.0\n" * lines
+
+
+@pytest.mark.parametrize(("turn_s", "pauses"), [(0.0015, []), (0.02, [pytest.approx(0.2)])])
+def test_uploads_pause_while_the_service_is_busy(turn_s: float, pauses: list[Any]) -> None:
+    slept = []
+
+    async def run() -> None:
+        loop, sleep = asyncio.get_running_loop(), asyncio.sleep
+        now_s = 100.0
+
+        async def pause(seconds: float) -> None:
+            nonlocal now_s
+            if seconds:
+                slept.append(seconds)
+            await sleep(0.0)
+            now_s += turn_s
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(loop, "time", lambda: now_s)
+            patch.setattr(uploads.asyncio, "sleep", pause)
+            await uploads.make_way()
+
+    asyncio.run(run())
+    assert slept == pauses
 
 
 def test_many_uploads_at_once_are_each_stored_once(tmp_path: Path) -> None:

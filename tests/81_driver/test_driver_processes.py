@@ -1,5 +1,6 @@
 """Real drivers with real clusters over real jobs: killed, drained, several at once."""
 
+import json
 import os
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from processes import Program, Programs, lives, program, wait_for
 
 from service.files import StateFolder
 from service.jobs import InputReference, Job, JobRequest, JobStatus
+from service.outputs.building_pages import BuildingQuery, building_page
 from service.settings import ServiceSettings
 from service.store import JobStore
 
@@ -46,12 +48,12 @@ class Site:
             "OPENBLAS_NUM_THREADS": "1",
         }
 
-    def driver(self, name: str, *, held: bool = False, **settings: str) -> Program:
-        """A driver; its tasks are held where they split, as long as `let_go` was not called, where that is wanted."""
+    def driver(self, name: str, *, held: bool = False, stage: str = "split", **settings: str) -> Program:
+        """A driver; its tasks are held at a stage, as long as `let_go` was not called, where that is wanted."""
         environment = {**self.environment, **{f"GABLEWORK_{key.upper()}": value for key, value in settings.items()}}
         if held:
             self._gate.mkdir()
-            environment |= asked.environment(pause={"split": str(self._gate)})
+            environment |= asked.environment(pause={stage: str(self._gate)})
         return self._programs.start(name, [str(program("gablework")), "driver", "--name", name], env=environment)
 
     def let_go(self) -> None:
@@ -123,6 +125,49 @@ def test_a_driver_that_is_ended_gives_its_job_back_and_another_takes_it_at_once(
     second = site.driver("second", lease_s="600")
     done = site.over(job, second)
     assert (done.status, done.attempt, done.lost_attempts) == (JobStatus.SUCCESSFUL, 2, 0)
+
+
+@pytest.mark.parametrize("site", ["sqlite"], indirect=True)
+def test_buildings_are_read_while_their_job_runs_and_once_more_after_its_driver_was_killed(site: Site) -> None:
+    job = site.submit()
+
+    def read(attempt: int) -> list[str]:
+        """The buildings that a reader sees."""
+        site.store.watch(job.job_id)
+        place = site.folder.so_far(job.job_id, attempt)
+        if not (place / "outputs.json").exists():
+            return []
+        page = building_page(place, BuildingQuery(by_arrival=True))
+        return [json.loads(text)["id"] for text in page.features()]
+
+    first = site.driver("first", held=True, stage="publish")
+    site.held(first)
+    before = first.wait_for(lambda: read(1), "buildings of the first attempt", DEADLINE_S)
+    # modelled, but far from published
+    assert not list(site.folder.run(job.job_id, 1).glob("state/*"))
+    children = first.children()
+    assert any("service.driver.so_far_process" in child.cmdline() for child in children)
+    first.kill(group=False)
+    wait_for(lambda: not [child for child in children if lives(child)], "the end of the workers and of the reader")
+    site.let_go()
+    second = site.driver("second")
+    done = site.over(job, second)
+    assert (done.status, done.attempt) == (JobStatus.SUCCESSFUL, 2)
+    outputs = building_page(site.folder.outputs(job.job_id, 2), BuildingQuery())
+    assert sorted(before) == [json.loads(text)["id"] for text in outputs.features()]
+    assert len(set(before)) == len(before)
+    assert second.stop() == 0
+
+
+@pytest.mark.parametrize("site", ["sqlite"], indirect=True)
+def test_a_job_that_no_client_reads_has_no_process_for_readers(site: Site) -> None:
+    job = site.submit()
+    driver = site.driver("one", held=True, stage="publish")
+    site.held(driver)
+    assert not any("service.driver.so_far_process" in child.cmdline() for child in driver.children())
+    site.let_go()
+    assert site.over(job, driver).status is JobStatus.SUCCESSFUL
+    assert not site.folder.so_far(job.job_id, 1).exists()
 
 
 @pytest.mark.parametrize("site", ["sqlite"], indirect=True)

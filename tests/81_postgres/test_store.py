@@ -1,6 +1,7 @@
 """The store on a real PostgreSQL."""
 
 import pytest
+from copy_contract import CopyContract
 from delivery_contract import DeliveryContract
 from processes import PostgresServer
 from store_contract import StoreContract, claim, running, submit
@@ -9,6 +10,14 @@ from service.errors import StoreBusyError, StoreError
 from service.store import JobStore, Patience
 
 pytestmark = pytest.mark.slow
+
+
+class TestCopiesOnPostgres(CopyContract):
+    """All of the contract of copies, on PostgreSQL."""
+
+    @pytest.fixture
+    def url(self, postgres_server: PostgresServer, request: pytest.FixtureRequest) -> str:
+        return postgres_server.create_database(with_tables="store" in request.fixturenames)
 
 
 class TestDeliveriesOnPostgres(DeliveryContract):

@@ -1,6 +1,7 @@
 """The API against its own OpenAPI document: generated requests, valid and not, and every answer held against it.
 
-CI runs some hundred; `GABLEWORK_OPENAPI_CASES=5000 .venv/bin/python -m pytest -m slow tests/83_openapi -s` runs more.
+CI runs some hundred on each kind of database; `GABLEWORK_OPENAPI_CASES=10000 .venv/bin/python -m pytest -m slow
+tests/83_openapi -s` runs more.
 """
 
 import base64
@@ -18,6 +19,7 @@ import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, given
 from live_service import POINTS
+from processes import postgres_server  # noqa: F401 - a fixture
 from schemathesis.generation import GenerationMode
 from schemathesis.specs.openapi.checks import positive_data_acceptance
 
@@ -31,16 +33,21 @@ import finished_runs
 
 schemathesis.serializer.alias("application/offset+octet-stream", "application/octet-stream")
 
-CASES = int(os.environ.get("GABLEWORK_OPENAPI_CASES", "500"))
-"""Requests to be generated, at least."""
+CASES = int(os.environ.get("GABLEWORK_OPENAPI_CASES", "250"))
+"""Requests to be generated for each kind of database, at least."""
 
 EXCLUDED = [positive_data_acceptance]
 """Whether an upload is there or a host is allowed, a schema cannot say: such a request is valid and yet refused."""
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[finished_runs.Service]:
-    with finished_runs.service(tmp_path_factory.mktemp("state")) as running:
+@pytest.fixture(scope="module", params=["SQLite", "PostgreSQL"])
+def service(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[finished_runs.Service]:
+    url = None
+    if request.param == "PostgreSQL":
+        url = request.getfixturevalue("postgres_server").create_database(with_tables=True)
+    with finished_runs.service(tmp_path_factory.mktemp("state"), url) as running:
         yield running
 
 

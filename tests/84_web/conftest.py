@@ -16,9 +16,13 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from chromium import Visit
 from processes import Program, free_port, missing, program
+from stocked_state import Stock, stock
 
 TESTS = Path(__file__).resolve().parents[1]
 VIEWER = TESTS.parent / "service" / "viewer"
+
+LISTED = "http://127.0.0.1:9"
+"""A host to which the stocked service may send messages; nothing listens there."""
 
 PAGE_MS = 60_000.0
 """A deadline for what takes a moment on a quiet machine; not a promise of speed."""
@@ -76,11 +80,11 @@ def _gablework() -> Path:
 
 
 @contextlib.contextmanager
-def _served(folder: Path, *options: str) -> Iterator[str]:
-    """The URL of a service on a free port, once it is ready."""
+def _served(folder: Path, *options: str, **variables: str) -> Iterator[str]:
+    """The URL of a service on a free port, once it is ready; with more variables in its environment."""
     port = free_port()
     command = [str(_gablework()), "serve", "--port", str(port), "--state", str(folder / "state"), *options]
-    served = Program("serve", command, folder / "serve.log", env=os.environ)
+    served = Program("serve", command, folder / f"serve-{port}.log", env={**os.environ, **variables})
     url = f"http://127.0.0.1:{port}/"
 
     def answers() -> bool:
@@ -98,10 +102,39 @@ def _served(folder: Path, *options: str) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def service(built_page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def service_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the service."""
+    return tmp_path_factory.mktemp("service")
+
+
+@pytest.fixture(scope="module")
+def service(built_page: Path, service_folder: Path) -> Iterator[str]:
     """URL of a service without keys, with a driver."""
-    with _served(tmp_path_factory.mktemp("service"), "--workers", "1") as url:
+    with _served(service_folder, "--workers", "1") as url:
         yield url
+
+
+TILES = "https://tiles.example.org/"
+"""Origin of the tiles beneath the map of `with_tiles`."""
+
+
+@pytest.fixture
+def with_tiles(service: str, service_folder: Path) -> Iterator[str]:
+    """URL of a second service on the same jobs, whose operator names tiles beneath the map."""
+    template = f"{TILES}{{z}}/{{x}}/{{y}}.png"
+    with _served(
+        service_folder, "--no-driver", GABLEWORK_MAP_TILES=template, GABLEWORK_MAP_CREDIT="© the owners"
+    ) as url:
+        yield url
+
+
+@pytest.fixture(scope="module")
+def stocked(built_page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Stock]]:
+    """URL of a service without keys and without a driver, and the jobs, schedules and webhooks that it has."""
+    folder = tmp_path_factory.mktemp("stocked")
+    stocks = stock(folder / "state")
+    with _served(folder, "--no-driver", GABLEWORK_WEBHOOK_HOSTS=f'["{LISTED}"]') as url:
+        yield url, stocks
 
 
 @pytest.fixture
@@ -112,6 +145,13 @@ def locked(built_page: Path, tmp_path: Path) -> Iterator[tuple[str, str]]:
     (key,) = [word for word in created.stdout.split() if word.startswith("gw_")]
     with _served(tmp_path, "--no-driver") as url:
         yield url, key
+
+
+@pytest.fixture
+def driverless(built_page: Path, tmp_path: Path) -> Iterator[tuple[str, Path]]:
+    """URL of a service without a driver, and its state folder: the test is the driver."""
+    with _served(tmp_path, "--no-driver") as url:
+        yield url, tmp_path / "state"
 
 
 @pytest.fixture(scope="module")

@@ -55,7 +55,7 @@ def hill(visit: Open, service: str, finished: str) -> Visit:
 
 def eye_m(opened: Visit) -> float:
     """Height of the camera above the drawn ground."""
-    return float(opened.page.locator("canvas").get_attribute("data-eye-m") or "nan")
+    return float(opened.canvas.get_attribute("data-eye-m") or "nan")
 
 
 def share_of_background(pixels: NDArray[np.uint8]) -> float:
@@ -73,7 +73,7 @@ BACKGROUND = np.array([0xEE, 0xF1, 0xF4], dtype=np.uint8)
 
 
 def test_zooming_in_with_the_wheel_ends_at_the_surface_under_the_pointer(hill: Visit, tmp_path: Path) -> None:
-    box = hill.page.locator("canvas").bounding_box()
+    box = hill.canvas.bounding_box()
     for x, y in ((0.5, 0.5), (0.3, 0.6), (0.7, 0.45)):
         hill.page.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"])
         for _ in range(60):
@@ -91,7 +91,7 @@ def test_zooming_in_with_the_wheel_ends_at_the_surface_under_the_pointer(hill: V
 
 
 def test_zooming_in_with_keys_never_leaves_a_blank_view(hill: Visit, tmp_path: Path) -> None:
-    canvas = hill.page.locator("canvas")
+    canvas = hill.canvas
     for n in range(30):
         canvas.press("+")
         seen = hill.pixels(tmp_path / f"plus-{n}.png")
@@ -105,7 +105,7 @@ def test_zooming_in_with_keys_never_leaves_a_blank_view(hill: Visit, tmp_path: P
 
 
 def test_a_drag_turns_around_the_surface_under_the_pointer(hill: Visit, tmp_path: Path) -> None:
-    box = hill.page.locator("canvas").bounding_box()
+    box = hill.canvas.bounding_box()
     mouse = hill.page.mouse
     mouse.move(box["x"] + 0.4 * box["width"], box["y"] + 0.6 * box["height"])
     for _ in range(10):

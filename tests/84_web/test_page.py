@@ -67,7 +67,7 @@ def test_a_dropped_tile_becomes_models_and_a_click_on_one_shows_its_record(
     assert seen == sorted(seen)
     job = re.search(r"#/jobs/(\w{32})$", page.url)
     listed = httpx.get(f"{service}jobs/{job[1]}/buildings", params={"limit": 1}).json()["numberMatched"]
-    assert page.locator("canvas").get_attribute("data-models") == str(listed)
+    expect(page.locator("canvas")).to_have_attribute("data-models", str(listed))
     seen = opened.pixels(tmp_path / "models.png")
     gables = of_hue(seen, "gable")
     assert gables.mean() > 0.002, "no gable roof is seen"
@@ -106,9 +106,9 @@ def test_every_download_is_the_file_that_the_results_name(visit: Open, service: 
     opened.open_job(finished)
     opened.page.locator(".menu summary", has_text="Download").click()
     links = opened.page.locator(".menu-list a[download]")
-    assert links.count() == len(results)
+    expect(links).to_have_count(len(results))
     digests = set()
-    for n in range(links.count()):
+    for n in range(len(results)):
         with opened.page.expect_download() as download:
             links.nth(n).click()
         digests.add(hashlib.sha256(Path(download.value.path()).read_bytes()).hexdigest())
@@ -131,13 +131,15 @@ def test_the_legend_hides_and_shows_a_roof_type(visit: Open, service: str, finis
     opened = visit(service)
     opened.open_job(finished)
     before = of_hue(opened.pixels(), "hip").sum()
-    rows = opened.page.locator(".building")
-    listed = rows.count()
+    tally = opened.page.locator(".list-title .tally")
+    listed = tally.inner_text()
     box = opened.page.get_by_role("checkbox", name="Hip")
     box.uncheck()
+    expect(tally).not_to_have_text(listed)
     assert of_hue(opened.pixels(), "hip").sum() < 0.1 * before
-    assert rows.count() < listed
+    assert int(tally.inner_text()) < int(listed)
     box.check()
+    expect(tally).to_have_text(listed)
     assert of_hue(opened.pixels(), "hip").sum() > 0.9 * before
 
 
@@ -187,11 +189,12 @@ def test_a_comparison_shows_each_method_and_the_page_of_all(
     page.locator(".building").first.click()
     building = page.locator(".record-id").inner_text()
     choice = page.get_by_role("combobox", name="Models of the method")
-    assert choice.locator("option").all_inner_texts() == labels
-    choice.select_option("kmeans")
+    expect(choice.locator("option")).to_have_text(labels)
+    with page.expect_response(lambda answer: answer.url.endswith("/results/cityjson?method=kmeans")):
+        choice.select_option("kmeans")
     opened.wait_for_models()
     expect(page.locator(".record-id")).to_have_text(building)
-    assert page.url.endswith(f"#/jobs/{found[1]}/methods/kmeans/buildings/{building}")
+    expect(page).to_have_url(f"{service}#/jobs/{found[1]}/methods/kmeans/buildings/{building}")
     planes = httpx.get(f"{service}jobs/{found[1]}/buildings/{building}?method=kmeans").json()["properties"]["n_planes"]
     expect(page.locator(".record tbody tr")).to_have_count(planes)
     page.screenshot(path=tmp_path / "kmeans.png")
@@ -226,7 +229,7 @@ def test_levels_of_detail_are_chosen_for_the_job_and_in_the_view(
     page.locator("summary", has_text="Options").click()
     boxes = page.get_by_role("group", name="Levels of detail").get_by_role("checkbox")
     names = ["LoD1.2: one block", "LoD1.3: level parts", "LoD2.2: roof faces"]
-    assert [text.strip() for text in boxes.locator("..").all_inner_texts()] == names
+    expect(boxes.locator("..")).to_have_text(names)
     assert [box.is_checked() for box in boxes.all()] == [False, False, True]
     button = page.locator("button[type=submit]")
     boxes.last.uncheck()
@@ -247,7 +250,7 @@ def test_levels_of_detail_are_chosen_for_the_job_and_in_the_view(
     page.locator(".building").first.click()
     expect(page.locator(".record dl").first).to_be_visible()
     choice = page.locator(".tools").get_by_role("group", name="Level of detail").get_by_role("button")
-    assert choice.all_inner_texts() == ["LoD1.2", "LoD1.3", "LoD2.2"]
+    expect(choice).to_have_text(["LoD1.2", "LoD1.3", "LoD2.2"])
     expect(choice.last).to_have_attribute("aria-pressed", "true")
     page.get_by_role("button", name="Fit").click()
     roof = opened.pixels_at_rest()
@@ -256,7 +259,7 @@ def test_levels_of_detail_are_chosen_for_the_job_and_in_the_view(
     expect(choice.last).to_have_attribute("aria-pressed", "false")
     block = opened.pixels()
     assert (block != roof).any(axis=2).mean() > 0.01, "the block looks like the roof"
-    assert page.locator("canvas").get_attribute("data-models") == "1"
+    expect(page.locator("canvas")).to_have_attribute("data-models", "1")
     choice.last.click()
     expect(choice.last).to_have_attribute("aria-pressed", "true")
     assert (opened.pixels_at_rest() != roof).any(axis=2).mean() < 0.001, "the view has moved"
@@ -290,10 +293,15 @@ def test_a_tile_without_crs_asks_for_one(visit: Open, service: str, tmp_path: Pa
 def test_a_result_without_buildings_says_what_to_try(visit: Open, service: str, tmp_path: Path) -> None:
     job = finished_job(service, _field(tmp_path / "field.laz", with_hut=True))
     opened = visit(service)
-    opened.page.locator(f'a[href="#/jobs/{job}"]').click()
+    opened.choose_job(job)
     expect(opened.page.get_by_role("heading", name="No building was found")).to_be_visible()
     expect(opened.page.locator(".stage-note")).to_contain_text("1 object was looked at and left out")
     expect(opened.page.locator(".stage-note")).to_contain_text("vertical unit")
+    opened.page.get_by_role("button", name="Without a model").click()
+    expect(opened.page.locator(".building")).to_have_count(1)
+    expect(opened.page.locator(".stage-note .card")).to_have_count(0)
+    opened.page.locator(".building").click()
+    expect(opened.page.locator(".record").get_by_role("heading", name="Not a building")).to_be_visible()
 
 
 def _field(path: Path, crs: str | None = "EPSG:25832", *, with_hut: bool = False) -> Path:
@@ -345,7 +353,7 @@ def test_nothing_is_cut_off_on_narrow_screens(
     opened = visit(service, viewport={"width": width, "height": 844}, color_scheme=scheme)
     opened.open_job(finished)
     assert opened.page.evaluate("document.documentElement.scrollWidth") == width
-    box = opened.page.locator("canvas").bounding_box()
+    box = opened.canvas.bounding_box()
     assert box["width"] > 0.4 * width
     assert of_hue(opened.pixels(), "gable").any()
     opened.page.screenshot(path=tmp_path / f"{width}-{scheme}.png", full_page=True)

@@ -158,7 +158,7 @@ def test_after_a_reload_the_page_offers_to_go_on_and_does(
     expect(
         opened.page.get_by_role("button", name="Add a tile first").or_(opened.page.locator("#tiles"))
     ).to_be_attached()
-    assert opened.page.evaluate("localStorage.length") == 0
+    opened.page.wait_for_function("localStorage.length === 0")
 
 
 def test_an_interrupted_upload_that_is_forgotten_is_gone_from_the_service(visit: Open, gate: Gate, large: Path) -> None:
@@ -173,7 +173,7 @@ def test_an_interrupted_upload_that_is_forgotten_is_gone_from_the_service(visit:
     with opened.page.expect_response(lambda answer: answer.request.method == "DELETE") as removed:
         opened.page.get_by_role("button", name="Forget large.las").click()
     assert removed.value.status == 204
-    assert opened.page.evaluate("localStorage.length") == 0
+    opened.page.wait_for_function("localStorage.length === 0")
 
 
 def test_a_file_that_is_removed_while_it_is_sent_leaves_nothing(visit: Open, gate: Gate, large: Path) -> None:
@@ -185,7 +185,7 @@ def test_a_file_that_is_removed_while_it_is_sent_leaves_nothing(visit: Open, gat
         opened.page.get_by_role("button", name="Remove large.las").click()
         gate.allow(float("inf"))
     assert removed.value.status in {204, 423}
-    assert opened.page.evaluate("localStorage.length") == 0
+    opened.page.wait_for_function("localStorage.length === 0")
 
 
 def test_a_small_file_does_not_load_the_library(visit: Open, service: str, house: Path) -> None:

@@ -110,6 +110,7 @@ def comparison_facts(request: CompareRequest, summary: CompareSummary) -> dict[s
                 "counts": run.counts,
                 "seconds_a_building": {name: round(value, 6) for name, value in spread.items()},
                 "failed_tiles": list(run.failed_tiles),
+                "tiles_without_points": list(run.tiles_without_points),
                 "warnings": list(run.warnings),
             }
         )

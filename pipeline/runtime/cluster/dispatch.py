@@ -59,6 +59,13 @@ def blame(stage: str, task: object, *, here: bool = False) -> str:
     )
 
 
+def tried_alone(stage: str, task: object) -> Event:
+    """The event of a task that killed its processes and is tried alone."""
+    facts = {name: str(value) for name, value in facts_of_task(task).items() if name == "tile" and value is not None}
+    message = "the processes of a task died: it is tried alone"
+    return Event(kind="detail", stage=stage, message=message, facts=facts)
+
+
 class ClusterMonitor:
     """Checks, while no result comes, whether workers are there and the scheduler answers.
 
@@ -347,6 +354,7 @@ class Dispatch(Generic[Task, Result]):
                 raise RunError(blame(self.stage, self.tasks[number])) from error
             self._drop(future, "suspect")
             LOG.warning("the task killed workers: it is tried alone", extra=self._facts(number))
+            self.watch.listener(tried_alone(self.stage, self.tasks[number]))
             self._suspects.append(number)
             return
         try:

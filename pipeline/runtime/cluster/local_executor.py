@@ -28,7 +28,7 @@ from types import TracebackType
 from typing import Any, Generic, Self
 
 from pipeline.errors import RunCancelledError, RunError
-from pipeline.runtime.cluster.dispatch import SETTLE_INTERRUPTED_S, TICK_S, blame
+from pipeline.runtime.cluster.dispatch import SETTLE_INTERRUPTED_S, TICK_S, blame, tried_alone
 from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, borrowed_child, start_failure
 from pipeline.runtime.isolation.supervision import ChildEnd
 from pipeline.runtime.monitoring.events import Watch
@@ -171,6 +171,7 @@ class _Stage(Generic[Task, Result]):
                 else:
                     facts = {"stage": self._stage, **facts_of_task(self._tasks[number])}
                     LOG.warning("the task killed its process (%s): it is tried alone", outcome.detail, extra=facts)
+                    self._watch.listener(tried_alone(self._stage, self._tasks[number]))
             except BaseException as error:  # noqa: BLE001 - raised where the results are waited for
                 landed = error
             with self._changed:

@@ -66,6 +66,8 @@ class RunMetrics(Collector):
             if event.kind == "warning":
                 self._warnings += 1
                 return
+            if event.kind == "detail":
+                return
             self._waiting = event.kind == "waiting"
             self._finished = event.kind == "finished"
             if event.kind in {"stage", "progress"}:

@@ -84,6 +84,7 @@ def supervise(
     cancelled: Callable[[], bool] = never,
     *,
     second_chance: bool = True,
+    on_second_chance: Callable[[int, str], None] = lambda _index, _detail: None,
     loads: Sequence[str] | None = None,
 ) -> Iterator[tuple[int, Result | Loss]]:
     """Call a function on items in a child process and survive the death of the child.
@@ -97,6 +98,8 @@ def supervise(
         Takes one item; both are pickled.
     second_chance : bool
         Whether an item that killed its process is tried once more, alone in a fresh one, before it is given up.
+    on_second_chance : callable
+        Gets the index of such an item and what happened to its process.
 
     Raises
     ------
@@ -139,6 +142,7 @@ def supervise(
         if alone or end.cause is EndCause.TIME or not second_chance:
             yield end.index, _loss(end, alone=alone)
         else:
+            on_second_chance(end.index, end.detail)
             lots.appendleft((guilty, True))
 
 

@@ -28,9 +28,13 @@ _FREED_BYTES = 2**25
 system and raises that limit up to this size only as larger blocks are freed; until then every array of a tile consists
 of new pages with a page fault each: a thirtieth of the processor time of a small run."""
 
-NOT_OURS = frozenset({"cffi", "pandas", "requests"})
-"""Packages that numba, pyarrow and laspy load if they are installed, although gablework needs none and its locks have
-none. In an environment with them a run would take a third of a second longer."""
+NOT_OURS = frozenset({"cffi", "pandas", "requests", "pygments"})
+"""Packages that libraries load if they are installed, although gablework needs none: numba, pyarrow and laspy the first
+three, httpx the last, for a command line of its own. A run would take a third of a second longer with the first three,
+and the start of a service or a client with the last."""
+
+_SENDS_TRACES = "opentelemetry.exporter.otlp.proto.http"
+"""The package that sends traces needs requests; it is loaded where traces are on, before anything needs it."""
 
 
 class _Blocker(MetaPathFinder):
@@ -38,7 +42,7 @@ class _Blocker(MetaPathFinder):
 
     def find_spec(self, name: str, *_: object) -> None:
         """Leave a module to the other finders."""
-        if name in NOT_OURS:
+        if name in NOT_OURS and not (name == "requests" and _SENDS_TRACES in sys.modules):
             raise ModuleNotFoundError(f"No module named {name!r} in a process of gablework", name=name)
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Literal
 
 from pipeline.errors import RunCancelledError
 
-EventKind = Literal["run", "stage", "progress", "warning", "waiting", "finished"]
+EventKind = Literal["run", "stage", "progress", "warning", "waiting", "detail", "finished"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -16,7 +16,7 @@ class Event:
     """Something that happened; has no object of the engine, so it can be logged, stored or sent."""
 
     kind: EventKind
-    """Kind of the event; `waiting` means that no worker is there."""
+    """Kind of the event; `waiting` means that no worker is there, `detail` is for logs: about one building or task."""
     stage: str = ""
     """plan, ingest, split, join, reconstruct or publish; empty for the run as a whole."""
     done: int = 0
@@ -29,6 +29,8 @@ class Event:
     """Finished units taken from an earlier run; sent once, when the stage begins."""
     failed: int = 0
     """Failed units, which are among the finished ones."""
+    facts: Mapping[str, str | float] = dataclasses.field(default_factory=dict)
+    """What a detail is about: tile, building, reason, seconds."""
 
 
 Listener = Callable[[Event], None]

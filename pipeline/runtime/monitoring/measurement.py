@@ -36,6 +36,8 @@ class Measured(Generic[Result]):
     """host:pid."""
     peak_bytes: int
     """Largest resident size of the process so far."""
+    tile: str | None = None
+    """The tile of the task, if it has one."""
 
 
 class _Account(threading.local):
@@ -63,8 +65,9 @@ def measure(function: Callable[[Task], Result], task: Task, stage: str = "") -> 
     began_s, started, cpu_s = time.time(), time.perf_counter(), time.thread_time()
     outcome = "failed"
     TALLIES.begin()
+    facts = facts_of_task(task)
     try:
-        with about(stage=stage, **facts_of_task(task)):
+        with about(stage=stage, **facts):
             try:
                 result = function(task)
             except RunCancelledError:
@@ -82,8 +85,15 @@ def measure(function: Callable[[Task], Result], task: Task, stage: str = "") -> 
         seconds = time.perf_counter() - started
         TALLIES.end(stage, outcome, seconds)
     process, peak_bytes = peak_of_process()
+    tile = facts["tile"]
     return Measured(
-        result=result, seconds=seconds, cpu_s=cpu_s, began_s=began_s, process=process, peak_bytes=peak_bytes
+        result=result,
+        seconds=seconds,
+        cpu_s=cpu_s,
+        began_s=began_s,
+        process=process,
+        peak_bytes=peak_bytes,
+        tile=None if tile is None else str(tile),
     )
 
 

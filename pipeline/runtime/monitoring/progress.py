@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
+from pipeline.runtime.monitoring import tracing
 from pipeline.runtime.monitoring.events import Event, EventKind, Listener, Watch
 from pipeline.runtime.monitoring.measurement import Measured
+from pipeline.runtime.monitoring.tracing import Part
 
 
 class Progress:
@@ -40,7 +42,7 @@ class Progress:
         own._part, own._parts, own._label = number, parts, label
         return own
 
-    def tell(self, kind: EventKind, stage: str, message: str = "", **counts: int) -> None:
+    def tell(self, kind: EventKind, stage: str, message: str = "", **counts: Any) -> None:
         """Send an event; `counts` are the counting fields of `Event`."""
         self.listener(Event(kind=kind, stage=stage, message=message, **counts))
 
@@ -50,9 +52,19 @@ class Progress:
             self.warnings.append(message)
             self.tell("warning", stage, message)
 
-    def measured(self, found: Measured[Any]) -> None:
-        """Note the peak memory of the process that ran a task."""
+    def detail(self, stage: str, message: str, **facts: str | float) -> None:
+        """Send what only logs need: something about one building or task."""
+        self.listener(Event(kind="detail", stage=stage, message=message, facts=facts))
+
+    def measured(self, found: Measured[Any], parts: Callable[[], Iterable[Part]] = tuple) -> None:
+        """Note the peak memory of the process that ran a task, and the spans of the task and of its parts."""
         self.peaks[found.process] = max(self.peaks.get(found.process, 0), found.peak_bytes)
+        if tracing.is_on():
+            name, times = "task" if found.tile is None else "tile", (found.began_s, found.began_s + found.seconds)
+            facts: dict[str, Any] = {"tile": found.tile, "process": found.process, "cpu_s": round(found.cpu_s, 3)}
+            task = tracing.finished(name, *times, **facts)
+            for part in parts():
+                tracing.finished(part.name, part.began_s, part.ended_s, below=task, error=part.error, **part.facts)
 
     @contextlib.contextmanager
     def stage(self, name: str, total: int, *, quiet: bool = False) -> Iterator[StageProgress]:
@@ -61,7 +73,8 @@ class Progress:
         stage = StageProgress(self, name, self._part * total, self._parts * total, quiet=quiet)
         if not quiet:
             self.tell("stage", name, self._label, done=stage.done, total=stage.total)
-        yield stage
+        with contextlib.nullcontext() if quiet else tracing.span(f"stage {name}", stage=name, total=total):
+            yield stage
         if not quiet:
             self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started
 

@@ -89,13 +89,19 @@ class Scratch:
 
     def path(self, *parts: str) -> Path:
         """A path inside; its folder exists afterwards. Raises RunCancelledError if scratch, and the run, is gone."""
-        path = Path(self.root, *parts)
+        path = os.path.join(self.root, *parts)  # noqa: PTH118 - a Path takes longer
+        folder = os.path.dirname(path)  # noqa: PTH120
+        if not os.path.isdir(folder):  # noqa: PTH112
+            self._make(folder)
+        return Path(path)
+
+    def _make(self, folder: str) -> None:
+        """Make a folder inside and those above it, but never the scratch folder itself."""
         try:
-            for folder in reversed(path.relative_to(self.root).parents[:-1]):
-                Path(self.root, folder).mkdir(exist_ok=True)
+            for above in reversed(Path(folder, "any").relative_to(self.root).parents[:-1]):
+                Path(self.root, above).mkdir(exist_ok=True)
         except FileNotFoundError:
             raise RunCancelledError(f"{self.root} is gone: the run is over") from None
-        return path
 
     def put_arrays(self, name: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
         """Store arrays, one file each under the folder `name`, so that they can be mapped."""

@@ -6,23 +6,26 @@ writes the outcome whole and last, after all other files that the task leaves in
 need not run: an interrupted run resumes where it stopped, and a later run repeats only what changed. (Mokhov, Mitchell
 and Peyton Jones 2018, Build systems à la carte, call this a constructive trace.)
 
-An outcome has a brief, the small part that travels to the driver, and a result, which the tasks of later stages read.
+An outcome has a brief, the small part that travels to the driver, and a result, which the tasks of later stages read:
+whole, or part by part (`InParts`).
 The other files that a task leaves belong to its unit, and the unit's next task replaces them. Outcomes of other keys
 are therefore removed before that task starts.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime as dt
 import enum
 import functools
 import hashlib
+import itertools
 import pickle
 import struct
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, BinaryIO, Generic, TypeVar
 
 import numpy as np
 import shapely
@@ -37,11 +40,12 @@ Brief = TypeVar("Brief")
 
 FOLDER = "kept"
 """Folder of scratch for all outcomes."""
-_FORMAT = 2
+_FORMAT = 4
 """Part of every key, to be raised when the class of an outcome moves or gets another content: the pickles of an older
 checkout of the same version are then not read."""
 _KEY_DIGITS = 40
 """Hexadecimal digits of a key: 160 bits."""
+_OFFSET = struct.Struct("<Q")
 
 
 def key_of(*parts: object) -> str:
@@ -120,6 +124,14 @@ class Place:
         return f"{FOLDER}/{self.stage}/{self.unit}/{self.key}"
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class InParts:
+    """A result of which only the parts are stored, each to be read alone by `part_of`."""
+
+    parts: tuple[Any, ...]
+    """Its parts."""
+
+
 def whole(result: Result) -> Result:
     """The brief of a small result: all of it."""
     return result
@@ -187,10 +199,19 @@ def run_and_store(work: OutcomeTask[Task, Result, Brief]) -> StoredOutcome[Brief
 
 
 def _packed(brief: object, result: object) -> bytes:
-    """The two pickles one after the other, so that the brief can be read alone."""
+    """The two pickles one after the other, so that the brief can be read alone; in place of the second, the parts.
+
+    Before the parts is a table of where each begins in the file, and where the last one ends.
+    """
     first = pickle.dumps(brief, protocol=pickle.HIGHEST_PROTOCOL)
+    head = len(first).to_bytes(8, "little") + first
+    if isinstance(result, InParts):
+        pieces = [pickle.dumps(part, protocol=pickle.HIGHEST_PROTOCOL) for part in result.parts]
+        begin = len(head) + _OFFSET.size * (len(pieces) + 1)
+        offsets = itertools.accumulate(map(len, pieces), initial=begin)
+        return b"".join((head, *map(_OFFSET.pack, offsets), *pieces))
     second = b"" if result is brief else pickle.dumps(result, protocol=pickle.HIGHEST_PROTOCOL)
-    return len(first).to_bytes(8, "little") + first + second
+    return head + second
 
 
 def brief_of(scratch: Scratch, place: Place) -> Any:
@@ -205,13 +226,35 @@ def result_of(scratch: Scratch, place: Place) -> Any:
 
     Raises RunCancelledError if the outcome is gone, and the run with it.
     """
+    with _opened(scratch, place) as stream:
+        content = stream.read()
+    first = 8 + int.from_bytes(content[:8], "little")
+    return pickle.loads(content[first:] or content[8:first])  # noqa: S301
+
+
+def part_of(scratch: Scratch, place: Place, number: int) -> Any:
+    """A part of a stored result that is `InParts`, counted from 0; the others are not read.
+
+    Raises RunCancelledError as `result_of`.
+    """
+    with _opened(scratch, place) as stream:
+        size = int.from_bytes(stream.read(8), "little")
+        stream.seek(8 + size + _OFFSET.size * number)
+        begin, end = (_OFFSET.unpack(stream.read(_OFFSET.size))[0] for _ in range(2))
+        stream.seek(begin)
+        return pickle.loads(stream.read(end - begin))  # noqa: S301
+
+
+@contextlib.contextmanager
+def _opened(scratch: Scratch, place: Place) -> Iterator[BinaryIO]:
+    """The file of an outcome."""
     try:
-        content = Path(scratch.root, place.name).read_bytes()
+        stream = Path(scratch.root, place.name).open("rb")  # noqa: SIM115 - closed below
     except FileNotFoundError:
         scratch.check_cancelled()
         raise RunCancelledError(f"{place.name} is gone from {scratch.root}: another run works there") from None
-    first = 8 + int.from_bytes(content[:8], "little")
-    return pickle.loads(content[first:] or content[8:first])  # noqa: S301
+    with stream:
+        yield stream
 
 
 def keys_of(scratch: Scratch, stage: str, unit: str) -> list[str]:
@@ -219,10 +262,15 @@ def keys_of(scratch: Scratch, stage: str, unit: str) -> list[str]:
     return [name for name in _names(scratch, f"{FOLDER}/{stage}/{unit}") if name[0] != "."]
 
 
+def stored_units(scratch: Scratch, stage: str) -> list[str]:
+    """The units of a stage that have outcomes or had some, sorted."""
+    return _names(scratch, f"{FOLDER}/{stage}")
+
+
 def drop_outcomes(scratch: Scratch, stage: str, wanted: Iterable[Place]) -> None:
     """Remove the stored outcomes of a stage except the wanted ones."""
     names = {place.name for place in wanted}
-    for unit in _names(scratch, f"{FOLDER}/{stage}"):
+    for unit in stored_units(scratch, stage):
         for key in keys_of(scratch, stage, unit):
             name = Place(stage, unit, key).name
             if name not in names:

@@ -46,10 +46,10 @@ def tidy(scratch: Scratch, joined: Joined, models: Collection[str], run_dirs: Se
 
     `models` are the stages under which its models are stored, `run_dirs` where it published.
     """
-    published = {publishing(run_dir) for run_dir in run_dirs}
+    published = {stage for run_dir in run_dirs for stage in (publishing(run_dir), writing_points(run_dir))}
     for stage in Path(scratch.root, FOLDER).glob("*"):
         by_others = stage.name.startswith("models-") and stage.name not in models
-        if by_others or (stage.name.startswith("publish-") and stage.name not in published):
+        if by_others or (stage.name.startswith(("publish-", "points-")) and stage.name not in published):
             shutil.rmtree(stage, ignore_errors=True)
     blocks = {site.block for site in joined.candidates}
     for folder in Path(scratch.root, "units").glob("*"):
@@ -60,3 +60,8 @@ def tidy(scratch: Scratch, joined: Joined, models: Collection[str], run_dirs: Se
 def publishing(run_dir: str) -> str:
     """The stage under which the outcomes of publishing into a run directory are stored."""
     return f"publish-{key_of(run_dir)}"
+
+
+def writing_points(run_dir: str) -> str:
+    """The stage under which the outcomes of the points of a run directory are stored."""
+    return f"points-{key_of(run_dir)}"

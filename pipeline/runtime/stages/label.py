@@ -9,17 +9,17 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from uuid import uuid4
 
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.model import BoolArray, ByteArray
+from pipeline.model import BoolArray, ByteArray, IntArray
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.gather import Surroundings, surroundings_of
-from pipeline.runtime.stages.sites import PointRange
+from pipeline.runtime.stages.sites import CandidateSite, PointRange, RejectedSite
 from pipeline.runtime.stages.window_points import bucket_paths, load_window
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, VEGETATION_CLASSES, WindowPoints
 from pipeline.terrain.ground import Terrain, ground_points, slopes_of
@@ -79,6 +79,42 @@ def label(task: LabelTask) -> Labelled:
 
     The classes are in scratch under `classes/<tile>/<input>.bin`, one byte per point of the bucket.
     """
+    found = classes_of_tile(task)
+    counts: Counter[int] = Counter()
+    for path in bucket_paths(task.scratch, task.tile):
+        records = np.fromfile(path, POINT)
+        labels = found.of(records)
+        histogram = np.bincount(labels)
+        counts.update({int(code): int(histogram[code]) for code in np.flatnonzero(histogram)})
+        target = class_path(task.scratch, task.tile, path.name)
+        temporary = target.with_name(f".{target.name}.{uuid4().hex}.part")
+        labels.tofile(temporary)
+        temporary.replace(target)
+    return Labelled(tile=task.tile, points=dict(counts))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TileClasses:
+    """The classes of a tile's points."""
+
+    core: npt.NDArray[np.void]
+    """(n,) POINT, the points of the tile without exact duplicates."""
+    first: IntArray
+    """(n,) int64, their order by their count of returns."""
+    found: ByteArray
+    """(n,) uint8, the classes by what lies around them."""
+    believed: ClassesInUse
+    """Which of the file's classes are believed."""
+
+    def of(self, records: npt.NDArray[np.void]) -> ByteArray:
+        """The classes of records of the tile, (m,) uint8."""
+        # points of one place and return number differ at most in their count of returns: the lowest decides for all
+        at = self.first[index_of_each(*places_of(records), *places_of(self.core[self.first]))]
+        return _believed(self.found[at], records["classification"], self.believed)
+
+
+def classes_of_tile(task: LabelTask) -> TileClasses:
+    """Classify the points of a tile by what lies around them."""
     task.scratch.check_cancelled()
     window = neighbourhood(task.tile, task.grid, task.settings)
     halo_mm = task.grid.core(task.tile).x0_mm - window.x0_mm
@@ -90,21 +126,17 @@ def label(task: LabelTask) -> Labelled:
     evidence = evidence_of(task, points, window)
     found = classes_of(evidence, wanted, task.settings.vegetation, given=task.given)[:core]
     found[_held_by(task, task.decks, points, window)[:core] & (found != PointClass.GROUND)] = PointClass.BRIDGE_DECK
-    counts: Counter[int] = Counter()
-    # points of one place and return number differ at most in their count of returns: the lowest decides for all
     first = np.argsort(points.return_count[:core], kind="stable")
-    places = points.x_mm[first], points.y_mm[first], points.z_mm[first], points.return_number[first]
-    for path in bucket_paths(task.scratch, task.tile):
-        records = np.fromfile(path, POINT)
-        at = first[index_of_each(*_places(records), *places)]
-        labels = _believed(found[at], records["classification"], task.classes)
-        histogram = np.bincount(labels)
-        counts.update({int(code): int(histogram[code]) for code in np.flatnonzero(histogram)})
-        target = class_path(task.scratch, task.tile, path.name)
-        temporary = target.with_name(f".{target.name}.{uuid4().hex}.part")
-        labels.tofile(temporary)
-        temporary.replace(target)
-    return Labelled(tile=task.tile, points=dict(counts))
+    return TileClasses(core=loaded.core, first=first, found=found, believed=task.classes)
+
+
+def by_tile(sites: Iterable[CandidateSite | RejectedSite]) -> dict[Tile, list[PointRange]]:
+    """The ranges of the points of sites, by their tiles."""
+    ranges: dict[Tile, list[PointRange]] = {}
+    for site in sites:
+        for part in site.ranges:
+            ranges.setdefault(part.tile, []).append(part)
+    return ranges
 
 
 def class_path(scratch: Scratch, tile: Tile, bucket: str) -> Path:
@@ -149,18 +181,20 @@ def _held_by(task: LabelTask, parts: Sequence[PointRange], points: WindowPoints,
     """Mask of the points that some ranges hold."""
     if not parts:
         return np.zeros(len(points), np.bool_)
-    pieces = []
-    for part in parts:
-        stored = task.scratch.array(f"{part.folder}/{part.tile.key}", "points", mapped=True).view(POINT)
-        records = np.array(stored[part.start : part.stop])
-        pieces.append(records[window.contains(records["x"], records["y"])])
-    records = np.concatenate(pieces)
-    at = index_of_each(points.x_mm, points.y_mm, points.z_mm, points.return_number, *_places(records))
+    records = np.concatenate([records_within(task.scratch, part, window) for part in parts])
+    at = index_of_each(points.x_mm, points.y_mm, points.z_mm, points.return_number, *places_of(records))
     inside: BoolArray = at >= 0
     return inside
 
 
-def _places(
+def records_within(scratch: Scratch, part: PointRange, window: Window) -> npt.NDArray[np.void]:
+    """The records of a range that lie in a window, (m,) POINT."""
+    stored = scratch.array(f"{part.folder}/{part.tile.key}", "points", mapped=True).view(POINT)
+    records = np.array(stored[part.start : part.stop])
+    return records[window.contains(records["x"], records["y"])]
+
+
+def places_of(
     records: npt.NDArray[np.void],
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64], ByteArray]:
     """Coordinates and return numbers of records, each in one piece."""

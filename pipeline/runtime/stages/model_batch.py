@@ -7,7 +7,7 @@ import functools
 import math
 import pickle
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 
 import numpy as np
 import shapely
@@ -31,7 +31,7 @@ from pipeline.runtime.stages.sites import CandidateSite
 from pipeline.tiling import Tile, TileGrid
 
 _BUNDLE_TIMEOUT_S = 60.0
-_LOST = frozenset({Reason.CRASHED, Reason.TIMED_OUT, Reason.OUT_OF_MEMORY, Reason.INTERNAL_ERROR})
+LOST = frozenset({Reason.CRASHED, Reason.TIMED_OUT, Reason.OUT_OF_MEMORY, Reason.INTERNAL_ERROR})
 """Reasons caused by processes or by gablework, not by the building's points: each deserves a log line."""
 REJECTED = "rejected"
 """The status, in the figures of a run, of a candidate that becomes a rejected object."""
@@ -97,6 +97,12 @@ class Modelled:
     seconds: float
     reused: bool = False
     """Whether the model was taken from an earlier batch, of the same input."""
+    ended_s: float = 0.0
+    """When it was done, in seconds since 1970 by the clock of its machine."""
+    detail: str = ""
+    """Of a building that failed: the measured figure and the limit, or what happened."""
+    retried: str = ""
+    """What happened to the process that modelled it first, if it was modelled again in another one."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -144,7 +150,7 @@ def model_batch(task: BatchTask) -> Batch:
     for model in each:
         building = model.modelled
         TALLIES.building(building.status, building.reason)
-        if building.reason in _LOST:
+        if building.reason in LOST:
             facts = {"building": building.building_id, "tile": building.owner.key, "reason": building.reason}
             LOG.warning("a building is lost", extra={**facts, "seconds": round(building.seconds, 3)})
     return Batch(
@@ -153,10 +159,11 @@ def model_batch(task: BatchTask) -> Batch:
     )
 
 
-def stored_results(scratch: Scratch, place: Place) -> list[StoredResult]:
-    """The models of a stored batch. Only for our own scratch: pickles run code."""
+def stored_results(scratch: Scratch, place: Place, only: Collection[str] | None = None) -> list[StoredResult]:
+    """The models of a stored batch, or those of some building_ids. Only for our own scratch: pickles run code."""
     batch: Batch = result_of(scratch, place)
-    return [pickle.loads(stored) for _, stored in batch.stored.values()]  # noqa: S301
+    wanted = batch.stored if only is None else [name for name in batch.stored if name in only]
+    return [pickle.loads(batch.stored[name][1]) for name in wanted]  # noqa: S301
 
 
 def _packed(
@@ -180,6 +187,8 @@ def _packed(
         points=result.n_points,
         seconds=seconds,
         reused=reused,
+        ended_s=time.time(),
+        detail=result.reason_detail if result.status is Status.FAILED else "",
     )
     own = task.own.get(site.building_id)
     facts = dataclasses.replace(
@@ -220,11 +229,14 @@ def _in_child(task: BatchTask, limits: IsolationLimits) -> Iterator[tuple[int, P
     common = dataclasses.replace(task, sites=())
     cancelled = functools.partial(_cancelled, task)
     work = functools.partial(model_site, common)
-    for index, model in supervise(work, task.sites, limits, cancelled, loads=_loads(task)):
-        if isinstance(model, Loss):
-            yield index, _lost(common, task.sites[index], model, limits, cancelled)
-        else:
-            yield index, model
+    retried: dict[int, str] = {}
+    for index, model in supervise(
+        work, task.sites, limits, cancelled, on_second_chance=retried.__setitem__, loads=_loads(task)
+    ):
+        found = _lost(common, task.sites[index], model, limits, cancelled) if isinstance(model, Loss) else model
+        if index in retried:
+            found = dataclasses.replace(found, modelled=dataclasses.replace(found.modelled, retried=retried[index]))
+        yield index, found
 
 
 def _loads(task: BatchTask) -> tuple[str, ...]:

@@ -44,12 +44,12 @@ class OutlineTask:
 
 def outline(context: RunContext, settings: RoofSettings, joined: Joined) -> Joined:
     """The candidates with the outlines of touching units, drawn together."""
-    scratch, grid = context.scratch, context.plan.grid
+    scratch, grid, alike = context.scratch, context.plan.grid, key_of(settings)
     tasks = {}
     for tile, units in _blocks_by_tile(joined.candidates).items():
         for task in outline_tasks(units, settings, grid, scratch):
             sites = [site for block in task.blocks for site in block]
-            tasks[Place("outline", tile.key, key_of(settings, task.blocks, joined.around(sites, grid)))] = task
+            tasks[Place("outline", tile.key, key_of(alike, task.blocks, joined.around(sites, grid)))] = task
     drop_outcomes(scratch, "outline", tasks)
     drawn = context.map_stored("outline", draw_outlines, tasks, whole)
     outlines: dict[str, MultiPolygon] = {}

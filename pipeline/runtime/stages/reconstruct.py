@@ -8,11 +8,20 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.model import Status
+from pipeline.runtime.monitoring.tracing import Part, slow_building_s
 from pipeline.runtime.overrides.overrides_file import own_modelling
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import Place, brief_of, drop_outcomes, key_of, keys_of
-from pipeline.runtime.stages.model_batch import Batch, BatchTask, Modelled, StoredResult, model_batch, stored_results
+from pipeline.runtime.stages.model_batch import (
+    LOST,
+    Batch,
+    BatchTask,
+    Modelled,
+    StoredResult,
+    model_batch,
+    stored_results,
+)
 from pipeline.runtime.stages.sites import CandidateSite, Joined, by_owner
 from pipeline.settings import RunSettings
 from pipeline.tiling import Tile
@@ -48,13 +57,20 @@ class Models:
 
 def models_stage(settings: RunSettings) -> str:
     """The stage under which models by these settings are stored."""
-    return f"models-{settings.settings_hash[:16]}"
+    return stage_of_models(settings.settings_hash)
+
+
+def stage_of_models(settings_hash: str) -> str:
+    """The stage under which models by settings with this hash are stored."""
+    return f"models-{settings_hash[:16]}"
 
 
 def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, compared: bool = False) -> Models:
     """Model all candidates, the batches of most points first; seconds may be compared with those of other methods."""
     scratch, plan = context.scratch, context.plan
     stage, method = models_stage(settings), settings.general.method
+    limits = context.isolation
+    alike = key_of(method, settings.building, plan.gps_kind, limits, plan.grid)
     tasks: dict[Place, BatchTask] = {}
     places: dict[Tile, list[Place]] = {}
     for tile, candidates in sorted(by_owner(joined.candidates).items()):
@@ -65,9 +81,7 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
                 for site in sites
                 if site.override is not None and site.override.remodels
             }
-            around, limits = joined.around(sites, plan.grid), context.isolation
-            key = key_of(sites, around, method, settings.building, own, plan.gps_kind, limits, plan.grid)
-            place = Place(stage, tile.key, key)
+            place = Place(stage, tile.key, key_of(alike, sites, joined.around(sites, plan.grid), own))
             places.setdefault(tile, []).append(place)
             tasks[place] = BatchTask(
                 sites=sites,
@@ -89,18 +103,49 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
     def count(models: Sequence[Modelled]) -> None:
         nonlocal made
         made += sum(not model.reused for model in models)
+        for model in models:
+            _tell(context, model)
 
     brief: Callable[[Batch], tuple[Modelled, ...]] = operator.attrgetter("modelled")
-    units = ProgressUnits(total=len(joined.candidates), done=len, failed=_failed_of)
+    units = ProgressUnits(total=len(joined.candidates), done=len, failed=_failed_of, parts=_traced)
     context.map_stored("reconstruct", model_batch, dict(largest_first), brief, units, count)
     # only now: models whose input did not change are taken from the earlier batches
     drop_outcomes(scratch, stage, tasks)
     return Models(places=places, scratch=scratch, made=made)
 
 
+def _tell(context: RunContext, model: Modelled) -> None:
+    """Tell logs of a building that failed, or whose process ended before it was modelled in another one."""
+    facts = {"building": model.building_id, "tile": model.owner.key}
+    if model.retried:
+        context.progress.detail("reconstruct", f"modelled again in a fresh process: {model.retried}", **facts)
+    if model.status == Status.FAILED.value:
+        reason = model.reason or ""
+        message = f"failed: {reason}" + (f": {model.detail}" if model.detail else "")
+        context.progress.detail("reconstruct", message, reason=reason, seconds=round(model.seconds, 3), **facts)
+
+
 def _failed_of(models: Sequence[Modelled]) -> int:
     """Number of failed buildings of a batch."""
     return sum(model.status == Status.FAILED.value for model in models)
+
+
+def _traced(models: Sequence[Modelled]) -> Iterator[Part]:
+    """The buildings of a batch that get a span: slow ones, and those that ended their process or met a fault of ours.
+
+    A city has a million buildings, and most take milliseconds.
+    """
+    for model in models:
+        is_lost = model.reason in LOST
+        if not model.reused and (is_lost or model.seconds >= slow_building_s()):
+            facts = {"building_id": model.building_id, "status": model.status, "reason": model.reason}
+            yield Part(
+                name="building",
+                began_s=model.ended_s - model.seconds,
+                ended_s=model.ended_s,
+                error=model.reason if is_lost else None,
+                facts=facts | {"points": model.points, "faces": model.faces},
+            )
 
 
 def batches(sites: Sequence[CandidateSite]) -> list[tuple[CandidateSite, ...]]:

@@ -95,6 +95,7 @@ def split_windows(
     content, points = content_by_tile(ingested), points_by_tile(ingested)
     plan_grid, grid, folder = context.plan.grid, windows.grid, windows.folder
     seen = {tile: content_of_window(content, plan_grid, plan_grid.window(tile), tile) for tile in windows.outlines}
+    alike = key_of(grid, settings.scene, windows.classes, folder)
     tasks = {}
     for tile, outlines in windows.outlines.items():
         task = SplitTask(
@@ -106,7 +107,7 @@ def split_windows(
             folder=folder,
             memory_bytes=window_bytes(grid, tile, points),
         )
-        key = key_of(tile, grid, settings.scene, windows.classes, outlines, folder, seen[tile])
+        key = key_of(alike, tile, outlines, seen[tile])
         tasks[Place(folder, tile.key, key)] = task
     clear_tiles(context.scratch, folder, tasks)
     function = functools.partial(split_window, settings=settings.scene)

@@ -52,11 +52,11 @@ def divide_units(
     """The candidates, divided into units; part of the join and not a stage of its own."""
     if settings.split == "nothing":
         return joined
-    scratch, grid = context.scratch, context.plan.grid
+    scratch, grid, alike = context.scratch, context.plan.grid, key_of(settings, min_strip_offset_m, crs_name)
     tasks = {}
     for tile, candidates in by_owner(joined.candidates).items():
         for task in unit_tasks(candidates, settings, min_strip_offset_m, grid, scratch, crs_name):
-            key = key_of(settings, min_strip_offset_m, crs_name, task.sites, joined.around(task.sites, grid))
+            key = key_of(alike, task.sites, joined.around(task.sites, grid))
             tasks[Place("units", tile.key, key)] = task
     drop_outcomes(scratch, "units", tasks)
     divided = context.map_stored("join", divide, tasks, whole, quiet=True)

@@ -12,7 +12,7 @@ export class Problem extends Error {
     readonly detail: string,
     /** What to do about it. */
     readonly remedy: string,
-    /** The kind of problem, the last part of its URN; empty if it has none. */
+    /** The kind of problem, the last part of its URI; empty if it has none. */
     readonly kind = "",
   ) {
     super(detail === "" ? title : `${title}: ${detail}`);
@@ -27,6 +27,12 @@ export interface Link {
 }
 
 export type Status = "accepted" | "running" | "successful" | "failed" | "dismissed";
+
+/** What a run found. */
+export interface Summary {
+  /** Buildings by status: ok, fallback, failed. */
+  statuses?: Record<string, number>;
+}
 
 export interface StatusInfo {
   jobID: string;
@@ -43,10 +49,17 @@ export interface StatusInfo {
   /** The schedule that made the job. */
   scheduleID?: string;
   links?: Link[];
-  request?: unknown;
-  /** The summary of each run of a comparison, by label. */
-  summary?: { runs?: Record<string, unknown> };
-  exception?: { title?: string; detail?: string };
+  /** Kept, whatever its age and size. */
+  keep?: boolean;
+  /** What was asked for; lists leave it out. */
+  request?: { inputs?: Record<string, unknown> };
+  summary?: Summary & {
+    /** The summary of each run of a comparison, by label. */
+    runs?: Record<string, Summary>;
+    /** Points by class, of a classification. */
+    classes?: Record<string, number>;
+  };
+  exception?: { type?: string; title?: string; detail?: string };
 }
 
 export interface Feature {
@@ -117,12 +130,22 @@ export function problemOf(status: number, reason: string, body: string, retryAft
   }
   const title = typeof document?.title === "string" ? document.title : reason || `Status ${status}`;
   const detail = typeof document?.detail === "string" ? document.detail : "";
-  const kind = typeof document?.type === "string" ? (document.type.split(":").at(-1) ?? "") : "";
+  const kind = typeof document?.type === "string" ? (document.type.split(/[:/]/).at(-1) ?? "") : "";
   // about keys, the service speaks to programmers and operators
   if (kind === "unauthorized") return new Problem(status, "This service needs a key", "", remedyOf(status, retryAfter), kind);
   if (kind === "forbidden") return new Problem(status, title, detail.split(": ")[0] ?? "", remedyOf(status, retryAfter), kind);
-  return new Problem(status, title, detail, remedyOf(status, retryAfter), kind);
+  return new Problem(status, title, detail, REMEDIES[kind] ?? remedyOf(status, retryAfter), kind);
 }
+
+/** What to do about a kind of problem, if its status does not say enough. */
+const REMEDIES: Record<string, string> = {
+  "target-refused": "Use another URL, or ask the operator of this service to allow this one.",
+  "input-refused": "Use files that this service may read, or ask its operator to allow this one.",
+  "no-such-upload": "The service no longer has this file. Send it again as a new job.",
+  "schedule-busy": "Wait until that job is over, or cancel it.",
+  "changed-meanwhile": "Close this, look at it as it is now, then change it.",
+  "not-replayable": "Wait until the attempt that is under way is over.",
+};
 
 function remedyOf(status: number, retryAfter: string | null): string {
   switch (status) {
@@ -132,7 +155,7 @@ function remedyOf(status: number, retryAfter: string | null): string {
       return "Your key may not do that. Ask the operator of this service for one that may.";
     case 404:
     case 410:
-      return "It may have been removed. Reload the list of jobs.";
+      return "It may have been removed. Go back to the list.";
     case 413:
       return "Split the tile, or ask the service's operator to raise the limit.";
     case 429: {

@@ -1,39 +1,51 @@
 import { buildingMesh, type SceneFrame } from "./building_mesh";
 import type { Building, SurfaceKind } from "./cityjson";
-import { CATEGORIES, bytesOf, categoryOf, type Category } from "./roof_types";
+import { figuresOf, flagsOf, type Figures, type Flag } from "./figures";
+import { OutlinesInMaking, type Outlines } from "./outlines";
+import { categoryOf, type Category } from "./roof_types";
 
-/** The part of a building's record that the page lists; the whole record is loaded when it is opened. */
+/** The part of a record that the page lists, sorts and filters; a building's whole record is loaded when it is opened. */
 export interface Listed {
   id: string;
   category: Category;
   reason: string | null;
   reasonDetail: string | null;
-  heightM: number | null;
-  areaM2: number | null;
+  /** The id of the given footprint; null without one. */
+  sourceId: string | null;
+  figures: Figures;
+  flags: Flag[];
 }
 
 /** Buildings of one category, merged into one set of triangles. */
 export interface Batch {
   category: Category;
   ids: string[];
+  /** Of each building; null for buildings that are `ok`. */
+  reasons: (string | null)[];
+  /** RMSE of each building in metres; null if unknown. */
+  rmseM: (number | null)[];
   /** Corner at which each building begins, and the number of corners after the last. */
   starts: Uint32Array;
   /** The same for the ends of the edges. */
   edgeStarts: Uint32Array;
   /** x_min, y_min, z_min, x_max, y_max, z_max of each building. */
   boxes: Float32Array;
+  /** 1 for each building that is shown; missing if all are. */
+  shown?: Uint8Array;
   positions: Float32Array;
   normals: Int8Array;
-  /** Red, green, blue, opaque; in the linear space that three works in. */
-  colours: Uint8Array;
+  /** The surface of each corner: its roof plane, or one of `SURFACE`. */
+  surfaces: Int16Array;
   edges: Float32Array;
 }
 
-const NEUTRAL: Record<Exclude<SurfaceKind, "roof">, string> = { wall: "#ece7de", ground: "#b9b3a8" };
+/** Surfaces that are not a numbered roof plane. */
+export const SURFACE = { wall: -1, ground: -2, roof: -3 } as const satisfies Record<SurfaceKind, number>;
 
 /** Gathers buildings by category until they are taken as batches. */
 export class Batcher {
   private readonly open = new Map<Category, Gathered>();
+  private outlines = new OutlinesInMaking();
 
   constructor(private readonly frame: SceneFrame) {}
 
@@ -42,18 +54,21 @@ export class Batcher {
     const { attributes } = building;
     const category = categoryOf(attributes["status"], attributes["roof_type"]);
     const mesh = buildingMesh(building, this.frame);
+    const [reason, figures] = [text(attributes["reason"]), figuresOf(attributes)];
     if (mesh.positions.length > 0) {
       const gathered = this.open.get(category) ?? new Gathered(category);
       this.open.set(category, gathered);
-      gathered.meshes.push({ id: building.id, mesh });
+      gathered.meshes.push({ id: building.id, reason, rmseM: figures.residual ?? null, mesh });
+      this.outlines.add(building, category, this.frame);
     }
     return {
       id: building.id,
       category,
-      reason: text(attributes["reason"]),
+      reason,
       reasonDetail: text(attributes["reason_detail"]),
-      heightM: number(attributes["height_m"]),
-      areaM2: number(attributes["footprint_area_m2"]),
+      sourceId: text(attributes["source_id"]),
+      figures,
+      flags: flagsOf(attributes),
     };
   }
 
@@ -63,10 +78,17 @@ export class Batcher {
     this.open.clear();
     return batches;
   }
+
+  /** The outlines of what was added since the last call. */
+  takeOutlines(): Outlines {
+    const { outlines } = this;
+    this.outlines = new OutlinesInMaking();
+    return outlines.packed();
+  }
 }
 
 class Gathered {
-  readonly meshes: { id: string; mesh: ReturnType<typeof buildingMesh> }[] = [];
+  readonly meshes: { id: string; reason: string | null; rmseM: number | null; mesh: ReturnType<typeof buildingMesh> }[] = [];
 
   constructor(private readonly category: Category) {}
 
@@ -82,28 +104,26 @@ class Gathered {
     const batch: Batch = {
       category: this.category,
       ids: this.meshes.map(({ id }) => id),
+      reasons: this.meshes.map(({ reason }) => reason),
+      rmseM: this.meshes.map(({ rmseM }) => rmseM),
       starts,
       edgeStarts,
       boxes: new Float32Array(6 * n),
       positions: new Float32Array(3 * corners),
       normals: new Int8Array(4 * corners), // four bytes per corner: graphics cards need that alignment
-      colours: new Uint8Array(4 * corners).fill(255),
+      surfaces: new Int16Array(corners),
       edges: new Float32Array(3 * edgeStarts[n]),
     };
-    const roof = linear(CATEGORIES[this.category].colour);
     this.meshes.forEach(({ mesh }, i) => {
-      const { kinds, normals } = mesh;
+      const { kinds, planes, normals } = mesh;
       batch.positions.set(mesh.positions, 3 * starts[i]);
       batch.edges.set(mesh.edges, 3 * edgeStarts[i]);
       batch.boxes.set(boxOf(mesh.positions), 6 * i);
       for (let corner = 0; corner < kinds.length; corner++) {
-        const at = 4 * (starts[i] + corner);
-        const kind = kinds[corner];
-        const colour = kind === "roof" ? roof : NEUTRAL_LINEAR[kind];
-        for (let part = 0; part < 3; part++) {
-          batch.normals[at + part] = normals[3 * corner + part];
-          batch.colours[at + part] = colour[part];
-        }
+        const at = starts[i] + corner;
+        for (let part = 0; part < 3; part++) batch.normals[4 * at + part] = normals[3 * corner + part];
+        const numbered = kinds[corner] === "roof" && planes[corner] >= 0;
+        batch.surfaces[at] = numbered ? planes[corner] : SURFACE[kinds[corner]];
       }
     });
     return batch;
@@ -120,20 +140,6 @@ function boxOf(positions: readonly number[]): number[] {
   return box;
 }
 
-/** IEC 61966-2-1: sRGB to linear light, both as bytes. */
-function linear(colour: string): number[] {
-  return bytesOf(colour).map((byte) => {
-    const value = byte / 255;
-    return Math.round(255 * (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4));
-  });
-}
-
-const NEUTRAL_LINEAR = { wall: linear(NEUTRAL.wall), ground: linear(NEUTRAL.ground) };
-
 function text(value: unknown): string | null {
   return typeof value === "string" && value !== "" ? value : null;
-}
-
-function number(value: unknown): number | null {
-  return typeof value === "number" && Number.isFinite(value) ? value : null;
 }

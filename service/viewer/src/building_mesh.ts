@@ -7,8 +7,10 @@ export interface BuildingMesh {
   positions: number[];
   /** Normals of the corners, -127 to 127. */
   normals: number[];
-  /** The surface that each corner belongs to. */
+  /** The kind of surface that each corner belongs to. */
   kinds: SurfaceKind[];
+  /** Its roof plane, -1 for none. */
+  planes: number[];
   /** x, y, z of both ends of the visible edges. */
   edges: number[];
 }
@@ -21,16 +23,21 @@ export interface SceneFrame {
   verticalUnitM: number;
 }
 
+/** The origin of the scene in metres. */
+export function originInMetres({ origin, horizontalUnitM, verticalUnitM }: SceneFrame): [number, number, number] {
+  return [origin[0] * horizontalUnitM, origin[1] * horizontalUnitM, origin[2] * verticalUnitM];
+}
+
 /** Faces that meet at a smaller angle look like one surface: no line is drawn between them. */
 const SMOOTH = Math.cos((2 * Math.PI) / 180);
 
 /** The triangles and the edges of a building; a building without faces gives none. */
 export function buildingMesh(building: Building, frame: SceneFrame): BuildingMesh {
   const vertices = inScene(building.vertices, frame);
-  const mesh: BuildingMesh = { positions: [], normals: [], kinds: [], edges: [] };
+  const mesh: BuildingMesh = { positions: [], normals: [], kinds: [], planes: [], edges: [] };
   const edges = new Map<number, { normal: Normal; seen: boolean }>();
   const count = vertices.length / 3;
-  for (const { kind, rings } of building.faces) {
+  for (const { kind, rings, plane = -1 } of building.faces) {
     const normal = ringNormal(vertices, rings[0] ?? []);
     const nx = Math.round(127 * normal[0]);
     const ny = Math.round(127 * normal[1]);
@@ -39,6 +46,7 @@ export function buildingMesh(building: Building, frame: SceneFrame): BuildingMes
       mesh.positions.push(vertices[3 * corner], vertices[3 * corner + 1], vertices[3 * corner + 2]);
       mesh.normals.push(nx, ny, nz);
       mesh.kinds.push(kind);
+      mesh.planes.push(plane);
     }
     for (const ring of rings) {
       for (let i = 0; i < ring.length; i++) {

@@ -15,6 +15,8 @@ export type SurfaceKind = "roof" | "wall" | "ground";
 export interface Face {
   kind: SurfaceKind;
   rings: number[][];
+  /** Number of the roof plane within its building; missing for walls, ground and level blocks. */
+  plane?: number;
 }
 
 /** One building in coordinates of its CRS. */
@@ -74,11 +76,16 @@ export class SequenceReader {
   }
 }
 
+interface RawSurface {
+  type: string;
+  plane_id?: unknown;
+}
+
 interface RawGeometry {
   type: string;
   lod?: string;
   boundaries: unknown;
-  semantics?: { surfaces: { type: string }[]; values: unknown };
+  semantics?: { surfaces: RawSurface[]; values: unknown };
 }
 
 interface RawLine {
@@ -124,10 +131,11 @@ type Rings = number[][];
 function facesOf(geometry: RawGeometry): Face[] {
   const surfaces = geometry.semantics?.surfaces ?? [];
   const values = geometry.semantics?.values;
-  const kindOf = (value: unknown): SurfaceKind =>
-    typeof value === "number" ? (KINDS[surfaces[value]?.type ?? ""] ?? "wall") : "wall";
   const shell = (boundaries: Rings[], semantic: unknown): Face[] =>
-    boundaries.map((rings, i) => ({ kind: kindOf(Array.isArray(semantic) ? semantic[i] : undefined), rings }));
+    boundaries.map((rings, i) => {
+      const value: unknown = Array.isArray(semantic) ? semantic[i] : undefined;
+      return faceOf(rings, typeof value === "number" ? surfaces[value] : undefined);
+    });
   switch (geometry.type) {
     case "MultiSurface":
     case "CompositeSurface":
@@ -139,4 +147,10 @@ function facesOf(geometry: RawGeometry): Face[] {
     default:
       return [];
   }
+}
+
+function faceOf(rings: Rings, surface: RawSurface | undefined): Face {
+  const face: Face = { kind: KINDS[surface?.type ?? ""] ?? "wall", rings };
+  if (typeof surface?.plane_id === "number") face.plane = surface.plane_id;
+  return face;
 }

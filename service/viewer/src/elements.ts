@@ -1,4 +1,4 @@
-import { CATEGORIES, type Category } from "./roof_types";
+import { CATEGORIES, isHatched, type Category } from "./roof_types";
 
 type Child = Node | string | number | null | undefined | false;
 type Properties = Record<string, string | number | boolean | ((event: never) => void) | null | undefined>;
@@ -36,10 +36,14 @@ export function byId<T extends HTMLElement = HTMLElement>(id: string): T {
 
 /** A small square in a category's colour, hatched where the models are. */
 export function swatch(category: Category): HTMLElement {
-  const hatch = category === "fallback" || category === "failed" ? " swatch-hatched" : "";
-  const square = el("span", { class: `swatch${hatch}`, "aria-hidden": "true" });
+  return colourSwatch(CATEGORIES[category].colour, isHatched(category));
+}
+
+/** A small square in a colour. */
+export function colourSwatch(colour: string, hatched = false): HTMLElement {
+  const square = el("span", { class: `swatch${hatched ? " swatch-hatched" : ""}`, "aria-hidden": "true" });
   // by the object model: the page's policy allows no style attributes
-  square.style.backgroundColor = CATEGORIES[category].colour;
+  square.style.backgroundColor = colour;
   return square;
 }
 

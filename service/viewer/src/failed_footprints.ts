@@ -2,18 +2,24 @@ import type { Feature } from "./api";
 import { Batcher, type Batch } from "./batching";
 import type { SceneFrame } from "./building_mesh";
 import type { Face } from "./cityjson";
+import type { Outlines } from "./outlines";
 
 const ABOVE_GROUND_M = 0.25;
 
-/** Footprints of buildings without a model, as flat faces on the ground. */
-export function failedFootprints(
+/**
+ * Outlines of objects without a model, as flat faces on the ground.
+ *
+ * @param status The status of all of them: failed or rejected.
+ */
+export function flatOutlines(
   features: readonly Feature[],
+  status: "failed" | "rejected",
   frame: SceneFrame,
   groundAt: (x: number, y: number) => number,
-): Batch[] {
+): { batches: Batch[]; outlines: Outlines } {
   const batcher = new Batcher({ origin: [0, 0, 0], horizontalUnitM: 1, verticalUnitM: 1 });
   for (const { geometry, properties, id } of features) {
-    const name = properties["building_id"] ?? id;
+    const name = properties["building_id"] ?? properties["object_id"] ?? id;
     if (typeof name !== "string") continue;
     const vertices: number[] = [];
     const faces: Face[] = polygonsOf(geometry).map((rings) => ({
@@ -30,9 +36,9 @@ export function failedFootprints(
     }));
     level(vertices);
     for (const { rings } of faces) if (seenFromBelow(vertices, rings[0] ?? [])) rings.forEach((ring) => ring.reverse());
-    batcher.add({ id: name, attributes: { status: "failed" }, vertices: Float64Array.from(vertices), faces, levels: [] });
+    batcher.add({ id: name, attributes: { status, reason: properties["reason"] }, vertices: Float64Array.from(vertices), faces, levels: [] });
   }
-  return batcher.take();
+  return { batches: batcher.take(), outlines: batcher.takeOutlines() };
 }
 
 type Ring = [number, number][];

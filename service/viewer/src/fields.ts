@@ -9,6 +9,7 @@ export const LABELS = {
   preset: "Preset",
   classes: "Classes of the file",
   footprints: "Footprints",
+  points: "Keep the points",
   title: "Title",
 } as const;
 
@@ -16,11 +17,12 @@ export const LABELS = {
 export function inFields(message: string): string {
   return message
     .replace(/\b(give|with)?( ?)the input (\w+)/gi, (whole: string, verb: string | undefined, space: string, name: string) => {
-      if (!(name in LABELS)) return whole;
+      if (!Object.hasOwn(LABELS, name)) return whole;
       const field = `“${LABELS[name as keyof typeof LABELS]}” under Options`;
       if (verb === undefined) return `${space}${field}`;
       return verb === "with" ? `in ${field}` : `${verb === "Give" ? "Set" : "set"} ${field}`;
     })
+    .replace(/,? or add \S+ to GABLEWORK_\w+/g, "")
     .replace(/,? or raise GABLEWORK_\w+/g, ", or ask the operator of this service to raise the limit");
 }
 

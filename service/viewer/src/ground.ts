@@ -18,7 +18,7 @@ interface Level {
 }
 
 /**
- * A smooth ground through the floors of the buildings, for the eye only: the run delivers no terrain.
+ * A smooth ground through the floors of the buildings, for the eye only, where a run has no terrain.
  *
  * Known nodes are averaged into ever coarser lattices and unknown ones filled from the next coarser one
  * ("pull-push", Gortler et al. 1996).
@@ -41,6 +41,35 @@ export function groundThrough(floors: readonly number[], box: readonly number[],
   }
   const heights = filled(finest);
   return { xMin, yMin, cellM, nx, ny, heights };
+}
+
+/** The terrain that a run has written beside its points. */
+export interface TerrainFile {
+  /** Easting and northing of the first node in metres. */
+  origin_m: readonly [number, number];
+  spacing_m: number;
+  elevation_unit_m: number;
+  /** Rows from south to north, nodes from west to east; null where unknown. */
+  elevations: readonly (readonly (number | null)[])[];
+}
+
+/**
+ * The ground of a run, with unknown nodes filled from those around; null if none is known.
+ *
+ * @param origin Of the scene, in metres.
+ */
+export function groundOf({ origin_m, spacing_m, elevation_unit_m, elevations }: TerrainFile, origin: Place): Ground | null {
+  const [nx, ny] = [elevations[0]?.length ?? 0, elevations.length];
+  const finest = level(nx, ny);
+  for (const [row, nodes] of elevations.entries()) {
+    for (const [column, value] of nodes.entries()) {
+      if (value === null) continue;
+      finest.sums[row * nx + column] = value * elevation_unit_m - origin[2];
+      finest.weights[row * nx + column] = 1;
+    }
+  }
+  if (!finest.weights.includes(1)) return null;
+  return { xMin: origin_m[0] - origin[0], yMin: origin_m[1] - origin[1], cellM: spacing_m, nx, ny, heights: filled(finest) };
 }
 
 function filled(fine: Level): Float32Array {

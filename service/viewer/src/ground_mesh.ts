@@ -1,8 +1,8 @@
 import { BufferAttribute, BufferGeometry, Mesh, MeshLambertMaterial } from "three";
 import type { Ground } from "./ground";
 
-/** The ground as a mesh that fades out towards its border. */
-export function groundMesh(ground: Ground): Mesh {
+/** The ground as a mesh. What is only guessed from floors fades out towards its border. */
+export function groundMesh(ground: Ground, isGuessed: boolean): Mesh {
   const { nx, ny, cellM } = ground;
   const positions = new Float32Array(3 * nx * ny);
   const colours = new Float32Array(4 * nx * ny).fill(1);
@@ -13,6 +13,7 @@ export function groundMesh(ground: Ground): Mesh {
       positions.set([ground.xMin + column * cellM, ground.yMin + row * cellM, ground.heights[at] - 0.06], 3 * at);
       const u = (2 * column) / (nx - 1) - 1;
       const v = (2 * row) / (ny - 1) - 1;
+      if (!isGuessed) continue;
       const fade = Math.min(Math.max((1 - Math.hypot(u, v)) / 0.35, 0), 1);
       colours[4 * at + 3] = fade * fade * (3 - 2 * fade);
     }
@@ -29,7 +30,9 @@ export function groundMesh(ground: Ground): Mesh {
   geometry.setAttribute("color", new BufferAttribute(colours, 4));
   geometry.setIndex(index);
   geometry.computeVertexNormals();
-  const mesh = new Mesh(geometry, new MeshLambertMaterial({ vertexColors: true, transparent: true }));
+  // farther back than models are: outlines lie just above the ground, and would be hidden seen from afar
+  const offset = { polygonOffset: true, polygonOffsetFactor: 3, polygonOffsetUnits: 3 };
+  const mesh = new Mesh(geometry, new MeshLambertMaterial({ vertexColors: true, transparent: true, ...offset }));
   mesh.renderOrder = -1;
   return mesh;
 }

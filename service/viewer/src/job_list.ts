@@ -1,19 +1,12 @@
 import { getJson, isOver, type Problem, type StatusInfo } from "./api";
 import { pageLink } from "./downloads";
 import { el } from "./elements";
+import { statusWords, titleOf } from "./job_words";
 import { asProblem, problemNotice } from "./notices";
 import { ago } from "./numbers";
 
-const SHOWN = 30;
+const SHOWN = 20;
 const REFRESH_MS = 4000;
-
-export const STATUS_WORDS: Record<StatusInfo["status"], string> = {
-  accepted: "waiting",
-  running: "running",
-  successful: "done",
-  failed: "failed",
-  dismissed: "cancelled",
-};
 
 /** The jobs, newest first; reloaded while one of them is under way. */
 export class JobList {
@@ -22,12 +15,13 @@ export class JobList {
   private timer: number | undefined;
   private readonly list = el("ul", { class: "jobs" });
   private readonly note = el("div");
+  private readonly all = el("a", { class: "all-jobs", href: "#/jobs", hidden: true }, "All jobs");
 
   constructor(
     place: HTMLElement,
     private readonly onProblem: (problem: Problem) => void,
   ) {
-    place.replaceChildren(el("h2", { id: "jobs-title" }, "Jobs"), this.note, this.list);
+    place.replaceChildren(el("h2", { id: "jobs-title" }, "Jobs"), this.note, this.list, this.all);
   }
 
   async start(): Promise<void> {
@@ -42,6 +36,7 @@ export class JobList {
       this.note.replaceChildren(
         this.jobs.length === 0 ? el("p", { class: "hint" }, "None yet. Jobs stay here after a reload.") : "",
       );
+      this.all.hidden = this.jobs.length === 0;
       this.draw();
     } catch (error) {
       const problem = asProblem(error);
@@ -68,7 +63,6 @@ export class JobList {
   }
 
   private entry(job: StatusInfo, now: Date): HTMLElement {
-    const running = job.status === "running" ? ` ${job.progress ?? 0} %` : "";
     return el(
       "a",
       {
@@ -77,7 +71,7 @@ export class JobList {
         "aria-current": job.jobID === this.current ? "page" : null,
       },
       el("span", { class: "job-title" }, titleOf(job)),
-      el("span", { class: `chip chip-${job.status}` }, STATUS_WORDS[job.status] + running),
+      el("span", { class: `chip chip-${job.status}` }, statusWords(job)),
       el("span", { class: "job-when" }, job.created === undefined ? "" : ago(new Date(job.created), now)),
       job.scheduleID === undefined
         ? null
@@ -90,9 +84,4 @@ export class JobList {
 function pageOf(job: StatusInfo): HTMLElement | null {
   if (job.links?.some(({ type }) => type === "text/html") !== true) return null;
   return el("div", { class: "job-page" }, pageLink(`jobs/${encodeURIComponent(job.jobID)}`, `Comparison of ${titleOf(job)}`));
-}
-
-/** The user's title of a job, otherwise the beginning of its id. */
-export function titleOf(job: StatusInfo): string {
-  return job.title ?? `Job ${job.jobID.slice(0, 8)}`;
 }

@@ -1,11 +1,14 @@
 import type { Place } from "./address";
-import { Problem, getJson, isOver, request, type Status, type StatusInfo } from "./api";
+import { Problem, getJson, isOver, type Status, type StatusInfo } from "./api";
 import { downloadList } from "./downloads";
 import { el } from "./elements";
 import { follow, type ServerEvent } from "./event_stream";
-import { titleOf } from "./job_list";
+import { cancellation, jobMenu, retry } from "./job_actions";
+import { MODELLED, failureRemedy, titleOf } from "./job_words";
 import { announce, asProblem, problemNotice, warningNotice } from "./notices";
 import { count, duration } from "./numbers";
+import { BuildingsSoFar } from "./so_far";
+import "./job_view.css";
 
 /** The calls of a job's view to the page. */
 export interface Hooks {
@@ -57,12 +60,17 @@ const SIDE_BY_SIDE: typeof STAGES = [
   ["page", "Write the page", ""],
 ];
 
-/** Processes whose results have buildings. */
-const MODELLED = new Set(["reconstruct", "compare"]);
+/** Stages in which a job has some of its buildings. */
+const HAS_MODELS = new Set(["reconstruct", "publish", "outputs"]);
+
+/** The further stage of a job that keeps the points. */
+const WITH_POINTS: typeof STAGES = [["octree", "Write the points", "tiles"]];
 
 function stagesOf(job: StatusInfo): typeof STAGES {
+  if (job.processID === "echo") return [];
   if (job.processID === "classify") return [...STAGES.slice(0, JOINED), ...CLASSIFIED, ...STAGES.slice(-1)];
-  return job.processID === "compare" ? [...STAGES.slice(0, -1), ...SIDE_BY_SIDE, ...STAGES.slice(-1)] : STAGES;
+  const more = job.processID === "compare" ? SIDE_BY_SIDE : job.request?.inputs?.["points"] === true ? WITH_POINTS : [];
+  return [...STAGES.slice(0, -1), ...more, ...STAGES.slice(-1)];
 }
 
 /** Show a job: its progress, its failure or its results. Returns a function that ends the view. */
@@ -76,16 +84,17 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
     if (calledOff.signal.aborted) return;
     document.title = `${titleOf(job)} · gablework`;
     if (job.status === "successful" && !MODELLED.has(job.processID ?? "reconstruct")) {
-      place.replaceChildren(await files(job, path, calledOff.signal));
+      place.replaceChildren(await files(job, path, hooks, calledOff.signal));
     } else if (job.status === "successful") {
       // the 3D library is loaded only if there is something to draw
       const { showResults } = await import("./results_view");
       if (calledOff.signal.aborted) return;
       leaveResults = showResults(place, job, named, hooks);
     } else if (isOver(job.status)) {
-      place.replaceChildren(ended(job));
+      place.replaceChildren(ended(job, hooks));
     } else {
-      const progress = new ProgressView(job, () => cancel(path, hooks));
+      const soFar = job.processID === "reconstruct" ? new BuildingsSoFar(path, calledOff.signal) : null;
+      const progress = new ProgressView(job, soFar, hooks);
       place.replaceChildren(progress.element);
       await progress.follow(path, calledOff.signal);
       hooks.onChange();
@@ -98,6 +107,11 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
     look().catch((error: unknown) => {
       if (calledOff.signal.aborted) return;
       const problem = asProblem(error);
+      if (problem.kind === "no-such-job") {
+        document.title = "No such job · gablework";
+        place.replaceChildren(gone());
+        return;
+      }
       place.replaceChildren(el("div", { class: "card" }, problemNotice(problem, begin)));
       hooks.onProblem(problem);
     });
@@ -109,27 +123,45 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
   };
 }
 
-async function cancel(path: string, hooks: Hooks): Promise<void> {
-  await request(path, { method: "DELETE" });
-  hooks.onChange();
-}
-
 /** A job whose results are files without buildings. */
-async function files(job: StatusInfo, path: string, signal: AbortSignal): Promise<HTMLElement> {
+async function files(job: StatusInfo, path: string, hooks: Hooks, signal: AbortSignal): Promise<HTMLElement> {
   const list = await downloadList(path, null, signal);
-  return el("div", { class: "card" }, el("h1", {}, titleOf(job)), el("p", {}, job.message ?? ""), list);
+  return el("div", { class: "card" }, heading(job, hooks), el("p", {}, job.message ?? ""), list);
 }
 
 /** A job that is over without results. */
-function ended(job: StatusInfo): HTMLElement {
+function ended(job: StatusInfo, hooks: Hooks): HTMLElement {
   const failure = job.exception;
   const notice =
     job.status === "failed"
-      ? problemNotice(
-          new Problem(0, failure?.title ?? "The job failed", failure?.detail ?? job.message ?? "", "Fix the cause and submit it again."),
-        )
-      : el("p", {}, "This job was cancelled; its files are removed.");
-  return el("div", { class: "card" }, el("h1", {}, titleOf(job)), notice);
+      ? problemNotice(new Problem(0, failure?.title ?? "The job failed", failure?.detail ?? job.message ?? "", failureRemedy(job)))
+      : el("p", {}, "This job was cancelled; its files are removed. Its tiles can be used again as long as the service keeps them.");
+  const note = el("div");
+  const again = el("button", { type: "button", class: "primary" }, "Try again…");
+  again.addEventListener("click", () => {
+    note.replaceChildren();
+    retry(job, hooks).catch((error: unknown) => {
+      const problem = asProblem(error);
+      note.replaceChildren(problemNotice(problem));
+      hooks.onProblem(problem);
+    });
+  });
+  return el("div", { class: "card" }, heading(job, hooks), notice, note, el("div", { class: "actions" }, again));
+}
+
+function heading(job: StatusInfo, hooks: Hooks): HTMLElement {
+  return el("div", { class: "job-head" }, el("h1", {}, titleOf(job)), jobMenu(job, hooks));
+}
+
+/** A job that the service does not have: its address is old. */
+function gone(): HTMLElement {
+  return el(
+    "div",
+    { class: "card" },
+    el("h1", {}, "This job is not here"),
+    el("p", {}, "It was removed by hand, or by its age: some services remove old jobs. Or it belongs to another key."),
+    el("div", { class: "actions" }, el("a", { class: "button primary", href: "#/jobs" }, "All jobs")),
+  );
 }
 
 class ProgressView {
@@ -145,27 +177,31 @@ class ProgressView {
   private readonly rows = new Map<string, { row: HTMLElement; figure: HTMLElement }>();
   private readonly started: number;
 
-  constructor(job: StatusInfo, cancel: () => Promise<void>) {
+  constructor(
+    job: StatusInfo,
+    private readonly soFar: BuildingsSoFar | null,
+    hooks: Hooks,
+  ) {
     this.started = Date.parse(job.started ?? job.created ?? new Date().toISOString());
     for (const [name, words] of stagesOf(job)) this.addStage(name, words);
     const button = el("button", { type: "button", class: "quiet" }, "Cancel the job");
     button.addEventListener("click", () => {
-      button.disabled = true;
-      button.textContent = "Cancelling…";
-      cancel().catch((error: unknown) => {
-        button.disabled = false;
-        button.textContent = "Cancel the job";
-        this.waiting.replaceChildren(problemNotice(asProblem(error)));
-      });
+      // a second request would remove the job that the first has stopped
+      if (button.getAttribute("aria-disabled") === "true") return;
+      button.setAttribute("aria-disabled", "true"); // not `disabled`: it keeps the focus
+      cancellation(job, hooks)
+        .catch((error: unknown) => this.waiting.replaceChildren(problemNotice(asProblem(error))))
+        .finally(() => button.removeAttribute("aria-disabled"));
     });
     this.element = el(
       "section",
       { class: "card progress", "aria-labelledby": "progress-title" },
-      el("h1", { id: "progress-title" }, titleOf(job)),
+      el("div", { class: "job-head" }, el("h1", { id: "progress-title" }, titleOf(job)), jobMenu(job, hooks)),
       el("div", { class: "progress-line" }, this.bar, this.percent),
       el("div", { class: "progress-words" }, this.message, this.elapsed),
       this.waiting,
       this.stages,
+      soFar?.element ?? "",
       this.warnings,
       el("div", { class: "actions" }, button),
     );
@@ -216,6 +252,7 @@ class ProgressView {
   }
 
   private enter(stage: string, event?: JobEvent): void {
+    if (HAS_MODELS.has(stage)) this.soFar?.begin();
     if (!this.rows.has(stage)) this.addStage(stage, stage);
     let before = true;
     for (const [name, { row, figure }] of this.rows) {

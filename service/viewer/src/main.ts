@@ -1,13 +1,15 @@
 /** The page: it shows what the address names. */
 
-import { placeOf } from "./address";
+import { partsOf, placeOf } from "./address";
 import { Problem, currentKey, getJson, keepKey } from "./api";
 import { byId, el } from "./elements";
 import { JobList } from "./job_list";
 import { showJob } from "./job_view";
 import { problemNotice } from "./notices";
 import { Submission } from "./submission";
+import { hasView, showView, type View } from "./views";
 import { welcome } from "./welcome";
+import "./frame.css";
 
 const main = byId("main");
 const jobs = new JobList(byId("jobs"), onProblem);
@@ -18,25 +20,42 @@ new Submission(byId("submission"), (jobId) => {
 
 let shown = "";
 let leave: () => void = () => undefined;
+let view: View | null = null;
 
 function route(): void {
   const place = placeOf(location.hash);
+  const address = partsOf(location.hash);
+  const isView = place === null && hasView(address.name);
   jobs.mark(place?.job ?? "");
-  document.body.classList.toggle("has-job", place !== null);
-  const run = place === null ? "" : `${place.job} ${place.method ?? ""}`;
-  if (run === shown && place !== null) return; // only the building changed: the job's view handles that itself
+  document.body.classList.toggle("has-job", place !== null || isView);
+  document.body.classList.toggle("has-view", isView);
+  for (const link of document.querySelectorAll("nav.places a")) {
+    const isHere = isView && link.getAttribute("href") === `#/${address.name}`;
+    if (isHere) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+  // only the building or the query changed: the view handles that itself
+  const now = place !== null ? `${place.job} ${place.method ?? ""}` : isView ? `/${[address.name, ...address.rest].join("/")}` : "";
+  if (now === shown && place !== null) return;
+  if (now === shown && view !== null) {
+    view.follow(address);
+    return;
+  }
   leave();
-  shown = run;
-  if (place === null) {
+  shown = now;
+  view = null;
+  main.scrollTop = 0;
+  const hooks = { onChange: () => void jobs.refresh(), onProblem };
+  if (place !== null) {
+    leave = showJob(main, place, hooks);
+  } else if (isView) {
+    view = showView(main, address, hooks);
+    leave = view.leave;
+  } else {
     document.title = "gablework";
     main.replaceChildren(welcome());
     leave = () => undefined;
-    return;
   }
-  leave = showJob(main, place, {
-    onChange: () => void jobs.refresh(),
-    onProblem,
-  });
 }
 
 /** Ask for a key that is missing or refused; show all other problems where they happened. */

@@ -1,6 +1,7 @@
 import { request } from "./api";
 import type { Batch, Listed } from "./batching";
 import { chunks } from "./json_lines";
+import type { Outlines } from "./outlines";
 
 /** A piece of the CityJSONSeq for the worker. */
 export interface ToLoading {
@@ -19,7 +20,7 @@ export type Reading = Omit<ToLoading, "bytes">;
 /** Messages of the worker. */
 export type FromLoading =
   | { kind: "frame"; origin: [number, number, number] }
-  | { kind: "buildings"; listed: Listed[]; batches: Batch[] }
+  | { kind: "buildings"; listed: Listed[]; batches: Batch[]; outlines: Outlines }
   /** The levels of detail to choose from, coarse to fine; empty if each building has one. */
   | { kind: "finished"; levels: string[] }
   | { kind: "failed"; detail: string };

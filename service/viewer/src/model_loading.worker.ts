@@ -38,8 +38,10 @@ async function read({ horizontalUnitM, verticalUnitM, lod }: Reading): Promise<v
   let listed: ReturnType<Batcher["add"]>[] = [];
   let size = FIRST_BATCH;
   const give = (): void => {
-    const batches = batcher?.take() ?? [];
-    tell({ kind: "buildings", listed, batches }, batches.flatMap(buffersOf));
+    if (batcher === null) return;
+    const batches = batcher.take();
+    const outlines = batcher.takeOutlines();
+    tell({ kind: "buildings", listed, batches, outlines }, [...batches.flatMap(buffersOf), ...outlineBuffers(outlines)]);
     listed = [];
   };
   for await (const line of jsonLines(arriving())) {
@@ -82,9 +84,13 @@ function buffersOf(batch: ReturnType<Batcher["take"]>[number]): Transferable[] {
     batch.boxes.buffer,
     batch.positions.buffer,
     batch.normals.buffer,
-    batch.colours.buffer,
+    batch.surfaces.buffer,
     batch.edges.buffer,
   ];
+}
+
+function outlineBuffers({ shapeStarts, ringStarts, xy }: ReturnType<Batcher["takeOutlines"]>): Transferable[] {
+  return [shapeStarts.buffer, ringStarts.buffer, xy.buffer];
 }
 
 function tell(message: FromLoading, transfer: Transferable[] = []): void {

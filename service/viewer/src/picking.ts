@@ -3,6 +3,8 @@ export interface Pickable {
   boxes: Float32Array;
   positions: Float32Array;
   starts: Uint32Array;
+  /** 1 for each building that is shown; missing if all are. */
+  shown?: Uint8Array;
 }
 
 export interface Hit<T extends Pickable> {
@@ -10,6 +12,8 @@ export interface Hit<T extends Pickable> {
   /** Number of the building within its batch. */
   index: number;
   distance: number;
+  /** First corner of the triangle that was hit. */
+  corner: number;
 }
 
 type Vector = readonly [number, number, number];
@@ -30,22 +34,24 @@ export function pick<T extends Pickable>(
   let best: Hit<T> | null = null;
   for (const batch of batches) {
     for (let index = 0; index + 1 < batch.starts.length; index++) {
+      if (batch.shown?.[index] === 0) continue;
       const entry = boxEntry(batch.boxes, 6 * index, origin, direction);
       if (entry >= (best?.distance ?? Infinity)) continue;
       for (let corner = batch.starts[index]; corner < batch.starts[index + 1]; corner += 3) {
         const distance = triangleDistance(batch.positions, 3 * corner, origin, direction, fromOutside);
-        if (distance < (best?.distance ?? Infinity)) best = { batch, index, distance };
+        if (distance < (best?.distance ?? Infinity)) best = { batch, index, distance, corner };
       }
     }
   }
   return best;
 }
 
-/** Distance from a point to the nearest box of buildings; 0 within one, infinity without boxes. */
+/** Distance from a point to the nearest box of shown buildings; 0 within one, infinity without boxes. */
 export function boxDistance(batches: Iterable<Pickable>, point: Vector): number {
   let nearest = Infinity;
-  for (const { boxes } of batches) {
+  for (const { boxes, shown } of batches) {
     for (let at = 0; at < boxes.length; at += 6) {
+      if (shown?.[at / 6] === 0) continue;
       let squared = 0;
       for (let axis = 0; axis < 3; axis++) {
         const beyond = Math.max(boxes[at + axis] - point[axis], point[axis] - boxes[at + axis + 3], 0);

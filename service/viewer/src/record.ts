@@ -1,10 +1,12 @@
 import { ofRun } from "./address";
 import { getJson, type Feature, type Problem } from "./api";
+import { dossierLink, followDossier } from "./dossier_link";
 import { downloadLink } from "./downloads";
 import { el, swatch } from "./elements";
 import { capital } from "./fields";
 import { asProblem, problemNotice, warningNotice } from "./notices";
 import { count, measure } from "./numbers";
+import { reasonWords } from "./reasons";
 import { CATEGORIES, categoryOf } from "./roof_types";
 
 type Record_ = Feature["properties"];
@@ -62,24 +64,6 @@ function groups(verticalUnit: string): [string, Row[]][] {
   ];
 }
 
-const REASONS: Record<string, string> = {
-  too_few_points: "too few points for a plane",
-  no_plane: "no roof plane was found in its points",
-  no_partition: "the roof planes could not be turned into faces",
-  invalid_solid: "the solid is not valid",
-  too_complex: "it exceeded the work limit of one building",
-  no_footprint: "no outline could be made from its points",
-  internal_error: "a fault of the program in this one building",
-  crashed: "it crashed its process; a bundle for a replay is kept",
-  timed_out: "it took too long; a bundle for a replay is kept",
-  out_of_memory: "it needed too much memory; a bundle for a replay is kept",
-};
-
-/** The reason of a building that is not `ok`, in words. */
-export function reasonWords(reason: string): string {
-  return REASONS[reason] ?? reason.replaceAll("_", " ");
-}
-
 /** Show the record of one building; returns a function that stops the loading. */
 export function showRecord(
   place: HTMLElement,
@@ -106,6 +90,7 @@ export function showRecord(
     );
   };
   load();
+  followDossier(jobPath, method, buildingId, calledOff.signal);
   return () => calledOff.abort();
 }
 
@@ -154,6 +139,7 @@ function record(
     heading,
     marks,
     ...(why === null ? [] : [why]),
+    el("div", { class: "record-links" }, dossierLink()),
     ...(codes.length > 0 ? [el("p", { class: "hint" }, `Codes of the method's own solid: ${codes.join(", ")}`)] : []),
     ...tables,
     ...planes(properties["planes"]),

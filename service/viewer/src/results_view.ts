@@ -1,24 +1,33 @@
-import { addressOf, ofRun, placeOf, type Place } from "./address";
-import { getJson, request, type Feature, type StatusInfo } from "./api";
+import { addressOf, ofRun, placeOf, queryOf, type Place } from "./address";
+import { getJson, type Feature, type StatusInfo } from "./api";
 import type { Batch, Listed } from "./batching";
-import { BuildingList } from "./building_list";
+import type { SceneFrame } from "./building_mesh";
+import { BuildingList, tallyWords } from "./building_list";
 import { downloadMenu, pageLink } from "./downloads";
 import { el } from "./elements";
-import { failedFootprints } from "./failed_footprints";
+import { flatOutlines } from "./failed_footprints";
+import { FIGURE_NAMES } from "./figures";
+import { FilterPanel } from "./filter_panel";
 import type { Hooks } from "./job_view";
-import { titleOf } from "./job_list";
+import { jobMenu } from "./job_actions";
+import { titleOf } from "./job_words";
 import { Legend } from "./legend";
 import { LevelChoice } from "./level_choice";
 import { loadModels, type FromLoading } from "./model_loading";
 import { announce, asProblem, problemNotice, warningNotice } from "./notices";
-import { count, counted, duration } from "./numbers";
+import { count, counted, duration, measure } from "./numbers";
+import type { OutlineMap } from "./outline_map";
+import type { Outlines } from "./outlines";
 import { showRecord } from "./record";
+import { rejectedRecord } from "./rejected_record";
+import { CATEGORY_NAMES, type Category } from "./roof_types";
 import { ModelScene } from "./scene";
-import type { Category } from "./roof_types";
+import { USUAL, isFiltered, queryWith, selected, tallies, wantedOf, type Wanted } from "./selection";
+import { ViewTools } from "./view_tools";
 
 /** The part of the report that the page reads. */
 interface Report {
-  crs?: { name?: string | null; horizontal_unit_m?: number | null; vertical_unit_m?: number | null };
+  crs?: { name?: string | null; to_wgs84?: string | null; horizontal_unit_m?: number | null; vertical_unit_m?: number | null };
   counts?: Record<string, number>;
   timings_s?: Record<string, number>;
   warnings?: string[];
@@ -27,7 +36,7 @@ interface Report {
 /** Show the results of a job: models, list, records and downloads. Returns a function that ends the view. */
 export function showResults(place: HTMLElement, job: StatusInfo, named: Place, hooks: Hooks): () => void {
   const view = new ResultsView(place, job, named.method, hooks);
-  view.start(named.building).catch((error: unknown) => view.fail(error));
+  view.start().catch((error: unknown) => view.fail(error));
   return () => view.leave();
 }
 
@@ -49,17 +58,35 @@ class ResultsView {
   private readonly downloads = el("div", { class: "result-actions" });
   private readonly panel = el("aside", { class: "panel", "aria-label": "Buildings" });
   private readonly list: BuildingList;
+  private readonly filters = new FilterPanel((wanted) => this.change(wanted));
+  private readonly listView: HTMLElement;
   private readonly legend: Legend;
   private readonly levels = new LevelChoice((lod) => void this.showLevel(lod));
+  private readonly viewTools = new ViewTools();
   private readonly counts = new Map<Category, number>();
+  /** The candidates, and once they are wanted the objects that were left out. */
   private readonly listed: Listed[] = [];
+  private readonly rejected = new Map<string, Listed>();
+  private loadingRejected: Promise<void> | null = null;
+  private readonly outlines: Outlines[] = [];
+  private wanted: Wanted = USUAL;
+  private shown: Listed[] = [];
   private scene: ModelScene | null = null;
+  private map: OutlineMap | null = null;
+  private readonly stage: HTMLElement;
+  private readonly top = el("button", { type: "button", title: "From above, north up (t)", onclick: () => this.scene?.top() }, "Top");
+  private readonly modes = {
+    "3d": el("button", { type: "button", onclick: () => this.change({ ...this.wanted, map: false }) }, "3D"),
+    map: el("button", { type: "button", onclick: () => this.change({ ...this.wanted, map: true }) }, "Map"),
+  };
   private stopRecord: () => void = () => undefined;
   private otherLevel = new AbortController();
   private report: Report = {};
   private selected: string | null = null;
   private origin: readonly [number, number, number] = [0, 0, 0];
   private fromScene = false;
+  private isLoaded = false;
+  private hasOrigin = false;
 
   constructor(
     place: HTMLElement,
@@ -71,17 +98,25 @@ class ResultsView {
     this.method = named ?? this.methods[0] ?? null;
     this.jobPath = `jobs/${encodeURIComponent(job.jobID)}`;
     this.list = new BuildingList((id) => this.address(id));
-    this.legend = new Legend((category, visible) => {
-      this.scene?.show(category, visible);
-      this.list.show(category, visible);
-    });
+    this.legend = new Legend(
+      (category, visible) => {
+        const hidden = new Set(this.wanted.hidden);
+        if (visible) hidden.delete(category);
+        else hidden.add(category);
+        this.change({ ...this.wanted, hidden });
+      },
+      (colouring) => this.scene?.colourBy(colouring),
+    );
+    const mode = el("div", { class: "tool-group", role: "group", "aria-label": "3D or map" }, ...Object.values(this.modes));
     const view = el(
       "div",
       { class: "tool-group", role: "group", "aria-label": "View" },
-      el("button", { type: "button", title: "Show all (f)", onclick: () => this.scene?.fit() }, "Fit"),
-      el("button", { type: "button", title: "From above, north up (t)", onclick: () => this.scene?.top() }, "Top"),
+      el("button", { type: "button", title: "Show all (f)", onclick: () => (this.map ?? this.scene)?.fit() }, "Fit"),
+      this.top,
     );
-    this.panel.replaceChildren(this.list.element);
+    this.listView = el("div", { class: "list" }, this.filters.element, this.list.element);
+    this.panel.replaceChildren(this.listView);
+    this.stage = el("div", { class: "stage3d" }, this.canvas, this.viewTools.cards, this.viewTools.bar(this.levels.element, mode, view), this.note);
     place.replaceChildren(
       el(
         "div",
@@ -93,45 +128,54 @@ class ResultsView {
           this.downloads,
         ),
         this.legend.element,
-        el("div", { class: "stage3d" }, this.canvas, el("div", { class: "tools" }, this.levels.element, view), this.note),
+        this.stage,
         this.panel,
       ),
     );
   }
 
-  async start(first: string | null): Promise<void> {
+  async start(): Promise<void> {
     window.addEventListener("hashchange", () => this.followAddress(), { signal: this.calledOff.signal });
     const [report, menu] = await Promise.all([this.loadReport(), downloadMenu(this.jobPath, this.method, this.calledOff.signal)]);
     if (this.calledOff.signal.aborted) return;
     this.report = report;
-    this.downloads.replaceChildren(...this.comparison(), menu, this.removal());
+    this.counts.set("rejected", report.counts?.["rejected"] ?? 0);
+    this.wanted = wantedOf(new URLSearchParams(queryOf(location.hash)));
+    this.apply();
+    this.downloads.replaceChildren(...this.comparison(), menu, jobMenu(this.job, this.hooks));
     this.showFacts();
     try {
       this.scene = new ModelScene(this.canvas, (id) => this.open(id));
+      this.viewTools.attach(this.scene, this.canvas);
     } catch {
       this.note.replaceChildren(
-        warningNotice("This browser cannot draw in 3D (WebGL is missing or switched off). The list, the records and the downloads still work."),
+        warningNotice("This browser cannot draw in 3D (WebGL is missing or switched off). The map, the list, the records and the downloads still work."),
       );
+      this.wanted = { ...this.wanted, map: true };
     }
     this.note.append(el("p", { class: "loading" }, "Loading the models…"));
     const levels = await this.load(
       null,
       (message) => {
-        if (message.kind === "frame") this.origin = message.origin;
+        if (message.kind === "frame") [this.origin, this.hasOrigin] = [message.origin, true];
         if (message.kind !== "buildings") return;
-        this.take(message.listed);
         this.scene?.add(message.batches);
+        this.take(message.listed, message.outlines);
       },
       this.calledOff.signal,
     );
-    await this.finished(first);
-    if (this.scene !== null) this.levels.offer(levels);
+    await this.finished(levels);
   }
 
-  fail(error: unknown): void {
+  /** Say what went wrong; `again` tries it once more. */
+  fail(error: unknown, again?: () => void): void {
     if (this.calledOff.signal.aborted) return;
     const problem = asProblem(error);
-    this.note.replaceChildren(problemNotice(problem));
+    const retry = (): void => {
+      this.note.replaceChildren();
+      again?.();
+    };
+    this.note.replaceChildren(problemNotice(problem, again && retry));
     this.hooks.onProblem(problem);
   }
 
@@ -139,7 +183,9 @@ class ResultsView {
     this.calledOff.abort();
     this.otherLevel.abort();
     this.stopRecord();
+    this.viewTools.leave();
     this.scene?.dispose();
+    this.map?.dispose();
   }
 
   // --- loading
@@ -180,47 +226,168 @@ class ResultsView {
     announce(`LoD${lod} is shown.`);
   }
 
-  private take(listed: Listed[]): void {
-    for (const building of listed) {
-      this.listed.push(building);
-      this.counts.set(building.category, (this.counts.get(building.category) ?? 0) + 1);
+  private take(listed: Listed[], outlines: Outlines): void {
+    for (const object of listed) {
+      this.listed.push(object);
+      if (object.category !== "rejected") this.counts.set(object.category, (this.counts.get(object.category) ?? 0) + 1);
     }
-    this.legend.set(this.counts);
-    this.list.set(this.listed);
+    this.outlines.push(outlines);
+    this.map?.add(outlines);
+    this.apply();
   }
 
-  private async finished(first: string | null): Promise<void> {
+  private async finished(levels: string[]): Promise<void> {
     this.scene?.finish();
     this.note.querySelector(".loading")?.remove();
     this.showFacts();
+    this.isLoaded = true;
     if (this.listed.length === 0) {
       this.note.replaceChildren(this.nothing());
       this.note.closest(".result")?.classList.add("result-empty");
       announce("No building was found.");
+      this.apply();
+      await this.chooseAddressed();
       return;
     }
     announce(`${counted(this.listed.length, "building")} loaded.`);
-    if (this.counts.has("failed")) await this.drawFailed();
-    if (first !== null) this.select(first);
+    const offered = this.viewTools.offerPoints(this.jobPath, this.method, this.frame());
+    if (this.counts.has("failed")) {
+      await offered; // outlines lie on the terrain
+      await this.drawFailed().catch((error: unknown) => this.fail(error));
+    }
+    if (this.calledOff.signal.aborted) return;
+    this.apply();
+    await this.chooseAddressed();
+    if (this.scene !== null) this.levels.offer(levels);
+    await offered;
     this.canvas.dataset["ready"] = "true";
+  }
+
+  /** The scene in the coordinates of the job. */
+  private frame(): SceneFrame {
+    const { crs } = this.report;
+    return { origin: this.origin, horizontalUnitM: crs?.horizontal_unit_m ?? 1, verticalUnitM: crs?.vertical_unit_m ?? 1 };
   }
 
   /** Draw the footprints of buildings without a model: only the records have their place. */
   private async drawFailed(): Promise<void> {
-    const { crs } = this.report;
     const failed = ofRun(`${this.jobPath}/buildings?status=failed&limit=10000&crs=native`, this.method);
     const page = await getJson<{ features: Feature[] }>(failed, {
       signal: this.calledOff.signal,
       headers: { Accept: "application/geo+json" },
     });
-    const frame = {
-      origin: this.origin,
-      horizontalUnitM: crs?.horizontal_unit_m ?? 1,
-      verticalUnitM: crs?.vertical_unit_m ?? 1,
-    };
+    this.placeBy(page.features);
+    this.takeOutlines(page.features, "failed");
+  }
+
+  /** Draw objects without a model. */
+  private takeOutlines(features: readonly Feature[], status: "failed" | "rejected"): void {
     const { scene } = this;
-    if (scene === null) return;
-    scene.add(failedFootprints(page.features, frame, (x, y) => scene.groundAt(x, y)));
+    const { batches, outlines } = flatOutlines(features, status, this.frame(), (x, y) => scene?.groundAt(x, y) ?? 0);
+    scene?.add(batches);
+    this.take(status === "rejected" ? [...this.rejected.values()] : [], outlines);
+  }
+
+  // --- filters, order and the map
+
+  /** Show something else, and name it in the address. */
+  private change(wanted: Wanted): void {
+    this.wanted = wanted;
+    history.replaceState(history.state, "", this.address(this.selected));
+    this.apply();
+    announce(`${tallyWords(this.shown.length, this.listed.length)} objects are listed.`);
+  }
+
+  /** Bring the list, the legend, the 3D view and the map to what is wanted. */
+  private apply(): void {
+    const { wanted } = this;
+    const counts = tallies(this.listed, wanted);
+    if (this.loadingRejected === null) counts.categories.set("rejected", this.counts.get("rejected") ?? 0);
+    for (const category of CATEGORY_NAMES) {
+      // a category that the other filters empty stays in the filters
+      if ((this.counts.get(category) ?? 0) > 0 && !counts.categories.has(category)) counts.categories.set(category, 0);
+    }
+    this.shown = selected(this.listed, wanted);
+    const all = CATEGORY_NAMES.reduce((n, name) => n + (wanted.hidden.has(name) ? 0 : (this.counts.get(name) ?? 0)), 0);
+    const figure = FIGURE_NAMES.find((name) => name === wanted.sort) ?? null;
+    this.list.set(this.shown, figure, this.listed.length === 0 ? "" : "No object fits these filters.");
+    this.filters.set(wanted, { shown: this.shown.length, all, ...counts });
+    this.legend.set(this.counts, this.shown);
+    this.legend.check(wanted.hidden);
+    const only = isFiltered(wanted) ? new Set(this.shown.map(({ id }) => id)) : null;
+    this.scene?.showOnly(only);
+    this.map?.showOnly(only);
+    if (!this.isLoaded) return;
+    if (!wanted.hidden.has("rejected")) void this.loadRejected().catch((error: unknown) => this.fail(error, this.retry));
+    this.showMap(wanted.map).catch((error: unknown) => this.fail(error));
+  }
+
+  /** Take the scene's origin from outlines if there is no model: far from it the figures would be too coarse. */
+  private placeBy(features: readonly Feature[]): void {
+    const first = cornerOf(features);
+    if (!this.hasOrigin && first !== null) [this.origin, this.hasOrigin] = [first, true];
+  }
+
+  /** Load the objects that were left out, unless they are there already. */
+  private loadRejected(): Promise<void> {
+    const load = async (): Promise<void> => {
+      if (this.counts.get("rejected") === 0) return;
+      const { listedRejected, rejectedObjects } = await import("./rejected_objects");
+      const features = await rejectedObjects(this.jobPath, this.method, this.calledOff.signal);
+      for (const feature of features) {
+        const object = listedRejected(feature);
+        this.rejected.set(object.id, object);
+      }
+      this.stage.closest(".result-empty")?.classList.remove("result-empty");
+      this.note.querySelector(".card")?.remove();
+      this.placeBy(features);
+      this.takeOutlines(features, "rejected");
+    };
+    this.loadingRejected ??= load().catch((error: unknown) => {
+      this.loadingRejected = null; // it can be tried again
+      throw error;
+    });
+    return this.loadingRejected;
+  }
+
+  /** Show the map in place of the 3D view, or the 3D view. */
+  private async showMap(wanted: boolean): Promise<void> {
+    this.modes["3d"].setAttribute("aria-pressed", String(!wanted));
+    this.modes.map.setAttribute("aria-pressed", String(wanted));
+    this.top.hidden = wanted;
+    this.canvas.hidden = wanted;
+    this.levels.element.classList.toggle("levels-away", wanted);
+    this.viewTools.setAway(wanted);
+    if (!wanted) {
+      this.map?.dispose();
+      this.map = null;
+      return;
+    }
+    if (this.map !== null) return;
+    const { OutlineMap } = await import("./outline_map");
+    if (this.calledOff.signal.aborted || !this.wanted.map || this.map !== null) return;
+    const map = new OutlineMap((id) => this.open(id));
+    this.map = map;
+    this.stage.prepend(map.element);
+    for (const outlines of this.outlines) map.add(outlines);
+    if (isFiltered(this.wanted)) map.showOnly(new Set(this.shown.map(({ id }) => id)));
+    map.select(this.selected, this.selected !== null);
+    await this.layBackground(map);
+  }
+
+  /** Lay the operator's tiles beneath the map, if there are some and the results lie on Earth. */
+  private async layBackground(map: OutlineMap): Promise<void> {
+    const { crs } = this.report;
+    if (document.querySelector('meta[name="map-tiles"]') === null || (crs?.to_wgs84 ?? null) === null) return;
+    const { Background, locate, tileSource } = await import("./background");
+    const source = tileSource();
+    if (source === null) return;
+    const [unit, [east, north]] = [crs?.horizontal_unit_m ?? 1, this.origin];
+    const inPlane = ([x, y]: [number, number]): [number, number] => [(x - east) * unit, (y - north) * unit];
+    const place = await locate(this.jobPath, this.method, inPlane, this.calledOff.signal);
+    if (place === null || this.map !== map) return;
+    const within = place.errorM < 0.5 ? "" : ` · placed to within ${measure(place.errorM, 1, "m")}`;
+    map.lay(new Background(source, place, map.request), `${source.credit}${within}`);
   }
 
   private showFacts(): void {
@@ -231,7 +398,7 @@ class ResultsView {
     const warnings = this.report.warnings ?? [];
     const crsName = this.report.crs?.name ?? "unknown";
     const facts = [
-      this.listed.length > 0 ? counted(this.listed.length, "building") : null,
+      this.listed.length > this.rejected.size ? counted(this.listed.length - this.rejected.size, "building") : null,
       rejected === undefined ? null : `${count(rejected)} other objects left out`,
       points === undefined ? null : `${count(points)} points`,
       seconds === undefined ? null : duration(seconds),
@@ -259,7 +426,7 @@ class ResultsView {
         "p",
         {},
         rejected > 0
-          ? `${counted(rejected, "object")} ${rejected === 1 ? "was" : "were"} looked at and left out: too small, too low, too narrow, or vegetation. Each is in the download “rejected” with its reason and the measured figure.`
+          ? `${counted(rejected, "object")} ${rejected === 1 ? "was" : "were"} looked at and left out: too small, too low, too narrow, or vegetation. Each is in the list under “Without a model”, and in the download “rejected”, with its reason and the measured figure.`
           : "Nothing rises above the ground.",
       ),
       el(
@@ -285,7 +452,7 @@ class ResultsView {
     );
     choice.addEventListener("change", () => {
       // the same building by another method
-      location.hash = addressOf({ job: this.job.jobID, method: choice.value, building: this.selected });
+      location.hash = addressOf({ job: this.job.jobID, method: choice.value, building: this.selected }, queryOf(location.hash));
     });
     const hasPage = this.job.links?.some(({ type }) => type === "text/html") === true;
     const page = pageLink(this.jobPath, "The methods side by side");
@@ -296,7 +463,8 @@ class ResultsView {
   // --- the record of one building
 
   private address(building: string | null): string {
-    return addressOf({ job: this.job.jobID, method: this.named, building });
+    const query = queryWith(queryOf(location.hash), this.wanted);
+    return addressOf({ job: this.job.jobID, method: this.named, building }, query);
   }
 
   /** Handle a click in the scene: it changes the address, and the view follows the address. */
@@ -308,9 +476,50 @@ class ResultsView {
   }
 
   private followAddress(): void {
+    const place = this.place();
+    if (place === null) return;
+    const query = queryOf(location.hash);
+    const wanted = wantedOf(new URLSearchParams(query));
+    if (queryWith(query, wanted) !== queryWith(query, this.wanted)) {
+      this.wanted = wanted;
+      this.apply();
+    }
+    // else only the dossier opened or closed
+    void this.chooseAddressed();
+  }
+
+  /** Show once more what the address asks for. */
+  private readonly retry = (): void => {
+    this.apply();
+    void this.chooseAddressed();
+  };
+
+  /** What the address names; null if that is not of these results. */
+  private place(): Place | null {
     const place = placeOf(location.hash);
-    if (place?.job !== this.job.jobID || place.method !== this.named) return;
-    this.select(place.building);
+    return place?.job === this.job.jobID && place.method === this.named ? place : null;
+  }
+
+  /** Select the object that the address names; one that is not a candidate may be among those that were left out. */
+  private async chooseAddressed(): Promise<void> {
+    const id = this.place()?.building;
+    if (id === undefined || id === this.selected) return;
+    const isKnown = id === null || this.listed.some((object) => object.id === id);
+    if (!isKnown) {
+      // it may come with the next buildings; it is looked for again once all are here
+      if (!this.isLoaded) return;
+      try {
+        await this.loadRejected();
+      } catch (error) {
+        // without that table the record says whether there is such a building
+        if (asProblem(error).status !== 404) {
+          this.fail(error, this.retry);
+          return;
+        }
+      }
+    }
+    // the address may have changed meanwhile, and led back here
+    if (id === this.place()?.building && id !== this.selected) this.select(id);
   }
 
   private select(id: string | null): void {
@@ -320,9 +529,11 @@ class ResultsView {
     this.stopRecord();
     this.selected = id;
     this.scene?.select(id, fly);
+    this.map?.select(id, fly);
     if (id === null) {
-      this.panel.replaceChildren(this.list.element);
-      if (before !== null) this.panel.querySelector<HTMLElement>(`a[href="${CSS.escape(this.address(before))}"]`)?.focus();
+      this.panel.replaceChildren(this.listView);
+      this.list.returned();
+      this.list.focus(before);
       return;
     }
     const body = el("div", { class: "record", "aria-live": "polite" });
@@ -345,27 +556,26 @@ class ResultsView {
     this.panel.scrollTop = 0;
     if (!fly) this.panel.scrollIntoView({ block: "nearest" }); // on narrow screens it is below the models
     if (fly && before === null) back.focus({ preventScroll: true });
+    const object = this.rejected.get(id);
+    if (object !== undefined) {
+      body.replaceChildren(...rejectedRecord(object));
+      this.stopRecord = () => undefined;
+      return;
+    }
     this.stopRecord = showRecord(body, this.jobPath, this.method, id, unitName(this.report.crs?.vertical_unit_m), this.hooks.onProblem);
-  }
-
-  /** Remove the job and its results, after asking. */
-  private removal(): HTMLElement {
-    const button = el("button", { type: "button", class: "quiet" }, "Remove");
-    button.addEventListener("click", () => {
-      if (!confirm(`Remove “${titleOf(this.job)}” and its results from the service?`)) return;
-      request(this.jobPath, { method: "DELETE" }).then(
-        () => {
-          this.hooks.onChange();
-          location.hash = "#/";
-        },
-        (error: unknown) => this.fail(error),
-      );
-    });
-    return button;
   }
 }
 
 function unitName(metres: number | null | undefined): string {
   if (metres == null || metres === 1) return "m";
   return Math.abs(metres - 0.3048) < 1e-5 ? "ft" : "";
+}
+
+/** A corner of the first outline, in whole units; null without outlines. */
+function cornerOf(features: readonly Feature[]): [number, number, number] | null {
+  for (const { geometry } of features) {
+    const [easting, northing] = (geometry?.coordinates as unknown[] | undefined)?.flat(3) as number[] ?? [];
+    if (typeof easting === "number" && typeof northing === "number") return [Math.round(easting), Math.round(northing), 0];
+  }
+  return null;
 }

@@ -2,6 +2,7 @@ import { variantOf } from "./address";
 import { Problem, getJson, request, type UploadInfo } from "./api";
 import { el, svg } from "./elements";
 import { LABELS, capital } from "./fields";
+import { choice, field } from "./form_fields";
 import { type Interrupted, fingerprint, forget, interrupted, keyOf } from "./interrupted";
 import { levelWords, levelsOffered, lodsInput } from "./levels_of_detail";
 import { announce, asProblem, problemNotice, warningNotice } from "./notices";
@@ -55,6 +56,7 @@ export class Submission {
   private readonly levels = el("div", { class: "boxes" });
   private readonly levelsHint = el("p", { class: "hint", id: "lods-hint" });
   private readonly classes = choice("classes", {});
+  private readonly points = el("input", { id: "with-points", type: "checkbox", "aria-describedby": "points-hint" });
   private readonly title = el("input", { id: "title", type: "text", autocomplete: "off", maxlength: 200 });
   private readonly options = el("details", { class: "options" });
 
@@ -100,6 +102,12 @@ export class Submission {
       field(LABELS.classes, this.classes, "Trusted, only compared with the result, or ignored."),
       field(LABELS.footprints, footprintPicker, "GeoPackage, GeoJSON or GeoParquet: one model per polygon."),
       this.footprintRow,
+      el(
+        "div",
+        { class: "field" },
+        el("label", {}, this.points, ` ${LABELS.points}`),
+        el("p", { class: "hint", id: "points-hint" }, "To see them over the models, with their distances to the roofs. Takes longer."),
+      ),
       field(LABELS.title, this.title),
     );
     for (const control of [this.method, this.preset, this.levels, this.anywhere]) {
@@ -321,7 +329,10 @@ export class Submission {
       ];
       const variants = this.variants();
       if (variants.length > 1) inputs["methods"] = variants;
-      else chosen.push(["method", this.method.value], ["preset", this.preset.value], ["lods", this.lods()]);
+      else {
+        chosen.push(["method", this.method.value], ["preset", this.preset.value], ["lods", this.lods()]);
+        if (this.points.checked) inputs["points"] = true;
+      }
       for (const [name, value] of chosen) if (value !== "") inputs[name] = value;
       if (this.anywhere.checked) inputs["allowOutsideAreaOfUse"] = true;
       if (this.footprints?.uploaded != null) inputs["footprints"] = { href: this.footprints.uploaded.href };
@@ -374,7 +385,7 @@ export class Submission {
     // by another CRS the tiles lie elsewhere, which the service finds out
     const unplaced = isFar && this.crs.value.trim() === "" && !this.anywhere.checked;
     const ready = this.tiles.length > 0 && !refused && !waiting && !noLevel && !unplaced && !this.starting;
-    for (const box of levelBoxes) box.disabled = comparison;
+    for (const box of [...levelBoxes, this.points]) box.disabled = comparison;
     this.levelsHint.textContent = comparison ? "Comparisons are made at LoD2.2." : "One or several; the records describe the finest.";
     const chosen = this.chosen();
     for (const box of this.others.querySelectorAll("input")) box.disabled = box.value === chosen;
@@ -462,20 +473,4 @@ function preflight(known: Record<string, unknown>): HTMLElement[] {
 
 function texts(value: unknown): string[] {
   return Array.isArray(value) ? value.filter((entry) => typeof entry === "string") : [];
-}
-
-function choice(id: string, options: Record<string, string>): HTMLSelectElement {
-  return el("select", { id }, ...Object.entries(options).map(([value, label]) => el("option", { value }, label)));
-}
-
-function field(label: string, control: HTMLElement, hint?: string): HTMLElement {
-  const hintId = `${control.id}-hint`;
-  if (hint !== undefined) control.setAttribute("aria-describedby", hintId);
-  return el(
-    "div",
-    { class: "field" },
-    el("label", { for: control.id }, label),
-    control,
-    hint === undefined ? null : el("p", { class: "hint", id: hintId }, hint),
-  );
 }

@@ -1,5 +1,6 @@
 import { describe, expect, it } from "vitest";
 import { addressOf, ofRun, placeOf, variantOf } from "../src/address";
+import { hasView } from "../src/views";
 
 describe("addresses of the page", () => {
   const job = "3f2a9c0d5e6b47189a0b1c2d3e4f5a6b";
@@ -20,6 +21,15 @@ describe("addresses of the page", () => {
 
   it("are none where no job is named", () => {
     for (const hash of ["", "#/", "#/jobs", "#/jobs/"]) expect(placeOf(hash)).toBeNull();
+  });
+
+  it("are read as far as they can be", () => {
+    expect(placeOf("#/jobs/%zz/buildings/a%2Fb")).toEqual({ job: "%zz", method: null, building: "a/b" });
+  });
+
+  it("name a view only by a word that the page knows", () => {
+    for (const name of ["jobs", "changes", "schedules", "webhooks"]) expect(hasView(name)).toBe(true);
+    for (const name of ["", "nothing", "toString", "constructor"]) expect(hasView(name)).toBe(false);
   });
 });
 

@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { groundDistance, groundThrough, heightAt } from "../src/ground";
+import { groundDistance, groundOf, groundThrough, heightAt } from "../src/ground";
 
 const BOX = [-10, -10, 110, 60];
 
@@ -32,4 +32,18 @@ test("a ray meets the ground where it falls below it, and none above it or besid
   expect(groundDistance(ground, [1, 25, 60], [1, 0, 0])).toBeNull();
   expect(groundDistance(ground, [200, 25, 60], down)).toBeNull();
   expect(groundDistance(groundThrough([50, 20, 7], BOX, 32), [50, 20, 17], down)).toBeCloseTo(10, 5);
+});
+
+test("the terrain of a run lies about the scene's origin, and unknown nodes lie between known ones", () => {
+  const file = { origin_m: [84000.5, 447000.5], spacing_m: 2, elevation_unit_m: 0.01, elevations: [[150, null, 350], [250, 250, 250]] } as const;
+  const ground = groundOf(file, [84000, 447000, 1]);
+  if (ground === null) throw new Error("no ground");
+  expect([ground.nx, ground.ny]).toEqual([3, 2]);
+  expect(heightAt(ground, 0.5, 0.5)).toBeCloseTo(0.5, 5);
+  expect(heightAt(ground, 4.5, 0.5)).toBeCloseTo(2.5, 5);
+  expect(heightAt(ground, 4.5, 2.5)).toBeCloseTo(1.5, 5);
+  expect(heightAt(ground, 2.5, 0.5)).toBeGreaterThan(0.5);
+  expect(heightAt(ground, 2.5, 0.5)).toBeLessThan(2.5);
+  expect(groundOf({ ...file, elevations: [[null, null]] }, [0, 0, 0])).toBeNull();
+  expect(groundOf({ ...file, elevations: [] }, [0, 0, 0])).toBeNull();
 });

@@ -61,3 +61,11 @@ test("the distance to the nearest house is that to its box", () => {
   expect(boxDistance(batches, [20, 3 + 4, 5 + 3])).toBeCloseTo(5, 5);
   expect(boxDistance([], [0, 0, 0])).toBe(Infinity);
 });
+
+test("a house that is hidden is neither met nor near", () => {
+  const [batch] = houses(2);
+  batch.shown = Uint8Array.from([0, 1]);
+  expect(pick([batch], [-50, 0, 1], [1, 0, 0])?.index).toBe(1);
+  expect(pick([batch], [0, 1, 100], [0, 0, -1])).toBeNull();
+  expect(boxDistance([batch], [0, 0, 1])).toBeCloseTo(15, 5);
+});

@@ -43,7 +43,7 @@ test("messages name the fields of the page, not inputs of a process or settings 
   expect(inFields("Give the right CRS with the input crs, or give the input allowOutsideAreaOfUse if it is")).toBe(
     "Give the right CRS in “CRS” under Options, or set “Use the tiles where they lie” under Options if it is",
   );
-  expect(inFields("Check the input bbox")).toBe("Check the input bbox");
+  for (const unknown of ["Check the input bbox", "Check the input constructor"]) expect(inFields(unknown)).toBe(unknown);
   expect(inFields("cut it into tiles, or raise GABLEWORK_MAX_POINTS")).toBe(
     "cut it into tiles, or ask the operator of this service to raise the limit",
   );
@@ -54,6 +54,15 @@ test("problems about keys say what a user can do", () => {
   const refused = problemOf(401, "", JSON.stringify(body), null);
   expect([refused.kind, refused.title, refused.detail]).toEqual(["unauthorized", "This service needs a key", ""]);
   expect(refused.remedy).not.toMatch(/header|gablework keys/);
+});
+
+test("problems with a remedy of their own do not speak of keys", () => {
+  const body = { type: "urn:gablework:problem:target-refused", title: "Webhooks are not sent to this URL", detail: "http://a: give an https URL, or add http://a to GABLEWORK_WEBHOOK_HOSTS" };
+  const refused = problemOf(403, "", JSON.stringify(body), null);
+  expect(refused.remedy).toContain("another URL");
+  expect(inFields(refused.detail)).toBe("http://a: give an https URL");
+  const gone = problemOf(404, "", '{"type": "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/no-such-job"}', null);
+  expect(gone.kind).toBe("no-such-job");
 });
 
 test("a place is shown with its latitude first", () => {

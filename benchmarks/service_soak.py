@@ -1,0 +1,368 @@
+"""Many clients for minutes while parts of the service fail: what is lost or doubled, and how long a status call takes.
+
+    python -m benchmarks.service_soak [--minutes 10] [--pollers 500] [--uploads 50] [--kill-driver-every 20]
+        [--fill-disk] [--lock-database] [--state DIR] [--tile FILE] [--megabytes 20]
+
+Each of the clients that upload sends the tile with an Idempotency-Key, waits until its job has ended and begins again;
+an answer that is lost is asked for again with the same key. As soon as there is a job, the others ask for the status
+of one once a second. Jobs model a small window of the tile, so that the service, not the modelling, is under load.
+
+`--kill-driver-every` sends SIGKILL to the driver. `--lock-database` holds an exclusive lock for the first 10 s of each
+minute, and `--fill-disk` writes to the last byte of the disk that `--state` lies on for 10 s from the middle of each
+minute: put it on a small file system of its own. When the time is over, all jobs must end, each exactly once. Every
+refusal must be a problem document that says when to come again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import concurrent.futures
+import contextlib
+import dataclasses
+import json
+import multiprocessing
+import os
+import signal
+import sqlite3
+import statistics
+import sys
+import tempfile
+import threading
+import time
+import uuid
+from collections import Counter
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import httpx
+import laspy
+import numpy as np
+import psutil  # type: ignore[import-untyped]
+
+from benchmarks.service_load import PAUSE_S, TILE, Poller, cpu_s, peak_mib, serving
+
+POINTS_IN_WINDOW = 8_000
+FAULT_S = 10.0
+"""How long the database is locked and the disk is full, in each minute."""
+LAST_JOBS_S = 900.0
+"""How long the last jobs may take when nothing fails any more."""
+LATER = {429, 503, 507}
+"""Refusals that pass."""
+GOES_ON = {"accepted", "running"}
+
+
+def large_tile(source: Path, folder: Path, megabytes: int) -> tuple[Path, str]:
+    """The points of a tile, over and over, as LAS of some size; and a small window in its middle."""
+    cloud = laspy.read(source)
+    wanted = megabytes * 10**6 // cloud.header.point_format.size
+    cloud.points = cloud.points[np.arange(wanted) % len(cloud.points)]
+    path = folder / "tile.las"
+    cloud.write(path)
+    middle = [np.median(cloud.x), np.median(cloud.y)]
+    far = np.maximum(abs(cloud.x - middle[0]), abs(cloud.y - middle[1]))
+    half = float(np.partition(far, POINTS_IN_WINDOW)[POINTS_IN_WINDOW])
+    return path, ",".join(f"{v:.2f}" for v in (middle[0] - half, middle[1] - half, middle[0] + half, middle[1] + half))
+
+
+@dataclasses.dataclass
+class Seen:
+    """What the clients of one process saw."""
+
+    jobs: list[str] = dataclasses.field(default_factory=list)
+    """Ids of the jobs that were made."""
+    calls_s: list[float] = dataclasses.field(default_factory=list)
+    """Seconds from each request for a status to its answer."""
+    uploads_s: list[float] = dataclasses.field(default_factory=list)
+    """Seconds from a tile's first byte to its job, with all refusals."""
+    refusals: Counter[str] = dataclasses.field(default_factory=Counter)
+    """Refusals by status and type."""
+    lost_answers: int = 0
+    """Requests whose connection broke."""
+    faults: list[str] = dataclasses.field(default_factory=list)
+    """What must not happen."""
+
+
+class Uploaders:
+    """Clients that send a tile as a job, wait until the job has ended and begin again."""
+
+    def __init__(self, url: str, tile: Path, bbox: str, current: Connection) -> None:
+        self._url, self._tile, self._current = url, tile, current
+        self._fields = {"crs": "EPSG:28992", "bbox": bbox, "meshes": "none"}
+        self._over = asyncio.Event()
+        self.seen = Seen()
+
+    def _refused(self, answer: httpx.Response) -> float:
+        """Seconds to wait after a refusal, which must say why and until when."""
+        try:
+            problem = answer.json()
+        except ValueError:
+            problem = {}
+        is_explained = problem.get("detail") and answer.status_code in LATER and "retry-after" in answer.headers
+        if not is_explained:
+            self.seen.faults.append(f"{answer.status_code} without a reason or Retry-After: {answer.text[:200]}")
+        self.seen.refusals[f"{answer.status_code} {problem.get('type', '')}"] += 1
+        return float(answer.headers.get("retry-after", 1.0))
+
+    async def _ask(self, client: httpx.AsyncClient, job: str | None) -> dict[str, Any] | None:
+        """The status of a job, or a new one, asked for until there is an answer and no refusal.
+
+        None if the time is over with a refusal: it has left nothing behind.
+        """
+        key = {"Idempotency-Key": f'"{uuid.uuid4()}"'}
+        while True:
+            try:
+                if job is None:
+                    with self._tile.open("rb") as stream:
+                        form = {"tile": (self._tile.name, stream)}
+                        answer = await client.post("/jobs", files=form, data=self._fields, headers=key)
+                else:
+                    answer = await client.get(f"/jobs/{job}")
+            except httpx.TransportError:
+                self.seen.lost_answers += 1
+                await asyncio.sleep(1.0)
+                continue
+            if answer.is_success:
+                return answer.json()
+            pause_s = self._refused(answer)
+            if self._over.is_set():
+                return None
+            await _rest(self._over, min(pause_s, 30.0))
+
+    async def _upload(self, client: httpx.AsyncClient, number: int) -> None:
+        while not self._over.is_set():
+            began = time.perf_counter()
+            made = await self._ask(client, None)
+            if made is None:
+                return
+            job = made["jobID"]
+            self.seen.uploads_s.append(time.perf_counter() - began)
+            self.seen.jobs.append(job)
+            self._current.send((number, job))
+            status = "accepted"
+            while status in GOES_ON and not self._over.is_set():
+                await _rest(self._over, 2.0)
+                status = (await self._ask(client, job) or {}).get("status", "")
+
+    async def run(self, seconds: float, uploads: int) -> None:
+        """All at once, until the time is over."""
+        limits = httpx.Limits(max_connections=None, max_keepalive_connections=None)
+        async with httpx.AsyncClient(base_url=self._url, timeout=120.0, limits=limits) as client:
+            tasks = [asyncio.create_task(self._upload(client, number)) for number in range(uploads)]
+            await asyncio.sleep(seconds)
+            self._over.set()
+            await asyncio.gather(*tasks)
+
+
+class Pollers:
+    """Clients that ask for the status of a job once a second."""
+
+    def __init__(self, url: str, current: Connection) -> None:
+        self._url, self._current = url, current
+        self._jobs: dict[int, str] = {}
+        self._over = asyncio.Event()
+        self.seen = Seen()
+
+    def _learn(self) -> None:
+        """Take the news of which jobs there are."""
+        while self._current.poll():
+            number, self._jobs[number] = self._current.recv()
+
+    async def _poll(self, number: int, pollers: int) -> None:
+        await asyncio.sleep(PAUSE_S * number / pollers)
+        poller = Poller(self._url)
+        while not self._over.is_set():
+            if not self._jobs:
+                await _rest(self._over, PAUSE_S)
+                continue
+            job = list(self._jobs.values())[number % len(self._jobs)]
+            began = time.perf_counter()
+            try:
+                status = await poller.get(f"/jobs/{job}")
+            except (OSError, asyncio.IncompleteReadError, ValueError) as error:
+                self.seen.faults.append(f"poll: {error!r}")
+                poller.close()
+                poller = Poller(self._url)
+                status = 0
+            self.seen.calls_s.append(time.perf_counter() - began)
+            if status != 200:
+                self.seen.refusals[f"{status} to a poll"] += 1
+            await _rest(self._over, max(0.0, PAUSE_S - (time.perf_counter() - began)))
+        poller.close()
+
+    async def run(self, seconds: float, pollers: int) -> None:
+        """All at once, until the time is over."""
+        asyncio.get_running_loop().add_reader(self._current.fileno(), self._learn)
+        tasks = [asyncio.create_task(self._poll(number, pollers)) for number in range(pollers)]
+        await asyncio.sleep(seconds)
+        self._over.set()
+        await asyncio.gather(*tasks)
+
+
+async def _rest(over: asyncio.Event, seconds: float) -> None:
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(over.wait(), seconds)
+
+
+def clients(url: str, tile: Path, bbox: str, options: argparse.Namespace) -> tuple[Seen, Seen]:
+    """What those that upload and those that poll saw.
+
+    They have a process each: a poll must not wait for a client that is busy with another's upload.
+    """
+    seconds = 60.0 * options.minutes
+    news, current = multiprocessing.Pipe(duplex=False)
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, spawn) as pool:
+        uploading = pool.submit(_upload_all, url, tile, bbox, current, seconds, options.uploads)
+        polling = Pollers(url, news)
+        asyncio.run(polling.run(seconds, options.pollers))
+        return uploading.result(), polling.seen
+
+
+def _upload_all(url: str, tile: Path, bbox: str, current: Connection, seconds: float, uploads: int) -> Seen:
+    uploading = Uploaders(url, tile, bbox, current)
+    asyncio.run(uploading.run(seconds, uploads))
+    return uploading.seen
+
+
+def every(seconds: float, first: float, over: threading.Event, action: Callable[[], None]) -> threading.Thread:
+    """Do something again and again in a thread, until it is over."""
+
+    def again() -> None:
+        if over.wait(first):
+            return
+        while True:
+            began = time.monotonic()
+            action()
+            if over.wait(max(0.0, seconds - (time.monotonic() - began))):
+                return
+
+    thread = threading.Thread(target=again)
+    thread.start()
+    return thread
+
+
+def kill_driver(pid: int, killed: list[float]) -> None:
+    """SIGKILL to the driver of a service."""
+    for child in psutil.Process(pid).children():
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if "driver" in " ".join(child.cmdline()):
+                child.send_signal(signal.SIGKILL)
+                killed.append(time.monotonic())
+
+
+def lock_database(path: Path) -> None:
+    """Hold the database's lock for a while."""
+    with contextlib.closing(sqlite3.connect(path, timeout=60.0, isolation_level=None)) as connection:
+        connection.execute("BEGIN EXCLUSIVE")
+        time.sleep(FAULT_S)
+        connection.execute("ROLLBACK")
+
+
+def fill_disk(filler: Path) -> None:
+    """Leave no byte free for a while."""
+    try:
+        with filler.open("wb") as stream:
+            size = 0
+            for step in (1 << 30, 1 << 20, 1 << 12):
+                with contextlib.suppress(OSError):
+                    while True:
+                        os.posix_fallocate(stream.fileno(), size, step)
+                        size += step
+            time.sleep(FAULT_S)
+    finally:
+        filler.unlink()
+
+
+@contextlib.contextmanager
+def failing(options: argparse.Namespace, pid: int, state: Path) -> Iterator[list[float]]:
+    """Faults for as long as the block lasts; yields the times at which drivers were killed."""
+    over, killed = threading.Event(), list[float]()
+    threads = []
+    if options.kill_driver_every:
+        seconds = options.kill_driver_every
+        threads.append(every(seconds, seconds, over, lambda: kill_driver(pid, killed)))
+    if options.lock_database:
+        threads.append(every(60.0, 0.0, over, lambda: lock_database(state / "service.db")))
+    if options.fill_disk:
+        threads.append(every(60.0, 30.0, over, lambda: fill_disk(state.parent / "filler")))
+    try:
+        yield killed
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
+
+
+def ended(url: str, jobs: list[str]) -> tuple[Counter[str], list[str]]:
+    """How all jobs ended, and what is lost or doubled."""
+    until = time.monotonic() + LAST_JOBS_S
+    while True:
+        listed: dict[str, str] = {}
+        n_listed, page = 0, f"{url}/jobs?limit=1000"
+        while page:
+            document = httpx.get(page, timeout=60.0).json()
+            n_listed += len(document["jobs"])
+            listed |= {job["jobID"]: job["status"] for job in document["jobs"]}
+            page = next((link["href"] for link in document["links"] if link["rel"] == "next"), "")
+        waiting = [job for job, status in listed.items() if status in GOES_ON]
+        if not waiting or time.monotonic() > until:
+            break
+        time.sleep(2.0)
+    faults = [f"{job} did not end" for job in waiting]
+    faults += [f"{job} is lost" for job in set(jobs) - set(listed)]
+    if n_listed != len(jobs) or len(set(jobs)) != len(jobs):
+        faults.append(f"{len(jobs)} jobs were answered, {len(set(jobs))} different; {n_listed} are listed")
+    for job in (job for job, status in listed.items() if status == "failed"):
+        message = httpx.get(f"{url}/jobs/{job}", timeout=60.0).json().get("message")
+        print(f"{job} failed: {message}", file=sys.stderr)
+    return Counter(listed.values()), faults
+
+
+def main() -> int:
+    """Load a service and let it fail; 1 where something is lost, doubled or refused without a reason."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--pollers", type=int, default=500)
+    parser.add_argument("--uploads", type=int, default=50)
+    parser.add_argument("--kill-driver-every", type=float, default=0.0, metavar="S")
+    parser.add_argument("--fill-disk", action="store_true")
+    parser.add_argument("--lock-database", action="store_true")
+    parser.add_argument("--state", type=Path, help="a folder for everything; default a temporary one")
+    parser.add_argument("--tile", type=Path, default=TILE)
+    parser.add_argument("--megabytes", type=int, default=20)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="gablework-soak-", dir=options.state) as folder:
+        tile, bbox = large_tile(options.tile, Path(folder), options.megabytes)
+        state = Path(folder) / "state"
+        with serving(state) as (url, pid):
+            cpu_before_s = cpu_s(pid)
+            with failing(options, pid, state) as killed:
+                uploading, polling = clients(url, tile, bbox, options)
+            api_cpu_s = cpu_s(pid) - cpu_before_s
+            _, peak = peak_mib(pid)
+            ends, faults = ended(url, uploading.jobs)
+            faults += uploading.faults + polling.faults
+    cuts = statistics.quantiles(polling.calls_s, n=100)
+    spread = (cuts[49], cuts[94], cuts[98], max(polling.calls_s))
+    figures = {
+        "machine": f"{os.cpu_count()} cores",
+        "jobs": f"{len(uploading.jobs)} with {tile.name} of {options.megabytes} MB: {json.dumps(dict(ends))}",
+        "drivers killed": str(len(killed)),
+        "longest upload, with its refusals": f"{max(uploading.uploads_s):.1f} s",
+        "status calls": f"{len(polling.calls_s)} of {options.pollers} pollers in {options.minutes:g} min",
+        "status p50, p95, p99, max": f"{', '.join(f'{1e3 * s:.0f}' for s in spread)} ms",
+        "refusals": json.dumps(dict(uploading.refusals + polling.refusals)),
+        "answers that did not come": str(uploading.lost_answers),
+        "API": f"{peak:.0f} MiB at most, {api_cpu_s:.0f} s of processor time",
+        "lost, doubled or unexplained": "; ".join(faults[:20]) or "nothing",
+    }
+    for name, value in figures.items():
+        print(f"{name:34} {value}")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

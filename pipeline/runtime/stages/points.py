@@ -1,0 +1,137 @@
+"""Points: those of all tiles as 3D Tiles over the models, each tile by a task, then the coarse nodes above them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+from pipeline.export.point_files import FOLDER, INDEX
+from pipeline.io import storage_at
+from pipeline.model import Reason
+from pipeline.runtime.plan import window_bytes
+from pipeline.runtime.run_context import ProgressUnits, RunContext
+from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of
+from pipeline.runtime.stages.cleanup import writing_points
+from pipeline.runtime.stages.coarse_points import coarse_levels, write_coarse_points
+from pipeline.runtime.stages.coarse_terrain import terrain_spacing
+from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
+from pipeline.runtime.stages.label import LabelTask, by_tile, label_halo_m, neighbourhood
+from pipeline.runtime.stages.reconstruct import Models
+from pipeline.runtime.stages.sites import CandidateSite, Joined
+from pipeline.runtime.stages.split import Splits
+from pipeline.runtime.stages.tile_points import (
+    PointsTask,
+    StoredTilePoints,
+    TileBuilding,
+    TilePoints,
+    write_tile_points,
+)
+from pipeline.settings import RunSettings
+from pipeline.tiling import MM, Tile
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PointsOutput:
+    """What the points of a run are made of, beside its candidates and models."""
+
+    run_dir: str
+    """The run directory, a path or URL."""
+    splits: Splits
+    """All tiles."""
+    ingested: Sequence[Ingested]
+    """What the inputs held."""
+    given: bool
+    """Whether footprints were given."""
+
+
+def write_points(
+    context: RunContext, settings: RunSettings, joined: Joined, models: Models, output: PointsOutput
+) -> tuple[str, ...]:
+    """Write the points of all tiles, then the nodes above them, then the root; the keys of tiles that failed."""
+    scratch, storage = context.scratch, storage_at(output.run_dir)
+    stage = writing_points(output.run_dir)
+    there: set[str] = set()
+    if scratch.attempt:
+        found = (key.split("/") for key in storage.keys(FOLDER))
+        there = {key[1] for key in found if len(key) == 3 and key[2] == INDEX}
+    tasks = _tasks(context, settings, joined, models, output)
+    tasks = {
+        Place(stage, place.unit, place.key): dataclasses.replace(task, again=place.unit in there)
+        for place, task in tasks.items()
+    }
+    # points that a user removed from the run directory are written again
+    drop_outcomes(scratch, stage, [place for place in tasks if place.unit in there])
+    units = ProgressUnits[TilePoints](failed=lambda one: int(bool(one.error)))
+    written = context.map_stored("octree", write_tile_points, tasks, _brief, units)
+    failed = {place: tile for place, tile in written.items() if tile.error}
+    for place, tile in failed.items():
+        context.progress.warn("octree", f"the points of tile {tile.tile.key} could not be written: {tile.error}")
+        scratch.path(place.name).unlink(missing_ok=True)  # so that a resumed run tries it again
+    good = {place: tile for place, tile in written.items() if not tile.error}
+    wanted = {place.unit for place in good}
+    if good:
+        wanted |= write_coarse_points(context, good, sorted(output.splits.places), output.run_dir)
+    for key in storage.keys(FOLDER) if there else []:
+        # the tasks of tiles have removed what they no longer have
+        if key not in wanted and key.split("/")[1] not in wanted:
+            storage.delete(key)
+    return tuple(sorted(tile.tile.key for tile in failed.values()))
+
+
+def _brief(stored: StoredTilePoints) -> TilePoints:
+    return stored.brief
+
+
+def _tasks(
+    context: RunContext, settings: RunSettings, joined: Joined, models: Models, output: PointsOutput
+) -> dict[Place, PointsTask]:
+    """One task per tile; their places lack the stage."""
+    scratch, grid, splits = context.scratch, context.plan.grid, output.splits
+    classes, _ = classes_in_use(output.ingested, trust=settings.general.classes == "trust")
+    candidates = by_tile(joined.candidates)
+    decks = by_tile([site for site in joined.rejected if site.verdict.reason is Reason.BRIDGE])
+    sites: dict[Tile, list[CandidateSite]] = {}
+    for site in sorted(joined.candidates, key=lambda one: one.building_id):
+        for tile in {part.tile for part in site.ranges}:
+            sites.setdefault(tile, []).append(site)
+    counts = points_by_tile(output.ingested)
+    seen = dataclasses.replace(grid, halo_mm=math.ceil(label_halo_m(settings.scene) * MM))
+    above, spacing = coarse_levels(list(splits.places)), terrain_spacing(splits.places, grid)
+    tasks = {}
+    for tile in sorted(splits.places):
+        near = tuple(grid.tiles_over(neighbourhood(tile, grid, settings.scene)))
+        own = sites.get(tile, [])
+        task = PointsTask(
+            label=LabelTask(
+                tile=tile,
+                grid=grid,
+                settings=settings.scene,
+                classes=classes,
+                given=output.given or classes.building,
+                scratch=scratch,
+                buildings=tuple(part for other in near for part in candidates.get(other, ())),
+                decks=tuple(part for other in near for part in decks.get(other, ())),
+            ),
+            run_dir=output.run_dir,
+            buildings=tuple(_part_in(tile, site) for site in own),
+            batches=tuple(place for owner in sorted({site.owner for site in own}) for place in models.places[owner]),
+            above=above,
+            terrain_spacing=spacing,
+            memory_bytes=window_bytes(seen, tile, counts),
+        )
+        label = task.label
+        what = (label.settings, label.classes, label.given, label.buildings, label.decks)
+        around = [splits.keys.get(other, "") for other in near]
+        key = key_of(output.run_dir, tile, grid, what, task.buildings, task.batches, above, spacing, around)
+        tasks[Place("", tile.key, key)] = task
+    return tasks
+
+
+def _part_in(tile: Tile, site: CandidateSite) -> TileBuilding:
+    """The part of a building in a tile."""
+    return TileBuilding(
+        building_id=site.building_id,
+        ranges=tuple(part for part in site.ranges if part.tile == tile),
+        tiles=tuple(sorted({part.tile.key for part in site.ranges})),
+    )

@@ -1,0 +1,93 @@
+"""When a request is sent again, and when the client gives up. No clock: times are arguments."""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+from email.utils import parsedate_to_datetime
+
+FIRST_PAUSE_S = 0.5
+"""Seconds before the second attempt; each further pause is twice the one before."""
+LONGEST_PAUSE_S = 15.0
+"""Longest pause that the client chooses by itself."""
+FIRST_CONTACT_S = 5.0
+"""Seconds of patience with a service that has never answered: its URL is probably wrong."""
+PATIENCE_S = 300.0
+"""Default patience in seconds: enough for the restart of a service."""
+
+PASSING = frozenset({408, 425, 429, 502, 503, 504})
+"""Status codes after which another attempt may help."""
+
+
+def is_passing(status: int, retry_after: str | None) -> bool:
+    """Whether another attempt may help: by the status, or because the service says when.
+
+    >>> is_passing(503, None), is_passing(507, None), is_passing(507, "60"), is_passing(404, None)
+    (True, False, True, False)
+    """
+    return status in PASSING or (status >= 400 and retry_after is not None)
+
+
+def wanted_pause_s(retry_after: str | None, now: dt.datetime) -> float:
+    """The pause in seconds that a header Retry-After wants; 0 without one, or if it is neither number nor date.
+
+    >>> wanted_pause_s("120", dt.datetime(2026, 3, 1, tzinfo=dt.UTC))
+    120.0
+    >>> wanted_pause_s("Sun, 01 Mar 2026 00:00:30 GMT", dt.datetime(2026, 3, 1, tzinfo=dt.UTC))
+    30.0
+    """
+    text = (retry_after or "").strip()
+    if text.isascii() and text.isdigit():
+        return float(text)
+    try:
+        at = parsedate_to_datetime(text)
+    except ValueError:
+        return 0.0
+    return max(0.0, ((at if at.tzinfo is not None else at.replace(tzinfo=dt.UTC)) - now).total_seconds())
+
+
+class Patience:
+    """How long one call goes on without progress.
+
+    Parameters
+    ----------
+    limit_s : float
+        Seconds without progress after which it ends.
+
+    >>> patience = Patience(2.0)
+    >>> [patience.pause_s(at_s) for at_s in (10.0, 10.5, 11.5, 12.0)]
+    [0.5, 1.0, 0.5, None]
+    >>> patience.progressed()
+    >>> patience.pause_s(50.0), patience.pause_s(50.5, wanted_s=60.0)
+    (0.5, None)
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self.limit_s = limit_s
+        self._since_s: float | None = None
+        self._failures = 0
+
+    def progressed(self) -> None:
+        """Begin anew: something has arrived."""
+        self._since_s, self._failures = None, 0
+
+    def pause_s(self, now_s: float, *, wanted_s: float = 0.0, limit_s: float = math.inf) -> float | None:
+        """Seconds until the next attempt, after one that has failed; None if there is none.
+
+        Parameters
+        ----------
+        now_s : float
+            A monotonic time.
+        wanted_s : float
+            The pause that the service wants. One that ends after the patience ends it now.
+        limit_s : float
+            A lower limit for this failure.
+        """
+        if self._since_s is None:
+            self._since_s = now_s
+        left_s = min(self.limit_s, limit_s) - (now_s - self._since_s)
+        self._failures += 1
+        if left_s <= 0.0 or wanted_s > left_s:
+            return None
+        own_s = min(FIRST_PAUSE_S * 2.0 ** min(self._failures - 1, 10), LONGEST_PAUSE_S)
+        return max(wanted_s, min(own_s, left_s))

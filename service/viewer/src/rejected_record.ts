@@ -1,0 +1,37 @@
+import type { Listed } from "./batching";
+import { el, swatch } from "./elements";
+import { capital } from "./fields";
+import { FIGURES, figureWords, type FigureName } from "./figures";
+import { warningNotice } from "./notices";
+import { reasonWords } from "./reasons";
+
+const SHOWN: FigureName[] = ["height", "area", "points"];
+
+/** What is known about an object that was left out. */
+export function rejectedRecord({ id, reason, reasonDetail, figures }: Listed): HTMLElement[] {
+  const why = reason === null ? "No reason is recorded" : capital(reasonWords(reason));
+  return [
+    el(
+      "div",
+      { class: "record-head" },
+      el("h2", {}, swatch("rejected"), "Not a building"),
+      el("code", { class: "record-id", title: id }, id),
+    ),
+    warningNotice(reasonDetail === null ? `${why}.` : `${why} (${reasonDetail}).`),
+    el(
+      "section",
+      {},
+      el("h3", {}, "What was measured"),
+      el(
+        "dl",
+        {},
+        ...SHOWN.flatMap((name) => [el("dt", {}, FIGURES[name].label), el("dd", {}, figureWords(name, figures) ?? "–")]),
+      ),
+    ),
+    el(
+      "section",
+      { class: "hint" },
+      "The outline is the box around the object. If it is a building, give this id with the action accept in an overrides file to a run on the command line.",
+    ),
+  ];
+}

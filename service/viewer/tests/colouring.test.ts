@@ -1,0 +1,90 @@
+import { expect, test } from "vitest";
+import { Batcher, SURFACE, type Batch } from "../src/batching";
+import { SequenceReader, type Building } from "../src/cityjson";
+import { classesOf, coloursOf, CYCLE, type Colouring } from "../src/colouring";
+import { bytesOf, CATEGORIES } from "../src/roof_types";
+import { GABLE, METADATA } from "./gable";
+
+/** The house with other attributes. */
+function house(id: string, attributes: Record<string, unknown>): Building {
+  const reader = new SequenceReader();
+  reader.read(JSON.stringify(METADATA));
+  const building = reader.read(JSON.stringify(GABLE)) as Building;
+  return { ...building, id, attributes: { ...building.attributes, ...attributes } };
+}
+
+const HOUSES = [
+  house("a", { rmse_m: 0.04 }),
+  house("b", { rmse_m: 0.3, status: "fallback", reason: "no_plane" }),
+  house("c", { rmse_m: null, status: "fallback", reason: "crashed" }),
+];
+
+function batched(): { batches: Batch[]; listed: ReturnType<Batcher["add"]>[] } {
+  const batcher = new Batcher({ origin: [565005, 5934003, 90], horizontalUnitM: 1, verticalUnitM: 1 });
+  const listed = HOUSES.map((building) => batcher.add(building));
+  return { batches: batcher.take(), listed };
+}
+
+/** sRGB bytes to the bytes of linear light that the models have. */
+function linear(colour: string): number[] {
+  return bytesOf(colour).map((byte) => {
+    const share = byte / 255;
+    return Math.round(255 * (share <= 0.04045 ? share / 12.92 : ((share + 0.055) / 1.055) ** 2.4));
+  });
+}
+
+/** Colour of the corners of each surface of a building. */
+function surfaceColours(batch: Batch, index: number, colouring: Colouring): Map<number, string> {
+  const colours = coloursOf(batch, colouring);
+  const seen = new Map<number, string>();
+  for (let corner = batch.starts[index]; corner < batch.starts[index + 1]; corner++) {
+    const colour = [...colours.slice(4 * corner, 4 * corner + 3)].join();
+    expect(seen.get(batch.surfaces[corner]) ?? colour).toBe(colour);
+    seen.set(batch.surfaces[corner], colour);
+  }
+  return seen;
+}
+
+test("each roof plane has a colour of its own, walls and ground keep theirs", () => {
+  const [ok] = batched().batches;
+  const byPlane = surfaceColours(ok, 0, "plane");
+  expect([...byPlane.keys()].sort()).toEqual([SURFACE.wall, SURFACE.ground, 0, 1].sort());
+  expect(byPlane.get(0)).toBe(linear(CYCLE[0]).join());
+  expect(byPlane.get(1)).toBe(linear(CYCLE[1]).join());
+  const byType = surfaceColours(ok, 0, "type");
+  expect(byType.get(0)).toBe(linear(CATEGORIES.gable.colour).join());
+  for (const surface of [SURFACE.wall, SURFACE.ground]) expect(byPlane.get(surface)).toBe(byType.get(surface));
+});
+
+test("residual, status and reason colour a whole roof as the legend says", () => {
+  const { batches, listed } = batched();
+  for (const colouring of ["residual", "status", "reason"] as const) {
+    for (const { id } of HOUSES) {
+      const batch = batches.find(({ ids }) => ids.includes(id)) as Batch;
+      const roofs = surfaceColours(batch, batch.ids.indexOf(id), colouring);
+      const [own] = classesOf(colouring, listed.filter((one) => one.id === id));
+      expect(new Set([roofs.get(0), roofs.get(1)])).toEqual(new Set([linear(own.colour).join()]));
+    }
+  }
+});
+
+test("the legend counts the buildings of each class and leaves out empty ones", () => {
+  const { listed } = batched();
+  const counts = (colouring: "residual" | "status" | "reason") => classesOf(colouring, listed).map(({ label, count }) => [label, count]);
+  expect(counts("residual")).toEqual([["up to 0.05 m", 1], ["to 0.5 m", 1], ["unknown", 1]]);
+  expect(counts("status")).toEqual([["Modelled", 1], ["Fallback block", 2]]);
+  expect(counts("reason")).toEqual([
+    ["none: modelled in full", 1],
+    ["no roof plane was found in its points", 1],
+    ["a fault, a crash, or a limit of time or memory", 1],
+  ]);
+  expect(classesOf("status", [])).toEqual([]);
+});
+
+test("a residual on the border of two classes belongs to the better one", () => {
+  const { listed } = batched();
+  const label = (rmseM: number) => classesOf("residual", [{ ...listed[0], figures: { residual: rmseM } }])[0].label;
+  expect([0.05, 0.0501, 0.1, 0.2, 0.5, 0.51].map(label)).toEqual([
+    "up to 0.05 m", "to 0.1 m", "to 0.1 m", "to 0.2 m", "to 0.5 m", "above 0.5 m",
+  ]);
+});

@@ -1,0 +1,77 @@
+// @vitest-environment happy-dom
+import { afterEach, beforeEach, expect, test, vi } from "vitest";
+import type { StatusInfo } from "../src/api";
+import { cancellation, jobMenu } from "../src/job_actions";
+import { showJob } from "../src/job_view";
+import { FakeService, press, settled } from "./fake_service";
+
+const WAITING: StatusInfo = { jobID: "1", status: "accepted", title: "a town" };
+const hooks = { onChange: vi.fn(), onProblem: vi.fn() };
+let service: FakeService;
+
+beforeEach(() => {
+  document.body.replaceChildren();
+  vi.clearAllMocks();
+  service = new FakeService();
+  service.on("DELETE jobs/1", { ...WAITING, status: "dismissed" });
+});
+
+afterEach(() => {
+  vi.unstubAllGlobals();
+});
+
+test("a job that has begun meanwhile is stopped only after a question", async () => {
+  service.on("GET jobs/1", { ...WAITING, status: "running" });
+  await cancellation(WAITING, hooks);
+  expect(service.count("DELETE jobs/1")).toBe(0);
+  expect(document.querySelector("dialog")?.textContent).toContain("“a town” is running");
+  press("Cancel the job");
+  await settled();
+  expect(service.count("DELETE jobs/1")).toBe(1);
+  expect(document.querySelector("dialog")).toBeNull();
+});
+
+test("a job that waits is stopped at once", async () => {
+  service.on("GET jobs/1", WAITING);
+  await cancellation(WAITING, hooks);
+  expect(service.count("DELETE jobs/1")).toBe(1);
+  expect(hooks.onChange).toHaveBeenCalledOnce();
+});
+
+test("a second click does not remove the job that the first stops", async () => {
+  service.on("GET jobs/1", { ...WAITING, processID: "echo" });
+  service.hold("GET jobs/1/events");
+  const place = document.body.appendChild(document.createElement("main"));
+  const leave = showJob(place, { job: "1", method: null, building: null }, hooks);
+  await settled();
+  press("Cancel the job");
+  press("Cancel the job");
+  await settled();
+  expect(service.count("DELETE jobs/1")).toBe(1);
+  leave();
+});
+
+test("a job that has ended meanwhile keeps its results, before the question and after it", async () => {
+  service.on("GET jobs/1", { ...WAITING, status: "successful" });
+  await cancellation(WAITING, hooks);
+  expect(document.querySelector("dialog")).toBeNull();
+  service.on("GET jobs/1", { ...WAITING, status: "running" });
+  await cancellation(WAITING, hooks);
+  service.on("GET jobs/1", { ...WAITING, status: "successful" });
+  press("Cancel the job");
+  await settled();
+  expect(service.count("DELETE jobs/1")).toBe(0);
+  expect(hooks.onChange).toHaveBeenCalledTimes(2);
+});
+
+test("a menu offers what fits the job as it is after it was kept", async () => {
+  const menu = jobMenu({ ...WAITING, request: { inputs: { crs: "EPSG:28992" } } }, hooks);
+  document.body.append(menu);
+  service.on("PATCH jobs/1", { ...WAITING, status: "failed", keep: true });
+  menu.querySelector("summary")?.click();
+  expect(menu.textContent).toContain("Cancel…");
+  press("Keep it");
+  await settled();
+  menu.querySelector("summary")?.click();
+  expect([...menu.querySelectorAll("button")].map(({ textContent }) => textContent)).toEqual(["Try again…", "No longer keep it", "Remove…"]);
+});

@@ -1,0 +1,78 @@
+"""The buildings of a running job on the page, as outlines; the test is the driver that says how far the job is."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from chromium import Visit
+from playwright.sync_api import expect
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "80_service"))
+
+import finished_runs as runs
+import small_buildings as small
+from running_runs import RunningRun
+
+from service.files import StateFolder
+from service.jobs import InputReference, Job, JobEvent, JobRequest
+from service.settings import ServiceSettings
+from service.store import JobStore
+
+pytestmark = pytest.mark.slow
+
+GABLE = runs.placed(small.gable(), "gable", 0.0, 0.0)
+COURTYARD = runs.placed(small.courtyard(), "courtyard", 20.0, 40.0)
+FAILED = runs.placed(small.failed(), "failed", 50.0, 50.0)
+TWO_PARTS = runs.placed(small.two_parts(), "two_parts", 130.0, 20.0, 7.0)
+
+
+def claimed(store: JobStore) -> Job:
+    job = store.claim("the test", lease_s=3600.0, max_attempts=3)
+    assert job is not None
+    return job
+
+
+def models(store: JobStore, job: Job) -> None:
+    """Say that the job models its buildings."""
+    event = JobEvent(
+        sequence=0, at=store.now(), kind="stage", stage="reconstruct", done=1, total=4, progress=60, message="modelled"
+    )
+    store.record(job, [event])
+
+
+def test_outlines_come_as_buildings_are_modelled_and_begin_anew_with_an_attempt(
+    driverless: tuple[str, Path], visit: Callable[..., Visit]
+) -> None:
+    url, state = driverless
+    folder = StateFolder(state)
+    with JobStore(ServiceSettings(state=state).database) as store:
+        request = JobRequest(tiles=(InputReference(kind="path", value="/srv/tile.laz"),), title="a town")
+        store.create(request, owner=None, max_queued=9, max_queued_per_key=9)
+        job = claimed(store)
+        folder.attempt(job.job_id, 1).mkdir(parents=True)
+        running = RunningRun(folder.run(job.job_id, 1))
+        page = visit(url).page
+        page.goto(f"{url}#/jobs/{job.job_id}")
+        plan = page.get_by_role("img", name="Outlines of the buildings so far, seen from above")
+        expect(page.get_by_role("progressbar", name="Progress of the job")).to_be_visible()
+        expect(plan).not_to_be_visible()
+        models(store, job)
+        running.models("x850_y4470", "a", COURTYARD, FAILED)
+        with running.writer(folder.so_far(job.job_id, 1)) as shown:
+            running.add_to(shown)
+            shown.show()
+            expect(plan).to_be_visible()
+            # one of the two has no outline
+            expect(plan.locator("path")).to_have_count(1)
+            expect(page.locator(".so-far figcaption")).to_have_text("2 buildings so far")
+            running.models("x851_y4470", "b", TWO_PARTS)
+            running.models("x850_y4470", "c", GABLE)
+            running.add_to(shown)
+            shown.show()
+        expect(page.locator(".so-far figcaption")).to_have_text("4 buildings so far")
+        expect(plan.locator("path")).to_have_count(3)
+        # the driver was lost, and another one began anew
+        with store._database.write() as connection:
+            connection.exec_driver_sql("UPDATE jobs SET attempt = 2")
+        expect(plan).not_to_be_visible()
