@@ -2,6 +2,7 @@
 
 import contextlib
 import datetime as dt
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
@@ -10,11 +11,13 @@ import finished_runs as runs
 from gate import Gate, gate_before
 from live_service import add_key, las_bytes, serving, settings_in
 from migrated import with_tables
+from processes import wait_for
 
 from service.client import AsyncClient, Client, UploadMemory
 from service.files import StateFolder
 from service.jobs import Job, JobEvent, JobRequest
 from service.keys import Scope
+from service.resumable import PREFIX
 from service.store import JobStore
 
 LARGE = las_bytes(200_000, compressed=False)
@@ -61,6 +64,21 @@ class Site:
         self.url = self._serving.enter_context(serving(self.settings))
         self.gate.lead_to(self.url)
         self.gate.shut(False)
+
+    def cut(self) -> None:
+        """End all connections, and wait until the bytes of an upload that have passed are stored.
+
+        A service that is busy may read them later than the client asks how many there are; the client then sends some
+        of them again.
+        """
+        before = self._stored_bytes()
+        self.gate.cut()
+        wait_for(lambda: self._stored_bytes() > before, "the bytes that have passed")
+
+    def _stored_bytes(self) -> int:
+        """Bytes of unfinished uploads whose requests have ended."""
+        places = self.runs.folder.uploads.glob(f"{PREFIX}*/progress.json")
+        return sum(json.loads(place.read_text())["synced_bytes"] for place in places)
 
     def stop(self) -> None:
         """Stop the service; new connections are refused."""

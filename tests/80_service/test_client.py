@@ -43,7 +43,7 @@ def test_an_upload_goes_on_over_broken_connections(site: Site, beside: ThreadPoo
     sent = beside.submit(site.client().upload, site.file())
     for _ in range(4):
         site.gate.wait_until_used_up(DEADLINE_S)
-        site.gate.cut()
+        site.cut()
         site.gate.allow(len(LARGE) // 6)
     site.gate.allow(float("inf"))
     record = site.store.upload(sent.result(DEADLINE_S))
@@ -58,7 +58,7 @@ def test_a_call_that_was_interrupted_continues_in_another_process(site: Site, be
     first = beside.submit(site.client(patience_s=0.0).upload, path)
     site.gate.wait_until_used_up(DEADLINE_S)
     site.gate.shut(True)
-    site.gate.cut()
+    site.cut()
     with pytest.raises(api.UnreachableError):
         first.result(DEADLINE_S)
     site.gate.allow(float("inf"))
