@@ -1,21 +1,20 @@
 """One tile's points to surface fragments, end to end, without I/O.
 
 Ground, heights, a TIN of thinned points, wall facets, fragments: the front half of the science (`reconstruct` is the
-other). Every step declares how far it looks; `SceneSettings.support_with` is the sum, and with a halo at least that
-wide the result does not depend on the tiles.
+other). Every step declares how far it looks (`SceneSettings`); with a halo at least that wide the result does not
+depend on the tiles.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 
 from pipeline.model import BoolArray, ByteArray, IntArray, LabelArray
 from pipeline.terrain.facets import SceneVertices, VertexKind
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
-from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above, lowest_per_cell
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
 from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.point_assignment import Allowed, ScenePoints
 from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
@@ -64,12 +63,6 @@ class SplitTile:
     """(n,) int64, indices into the window's points of those that the core owns."""
     point_fragment: LabelArray
     """(n,) int32, their fragments; -1 where none."""
-    terrain: Terrain
-    """The ground, on the lattice of the window; drawn where the core and its surroundings need it."""
-    occupied: BoolArray
-    """(rows, columns) on the lattice of the terrain: the cell holds a point."""
-    outliers: int
-    """Gross outliers in the core."""
 
 
 def lattice_of(window: Window) -> tuple[int, int, int, int]:
@@ -80,32 +73,25 @@ def lattice_of(window: Window) -> tuple[int, int, int, int]:
     return column0, row0, columns, rows
 
 
-def terrain_of(
-    points: WindowPoints,
-    window: Window,
-    settings: SceneSettings,
-    classes: ClassesInUse,
-    wanted: Window | None = None,
-) -> tuple[Terrain, BoolArray, BoolArray]:
-    """Terrain of a window, the mask of points that are not outliers, and the occupied cells.
+def usable_as_ground(points: WindowPoints, kept: BoolArray, classes: ClassesInUse) -> BoolArray:
+    """(n,) which points may be ground: those of class 2 where it is believed, else last returns; no outliers."""
+    usable: BoolArray = kept & (points.classification == GROUND_CLASS if classes.ground else _is_last(points))
+    return usable
 
-    `wanted` is where terrain is needed; in the whole window by default.
+
+def terrain_of(
+    points: WindowPoints, window: Window, settings: SceneSettings, classes: ClassesInUse
+) -> tuple[Terrain, BoolArray]:
+    """Terrain of a window, and the mask of points that are not outliers.
+
+    A run does the same in stages: outliers by tile, the ground by larger blocks.
     """
-    lattice = lattice_of(window)
     kept = dense_enough(points.x_mm, points.y_mm, points.z_mm, settings.outliers)
-    usable = kept & (points.classification == GROUND_CLASS if classes.ground else _is_last(points))
-    terrain = ground_of(
-        points.x_mm,
-        points.y_mm,
-        points.z_mm,
-        usable,
-        lattice,
-        settings.ground,
-        trusted=classes.ground,
-        wanted=None if wanted is None else lattice_of(wanted),
-    )
-    occupied: BoolArray = lowest_per_cell(points.x_mm, points.y_mm, points.z_mm, kept, *lattice) != NO_DATA
-    return terrain, kept, occupied
+    usable = usable_as_ground(points, kept, classes)
+    window_cells = lattice_of(window)
+    trusted = classes.ground
+    terrain = ground_of(points.x_mm, points.y_mm, points.z_mm, usable, window_cells, settings.ground, trusted=trusted)
+    return terrain, kept
 
 
 def _is_last(points: WindowPoints) -> BoolArray:
@@ -182,18 +168,23 @@ def _thin(points: WindowPoints, height_mm: IntArray, vertices: SceneVertices, se
 
 
 def split_tile(
-    points: WindowPoints, core: Window, window: Window, settings: SceneSettings, classes: ClassesInUse
+    points: WindowPoints, core: Window, terrain: Terrain, settings: SceneSettings, classes: ClassesInUse
 ) -> SplitTile:
     """Split the core of one tile into surface fragments, and assign its points.
 
-    The window has the core and a halo of at least `settings.support_with(classes, footprints=False)`.
+    Parameters
+    ----------
+    points : WindowPoints
+        Those of the core and of `split_support_m` around it, without outliers; farther ones do not matter.
+    core : Window
+        What the tile owns.
+    terrain : Terrain
+        The ground wherever these points lie.
+    settings, classes
+        As for the run.
     """
-    wanted = core.grown(math.ceil(1000 * settings.terrain_m(footprints=False)))
-    terrain, kept, occupied = terrain_of(points, window, settings, classes, wanted)
-    outliers = int((core.contains(points.x_mm, points.y_mm) & ~kept).sum())
-    # from here on only the core and what its fragments can reach; most of the halo served the terrain
-    near = core.grown(round(1000 * (settings.surfaces.support_m + settings.vegetation.support_m)))
-    near_index = np.flatnonzero(near.contains(points.x_mm, points.y_mm) & kept)
+    near = core.grown(round(1000 * settings.split_support_m(footprints=False)))
+    near_index = np.flatnonzero(near.contains(points.x_mm, points.y_mm))
     points = points.take(near_index)
     height = height_above(points.x_mm, points.y_mm, points.z_mm, terrain.elevation_mm, terrain.column0, terrain.row0)
     building = (points.classification == BUILDING_CLASS) & classes.building
@@ -228,11 +219,4 @@ def split_tile(
         canopy_m=settings.vegetation.canopy_m,
         ground_m=settings.ground.tolerance_m,
     )
-    return SplitTile(
-        fragments=fragments,
-        core_index=near_index[core_index],
-        point_fragment=point_fragment,
-        terrain=terrain,
-        occupied=occupied,
-        outliers=outliers,
-    )
+    return SplitTile(fragments=fragments, core_index=near_index[core_index], point_fragment=point_fragment)

@@ -1,4 +1,4 @@
-"""Classification: plan, ingest, split and join as in a run, then a class for every point, written in file order."""
+"""Classification: plan, ingest, ground, split and join as in a run, then a class for every point, in file order."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from pipeline.runtime.run_context import RunContext, run_context
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
 from pipeline.runtime.stages.given_footprints import given_footprints
+from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest, part_of
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use
 from pipeline.runtime.stages.join import join
@@ -172,7 +173,8 @@ def classify(
         cancelled=cancelled,
     ) as context:
         ingested = ingest(context, paths)
-        splits = split(context, request.settings, ingested, footprints)
+        ground = find_ground(context, request.settings, ingested)
+        splits = split(context, request.settings, ingested, ground, footprints)
         joined = join(
             context, request.settings.scene, request.settings.building.roof.min_strip_offset_m, splits, footprints
         )

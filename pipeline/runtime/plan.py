@@ -16,8 +16,7 @@ from pipeline.io.gps_time import GpsTimeKind
 from pipeline.io.source import IMPOSSIBLE_DENSITY
 from pipeline.runtime.cluster.memory_needs import WINDOW_BASE_BYTES
 from pipeline.settings import RunSettings
-from pipeline.terrain.scene_settings import ClassesInUse
-from pipeline.tiling import MM, Tile, TileGrid
+from pipeline.tiling import MM, Tile, TileGrid, Window
 
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
 _POINTS_PER_WINDOW = 12_000_000
@@ -25,6 +24,10 @@ _ASKED_AT_ONCE = 8
 """Remote files whose headers are read at once: a header takes some ten requests of tens of milliseconds each."""
 _BYTES_PER_POINT = 220
 """Bytes per point of the window: measured peak of a split above the size of its process, at 3 and 5 million points."""
+_BYTES_PER_JUDGED_POINT = 140
+"""The same of the search for duplicates and outliers."""
+_BYTES_PER_CELL = 120
+"""The same per cell of 1 m of the ground filter."""
 LARGEST_TASK_BYTES = _POINTS_PER_WINDOW * _BYTES_PER_POINT
 """Peak of the largest task of plans that choose their tile size."""
 
@@ -208,14 +211,11 @@ def check_memory(plan: Plan, limit_bytes: int | None) -> None:
     )
 
 
-def split_grid(plan: Plan, settings: RunSettings, classes: ClassesInUse, *, footprints: bool) -> TileGrid:
-    """The plan's lattice with the halo that the split needs, given which classes are believed.
-
-    Classes are known only after the points are read, so the plan assumes the widest halo. A halo set by the user stays.
-    """
+def split_grid(plan: Plan, settings: RunSettings, *, footprints: bool) -> TileGrid:
+    """The plan's lattice with the halo that the split needs: none in given footprints. One set by the user stays."""
     if settings.general.halo_m:
         return plan.grid
-    support_m = settings.scene.support_with(classes, footprints=footprints)
+    support_m = settings.scene.split_support_m(footprints=footprints)
     return dataclasses.replace(plan.grid, halo_mm=math.ceil(support_m * MM))
 
 
@@ -235,6 +235,17 @@ def check_windows(plan: Plan, grid: TileGrid, points_by_tile: Mapping[Tile, int]
                 f"{limit_bytes / 1e9:.1f} GB can take",
                 "Set a smaller tile_size_m, or give the workers more memory",
             )
+
+
+def points_bytes(points: int) -> int:
+    """Estimated peak memory of a process that judges so many points of a tile."""
+    return WINDOW_BASE_BYTES + points * _BYTES_PER_JUDGED_POINT
+
+
+def ground_bytes(window: Window) -> int:
+    """Estimated peak memory of a process that finds the ground of a window."""
+    cells = (window.x1_mm - window.x0_mm) * (window.y1_mm - window.y0_mm) // MM**2
+    return WINDOW_BASE_BYTES + cells * _BYTES_PER_CELL
 
 
 def window_bytes(grid: TileGrid, tile: Tile, points_by_tile: Mapping[Tile, int]) -> int:

@@ -52,6 +52,7 @@ from pipeline.runtime.scratch.location import run_scratch
 from pipeline.runtime.stages.apply_overrides import WARNING, EntryOutcome, apply_overrides
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.given_footprints import GivenFootprints, given_footprints
+from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested, points_by_tile
 from pipeline.runtime.stages.join import join
@@ -252,11 +253,12 @@ class _Search:
     def _candidates(self, tiles: frozenset[Tile] | None) -> _Found:
         """The candidates of some tiles; of all tiles for None."""
         context, settings = self.context, self.request.settings
-        splits = split(context, settings, self.ingested, self.footprints, tiles)
+        ground = find_ground(context, settings, self.ingested, tiles)
+        splits = split(context, settings, self.ingested, ground, self.footprints, tiles)
         roof = settings.building.roof
         found = join(context, settings.scene, roof.min_strip_offset_m, splits, self.footprints)
         judged = outline(context, roof, found)
-        joined, outcomes = apply_overrides(context, settings, judged, self.overrides, self.ingested)
+        joined, outcomes = apply_overrides(context, settings, judged, self.overrides, self.ingested, ground)
         now = {o.building_id: o.effective.fingerprint for o in outcomes if o.building_id and o.effective is not None}
         before = self.earlier.fingerprints
         changed = frozenset({name for name in {*now, *before} if now.get(name) != before.get(name)} | set(self.only))

@@ -1,4 +1,4 @@
-"""A run from inputs to a run directory: plan, ingest, split, join, outline, reconstruct, publish."""
+"""A run from inputs to a run directory: plan, ingest, ground, split, join, outline, reconstruct, publish."""
 
 from __future__ import annotations
 
@@ -42,6 +42,7 @@ from pipeline.runtime.stages.apply_overrides import apply_overrides
 from pipeline.runtime.stages.cleanup import tidy
 from pipeline.runtime.stages.counts import Counted, run_counts
 from pipeline.runtime.stages.given_footprints import GivenFootprints, given_footprints
+from pipeline.runtime.stages.ground import Ground, find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.join import join
@@ -249,6 +250,7 @@ class _Candidates:
     """What the stages that all variants share found."""
 
     ingested: Sequence[Ingested]
+    ground: Ground
     splits: Splits
     joined: Joined
 
@@ -258,10 +260,11 @@ def _find_candidates(
 ) -> _Candidates:
     """The stages up to the candidates."""
     ingested = ingest(context, paths)
-    splits = split(context, settings, ingested, footprints)
+    ground = find_ground(context, settings, ingested)
+    splits = split(context, settings, ingested, ground, footprints)
     roof = settings.building.roof
     joined = join(context, settings.scene, roof.min_strip_offset_m, splits, footprints)
-    return _Candidates(ingested=ingested, splits=splits, joined=outline(context, roof, joined))
+    return _Candidates(ingested=ingested, ground=ground, splits=splits, joined=outline(context, roof, joined))
 
 
 def _override(
@@ -272,7 +275,7 @@ def _override(
     runs: Sequence[_VariantRun],
 ) -> _Candidates:
     """The candidates after the overrides; the outcome of each entry goes into the run directories."""
-    joined, entries = apply_overrides(context, settings, found.joined, overrides, found.ingested)
+    joined, entries = apply_overrides(context, settings, found.joined, overrides, found.ingested, found.ground)
     for entry in entries:
         if entry.warning:
             context.progress.warn("join", entry.warning)
@@ -391,7 +394,7 @@ class _VariantRun:
         driver, peak_bytes = peak_of_process()
         self.progress.peaks[driver] = peak_bytes
         failed_tiles = tuple(outcome.tile.key for outcome in self.published if outcome.error)
-        counts = run_counts(context.plan, found.ingested, found.splits, found.joined, self.counted)
+        counts = run_counts(context.plan, found.ingested, found.ground, found.splits, found.joined, self.counted)
         manifest = dataclasses.replace(
             self.manifest,
             status=RunStatus.INCOMPLETE if failed_tiles else RunStatus.FINISHED,

@@ -142,7 +142,6 @@ def ground_of(
     settings: GroundSettings,
     *,
     trusted: bool,
-    wanted: tuple[int, int, int, int] | None = None,
 ) -> Terrain:
     """Terrain under a window of points.
 
@@ -156,9 +155,6 @@ def ground_of(
         column0, row0, columns, rows of the lattice.
     trusted : bool
         The usable points are ground by the classes of the file: they are only interpolated.
-    wanted : tuple of int, optional
-        column0, row0, columns, rows of the cells whose heights and slopes are needed; all by default. The rest of the
-        window only serves them.
 
     Returns
     -------
@@ -167,6 +163,33 @@ def ground_of(
     """
     column0, row0, columns, rows = window
     lowest = lowest_per_cell(x_mm, y_mm, z_mm, usable, column0, row0, columns, rows)
+    return ground_on(lowest, (column0, row0), settings, trusted=trusted)
+
+
+def ground_on(
+    lowest: Elevations,
+    corner: tuple[int, int],
+    settings: GroundSettings,
+    *,
+    trusted: bool,
+    wanted: tuple[slice, slice] | None = None,
+) -> Terrain:
+    """Terrain through the lowest usable points of cells.
+
+    Parameters
+    ----------
+    lowest : (rows, columns) int32
+        Elevations in mm, NO_DATA where a cell holds no usable point.
+    corner : tuple of int
+        Absolute column and row of the first cell.
+    settings, trusted
+        As for `ground_of`.
+    wanted : tuple of slices, optional
+        Rows and columns whose heights and slopes are needed; all by default. The others only serve them, and may stay
+        without elevation.
+    """
+    column0, row0 = corner
+    rows, columns = lowest.shape
     elevation = np.full((rows, columns), NO_DATA, np.int32)
     slope = np.zeros((rows, columns), np.int32)
     measured = np.zeros((rows, columns), np.bool_)
@@ -178,16 +201,16 @@ def ground_of(
         if not trusted:
             pit_depth_mm = round(settings.pit_depth_m * 1000)
             part = without_pits(part, pit_depth_mm)
-            corner = (column0 + seen[1].start, row0 + seen[0].start)
+            place = (column0 + seen[1].start, row0 + seen[0].start)
             if settings.filter == "hierarchical":
-                is_ground = steady = hierarchical_ground(part, corner, settings, pit_depth_mm)
+                is_ground = steady = hierarchical_ground(part, place, settings, pit_depth_mm)
             else:
-                is_ground, steady = morphological_ground(part, corner, settings)
+                is_ground, steady = morphological_ground(part, place, settings)
                 beside = (settings.rejoin_m, settings.rejoin_step_m * 1000.0)
+        down, across = (slice(0, rows), slice(0, columns)) if wanted is None else wanted
         # one cell more for heights between the middles of cells, one for the slope there
-        west, south, width, depth = window if wanted is None else wanted
-        west, south = west - column0 - seen[1].start - 2, south - row0 - seen[0].start - 2
-        drawn = (west, south, west + width + 4, south + depth + 4)
+        west, south = across.start - seen[1].start - 2, down.start - seen[0].start - 2
+        drawn = (west, south, west + across.stop - across.start + 4, south + down.stop - down.start + 4)
         elevation[seen] = _terrain(part, (is_ground, steady), settings.reach_m, settings.max_slope, drawn, beside)
         slope[seen] = slopes_of(elevation[seen])
         measured[seen] = is_ground

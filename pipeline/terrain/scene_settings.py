@@ -42,28 +42,24 @@ class SceneSettings:
 
     @property
     def support_m(self) -> float:
-        """Farthest that a tile looks beyond its core: to find fragments among points without usable classes."""
-        return self.support_with(ClassesInUse(), footprints=False)
+        """Farthest in metres that a tile looks at points beyond its core: to judge outliers, or to find surfaces."""
+        return max(self.outliers.support_m, self.split_support_m(footprints=False))
 
-    def support_with(self, classes: ClassesInUse, *, footprints: bool) -> float:
-        """How far in metres a tile looks beyond its core, given classes in use and `footprints`; at most `support_m`.
+    def split_support_m(self, *, footprints: bool) -> float:
+        """How far in metres the split of a tile looks at points beyond its core.
 
-        Three lengths add up: how far from the core terrain is needed, how far a terrain elevation looks from there, and
-        how far the search for outliers looks.
-
-        - Terrain is stored for the core and its apron (`APRON_M`). Fragments need it at all points of the core and at
-          the facets and vertices around it. With given footprints only points of the core count, without a TIN: each
-          must lie in a footprint and above the ground.
-        - A terrain elevation looks as far as the ground filter. With class 2 as ground no filter runs, which leaves
-          `GroundSettings.trusted_support_m`.
-        - Class 6 does not shorten the distance: its points are judged one by one.
+        A fragment depends on the facets around it, and these on the planarity of their vertices. Points in given
+        footprints are taken one by one, without a TIN.
         """
-        ground_m = self.ground.trusted_support_m if classes.ground else self.ground.support_m
-        return self.outliers.support_m + ground_m + self.terrain_m(footprints=footprints)
+        return 0.0 if footprints else self.surfaces.support_m + self.vegetation.support_m
 
     def terrain_m(self, *, footprints: bool) -> float:
-        """How far beyond the core terrain is needed, in metres: for points in given footprints, or for all points."""
-        if footprints:
-            return float(APRON_M)
-        around_m = max(self.surfaces.support_m, self.vegetation.support_m) + self.vegetation.support_m
-        return max(float(APRON_M), around_m)
+        """How far beyond the core the split needs terrain, in metres: at all points that it looks at."""
+        return max(float(APRON_M), self.split_support_m(footprints=footprints))
+
+    def ground_support_m(self, classes: ClassesInUse) -> float:
+        """How far in metres a terrain elevation looks at the lowest points of cells.
+
+        It looks as far as the ground filter. With class 2 as ground no filter runs, only planes are drawn.
+        """
+        return self.ground.trusted_support_m if classes.ground else self.ground.support_m

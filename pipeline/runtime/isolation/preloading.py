@@ -13,7 +13,12 @@ Job = Literal["reconstruct", "classify"]
 
 _METHOD = "arrangement"
 """The default method; a child loads other methods itself."""
-_STAGES = ("numpy.ma", "pipeline.runtime.stages.ingest", "pipeline.runtime.stages.split_window")
+_STAGES = (
+    "numpy.ma",
+    "pipeline.runtime.stages.ingest",
+    "pipeline.runtime.stages.ground",
+    "pipeline.runtime.stages.split_window",
+)
 _LOADS = {
     "reconstruct": ("pipeline.runtime.stages.publish", "pipeline.export.tile", "pipeline.runtime.digest"),
     "classify": ("pipeline.runtime.stages.label", "pipeline.runtime.stages.write_classified"),

@@ -20,6 +20,7 @@ from pipeline.runtime.plan import split_grid
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.given_footprints import numbers_by_tile
+from pipeline.runtime.stages.ground import Ground
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
 from pipeline.runtime.stages.join import join_footprints
 from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, RejectedSite, largest_first
@@ -79,13 +80,14 @@ def apply_overrides(
     joined: Joined,
     overrides: Sequence[Override],
     ingested: Sequence[Ingested],
+    ground: Ground,
 ) -> tuple[Joined, tuple[EntryOutcome, ...]]:
     """The candidates after the overrides, and the outcome of each entry; its time counts as join and redraw."""
     started = time.perf_counter()
     outcomes = outcomes_of(overrides, joined, context.scratch, context.plan.grid)
     redrawn: dict[str, tuple[PointRange, ...]] = {}
     for number, layer in enumerate(_layers_of(outcomes)):
-        redrawn |= _redrawn(context, settings, layer, ingested, f"redrawn-{number}")
+        redrawn |= _redrawn(context, settings, layer, ingested, ground, f"redrawn-{number}")
     changed = _overridden(joined, outcomes, redrawn, context.scratch)
     timings = context.progress.timings
     timings["join"] = timings.get("join", 0.0) + time.perf_counter() - started - timings.get("redraw", 0.0)
@@ -97,6 +99,7 @@ def _redrawn(
     settings: RunSettings,
     layer: Sequence[EntryOutcome],
     ingested: Sequence[Ingested],
+    ground: Ground,
     folder: str,
 ) -> dict[str, tuple[PointRange, ...]]:
     """The points inside the other footprints of some buildings, by building_id; stored in a folder of scratch."""
@@ -109,13 +112,13 @@ def _redrawn(
     met = numbers_by_tile(points_by_tile(ingested), grid, polygons)
     numbers = {tile: found for tile, found in met.items() if found}
     windows = SplitWindows(
-        grid=split_grid(context.plan, settings, classes, footprints=True),
+        grid=split_grid(context.plan, settings, footprints=True),
         classes=classes,
         outlines={tile: tuple(polygons[k] for k in found) for tile, found in sorted(numbers.items())},
         numbers=numbers,
         folder=folder,
     )
-    splits = split_windows(context, "redraw", windows, settings, ingested)
+    splits = split_windows(context, "redraw", windows, settings, ingested, ground)
     names = [name for name, _ in named]
     sites = join_footprints(splits.stored(context.scratch), grid, splits.numbers, polygons, names, "").candidates
     return {

@@ -31,11 +31,14 @@ def clear_points(scratch: Scratch, wanted: Iterable[Place]) -> None:
             bucket.unlink(missing_ok=True)
 
 
-def clear_tiles(scratch: Scratch, folder: str, wanted: Iterable[Place]) -> None:
-    """Remove the outcomes of splits that are not wanted, and the files of tiles that are no longer split."""
+def clear_tiles(scratch: Scratch, folder: str, wanted: Iterable[Place], keys: Collection[str] | None = None) -> None:
+    """Remove the outcomes of a stage that are not wanted, and the files of tiles that it no longer has.
+
+    `keys` are those of its tiles; by default its tasks are by tile.
+    """
     wanted = list(wanted)
     drop_outcomes(scratch, folder, wanted)
-    tiles = {place.unit for place in wanted}
+    tiles = {place.unit for place in wanted} if keys is None else keys
     for tile in Path(scratch.root, folder).glob("*"):
         if tile.name not in tiles:
             shutil.rmtree(tile, ignore_errors=True)

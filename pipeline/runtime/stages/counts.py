@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from pipeline.runtime.manifest import SLOWEST, SlowBuilding
 from pipeline.runtime.plan import Plan
+from pipeline.runtime.stages.ground import Ground
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.model_batch import REJECTED
 from pipeline.runtime.stages.reconstruct import Models
@@ -71,7 +72,7 @@ class Counted:
 
 
 def run_counts(
-    plan: Plan, ingested: Sequence[Ingested], splits: Splits, joined: Joined, found: Counted
+    plan: Plan, ingested: Sequence[Ingested], ground: Ground, splits: Splits, joined: Joined, found: Counted
 ) -> dict[str, int]:
     """The counts in run.json."""
     by_status = found.statuses
@@ -82,8 +83,8 @@ def run_counts(
         "points_promised": plan.points,
         "points": sum(s.points for s in splits.figures),
         **{f"dropped_{cause}": count for cause, count in sorted(dropped.items())},
-        "duplicates": sum(s.duplicates for s in splits.figures),
-        "outliers": sum(s.outliers for s in splits.figures),
+        "duplicates": sum(cells.duplicates for cells in ground.cells.values()),
+        "outliers": sum(cells.outliers for cells in ground.cells.values()),
         "tiles": len(splits.figures),
         "candidates": by_status.total(),
         "ok": by_status["ok"],

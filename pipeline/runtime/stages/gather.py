@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime as dt
 import hashlib
 import math
@@ -20,6 +19,7 @@ from pipeline.model import BoolArray, Candidate, IntArray
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.sites import CandidateSite
+from pipeline.runtime.stages.surroundings import Surroundings, surroundings_of
 from pipeline.runtime.stages.window_points import bucket_paths
 from pipeline.strip_alignment import aligned_mm
 from pipeline.terrain.lattice import CELL_MM, NO_DATA
@@ -42,42 +42,6 @@ _BESIDE_CELLS = 2
 """Points within these cells of the roof lie beside it."""
 _HEIGHT_WITHOUT_TERRAIN_MM = 2500
 """Assumed height of the lowest point above ground where no terrain is known."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Surroundings:
-    """Terrain around a candidate, on the 1 m lattice."""
-
-    column0: int
-    row0: int
-    elevation_mm: npt.NDArray[np.int32]
-    """(rows, columns), NO_DATA where unknown."""
-    occupied: BoolArray
-    """(rows, columns), some point lies in the cell."""
-
-
-def surroundings_of(scratch: Scratch, grid: TileGrid, view: Window) -> Surroundings:
-    """Mosaic of the tiles' terrain over a view."""
-    column0, row0 = view.x0_mm // CELL_MM, view.y0_mm // CELL_MM
-    columns, rows = -(-view.x1_mm // CELL_MM) - column0, -(-view.y1_mm // CELL_MM) - row0
-    elevation = np.full((rows, columns), NO_DATA, np.int32)
-    occupied = np.zeros((rows, columns), np.bool_)
-    # a cell belongs to the tile of its centre, so neighbours of the view's own tiles may have its border cells
-    for tile in grid.tiles_over(view.grown(CELL_MM)):
-        name = f"tiles/{tile.key}"
-        if not scratch.has(name):
-            continue
-        corner = scratch.array(name, "corner")
-        part = scratch.array(name, "terrain", mapped=True)
-        c0, r0 = int(corner[0]) - column0, int(corner[1]) - row0
-        left, right = max(c0, 0), min(c0 + part.shape[1], columns)
-        low, high = max(r0, 0), min(r0 + part.shape[0], rows)
-        if left < right and low < high:
-            theirs = (slice(low - r0, high - r0), slice(left - c0, right - c0))
-            ours = (slice(low, high), slice(left, right))
-            elevation[ours] = part[theirs]
-            occupied[ours] = scratch.array(name, "occupied", mapped=True)[theirs]
-    return Surroundings(column0=column0, row0=row0, elevation_mm=elevation, occupied=occupied)
 
 
 def _grown(mask: BoolArray, cells: int) -> BoolArray:

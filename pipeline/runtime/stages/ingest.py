@@ -184,6 +184,7 @@ def _ingested(task: IngestTask) -> Ingested:
         part.replace(task.scratch.path("points", tile.key, f"{task.part}.bin"))
     return Ingested(
         path=task.path,
+        part=task.part,
         points_by_tile=dict(counts),
         content={tile: sums.tobytes() for tile, sums in content.items()},
         classes=dict(classes),

@@ -25,6 +25,8 @@ class Ingested:
 
     path: str
     """The file."""
+    part: str
+    """Name of its buckets."""
     points_by_tile: dict[Tile, int]
     """Points in each tile's bucket."""
     content: dict[Tile, bytes]

@@ -18,13 +18,12 @@ import numpy.typing as npt
 
 from pipeline.model import BoolArray, ByteArray, IntArray
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages.gather import Surroundings, surroundings_of
 from pipeline.runtime.stages.sites import CandidateSite, PointRange, RejectedSite
-from pipeline.runtime.stages.window_points import bucket_paths, load_window
+from pipeline.runtime.stages.surroundings import surroundings_of, terrain_around
+from pipeline.runtime.stages.window_points import LoadedWindow, bucket_paths, load_window
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, VEGETATION_CLASSES, WindowPoints
-from pipeline.terrain.ground import Terrain, ground_points, slopes_of
-from pipeline.terrain.lattice import NO_DATA, height_above
-from pipeline.terrain.outliers import dense_enough
+from pipeline.terrain.ground import ground_points
+from pipeline.terrain.lattice import height_above
 from pipeline.terrain.point_classes import PointClass, PointEvidence, classes_of, index_of_each, support_m
 from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
@@ -66,7 +65,7 @@ class Labelled:
 
 def label_halo_m(settings: SceneSettings) -> float:
     """How far the classes of a tile look beyond its core."""
-    return support_m(settings.vegetation) + settings.outliers.support_m
+    return support_m(settings.vegetation)
 
 
 def neighbourhood(tile: Tile, grid: TileGrid, settings: SceneSettings) -> Window:
@@ -123,7 +122,7 @@ def classes_of_tile(task: LabelTask) -> TileClasses:
     task.scratch.check_cancelled()
     wanted = np.zeros(len(points), np.bool_)
     wanted[:core] = True
-    evidence = evidence_of(task, points, window)
+    evidence = evidence_of(task, loaded, window)
     found = classes_of(evidence, wanted, task.settings.vegetation, given=task.given)[:core]
     found[_held_by(task, task.decks, points, window)[:core] & (found != PointClass.GROUND)] = PointClass.BRIDGE_DECK
     first = np.argsort(points.return_count[:core], kind="stable")
@@ -144,8 +143,9 @@ def class_path(scratch: Scratch, tile: Tile, bucket: str) -> Path:
     return scratch.path(FOLDER, tile.key, bucket)
 
 
-def evidence_of(task: LabelTask, points: WindowPoints, window: Window) -> PointEvidence:
+def evidence_of(task: LabelTask, loaded: LoadedWindow, window: Window) -> PointEvidence:
     """What is known of the points of a tile's neighbourhood."""
+    points = loaded.points
     around = surroundings_of(task.scratch, task.grid, window.grown(2 * MM))
     terrain = terrain_around(around)
     x, y, z = points.x_mm, points.y_mm, points.z_mm
@@ -161,19 +161,8 @@ def evidence_of(task: LabelTask, points: WindowPoints, window: Window) -> PointE
         rise_mm=-height_above(x, y, np.zeros_like(z), terrain.slope_mm, around.column0, around.row0),
         ground=ground,
         building=_held_by(task, task.buildings, points, window),
-        outlier=~dense_enough(x, y, z, task.settings.outliers),
+        outlier=~loaded.kept,
         echoes=points.return_count > 1,
-    )
-
-
-def terrain_around(around: Surroundings) -> Terrain:
-    """The mosaic of the tiles' terrain as one."""
-    return Terrain(
-        elevation_mm=around.elevation_mm,
-        slope_mm=slopes_of(around.elevation_mm),
-        measured=around.elevation_mm != NO_DATA,
-        column0=around.column0,
-        row0=around.row0,
     )
 
 

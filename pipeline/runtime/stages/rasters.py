@@ -16,13 +16,12 @@ from pipeline.io import LocalStorage, SpatialReference
 from pipeline.io.crs import INTERNATIONAL_FOOT_M, US_SURVEY_FOOT_M
 from pipeline.model import BoolArray
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.stages.gather import Surroundings, surroundings_of
+from pipeline.runtime.stages.surroundings import Surroundings, surroundings_of
 from pipeline.runtime.stages.window_points import load_window
 from pipeline.scene import WindowPoints
 from pipeline.terrain.elevation_rasters import FILL_M, closed, columns_of, filled, highest_in_cells, terrain_at
 from pipeline.terrain.ground import slopes_of
 from pipeline.terrain.lattice import CELL_MM, height_above
-from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.point_classes import PIT_REACH_MM, noise_of
 from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
@@ -96,8 +95,9 @@ def draw_tile(task: RasterTask) -> Tile:
     core, lattice = task.grid.core(task.tile), task.lattice
     reach = math.ceil(FILL_M * MM / lattice.side_mm)
     see_mm = math.ceil((reach + 2) * lattice.side_mm) + 2 * FILL_M * MM + 2 * CELL_MM
-    halo_mm = see_mm + PIT_REACH_MM + math.ceil(task.settings.outliers.support_m * MM)
-    points = load_window(task.scratch, dataclasses.replace(task.grid, halo_mm=halo_mm), task.tile).points
+    halo_mm = see_mm + PIT_REACH_MM
+    loaded = load_window(task.scratch, dataclasses.replace(task.grid, halo_mm=halo_mm), task.tile)
+    points = loaded.points
     around = surroundings_of(task.scratch, task.grid, core.grown(halo_mm))
     x, y, z = points.x_mm, points.y_mm, points.z_mm
     slope = slopes_of(around.elevation_mm)
@@ -106,7 +106,7 @@ def draw_tile(task: RasterTask) -> Tile:
         y,
         height_above(x, y, z, around.elevation_mm, around.column0, around.row0),
         -height_above(x, y, np.zeros_like(z), slope, around.column0, around.row0),
-        ~dense_enough(x, y, z, task.settings.outliers),
+        ~loaded.kept,
     )
     shown = points.take(np.flatnonzero(~noise))
     filled_cells = closed(around.occupied, FILL_M)

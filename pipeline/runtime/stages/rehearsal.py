@@ -12,6 +12,8 @@ import shapely
 
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.stages.cells import CellsTask, find_cells
+from pipeline.runtime.stages.ground import GroundTask, draw_ground
 from pipeline.runtime.stages.join import join_tiles
 from pipeline.runtime.stages.split_window import SplitTask, split_window
 from pipeline.runtime.stages.tile_content import zone_sums
@@ -48,13 +50,11 @@ def rehearse_scene(outlines: str = "") -> None:
     with tempfile.TemporaryDirectory(prefix="gablework-rehearsal-") as folder:
         scratch = Scratch(folder)
         points.tofile(scratch.path("points", tile.key, "made-up.bin"))
-        task = SplitTask(
-            tile=tile,
-            grid=grid,
-            classes=ClassesInUse(ground=True, building=True),
-            scratch=scratch,
-            footprints=footprints,
-        )
+        classes = ClassesInUse(ground=True, building=True)
+        find_cells(CellsTask(tile=tile, grid=grid, classes=classes, scratch=scratch), settings.outliers)
+        block = GroundTask(tiles=(tile,), seen=(tile,), grid=grid, reach_mm=MM, trusted=True, scratch=scratch)
+        draw_ground(block, settings.ground)
+        task = SplitTask(tile=tile, grid=grid, classes=classes, scratch=scratch, footprints=footprints)
         found = split_window(task, settings)
         if footprints is not None:
             return

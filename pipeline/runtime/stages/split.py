@@ -14,6 +14,7 @@ from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import Place, key_of, result_of
 from pipeline.runtime.stages.cleanup import clear_tiles
 from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline, numbers_by_tile
+from pipeline.runtime.stages.ground import Ground, terrain_of_window
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, content_by_tile, points_by_tile
 from pipeline.runtime.stages.split_window import Split, SplitFigures, SplitTask, split_window
 from pipeline.runtime.stages.tile_content import content_of_window
@@ -60,6 +61,7 @@ def split(
     context: RunContext,
     settings: RunSettings,
     ingested: Sequence[Ingested],
+    ground: Ground,
     footprints: GivenFootprints | None,
     only: Collection[Tile] | None = None,
 ) -> Splits:
@@ -67,7 +69,7 @@ def split(
     plan, progress = context.plan, context.progress
     tiles = points_by_tile(ingested)
     classes, why = classes_in_use(ingested, trust=settings.general.classes == "trust")
-    grid = split_grid(plan, settings, classes, footprints=footprints is not None)
+    grid = split_grid(plan, settings, footprints=footprints is not None)
     check_windows(plan, grid, tiles, context.executor.memory_limit_bytes)
     if only is not None:
         tiles = Counter({tile: points for tile, points in tiles.items() if tile in only})
@@ -79,17 +81,16 @@ def split(
     order = [tile for tile, _ in sorted(tiles.items(), key=lambda item: (-item[1], item[0]))]
     outlines = {tile: None if footprints is None else tuple(polygons[k] for k in numbers[tile]) for tile in order}
     windows = SplitWindows(grid=grid, classes=classes, outlines=outlines, numbers=numbers)
-    splits = split_windows(context, "split", windows, settings, ingested)
-    duplicates, outliers = (sum(getattr(s, name) for s in splits.figures) for name in ("duplicates", "outliers"))
-    if duplicates:
-        progress.warn("split", f"{duplicates} duplicated points were dropped")
-    if outliers:
-        progress.warn("split", f"{outliers} gross outliers were left out")
-    return splits
+    return split_windows(context, "split", windows, settings, ingested, ground)
 
 
 def split_windows(
-    context: RunContext, stage: str, windows: SplitWindows, settings: RunSettings, ingested: Sequence[Ingested]
+    context: RunContext,
+    stage: str,
+    windows: SplitWindows,
+    settings: RunSettings,
+    ingested: Sequence[Ingested],
+    ground: Ground,
 ) -> Splits:
     """Split some tiles, each with its own footprints."""
     content, points = content_by_tile(ingested), points_by_tile(ingested)
@@ -107,17 +108,17 @@ def split_windows(
             folder=folder,
             memory_bytes=window_bytes(grid, tile, points),
         )
-        key = key_of(alike, tile, outlines, seen[tile])
+        key = key_of(alike, tile, outlines, seen[tile], terrain_of_window(ground, plan_grid, tile))
         tasks[Place(folder, tile.key, key)] = task
     clear_tiles(context.scratch, folder, tasks)
     function = functools.partial(split_window, settings=settings.scene)
     brief: Callable[[Split], SplitFigures] = operator.attrgetter("figures")
     found = context.map_stored(stage, function, tasks, brief)
-    outcomes = {figures.tile: figures.outcome for figures in found.values()}
+    outcomes = {figures.tile: (figures.outcome, ground.tiles[figures.tile].outcome) for figures in found.values()}
     keys = {}
     for tile in outcomes:
         core = grid.core(tile)
-        around = [(other.key, outcomes.get(other, "")) for other in grid.tiles_over(core.grown(grid.size_mm))]
+        around = [(other.key, outcomes.get(other, ())) for other in grid.tiles_over(core.grown(grid.size_mm))]
         keys[tile] = key_of(around, seen[tile])
     return Splits(
         figures=tuple(found.values()),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +14,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.model import BoolArray, IntArray
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.open_fragments import TileSurfaces, open_fragments
+from pipeline.runtime.stages.surroundings import surroundings_of, terrain_around
 from pipeline.runtime.stages.window_points import load_window
 from pipeline.scene import (
     BUILDING_CLASS,
@@ -22,17 +22,13 @@ from pipeline.scene import (
     VEGETATION_CLASSES,
     SplitTile,
     WindowPoints,
-    lattice_of,
     split_tile,
-    terrain_of,
 )
 from pipeline.terrain.ground import Terrain, ground_points
-from pipeline.terrain.scene_settings import APRON_M, ClassesInUse, SceneSettings
+from pipeline.terrain.lattice import CELL_MM
+from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
 from pipeline.terrain.settings import GroundSettings
-from pipeline.tiling import MM, Tile, TileGrid, Window
-
-if TYPE_CHECKING:
-    from hashlib import _Hash as Hash
+from pipeline.tiling import MM, Tile, TileGrid
 
 _PLACE_BITS = 20
 """Bits of a coordinate in a sort key: 1,048 m in millimetres."""
@@ -47,11 +43,11 @@ class SplitTask:
     tile: Tile
     """The tile."""
     grid: TileGrid
-    """The lattice, its halo as wide as `SceneSettings.support_with` asks for."""
+    """The lattice, its halo as wide as `SceneSettings.split_support_m` asks for."""
     classes: ClassesInUse
     """Which of the file's classes are believed."""
     scratch: Scratch
-    """Points in, fragments out."""
+    """Points and terrain in, fragments out."""
     footprints: tuple[Polygon | MultiPolygon, ...] | None
     """Outlines in metres of the given footprints that meet the tile; None where none were given. The first wins where
     they overlap."""
@@ -81,14 +77,10 @@ class SplitFigures:
     """The tile."""
     points: int
     """Points of the core, without duplicates."""
-    duplicates: int
-    """Exact duplicates in the core that were dropped."""
-    outliers: int
-    """Gross outliers in the core."""
     audit: tuple[int, int, int]
     """Points of the core: assigned and class 6, assigned and not, class 6 and not assigned."""
     outcome: str
-    """Digest of the stored points and terrain: equal where later stages see no difference."""
+    """Digest of the stored points: equal where later stages see no difference."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -106,28 +98,28 @@ class Split:
 
 
 def split_window(task: SplitTask, settings: SceneSettings) -> Split:
-    """Split one tile and store its points, sorted by fragment, and its terrain.
+    """Split one tile and store its points, sorted by fragment.
 
-    The arrays are in scratch under `<folder>/<tile>/`.
+    They are in scratch under `<folder>/<tile>/`.
     """
     task.scratch.check_cancelled()
     loaded = load_window(task.scratch, task.grid, task.tile)
-    points = loaded.points
-    core, window = task.grid.core(task.tile), task.grid.window(task.tile)
+    core = task.grid.core(task.tile)
+    # one cell more for heights between the middles of cells, one for the slope there
+    near = core.grown(math.ceil(settings.terrain_m(footprints=task.footprints is not None) * MM) + 2 * CELL_MM)
+    terrain = terrain_around(surroundings_of(task.scratch, task.grid, near))
     task.scratch.check_cancelled()
     result: SplitTile | None = None
     if task.footprints is None:
-        result = split_tile(points, core, window, settings, task.classes)
-        index, owner = result.core_index, result.point_fragment.astype(np.int64)
-        terrain, occupied, outliers = result.terrain, result.occupied, result.outliers
+        kept = np.flatnonzero(loaded.kept)
+        points = loaded.points if len(kept) == len(loaded.points) else loaded.points.take(kept)
+        result = split_tile(points, core, terrain, settings, task.classes)
+        index, owner = kept[result.core_index], result.point_fragment.astype(np.int64)
     else:
-        wanted = core.grown(math.ceil(settings.terrain_m(footprints=True) * MM))
-        terrain, kept, occupied = terrain_of(points, window, settings, task.classes, wanted)
-        own = len(loaded.core)
-        outliers = int((~kept[:own]).sum())
-        index = np.flatnonzero(kept[:own])
-        above = _above_ground(points, index, terrain, task.classes, settings.ground)
-        owner = _inside_footprints(points, index, above, task)
+        index = np.flatnonzero(loaded.kept[: len(loaded.core)])
+        above = _above_ground(loaded.points, index, terrain, task.classes, settings.ground)
+        owner = _inside_footprints(loaded.points, index, above, task)
+    points = loaded.points
     is_building = points.classification[index] == BUILDING_CLASS
     assigned = owner >= 0
     audit = (
@@ -135,9 +127,7 @@ def split_window(task: SplitTask, settings: SceneSettings) -> Split:
         int((assigned & ~is_building).sum()),
         int((~assigned & is_building).sum()),
     )
-    outcome = hashlib.sha256()
-    keys, starts, lowest = _store(task, loaded.core[index[assigned]], owner[assigned], outcome)
-    _store_terrain(task, terrain, occupied, core, outcome)
+    keys, starts, lowest, outcome = _store(task, loaded.core[index[assigned]], owner[assigned])
     surfaces, footprints = None, None
     if result is None:
         footprints = FootprintPoints(starts=starts, keys=keys, lowest_points_mm=lowest)
@@ -147,32 +137,20 @@ def split_window(task: SplitTask, settings: SceneSettings) -> Split:
     figures = SplitFigures(
         tile=task.tile,
         points=len(loaded.core),
-        duplicates=loaded.duplicates,
-        outliers=outliers,
         audit=audit,
-        outcome=outcome.hexdigest(),
+        outcome=outcome,
     )
     return Split(tile=task.tile, surfaces=surfaces, footprints=footprints, figures=figures)
 
 
-def _put(task: SplitTask, arrays: dict[str, npt.NDArray[Any]], outcome: Hash) -> None:
-    """Store arrays of the tile, and add them to the digest of its outcome."""
-    for name, array in sorted(arrays.items()):
-        outcome.update(f"{name} {array.dtype.str} {array.shape} ".encode())
-        outcome.update(array.tobytes())
-    task.scratch.put_arrays(f"{task.folder}/{task.tile.key}", arrays)
-
-
-def _store(
-    task: SplitTask, records: npt.NDArray[np.void], owner: IntArray, outcome: Hash
-) -> tuple[IntArray, IntArray, IntArray]:
-    """Store points sorted by owner; the owners, where each one's points start, and their smallest points."""
+def _store(task: SplitTask, records: npt.NDArray[np.void], owner: IntArray) -> tuple[IntArray, IntArray, IntArray, str]:
+    """Store points sorted by owner; the owners, where each one's points start, their smallest points, and a digest."""
     order = _order_by_owner(records, owner)
     records, owner = np.take(records, order), owner[order]
-    _put(task, {"points": records.view(np.uint8)}, outcome)
+    task.scratch.put_arrays(f"{task.folder}/{task.tile.key}", {"points": records.view(np.uint8)})
     keys, starts = np.unique(owner, return_index=True)
     lowest = np.column_stack([records[name][starts] for name in "xyz"]).astype(np.int64)
-    return keys, np.append(starts, len(owner)).astype(np.int64), lowest
+    return keys, np.append(starts, len(owner)).astype(np.int64), lowest, hashlib.sha256(records.tobytes()).hexdigest()
 
 
 def _order_by_owner(records: npt.NDArray[np.void], owner: IntArray) -> IntArray:
@@ -194,24 +172,6 @@ def _order_by_owner(records: npt.NDArray[np.void], owner: IntArray) -> IntArray:
         points = order[rows]
         order[rows] = points[np.lexsort((points, records["z"][points], key[rows]))]
     return order.astype(np.int64)
-
-
-def _store_terrain(task: SplitTask, terrain: Terrain, occupied: BoolArray, core: Window, outcome: Hash) -> None:
-    """Store the terrain of the core and an apron around it.
-
-    The apron lets a candidate at the data's edge see terrain whose own tile holds no point and so is never made.
-    Where aprons overlap they agree.
-    """
-    apron = core.grown(APRON_M * MM)
-    column0, row0, n_columns, n_rows = lattice_of(apron)
-    rows = slice(row0 - terrain.row0, row0 - terrain.row0 + n_rows)
-    columns = slice(column0 - terrain.column0, column0 - terrain.column0 + n_columns)
-    arrays: dict[str, npt.NDArray[Any]] = {
-        "terrain": np.ascontiguousarray(terrain.elevation_mm[rows, columns]),
-        "occupied": np.ascontiguousarray(occupied[rows, columns]),
-        "corner": np.array([column0, row0], np.int64),
-    }
-    _put(task, arrays, outcome)
 
 
 def _above_ground(

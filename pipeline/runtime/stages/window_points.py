@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator
+from enum import IntEnum
 from pathlib import Path
 from typing import TypeAlias
 
@@ -11,11 +12,26 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.compiler import kernel
-from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
+from pipeline.model import BoolArray, ByteArray, IntArray
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.scene import WindowPoints
-from pipeline.spatial_hash import first_of_each
 from pipeline.tiling import Tile, TileGrid, Window
+
+FOLDER = "cells"
+"""Folder of scratch with the states of each tile's points."""
+
+
+class PointState(IntEnum):
+    """What is known of a point in a bucket."""
+
+    DUPLICATE = 0
+    """It equals another one, which stays."""
+    OUTLIER = 1
+    """It is nearly alone."""
+    KEPT = 2
+
+
+_DUPLICATE, _KEPT = int(PointState.DUPLICATE), int(PointState.KEPT)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -24,80 +40,73 @@ class LoadedWindow:
 
     points: WindowPoints
     """All of them."""
+    kept: BoolArray
+    """Which of them are not outliers."""
     core: npt.NDArray[np.void]
     """(n,) POINT, the core's records without exact duplicates: the first n of `points`, in that order."""
-    duplicates: int
-    """Exact duplicates that were dropped from the core."""
 
 
-Columns: TypeAlias = tuple[
-    IntArray,
-    IntArray,
-    IntArray,
-    ByteArray,
-    FloatArray,
-    npt.NDArray[np.uint16],
-    ByteArray,
-    ByteArray,
-]
-"""x, y, z in mm, return number, GPS time, source, class, return count: as `first_of_each` takes them."""
-
-_OF_POINTS = (0, 1, 2, 3, 6, 7)
-"""The columns that stay in memory; the others only serve to find duplicates."""
+_Columns: TypeAlias = tuple[IntArray, IntArray, IntArray, ByteArray, ByteArray, ByteArray, BoolArray]
+"""x, y, z in mm, return number, return count, class, whether it is kept."""
 
 
 @kernel
-def _columns_inside(records: npt.NDArray[np.void], x0: int, y0: int, x1: int, y1: int) -> Columns:
-    """Columns of the (n,) records with x0 <= x < x1 and y0 <= y < y1 in mm, in the order of the records."""
+def _columns_inside(records: npt.NDArray[np.void], states: ByteArray, x0: int, y0: int, x1: int, y1: int) -> _Columns:
+    """Columns of the (n,) records with x0 <= x < x1 and y0 <= y < y1 in mm that are no duplicates, in their order."""
     size = records.size
     # room for all records, though only what is written takes memory: records are wide, and this reads them once
     x, y, z = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
     return_number, return_count = np.empty(size, np.uint8), np.empty(size, np.uint8)
-    classification, source, gps_time = np.empty(size, np.uint8), np.empty(size, np.uint16), np.empty(size, np.float64)
+    classification, kept = np.empty(size, np.uint8), np.empty(size, np.bool_)
     n = 0
     for i in range(size):
         point = records[i]
-        if x0 <= point.x < x1 and y0 <= point.y < y1:
+        if states[i] != _DUPLICATE and x0 <= point.x < x1 and y0 <= point.y < y1:
             x[n], y[n], z[n] = point.x, point.y, point.z
             return_number[n], return_count[n] = point.return_number, point.return_count
-            classification[n], source[n], gps_time[n] = point.classification, point.source, point.gps_time
+            classification[n], kept[n] = point.classification, states[i] == _KEPT
             n += 1
-    return x[:n], y[:n], z[:n], return_number[:n], gps_time[:n], source[:n], classification[:n], return_count[:n]
-
-
-def _columns_of(parts: Sequence[npt.NDArray[np.void]], window: Window) -> tuple[Columns, BoolArray]:
-    """Points in a window of one tile's buckets, one of each set of equal points; and which of them stayed."""
-    found = [_columns_inside(part, window.x0_mm, window.y0_mm, window.x1_mm, window.y1_mm) for part in parts]
-    columns: Columns = found[0] if len(found) == 1 else tuple(map(np.concatenate, zip(*found, strict=True)))  # type: ignore[assignment]
-    kept = first_of_each(*columns)
-    if not kept.all():
-        columns = tuple(column[kept] for column in columns)  # type: ignore[assignment]
-    return columns, kept
+    return x[:n], y[:n], z[:n], return_number[:n], return_count[:n], classification[:n], kept[:n]
 
 
 def load_window(scratch: Scratch, grid: TileGrid, tile: Tile) -> LoadedWindow:
     """Read the core and its halo.
 
-    Equal points share a tile, so duplicates are removed tile by tile. Only the needed columns of the halo stay in
-    memory, since it can be many times its core.
+    Only the needed columns of the halo stay in memory, since it can be many times its core.
     """
-    window = grid.window(tile)
-    own = [np.fromfile(path, POINT) for path in bucket_paths(scratch, tile)] or [np.empty(0, POINT)]
-    columns, kept = _columns_of(own, grid.core(tile))
-    records = own[0] if len(own) == 1 else np.concatenate(own)
-    core = records if kept.all() else records[kept]
-    duplicates = len(records) - len(core)
-    del own, records
-    around = [bucket_paths(scratch, other) for other in grid.tiles_over(window) if other != tile]
-    halo = [_columns_of([np.fromfile(path, POINT) for path in paths], window)[0] for paths in around if paths]
-    everything = list(zip(columns, *halo, strict=True))
-    x, y, z, return_number, classification, return_count = (
-        everything[k][0] if len(everything[k]) == 1 else np.concatenate(everything[k]) for k in _OF_POINTS
+    core, window = grid.core(tile), grid.window(tile)
+    own = list(_buckets(scratch, tile))
+    found = [_columns_inside(records, states, *_bounds(core)) for records, states in own]
+    unique = [records if states.all() else records[states != _DUPLICATE] for records, states in own]
+    records = np.empty(0, POINT) if not unique else unique[0] if len(unique) == 1 else np.concatenate(unique)
+    del own, unique
+    for other in grid.tiles_over(window):
+        if other != tile:
+            found.extend(_columns_inside(*bucket, *_bounds(window)) for bucket in _buckets(scratch, other))
+    if not found:
+        found.append(_columns_inside(records, np.empty(0, np.uint8), *_bounds(core)))
+    x, y, z, return_number, return_count, classification, kept = (
+        columns[0] if len(columns) == 1 else np.concatenate(columns) for columns in zip(*found, strict=True)
     )
     points = WindowPoints(
         x_mm=x, y_mm=y, z_mm=z, return_number=return_number, return_count=return_count, classification=classification
     )
-    return LoadedWindow(points=points, core=core, duplicates=duplicates)
+    return LoadedWindow(points=points, kept=kept, core=records)
+
+
+def _bounds(window: Window) -> tuple[int, int, int, int]:
+    return window.x0_mm, window.y0_mm, window.x1_mm, window.y1_mm
+
+
+def _buckets(scratch: Scratch, tile: Tile) -> Iterator[tuple[npt.NDArray[np.void], ByteArray]]:
+    """The buckets of a tile, each with the states of its points."""
+    paths = bucket_paths(scratch, tile)
+    states = scratch.array(f"{FOLDER}/{tile.key}", "states") if paths else np.empty(0, np.uint8)
+    begin = 0
+    for path in paths:
+        records = np.fromfile(path, POINT)
+        yield records, states[begin : begin + len(records)]
+        begin += len(records)
 
 
 def bucket_paths(scratch: Scratch, tile: Tile) -> list[Path]:

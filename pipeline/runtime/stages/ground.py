@@ -1,0 +1,227 @@
+"""Ground: the terrain of a run, found once over the cells of all tiles, in blocks.
+
+The filter looks 200 m far. Over the cells of a block of one to two kilometres that costs little; a tile that looked for
+its own ground would read several times its own points instead.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import math
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+
+from pipeline.model import BoolArray
+from pipeline.runtime.plan import ground_bytes
+from pipeline.runtime.run_context import RunContext
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.outcomes import Place, key_of, whole
+from pipeline.runtime.stages.cells import TileCells, digests_of, find_all_cells
+from pipeline.runtime.stages.cleanup import clear_tiles
+from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
+from pipeline.runtime.stages.surroundings import FOLDER
+from pipeline.runtime.stages.tile_content import ZoneSums, content_of_window, zone_sums_of
+from pipeline.runtime.stages.window_points import FOLDER as CELLS
+from pipeline.scene import lattice_of
+from pipeline.settings import RunSettings
+from pipeline.terrain.ground import ground_on
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
+from pipeline.terrain.scene_settings import APRON_M
+from pipeline.terrain.settings import GroundSettings
+from pipeline.tiling import MM, Tile, TileGrid, Window
+
+BLOCK_M = 1500
+"""About the side of a block. Wider ones look at fewer cells twice, and need more memory."""
+_SLOPE_CELLS = 3
+"""Cells beyond a point that its height and slope depend on, with one to spare."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GroundTask:
+    """One block."""
+
+    tiles: tuple[Tile, ...]
+    """Its tiles with points."""
+    seen: tuple[Tile, ...]
+    """All tiles with points that its filter sees, its own among them."""
+    grid: TileGrid
+    """The lattice; the halo is how far the split of a tile looks."""
+    reach_mm: int
+    """How far an elevation looks."""
+    trusted: bool
+    """The cells hold ground by the classes of the file."""
+    scratch: Scratch
+    """Cells in, terrain out."""
+    memory_bytes: int = 0
+    """Estimated peak memory of the process."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TileGround:
+    """The terrain of a tile as the driver knows it."""
+
+    tile: Tile
+    """The tile."""
+    outcome: str
+    """Digest of its terrain and of which cells hold points."""
+    zones: bytes
+    """Which terrain it is, zone by zone: the bytes of a `ZoneSums`, with known cells in the place of points."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ground:
+    """The ground of a run; its terrain is in scratch."""
+
+    cells: Mapping[Tile, TileCells]
+    """What was found of the points of each tile."""
+    tiles: Mapping[Tile, TileGround]
+    """The terrain of each tile."""
+
+
+def find_ground(
+    context: RunContext, settings: RunSettings, ingested: Sequence[Ingested], only: Collection[Tile] | None = None
+) -> Ground:
+    """The ground of all tiles, or of some and of what their splits see."""
+    grid, scene = context.plan.grid, settings.scene
+    classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
+    reach_mm = math.ceil(scene.ground_support_m(classes) * MM)
+    points = points_by_tile(ingested)
+    drawn = set(points)
+    if only is not None:
+        drawn &= {other for tile in only for other in grid.tiles_over(terrain_window(grid, tile))}
+    blocks: dict[tuple[int, int], list[Tile]] = {}
+    side = max(1, round(BLOCK_M * MM / grid.size_mm))
+    for tile in sorted(drawn):
+        blocks.setdefault((tile.column // side, tile.row // side), []).append(tile)
+    seen = {
+        name: tuple(tile for tile in grid.tiles_over(_around(grid, tiles).grown(reach_mm)) if tile in points)
+        for name, tiles in blocks.items()
+    }
+    wanted = {tile for tiles in seen.values() for tile in tiles}
+    cells = find_all_cells(context, scene.outliers, ingested, classes, wanted)
+    duplicates, outliers = (sum(getattr(c, name) for c in cells.values()) for name in ("duplicates", "outliers"))
+    if duplicates:
+        context.progress.warn("cells", f"{duplicates} duplicated points were dropped")
+    if outliers:
+        context.progress.warn("cells", f"{outliers} gross outliers were left out")
+    alike = key_of(grid, scene.ground, classes.ground)
+    tasks = {}
+    for (column, row), tiles in blocks.items():
+        around = seen[column, row]
+        key = key_of(alike, [tile.key for tile in tiles], digests_of(cells, around))
+        window = _around(grid, tiles).grown(reach_mm)
+        tasks[Place(FOLDER, f"x{column}_y{row}", key)] = GroundTask(
+            tiles=tuple(tiles),
+            seen=around,
+            grid=grid,
+            reach_mm=reach_mm,
+            trusted=classes.ground,
+            scratch=context.scratch,
+            memory_bytes=ground_bytes(window),
+        )
+    clear_tiles(context.scratch, FOLDER, tasks, {tile.key for tile in drawn})
+    found = context.map_stored("ground", functools.partial(draw_ground, settings=scene.ground), tasks, whole)
+    return Ground(cells=cells, tiles={one.tile: one for tiles in found.values() for one in tiles})
+
+
+def terrain_window(grid: TileGrid, tile: Tile) -> Window:
+    """Where the split of a tile needs terrain."""
+    return grid.window(tile).grown(_SLOPE_CELLS * CELL_MM)
+
+
+def _around(grid: TileGrid, tiles: Sequence[Tile]) -> Window:
+    """The cores of some tiles and their aprons, as one rectangle."""
+    cores = [grid.core(tile) for tile in tiles]
+    return Window(
+        x0_mm=min(core.x0_mm for core in cores),
+        y0_mm=min(core.y0_mm for core in cores),
+        x1_mm=max(core.x1_mm for core in cores),
+        y1_mm=max(core.y1_mm for core in cores),
+    ).grown(APRON_M * MM)
+
+
+def draw_ground(task: GroundTask, settings: GroundSettings) -> tuple[TileGround, ...]:
+    """Find the ground of a block and store the terrain of its tiles.
+
+    In scratch under `ground/<tile>/` are `terrain`, `occupied` and `corner`: the elevations of the core and an apron
+    around it, which of the cells hold points, and the column and row of the first one. The apron lets a candidate at
+    the data's edge see terrain whose own tile holds no point and so is never made. Where aprons overlap they agree.
+    """
+    task.scratch.check_cancelled()
+    inside = _around(task.grid, task.tiles)
+    lowest, occupied, corner = _cells_in(task, inside.grown(task.reach_mm))
+    column0, row0, columns, rows = lattice_of(inside)
+    wanted = (
+        slice(row0 - corner[1], row0 - corner[1] + rows),
+        slice(column0 - corner[0], column0 - corner[0] + columns),
+    )
+    task.scratch.check_cancelled()
+    terrain = ground_on(lowest, corner, settings, trusted=task.trusted, wanted=wanted).elevation_mm
+    return tuple(_stored(task, tile, terrain, occupied, corner) for tile in task.tiles)
+
+
+def _cells_in(task: GroundTask, window: Window) -> tuple[Elevations, BoolArray, tuple[int, int]]:
+    """Lowest points and occupied cells of a window, from those of its tiles, and its first column and row."""
+    column0, row0, columns, rows = lattice_of(window)
+    lowest = np.full((rows, columns), NO_DATA, np.int32)
+    occupied = np.zeros((rows, columns), np.bool_)
+    for tile in task.seen:
+        c, r, wide, high = lattice_of(task.grid.core(tile))
+        c, r = c - column0, r - row0
+        left, right, low, top = max(c, 0), min(c + wide, columns), max(r, 0), min(r + high, rows)
+        if left >= right or low >= top:
+            continue
+        ours, theirs = (slice(low, top), slice(left, right)), (slice(low - r, top - r), slice(left - c, right - c))
+        name = f"{CELLS}/{tile.key}"
+        # tiles share the cells across their border
+        np.minimum(lowest[ours], task.scratch.array(name, "lowest", mapped=True)[theirs], out=lowest[ours])
+        occupied[ours] |= task.scratch.array(name, "occupied", mapped=True)[theirs]
+    return lowest, occupied, (column0, row0)
+
+
+def _stored(
+    task: GroundTask, tile: Tile, terrain: Elevations, occupied: BoolArray, corner: tuple[int, int]
+) -> TileGround:
+    """Store the terrain of one tile."""
+    column0, row0, columns, rows = lattice_of(task.grid.core(tile).grown(APRON_M * MM))
+    part = (slice(row0 - corner[1], row0 - corner[1] + rows), slice(column0 - corner[0], column0 - corner[0] + columns))
+    elevations, held = np.ascontiguousarray(terrain[part]), np.ascontiguousarray(occupied[part])
+    arrays = {"terrain": elevations, "occupied": held, "corner": np.array([column0, row0], np.int64)}
+    task.scratch.put_arrays(f"{FOLDER}/{tile.key}", arrays)
+    return TileGround(
+        tile=tile,
+        outcome=hashlib.sha256(elevations.tobytes() + held.tobytes()).hexdigest(),
+        zones=_zones(elevations, task.grid).tobytes(),
+    )
+
+
+def _zones(elevations: Elevations, grid: TileGrid) -> ZoneSums:
+    """Known cells and digest of a tile's terrain by zone: (3, 3, 3) uint64, by column and row as for points."""
+    # the apron, a cell that the core's edge may cut, and what the splits of neighbours see
+    width = APRON_M + 1 + math.ceil((grid.halo_mm + _SLOPE_CELLS * CELL_MM) / CELL_MM)
+    cuts = []
+    for size in elevations.shape:
+        low = min(width, size)
+        cuts.append((0, low, max(size - width, low), size))
+    zones = np.zeros((3, 3, 3), np.uint64)
+    for row in range(3):
+        for column in range(3):
+            part = elevations[cuts[0][row] : cuts[0][row + 1], cuts[1][column] : cuts[1][column + 1]]
+            digest = hashlib.blake2b(f"{part.shape}".encode() + part.tobytes(), digest_size=16).digest()
+            zones[column, row] = (np.count_nonzero(part != NO_DATA), *np.frombuffer(digest, np.uint64))
+    return zones
+
+
+def terrain_of_window(ground: Ground, grid: TileGrid, tile: Tile) -> list[object]:
+    """The terrain that the split of a tile sees, for its key."""
+    # neighbours count by zones where these lie apart, which some more metres make sure
+    apart = dataclasses.replace(grid, halo_mm=grid.halo_mm + 2 * _SLOPE_CELLS * CELL_MM)
+    seen = {
+        other: zone_sums_of(ground.tiles[other].zones)
+        for other in grid.tiles_over(terrain_window(grid, tile))
+        if other in ground.tiles
+    }
+    return content_of_window(seen, apart, terrain_window(grid, tile), tile)
