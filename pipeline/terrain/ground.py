@@ -163,7 +163,10 @@ def ground_of(
     """
     column0, row0, columns, rows = window
     lowest = lowest_per_cell(x_mm, y_mm, z_mm, usable, column0, row0, columns, rows)
-    return ground_on(lowest, (column0, row0), settings, trusted=trusted)
+    elevation, measured = ground_on(lowest, (column0, row0), settings, trusted=trusted)
+    return Terrain(
+        elevation_mm=elevation, slope_mm=slopes_of(elevation), measured=measured, column0=column0, row0=row0
+    )
 
 
 def ground_on(
@@ -173,8 +176,8 @@ def ground_on(
     *,
     trusted: bool,
     wanted: tuple[slice, slice] | None = None,
-) -> Terrain:
-    """Terrain through the lowest usable points of cells.
+) -> tuple[Elevations, BoolArray]:
+    """Terrain in mm through the lowest usable points of cells, and the cells that hold ground: (rows, columns) each.
 
     Parameters
     ----------
@@ -185,13 +188,12 @@ def ground_on(
     settings, trusted
         As for `ground_of`.
     wanted : tuple of slices, optional
-        Rows and columns whose heights and slopes are needed; all by default. The others only serve them, and may stay
-        without elevation.
+        Rows and columns whose elevations are needed; all by default. The others only serve them, and may stay
+        without.
     """
     column0, row0 = corner
     rows, columns = lowest.shape
     elevation = np.full((rows, columns), NO_DATA, np.int32)
-    slope = np.zeros((rows, columns), np.int32)
     measured = np.zeros((rows, columns), np.bool_)
     seen = _part_with_data(lowest, settings.reach_m + 1)
     part = np.ascontiguousarray(lowest[seen])
@@ -208,13 +210,11 @@ def ground_on(
                 is_ground, steady = morphological_ground(part, place, settings)
                 beside = (settings.rejoin_m, settings.rejoin_step_m * 1000.0)
         down, across = (slice(0, rows), slice(0, columns)) if wanted is None else wanted
-        # one cell more for heights between the middles of cells, one for the slope there
-        west, south = across.start - seen[1].start - 2, down.start - seen[0].start - 2
-        drawn = (west, south, west + across.stop - across.start + 4, south + down.stop - down.start + 4)
+        west, south = across.start - seen[1].start, down.start - seen[0].start
+        drawn = (west, south, west + across.stop - across.start, south + down.stop - down.start)
         elevation[seen] = _terrain(part, (is_ground, steady), settings.reach_m, settings.max_slope, drawn, beside)
-        slope[seen] = slopes_of(elevation[seen])
         measured[seen] = is_ground
-    return Terrain(elevation_mm=elevation, slope_mm=slope, measured=measured, column0=column0, row0=row0)
+    return elevation, measured
 
 
 def _part_with_data(lowest: Elevations, margin: int) -> tuple[slice, slice]:

@@ -159,7 +159,7 @@ def draw_ground(task: GroundTask, settings: GroundSettings) -> tuple[TileGround,
         slice(column0 - corner[0], column0 - corner[0] + columns),
     )
     task.scratch.check_cancelled()
-    terrain = ground_on(lowest, corner, settings, trusted=task.trusted, wanted=wanted).elevation_mm
+    terrain, _ = ground_on(lowest, corner, settings, trusted=task.trusted, wanted=wanted)
     return tuple(_stored(task, tile, terrain, occupied, corner) for tile in task.tiles)
 
 
