@@ -23,12 +23,11 @@ from benchmarks.entries import markdown_table
 from benchmarks.ground import DATA
 from benchmarks.unseen import FOREST, SPARSE, TILES, ClassScore, half_of, judged_points, thinned_to
 from pipeline.model import BoolArray, FloatArray, IntArray
-from pipeline.scene import BUILDING_CLASS, WindowPoints, split_tile
+from pipeline.scene import BUILDING_CLASS, WindowPoints, split_tile, terrain_of
 from pipeline.settings import RunSettings
 from pipeline.terrain.candidates import Surfaces, judge_surfaces, unite_levels
 from pipeline.terrain.ground import ground_points
 from pipeline.terrain.lattice import NO_DATA, height_above
-from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.scene_settings import ClassesInUse
 from pipeline.terrain.sparse_points import PRODUCTS, Role, Sign, SparsePoints, terms_of
 from pipeline.tiling import Window
@@ -80,9 +79,10 @@ def scene_of(points: WindowPoints) -> SparsePoints:
     settings, classes = RunSettings.from_mapping({"classes": "ignore"}).scene, ClassesInUse()
     x, y, z = points.x_mm, points.y_mm, points.z_mm
     core = Window(x0_mm=int(x.min()), y0_mm=int(y.min()), x1_mm=int(x.max()) + 1, y1_mm=int(y.max()) + 1)
-    window = core.grown(round(1000 * settings.support_with(classes, footprints=False)))
-    found = split_tile(points, core, window, settings, classes)
-    parts, terrain = found.fragments, found.terrain
+    terrain, kept = terrain_of(points, core, settings, classes)
+    index = np.flatnonzero(kept)
+    found = split_tile(points.take(index), core, terrain, settings, classes)
+    parts = found.fragments
     surfaces = Surfaces(
         kind=parts.kind, sums=parts.sums, boxes_mm=parts.boxes_mm, lowest_point_mm=parts.lowest_point_mm,
         along_steps=np.unique(parts.along_steps[:, :2], axis=0),
@@ -90,11 +90,11 @@ def scene_of(points: WindowPoints) -> SparsePoints:
     leader = unite_levels(surfaces, judge_surfaces(surfaces, settings.candidates), settings.candidates)
     role = np.full(len(x), Role.OTHER, np.int8)
     held = found.point_fragment >= 0
-    role[found.core_index[held]] = np.where(leader[found.point_fragment[held]] >= 0, Role.HELD, Role.OTHER)
+    role[index[found.core_index[held]]] = np.where(leader[found.point_fragment[held]] >= 0, Role.HELD, Role.OTHER)
     height = height_above(x, y, z, terrain.elevation_mm, terrain.column0, terrain.row0)
     ground = ground_points(x, y, z, terrain, settings.ground)
     role[ground] = Role.GROUND
-    role[~dense_enough(x, y, z, settings.outliers) & ~ground] = Role.NOISE
+    role[~kept & ~ground] = Role.NOISE
     height[height == NO_DATA] = 0
     return SparsePoints(x_mm=x, y_mm=y, z_mm=z, height_mm=height, role=role, several=points.return_count > 1)
 

@@ -24,6 +24,10 @@ class Rates:
     """Additional wall seconds to start and end an embedded cluster."""
     ingest_per_million: float = 0.5
     """CPU seconds per million points."""
+    cells_per_million: float = 0.1
+    """CPU seconds per million points."""
+    ground_per_km2: float = 2.0
+    """CPU seconds per square kilometre of tiles."""
     split_per_million: float = 1.0
     """CPU seconds per million points of windows, halos included."""
     join_per_million: float = 0.3
@@ -57,6 +61,8 @@ class Expected:
     """Points of the tiles' windows, halos included."""
     buildings: int
     """Number of buildings."""
+    area_km2: float = 0.0
+    """Area of the tiles."""
     task_bytes: int = 0
     """Memory of its largest task, above the process's own size."""
     models: bool = True
@@ -72,6 +78,8 @@ class Expected:
         millions = self.points / 1e6
         return {
             "ingest": millions * RATES.ingest_per_million,
+            "cells": millions * RATES.cells_per_million,
+            "ground": self.area_km2 * RATES.ground_per_km2,
             "split": self.seen_points / 1e6 * RATES.split_per_million,
             "join": millions * RATES.join_per_million,
             "reconstruct": self.buildings * RATES.reconstruct_each,
@@ -80,7 +88,8 @@ class Expected:
 
     def wall_s(self, hands: int) -> dict[str, float]:
         """Wall seconds by stage with so many processes."""
-        at_once = {"ingest": len(self.points_by_file), "split": self.tiles, "join": 1, "publish": self.tiles}
+        at_once = {"ingest": len(self.points_by_file), "join": 1, "ground": max(1, round(self.area_km2))}
+        at_once |= dict.fromkeys(("cells", "split", "publish"), self.tiles)
         return {
             stage: seconds / max(1, min(hands, at_once.get(stage, hands))) for stage, seconds in self.cpu_s().items()
         }
@@ -112,6 +121,7 @@ def expected(plan: Plan, buildings: int | None = None) -> Expected:
         tiles=len(tiles),
         # tiles at the edge of the data see less, and no window sees more points than there are
         seen_points=total * min(halo_share, max(1.0, len(tiles))),
+        area_km2=len(tiles) * side**2 / 1e6,
         buildings=round(total / 1e6 * RATES.buildings_per_million) if buildings is None else buildings,
         task_bytes=plan.window_bytes,
     )

@@ -48,32 +48,42 @@ Distances = npt.NDArray[np.float32]
 
 
 @kernel
-def _drop(
-    lowest: Elevations, r: int, c: int, stride: tuple[int, int, float], within: float, drop_mm: float
-) -> tuple[float, float]:
-    """Distance along a direction to the first drop, in cells, and its depth in mm; -1 where there is none.
+def _drops(
+    lowest: Elevations, stride: tuple[int, int, float], farthest: int, drop_mm: float
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    """Strides from each cell to the first drop along a direction, 0 where there is none, and the drop's depth in mm.
 
-    The walk passes over objects that rise more steeply than 45 degrees: parapets, cars, trees, houses.
+    The walk passes over objects that rise more steeply than 45 degrees: parapets, cars, trees, houses. It does so for
+    `farthest` strides at most. From the first cell that it stands on, it goes on as the walk of that cell does.
     """
     rows, columns = lowest.shape
     down, across, length = stride
-    here, at, last = lowest[r, c], 0.0, 0.0
-    number = 1
-    while number * length <= within:
-        a, b = r + number * down, c + number * across
-        if a < 0 or a >= rows or b < 0 or b >= columns:
-            break
-        away = number * length
-        z = lowest[a, b]
-        if z != NO_DATA:
-            if z - here <= _STEEPEST * CELL_MM * (away - last):
-                fall = float(here - z)
-                if fall > drop_mm + _STEEPEST * CELL_MM * (away - at):
-                    return away, fall
-                here, at = z, away
-            last = away
-        number += 1
-    return -1.0, 0.0
+    strides = np.zeros((rows, columns), np.int32)
+    falls = np.zeros((rows, columns), np.int32)
+    for k in range(rows):
+        # cells that lie ahead come first
+        r = rows - 1 - k if down > 0 else k
+        for m in range(columns):
+            c = columns - 1 - m if across > 0 else m
+            here = lowest[r, c]
+            if here == NO_DATA:
+                continue
+            last = 0
+            for number in range(1, farthest + 1):
+                a, b = r + number * down, c + number * across
+                if a < 0 or a >= rows or b < 0 or b >= columns:
+                    break
+                z = lowest[a, b]
+                if z == NO_DATA:
+                    continue
+                if z - here <= _STEEPEST * CELL_MM * length * (number - last):
+                    if here - z > drop_mm + _STEEPEST * CELL_MM * length * number:
+                        strides[r, c], falls[r, c] = number, here - z
+                    elif strides[a, b] > 0:
+                        strides[r, c], falls[r, c] = number + strides[a, b], falls[a, b]
+                    break
+                last = number
+    return strides, falls
 
 
 @kernel
@@ -84,16 +94,16 @@ def _widths(
     rows, columns = lowest.shape
     ahead = np.full((rows, columns), -1.0, np.float32)
     behind = np.full((rows, columns), -1.0, np.float32)
-    back = (-stride[0], -stride[1], stride[2])
+    length = stride[2]
+    farthest = int(widest / length)
+    strides, falls = _drops(lowest, stride, farthest, drop_mm)
+    back, back_falls = _drops(lowest, (-stride[0], -stride[1], length), farthest, drop_mm)
     for r in range(rows):
         for c in range(columns):
-            if lowest[r, c] == NO_DATA:
+            far, other_far = strides[r, c] * length, back[r, c] * length
+            if strides[r, c] == 0 or back[r, c] == 0 or far + other_far > widest:
                 continue
-            far, fall = _drop(lowest, r, c, stride, widest, drop_mm)
-            if far < 0:
-                continue
-            other_far, other_fall = _drop(lowest, r, c, back, widest - far, drop_mm)
-            if other_far >= 0 and min(fall, other_fall) > rise_mm * (far + other_far) / 2:
+            if min(falls[r, c], back_falls[r, c]) > rise_mm * (far + other_far) / 2:
                 ahead[r, c], behind[r, c] = far, other_far
     return ahead, behind
 

@@ -164,9 +164,7 @@ def ground_of(
     column0, row0, columns, rows = window
     lowest = lowest_per_cell(x_mm, y_mm, z_mm, usable, column0, row0, columns, rows)
     elevation, measured = ground_on(lowest, (column0, row0), settings, trusted=trusted)
-    return Terrain(
-        elevation_mm=elevation, slope_mm=slopes_of(elevation), measured=measured, column0=column0, row0=row0
-    )
+    return Terrain(elevation_mm=elevation, slope_mm=slopes_of(elevation), measured=measured, column0=column0, row0=row0)
 
 
 def ground_on(

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from whole_scene import seen_m, split_alone
 
-from pipeline.scene import WindowPoints, lattice_of, split_tile, terrain_of
+from pipeline.scene import WindowPoints, lattice_of, terrain_of
 from pipeline.settings import RunSettings
 from pipeline.terrain.lattice import NO_DATA, height_above
 from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
@@ -35,7 +36,7 @@ def inside(points: WindowPoints, window: Window) -> WindowPoints:
 
 def test_the_ground_of_a_town_does_not_include_its_roofs(town: Any) -> None:
     points = town.points
-    terrain, kept, _ = terrain_of(points, WHOLE, HIERARCHICAL, ClassesInUse())
+    terrain, kept = terrain_of(points, WHOLE, HIERARCHICAL, ClassesInUse())
     height = height_above(points.x_mm, points.y_mm, points.z_mm, terrain.elevation_mm, 0, 0)
     found = kept & (height != NO_DATA) & (height < 500)
     assert found[town.truth == GROUND].mean() > 0.99
@@ -45,8 +46,8 @@ def test_the_ground_of_a_town_does_not_include_its_roofs(town: Any) -> None:
 def test_trusted_classes_need_no_filter(town: Any) -> None:
     classes = ClassesInUse(ground=True, building=True)
     ground = dataclasses.replace(HIERARCHICAL.ground, filter="morphological", bridge_m=32)
-    other, _, _ = terrain_of(town.points, WHOLE, dataclasses.replace(HIERARCHICAL, ground=ground), classes)
-    terrain, _, _ = terrain_of(town.points, WHOLE, HIERARCHICAL, classes)
+    other, _ = terrain_of(town.points, WHOLE, dataclasses.replace(HIERARCHICAL, ground=ground), classes)
+    terrain, _ = terrain_of(town.points, WHOLE, HIERARCHICAL, classes)
     np.testing.assert_array_equal(terrain.elevation_mm, other.elevation_mm)
 
 
@@ -55,11 +56,10 @@ def test_trusted_classes_need_no_filter(town: Any) -> None:
 )
 def test_tiles_change_neither_terrain_nor_fragments(town: Any, size_mm: int, shift: tuple[int, int]) -> None:
     points = town.points
-    assert NARROW.support_m < 80
-    grid = TileGrid(
-        size_mm=size_mm, halo_mm=math.ceil(1000 * NARROW.support_m), origin_x_mm=shift[0], origin_y_mm=shift[1]
-    )
-    whole = split_tile(points, WHOLE, WHOLE, NARROW, ClassesInUse())
+    support_m = seen_m(NARROW, ClassesInUse())
+    assert support_m < 80
+    grid = TileGrid(size_mm=size_mm, halo_mm=math.ceil(1000 * support_m), origin_x_mm=shift[0], origin_y_mm=shift[1])
+    whole = split_alone(points, WHOLE, WHOLE, NARROW, ClassesInUse())
     on_fragment = np.zeros(len(points), np.bool_)
     on_fragment[whole.core_index] = whole.point_fragment >= 0
     seen, cut_windows = 0, 0
@@ -67,7 +67,7 @@ def test_tiles_change_neither_terrain_nor_fragments(town: Any, size_mm: int, shi
         assert isinstance(tile, Tile)
         window, core = grid.window(tile), grid.core(tile)
         index = np.flatnonzero(window.contains(points.x_mm, points.y_mm))
-        part = split_tile(points.take(index), core, window, NARROW, ClassesInUse())
+        part = split_alone(points.take(index), core, window, NARROW, ClassesInUse())
         cut_windows += len(index) < len(points)
         column0, row0, columns, rows = lattice_of(
             Window(
@@ -90,8 +90,9 @@ def test_tiles_change_neither_terrain_nor_fragments(town: Any, size_mm: int, shi
     assert cut_windows > 0
 
 
-def test_the_filter_widens_the_halo_and_is_a_setting_of_the_ground() -> None:
+def test_the_filter_is_a_setting_of_the_ground_and_decides_how_far_it_looks() -> None:
     settings = RunSettings.from_mapping({"ground": {"filter": "hierarchical"}})
     assert settings.scene.ground.filter == "hierarchical"
-    assert settings.halo_m == RunSettings().halo_m - GroundSettings().support_m + settings.scene.ground.support_m
+    assert settings.scene.ground_support_m(ClassesInUse()) != GroundSettings().support_m
+    assert settings.halo_m == RunSettings().halo_m
     assert settings.settings_hash != RunSettings().settings_hash

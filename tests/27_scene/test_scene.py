@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from slow_join import WholeSplit, whole_surfaces
+from whole_scene import WholeScene, seen_m, split_alone
 
 from pipeline.model import IntArray
-from pipeline.scene import SplitTile, WindowPoints, lattice_of, split_tile
+from pipeline.scene import WindowPoints, lattice_of
 from pipeline.terrain.candidates import Surfaces, judge_surfaces, unite_levels
 from pipeline.terrain.decks_and_vehicles import shape_figures
 from pipeline.terrain.facets import FacetKind
@@ -73,8 +74,8 @@ def with_points(points: WindowPoints, more: IntArray) -> WindowPoints:
 
 def split_whole(
     points: WindowPoints, classes: ClassesInUse = IGNORED, settings: SceneSettings | None = None
-) -> SplitTile:
-    return split_tile(points, WHOLE, WHOLE, settings or SceneSettings(), classes)
+) -> WholeScene:
+    return split_alone(points, WHOLE, WHOLE, settings or SceneSettings(), classes)
 
 
 def surfaces_of(f: Fragments) -> Surfaces:
@@ -87,7 +88,7 @@ def surfaces_of(f: Fragments) -> Surfaces:
     )
 
 
-def candidate_of_points(found: SplitTile) -> IntArray:
+def candidate_of_points(found: WholeScene) -> IntArray:
     """Leader of the candidate of every point of the window, -1 where none; the core is the window."""
     surfaces = surfaces_of(found.fragments)
     leader = unite_levels(surfaces, judge_surfaces(surfaces, CandidateSettings()), CandidateSettings())
@@ -229,23 +230,12 @@ def test_strays_far_above_and_below_are_counted_and_change_nothing(town: Any) ->
     np.testing.assert_array_equal(after.fragments.sums, before.fragments.sums)
     np.testing.assert_array_equal(after.core_index, before.core_index)
     np.testing.assert_array_equal(after.point_fragment, before.point_fragment)
-    np.testing.assert_array_equal(after.occupied, before.occupied)
-
-
-def test_a_cell_is_occupied_where_a_point_lies_in_it(town: Any) -> None:
-    hole = taken(town.points, ~((town.points.x_mm // 1000 == 7) & (town.points.y_mm // 1000 == 9)))
-    occupied = split_whole(hole).occupied
-    expected = np.zeros((110, 110), np.bool_)
-    expected[hole.y_mm // 1000, hole.x_mm // 1000] = True
-    assert not expected[9, 7]
-    np.testing.assert_array_equal(occupied, expected)
 
 
 def test_a_tile_without_points_has_no_fragments(town: Any) -> None:
     found = split_whole(taken(town.points, np.zeros(len(town.points), np.bool_)))
     assert len(found.fragments.kind) == len(found.core_index) == len(found.point_fragment) == found.outliers == 0
     assert (found.terrain.elevation_mm == NO_DATA).all()
-    assert not found.occupied.any()
 
 
 # -- classes -----------------------------------------------------------------------------------------------------------
@@ -338,7 +328,7 @@ def test_a_shift_by_whole_metres_gives_the_same_fragments_there(town: Any, shift
     moved = changed(town.points, x_mm=town.points.x_mm + dx, y_mm=town.points.y_mm + dy)
     window = Window(x0_mm=dx, y0_mm=dy, x1_mm=dx + 110_000, y1_mm=dy + 110_000)
     here = split_whole(town.points)
-    there = split_tile(moved, window, window, SceneSettings(), IGNORED)
+    there = split_alone(moved, window, window, SceneSettings(), IGNORED)
     np.testing.assert_array_equal(there.terrain.elevation_mm, here.terrain.elevation_mm)
     np.testing.assert_array_equal(there.core_index, here.core_index)
     np.testing.assert_array_equal(there.point_fragment, here.point_fragment)
@@ -415,13 +405,13 @@ def test_every_stage_widens_the_support() -> None:
         SceneSettings(surfaces=SurfaceSettings(max_circumradius_m=7.0)),
         SceneSettings(vegetation=VegetationSettings(radius_m=1.2)),
     ]
-    assert all(settings.support_m > base.support_m for settings in wider)
+    assert all(seen_m(settings, IGNORED) > seen_m(base, IGNORED) for settings in wider)
 
 
 # -- tiles -------------------------------------------------------------------------------------------------------------
 
 
-def described(tile: Tile, found: SplitTile) -> WholeSplit:
+def described(tile: Tile, found: WholeScene) -> WholeSplit:
     """What the slow join reads of a split."""
     return WholeSplit(tile=tile, fragments=found.fragments, starts=np.zeros(1, np.int64), keys=np.empty(0, np.int64))
 
@@ -436,7 +426,7 @@ def in_tiles(
     for tile in tiles:
         window = grid.window(tile)
         seen = np.flatnonzero(window.contains(points.x_mm, points.y_mm))
-        found = split_tile(taken(points, seen), grid.core(tile), window, settings, classes)
+        found = split_alone(taken(points, seen), grid.core(tile), window, settings, classes)
         splits.append(described(tile, found))
         owners.append((seen[found.core_index], found.point_fragment))
     surfaces, surface_of_fragment, offsets = whole_surfaces(splits)
@@ -466,7 +456,7 @@ def test_tiles_give_the_surfaces_of_the_whole(
     strays = np.column_stack((random.integers(0, 110_000, (60, 2)), random.integers(-9000, 30_000, 60)))
     points = with_points(taken(p, dry), np.repeat(strays, 3, axis=0) + random.integers(0, 900, (180, 3)))
     points = taken(points, WHOLE.contains(points.x_mm, points.y_mm))
-    support_mm = math.ceil(1000 * NARROW.support_with(classes, footprints=False))
+    support_mm = math.ceil(1000 * seen_m(NARROW, classes))
     everything = TileGrid(size_mm=400_000, halo_mm=support_mm, origin_x_mm=-100_000, origin_y_mm=-100_000)
     expected, expected_owner = in_tiles(points, everything, NARROW, classes)
     grid = TileGrid(size_mm=size_mm, halo_mm=support_mm, origin_x_mm=origin_mm[0], origin_y_mm=origin_mm[1])

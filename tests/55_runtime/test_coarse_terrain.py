@@ -43,7 +43,7 @@ def document(folder: Path, grid: TileGrid, spacing: int) -> bytes:
             "occupied": inside,
             "corner": np.array([column0, row0]),
         }
-        scratch.put_arrays(f"tiles/{tile.key}", arrays)
+        scratch.put_arrays(f"ground/{tile.key}", arrays)
     parts = [terrain_part(scratch, grid, tile, spacing) for tile in tiles]
     return terrain_document(parts, spacing, BOUNDS)
 

@@ -15,6 +15,7 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from slow_join import WholeSplit, whole_join, whole_surfaces
+from whole_scene import seen_m, split_alone
 
 from pipeline.kernels.union_find import united
 from pipeline.model import IntArray, Tin
@@ -24,7 +25,7 @@ from pipeline.runtime.stages.join import join_tiles
 from pipeline.runtime.stages.open_fragments import open_fragments
 from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split_window import Split, SplitFigures
-from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints, split_tile
+from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints
 from pipeline.terrain.candidates import NOWHERE
 from pipeline.terrain.facets import FacetKind, SceneVertices, VertexKind
 from pipeline.terrain.fragment_sums import N_SUMS, Sum
@@ -56,7 +57,7 @@ EASY = CandidateSettings(
 def handed_on(whole: WholeSplit, grid: TileGrid, cut: SurfaceSettings, judging: CandidateSettings) -> Split:
     """What a split hands on of its fragments; through a pickle, as in a run."""
     surfaces = open_fragments(whole.fragments, whole.keys, whole.starts, whole.tile, grid, cut, judging)
-    figures = SplitFigures(tile=whole.tile, points=0, duplicates=0, outliers=0, audit=(0, 0, 0), outcome="")
+    figures = SplitFigures(tile=whole.tile, points=0, audit=(0, 0, 0), outcome="")
     found = Split(tile=whole.tile, surfaces=surfaces, footprints=None, figures=figures)
     copy: Split = pickle.loads(pickle.dumps(found))
     return copy
@@ -366,7 +367,7 @@ def test_towns_in_tiny_tiles_are_joined_as_by_the_slow_join(
     codes = np.where(z < np.percentile(z, 60), GROUND_CLASS, BUILDING_CLASS).astype(np.uint8)
     points = WindowPoints(x_mm=x, y_mm=y, z_mm=z, return_number=number, return_count=count, classification=codes)
     scene = SceneSettings()
-    halo = math.ceil(1000 * scene.support_with(classes, footprints=False))
+    halo = math.ceil(1000 * seen_m(scene, classes))
     sites = []
     for size_mm, origin in ((22_000, 3_700), (38_000, -9_100)):
         grid = TileGrid(size_mm=size_mm, halo_mm=halo, origin_x_mm=origin, origin_y_mm=-origin)
@@ -375,7 +376,7 @@ def test_towns_in_tiny_tiles_are_joined_as_by_the_slow_join(
         for tile in sorted({Tile(c, r) for c, r in zip(columns.tolist(), rows.tolist(), strict=True)}):
             window = grid.window(tile)
             inside = points.take(np.flatnonzero(window.contains(x, y)))
-            found = split_tile(inside, grid.core(tile), window, scene, classes)
+            found = split_alone(inside, grid.core(tile), window, scene, classes)
             wholes.append(sorted_points(tile, found.fragments, found.point_fragment))
         slow, new = both_joins(wholes, grid, scene.surfaces, scene.candidates)
         assert new == slow

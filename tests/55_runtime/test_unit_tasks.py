@@ -62,7 +62,8 @@ def stored(points: npt.NDArray[np.void], grid: TileGrid, root: Path, fragments: 
     ranges = []
     for tile in tiles:
         own = points[(column == tile.column) & (line == tile.row)]
-        scratch.put_arrays(f"tiles/{tile.key}", {"points": own.view(np.uint8), **level})
+        scratch.put_arrays(f"tiles/{tile.key}", {"points": own.view(np.uint8)})
+        scratch.put_arrays(f"ground/{tile.key}", level)
         cuts = np.linspace(0, len(own), fragments + 1).astype(int).tolist()
         ranges += [PointRange(tile=tile, start=a, stop=b) for a, b in itertools.pairwise(cuts)]
     lowest = min(zip(points["x"].tolist(), points["y"].tolist(), points["z"].tolist(), strict=True))

@@ -16,7 +16,7 @@ from pipeline.runtime.plan import Plan, check_windows, make_plan, split_grid
 from pipeline.runtime.stages import split
 from pipeline.runtime.stages.split_window import Split, SplitTask, split_window
 from pipeline.settings import RunSettings
-from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
+from pipeline.terrain.scene_settings import APRON_M, ClassesInUse, SceneSettings
 from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
@@ -90,25 +90,25 @@ def test_narrow_windows_give_the_content_of_one_that_sees_everything(
     assert whole.counts["candidates"] >= (12 if given else 3)
     assert {grid.halo_mm for grid in grids} == {1000 * MM}
     chosen = RunSettings.from_mapping(settings).scene
-    support_m = chosen.support_with(TRUSTED if trust == "trust" else ClassesInUse(), footprints=given)
+    support_m = chosen.split_support_m(footprints=given)
     for size in (11.0, 23.7):
         grids.clear()
         assert reconstruct(classified, settings=settings | {"tile_size_m": size}, **request).digest == whole.digest
         assert {grid.halo_mm for grid in grids} == {math.ceil(support_m * MM)}
 
 
-def test_what_is_known_of_the_points_narrows_the_windows() -> None:
+def test_given_footprints_and_trusted_ground_shorten_what_is_seen() -> None:
     settings = SceneSettings()
-    widest = settings.support_with(ClassesInUse(), footprints=False)
-    assert settings.support_m == widest
-    trusted = settings.support_with(ClassesInUse(ground=True), footprints=False)
-    given = settings.support_with(ClassesInUse(), footprints=True)
-    both = settings.support_with(TRUSTED, footprints=True)
-    # outliers, planes and the slope, cells and the middles of four of them; the apron with the cell at its edge
+    assert settings.split_support_m(footprints=True) == 0.0 < settings.split_support_m(footprints=False)
+    # terrain is needed wherever points are looked at, and on the apron around the core
+    for given in (False, True):
+        assert settings.terrain_m(footprints=given) >= settings.split_support_m(footprints=given)
+        assert settings.terrain_m(footprints=given) >= APRON_M
+    assert settings.support_m >= max(settings.outliers.support_m, settings.split_support_m(footprints=False))
+    # planes and the slope, cells and the middles of four of them
     assert settings.ground.trusted_support_m >= settings.ground.reach_m + 3
-    assert both >= settings.outliers.support_m + settings.ground.reach_m + 1 + 7
-    assert both < min(trusted, given) < max(trusted, given) < widest
-    assert settings.support_with(ClassesInUse(building=True), footprints=False) == widest
+    assert settings.ground_support_m(TRUSTED) < settings.ground_support_m(ClassesInUse())
+    assert settings.ground_support_m(ClassesInUse(building=True)) == settings.ground_support_m(ClassesInUse())
 
 
 @pytest.mark.parametrize("filter_name", ["morphological", "hierarchical"])
@@ -128,16 +128,16 @@ def plan(suburb: Path) -> Plan:
 def test_a_halo_of_the_user_stays(plan: Plan, suburb: Path) -> None:
     settings = RunSettings.from_mapping({"tile_size_m": 50.0, "halo_m": 300.0})
     own = make_plan([str(suburb)], ReadOptions(), settings)
-    assert split_grid(own, settings, TRUSTED, footprints=True).halo_mm == 300 * MM
-    narrow = split_grid(plan, RunSettings(), TRUSTED, footprints=True)
+    assert split_grid(own, settings, footprints=True).halo_mm == 300 * MM
+    narrow = split_grid(plan, RunSettings(), footprints=True)
     assert narrow.halo_mm < plan.grid.halo_mm
     assert (narrow.size_mm, narrow.origin_x_mm) == (plan.grid.size_mm, plan.grid.origin_x_mm)
 
 
 def test_the_memory_of_the_windows_that_are_used_is_counted(plan: Plan) -> None:
     points = {Tile(column, 0): 1_000_000 for column in range(11)}
-    narrow = split_grid(plan, RunSettings(), TRUSTED, footprints=True)
-    limit = 1_000_000_000  # some four million points
+    narrow = split_grid(plan, RunSettings(), footprints=True)
+    limit = 500_000_000  # some two million points
     check_windows(plan, narrow, points, limit)
     with pytest.raises(InputError, match="and its halo hold about"):
         check_windows(plan, plan.grid, points, limit)

@@ -224,7 +224,7 @@ def ground_of_a_window(xyz: FloatArray, last: BoolArray) -> BoolArray:
         classification=np.zeros(n, np.uint8),
     )
     window = Window(x0_mm=int(x.min()), y0_mm=int(y.min()), x1_mm=int(x.max()) + 1, y1_mm=int(y.max()) + 1)
-    terrain, kept, _ = terrain_of(points, window.grown(200_000), SETTINGS, ClassesInUse())
+    terrain, kept = terrain_of(points, window.grown(200_000), SETTINGS, ClassesInUse())
     found: BoolArray = kept & ground_points(x, y, z, terrain, SETTINGS.ground)
     return found
 

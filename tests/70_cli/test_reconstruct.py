@@ -79,7 +79,7 @@ def test_levels_of_detail_are_written_side_by_side(scene: Path, run: Run, tmp_pa
 
 def test_the_stages_are_reported_in_order(run: Run) -> None:
     stages = [event["stage"] for event in run[2] if event["kind"] == "stage"]
-    assert stages == ["ingest", "split", "join", "outline", "reconstruct", "publish"]
+    assert stages == ["ingest", "cells", "ground", "split", "join", "outline", "reconstruct", "publish"]
 
 
 def test_a_building_is_overridden_and_the_run_brought_in_line(scene: Path, run: Run, tmp_path: Path) -> None:

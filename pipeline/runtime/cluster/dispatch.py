@@ -51,7 +51,7 @@ _NOT_SHARED = (
 
 def blame(stage: str, task: object, *, here: bool = False) -> str:
     """The message if a task alone killed its processes; `here` if they are children, not workers."""
-    smaller = ", or set a smaller tile_size_m" if stage == "split" else ""
+    smaller = ", or set a smaller tile_size_m" if stage in {"cells", "split"} else ""
     who, advice = ("processes", "Use a machine with more memory") if here else ("workers", "Give them more memory")
     return (
         f"stage {stage}: {who} died again and again on one task, also when it ran alone: {repr(task)[:300]}. "

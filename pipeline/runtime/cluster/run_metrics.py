@@ -26,6 +26,8 @@ from pipeline.runtime.monitoring.tallies import TALLIES, Tallies
 UNITS = {
     "plan": "files",
     "ingest": "files",
+    "cells": "tiles",
+    "ground": "blocks",
     "split": "tiles",
     "redraw": "tiles",
     "join": "steps",
