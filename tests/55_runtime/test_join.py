@@ -56,7 +56,7 @@ EASY = CandidateSettings(
 def handed_on(whole: WholeSplit, grid: TileGrid, cut: SurfaceSettings, judging: CandidateSettings) -> Split:
     """What a split hands on of its fragments; through a pickle, as in a run."""
     surfaces = open_fragments(whole.fragments, whole.keys, whole.starts, whole.tile, grid, cut, judging)
-    figures = SplitFigures(tile=whole.tile, points=0, duplicates=0, outliers=0, audit=(0, 0, 0), outcome="")
+    figures = SplitFigures(tile=whole.tile, points=0, duplicates=0, outliers=0, audit=(0, 0, 0), outcome="", borders=())
     found = Split(tile=whole.tile, surfaces=surfaces, footprints=None, figures=figures)
     copy: Split = pickle.loads(pickle.dumps(found))
     return copy

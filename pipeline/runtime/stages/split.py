@@ -31,7 +31,7 @@ class Splits:
     places: Mapping[Tile, Place]
     """Where their descriptors are stored."""
     keys: Mapping[Tile, str]
-    """Digest of what lies in and around each tile: equal where later stages see no difference."""
+    """Digest of what lies in and near each tile: equal where later stages see no difference."""
     numbers: Mapping[Tile, Sequence[int]]
     """By tile, the numbers of the given footprints that meet it; empty where none were given."""
 
@@ -113,12 +113,12 @@ def split_windows(
     function = functools.partial(split_window, settings=settings.scene)
     brief: Callable[[Split], SplitFigures] = operator.attrgetter("figures")
     found = context.map_stored(stage, function, tasks, brief)
-    outcomes = {figures.tile: figures.outcome for figures in found.values()}
+    of_tile = {figures.tile: figures for figures in found.values()}
     keys = {}
-    for tile in outcomes:
-        core = grid.core(tile)
-        around = [(other.key, outcomes.get(other, "")) for other in grid.tiles_over(core.grown(grid.size_mm))]
-        keys[tile] = key_of(around, seen[tile])
+    for tile, figures in of_tile.items():
+        near = grid.tiles_over(grid.core(tile).grown(grid.size_mm))
+        beside = [(other.key, of_tile[other].facing(tile)) for other in near if other in of_tile and other != tile]
+        keys[tile] = key_of(figures.outcome, beside, seen[tile])
     return Splits(
         figures=tuple(found.values()),
         places={figures.tile: place for place, figures in found.items()},

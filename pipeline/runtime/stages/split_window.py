@@ -14,6 +14,8 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.model import BoolArray, IntArray
 from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.outcomes import key_of
+from pipeline.runtime.stages.gather import VIEW_M
 from pipeline.runtime.stages.open_fragments import TileSurfaces, open_fragments
 from pipeline.runtime.stages.window_points import load_window
 from pipeline.scene import (
@@ -36,6 +38,10 @@ if TYPE_CHECKING:
 
 _PLACE_BITS = 20
 """Bits of a coordinate in a sort key: 1,048 m in millimetres."""
+_SEEN_CELLS = APRON_M + VIEW_M + 2
+"""Cells from the edge of a tile's terrain, its apron included, that a building of a neighbour may see: the view may
+begin and end within a cell."""
+_NEIGHBOURS = tuple((column, row) for column in (-1, 0, 1) for row in (-1, 0, 1) if (column, row) != (0, 0))
 _STRIPS = 2**16 - 1
 """Strips of a tile in which the points of footprints are looked for; their numbers fit two bytes."""
 
@@ -89,6 +95,12 @@ class SplitFigures:
     """Points of the core: assigned and class 6, assigned and not, class 6 and not assigned."""
     outcome: str
     """Digest of the stored points and terrain: equal where later stages see no difference."""
+    borders: tuple[str, ...]
+    """Digests of the terrain that each of the eight neighbours may see, in the order of `_NEIGHBOURS`."""
+
+    def facing(self, other: Tile) -> str:
+        """Digest of the tile's terrain that the buildings of a neighbour may see."""
+        return self.borders[_NEIGHBOURS.index((other.column - self.tile.column, other.row - self.tile.row))]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -137,7 +149,7 @@ def split_window(task: SplitTask, settings: SceneSettings) -> Split:
     )
     outcome = hashlib.sha256()
     keys, starts, lowest = _store(task, loaded.core[index[assigned]], owner[assigned], outcome)
-    _store_terrain(task, terrain, occupied, core, outcome)
+    borders = _store_terrain(task, terrain, occupied, core, outcome)
     surfaces, footprints = None, None
     if result is None:
         footprints = FootprintPoints(starts=starts, keys=keys, lowest_points_mm=lowest)
@@ -151,6 +163,7 @@ def split_window(task: SplitTask, settings: SceneSettings) -> Split:
         outliers=outliers,
         audit=audit,
         outcome=outcome.hexdigest(),
+        borders=borders,
     )
     return Split(tile=task.tile, surfaces=surfaces, footprints=footprints, figures=figures)
 
@@ -196,8 +209,10 @@ def _order_by_owner(records: npt.NDArray[np.void], owner: IntArray) -> IntArray:
     return order.astype(np.int64)
 
 
-def _store_terrain(task: SplitTask, terrain: Terrain, occupied: BoolArray, core: Window, outcome: Hash) -> None:
-    """Store the terrain of the core and an apron around it.
+def _store_terrain(
+    task: SplitTask, terrain: Terrain, occupied: BoolArray, core: Window, outcome: Hash
+) -> tuple[str, ...]:
+    """Store the terrain of the core and an apron around it; the digests of what each neighbour may see of it.
 
     The apron lets a candidate at the data's edge see terrain whose own tile holds no point and so is never made.
     Where aprons overlap they agree.
@@ -212,6 +227,13 @@ def _store_terrain(task: SplitTask, terrain: Terrain, occupied: BoolArray, core:
         "corner": np.array([column0, row0], np.int64),
     }
     _put(task, arrays, outcome)
+    return tuple(_seen_from(column, row, arrays["terrain"], arrays["occupied"]) for column, row in _NEIGHBOURS)
+
+
+def _seen_from(column: int, row: int, *arrays: npt.NDArray[Any]) -> str:
+    """Digest of the cells of a tile's arrays near one neighbour, by its column and row counted from the tile."""
+    cells = {-1: slice(_SEEN_CELLS), 0: slice(None), 1: slice(-_SEEN_CELLS, None)}
+    return key_of(*(array[cells[row], cells[column]] for array in arrays))
 
 
 def _above_ground(
