@@ -42,8 +42,8 @@ class SceneSettings:
 
     @property
     def support_m(self) -> float:
-        """Farthest in metres that a tile looks at points beyond its core: to judge outliers, or to find surfaces."""
-        return max(self.outliers.support_m, self.split_support_m(footprints=False))
+        """Farthest in metres that points beyond its core matter to a tile: where it looks, and whether those count."""
+        return self.split_support_m(footprints=False) + self.outliers.support_m
 
     def split_support_m(self, *, footprints: bool) -> float:
         """How far in metres the split of a tile looks at points beyond its core.

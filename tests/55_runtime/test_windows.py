@@ -104,7 +104,7 @@ def test_given_footprints_and_trusted_ground_shorten_what_is_seen() -> None:
     for given in (False, True):
         assert settings.terrain_m(footprints=given) >= settings.split_support_m(footprints=given)
         assert settings.terrain_m(footprints=given) >= APRON_M
-    assert settings.support_m >= max(settings.outliers.support_m, settings.split_support_m(footprints=False))
+    assert settings.support_m >= settings.outliers.support_m + settings.split_support_m(footprints=False)
     # planes and the slope, cells and the middles of four of them
     assert settings.ground.trusted_support_m >= settings.ground.reach_m + 3
     assert settings.ground_support_m(TRUSTED) < settings.ground_support_m(ClassesInUse())

@@ -154,6 +154,11 @@ def files_of(run_dir: Path) -> dict[str, bytes]:
     }
 
 
+def states_of(run_dir: Path) -> dict[str, bytes]:
+    """The states of the tiles, which hold the digests of their files."""
+    return {path.name: path.read_bytes() for path in (run_dir / "state").iterdir()}
+
+
 def stop_at(stage: str, done: int) -> Callable[[Event], None]:
     """Interrupts a run when a stage is so far."""
 
@@ -201,6 +206,14 @@ def test_what_changed_is_done_again_and_nothing_else(used: Place, finished: Fini
     assert used.run_as_fresh().digest != first.digest
     assert used.tasks["ingest"] == 1
     assert 0 < used.tasks["split"] <= whole["split"]
+
+
+def test_only_tiles_whose_files_differ_are_published_again(used: Place, finished: Finished) -> None:
+    used.change("sw.laz", raised)
+    used.run()
+    before, after = states_of(finished.aside / "run"), states_of(used.folder / "run")
+    differing = [name for name in after if after[name] != before[name]]
+    assert 0 < len(differing) == used.tasks["publish"] < len(after)
 
 
 def test_a_file_that_was_only_touched_costs_its_reading(used: Place, finished: Finished) -> None:

@@ -40,7 +40,7 @@ Brief = TypeVar("Brief")
 
 FOLDER = "kept"
 """Folder of scratch for all outcomes."""
-_FORMAT = 5
+_FORMAT = 6
 """Part of every key, to be raised when the class of an outcome moves or gets another content: the pickles of an older
 checkout of the same version are then not read."""
 _KEY_DIGITS = 40

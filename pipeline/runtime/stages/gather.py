@@ -30,7 +30,7 @@ Area = TypeVar("Area", Polygon, MultiPolygon, Polygon | MultiPolygon)
 # None of these is a setting: they define the terms of the docs, in metres or in cells of the 1 m lattice.
 _GROUND_MARGIN_M = 4
 """Terrain within this distance of the roof is sampled."""
-_VIEW_MARGIN_M = 14
+_VIEW_M = 14
 """Width of the view around a candidate: reaches all cells that the masks below look at."""
 _OUTLINE_CELLS = 2
 """Terrain within these cells of the roof gives the ground elevation."""
@@ -123,7 +123,7 @@ def gather(
         low = np.array([round(x0 * MM), round(y0 * MM), 0], np.int64)
         high = np.array([round(x1 * MM), round(y1 * MM), 0], np.int64)
     origin_mm = low // MM * MM
-    margin = _VIEW_MARGIN_M * MM
+    margin = _VIEW_M * MM
     view = Window(x0_mm=int(low[0]), y0_mm=int(low[1]), x1_mm=int(high[0]) + 1, y1_mm=int(high[1]) + 1).grown(margin)
     around = surroundings_of(scratch, grid, view)
     own = np.zeros(around.occupied.shape, np.bool_)

@@ -65,10 +65,8 @@ class TileGround:
 
     tile: Tile
     """The tile."""
-    outcome: str
-    """Digest of its terrain and of which cells hold points."""
     zones: bytes
-    """Which terrain it is, zone by zone: the bytes of a `ZoneSums`, with known cells in the place of points."""
+    """Its terrain and which cells hold points, zone by zone: the bytes of a `ZoneSums`, with such cells for points."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -193,14 +191,13 @@ def _stored(
     task.scratch.put_arrays(f"{FOLDER}/{tile.key}", arrays)
     return TileGround(
         tile=tile,
-        outcome=hashlib.sha256(elevations.tobytes() + held.tobytes()).hexdigest(),
-        zones=_zones(elevations, task.grid).tobytes(),
+        zones=_zones(elevations, held, task.grid).tobytes(),
     )
 
 
-def _zones(elevations: Elevations, grid: TileGrid) -> ZoneSums:
-    """Known cells and digest of a tile's terrain by zone: (3, 3, 3) uint64, by column and row as for points."""
-    # the apron, a cell that the core's edge may cut, and what the splits of neighbours see
+def _zones(elevations: Elevations, occupied: BoolArray, grid: TileGrid) -> ZoneSums:
+    """Cells that are known or hold points, and digest of these, by zone: (3, 3, 3) uint64, by column and row."""
+    # the apron, a cell that the core's edge may cut, and what the splits of neighbours see: farther than later stages
     width = APRON_M + 1 + math.ceil((grid.halo_mm + _SLOPE_CELLS * CELL_MM) / CELL_MM)
     cuts = []
     for size in elevations.shape:
@@ -209,14 +206,16 @@ def _zones(elevations: Elevations, grid: TileGrid) -> ZoneSums:
     zones = np.zeros((3, 3, 3), np.uint64)
     for row in range(3):
         for column in range(3):
-            part = elevations[cuts[0][row] : cuts[0][row + 1], cuts[1][column] : cuts[1][column + 1]]
-            digest = hashlib.blake2b(f"{part.shape}".encode() + part.tobytes(), digest_size=16).digest()
-            zones[column, row] = (np.count_nonzero(part != NO_DATA), *np.frombuffer(digest, np.uint64))
+            zone = (slice(*cuts[0][row : row + 2]), slice(*cuts[1][column : column + 2]))
+            part, held = elevations[zone], occupied[zone]
+            digest = hashlib.blake2b(f"{part.shape}".encode() + part.tobytes() + held.tobytes(), digest_size=16)
+            cells = np.count_nonzero((part != NO_DATA) | held)
+            zones[column, row] = (cells, *np.frombuffer(digest.digest(), np.uint64))
     return zones
 
 
 def terrain_of_window(ground: Ground, grid: TileGrid, tile: Tile) -> list[object]:
-    """The terrain that the split of a tile sees, for its key."""
+    """The terrain that the split of a tile and all later stages see, for their keys."""
     # neighbours count by zones where these lie apart, which some more metres make sure
     apart = dataclasses.replace(grid, halo_mm=grid.halo_mm + 2 * _SLOPE_CELLS * CELL_MM)
     seen = {

@@ -103,6 +103,8 @@ class Modelled:
     """Of a building that failed: the measured figure and the limit, or what happened."""
     retried: str = ""
     """What happened to the process that modelled it first, if it was modelled again in another one."""
+    content: str = ""
+    """Digest of all that is published of it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -177,6 +179,16 @@ def _packed(
     reused: bool = False,
 ) -> Packed:
     is_rejected = _is_rejected(task, site, result)
+    own = task.own.get(site.building_id)
+    facts = dataclasses.replace(
+        facts,
+        source_attributes=site.source_attributes,
+        overridden=None if site.override is None else site.override.effects,
+        settings_hash=None if own is None else own.settings_hash,
+    )
+    packed = pickle.dumps(
+        StoredResult(result=result, facts=facts, is_rejected=is_rejected), protocol=pickle.HIGHEST_PROTOCOL
+    )
     modelled = Modelled(
         building_id=result.building_id,
         owner=site.owner,
@@ -189,16 +201,9 @@ def _packed(
         reused=reused,
         ended_s=time.time(),
         detail=result.reason_detail if result.status is Status.FAILED else "",
+        # equal input makes an equal model, but its pickle may differ
+        content=key_of(result.building_id, made_from or packed, facts, is_rejected),
     )
-    own = task.own.get(site.building_id)
-    facts = dataclasses.replace(
-        facts,
-        source_attributes=site.source_attributes,
-        overridden=None if site.override is None else site.override.effects,
-        settings_hash=None if own is None else own.settings_hash,
-    )
-    stored = StoredResult(result=result, facts=facts, is_rejected=is_rejected)
-    packed = pickle.dumps(stored, protocol=pickle.HIGHEST_PROTOCOL)
     return Packed(modelled=modelled, stored=packed, made_from=made_from)
 
 

@@ -102,6 +102,7 @@ def _tasks(
     for tile in sorted(splits.places):
         near = tuple(grid.tiles_over(neighbourhood(tile, grid, settings.scene)))
         own = sites.get(tile, [])
+        owners = sorted({site.owner for site in own})
         task = PointsTask(
             label=LabelTask(
                 tile=tile,
@@ -115,7 +116,7 @@ def _tasks(
             ),
             run_dir=output.run_dir,
             buildings=tuple(_part_in(tile, site) for site in own),
-            batches=tuple(place for owner in sorted({site.owner for site in own}) for place in models.places[owner]),
+            batches=tuple(place for owner in owners for place in models.places[owner]),
             above=above,
             terrain_spacing=spacing,
             memory_bytes=window_bytes(seen, tile, counts),
@@ -123,7 +124,8 @@ def _tasks(
         label = task.label
         what = (label.settings, label.classes, label.given, label.buildings, label.decks)
         around = [splits.keys.get(other, "") for other in near]
-        key = key_of(output.run_dir, tile, grid, what, task.buildings, task.batches, above, spacing, around)
+        modelled = [models.contents[owner] for owner in owners]
+        key = key_of(output.run_dir, tile, grid, what, task.buildings, modelled, above, spacing, around)
         tasks[Place("", tile.key, key)] = task
     return tasks
 

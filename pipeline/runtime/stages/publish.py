@@ -154,7 +154,9 @@ def publish(
             again=tile.key in there,
             empty_tables=not models.places and not rejected and tile == owners[0],
         )
-        key = key_of(run_dir, task.batches, task.rejected, records, task.meshes, task.empty_tables)
+        models_of_tile = models.contents.get(tile, "")
+        rejected_there = [dataclasses.replace(site, ranges=()) for site in task.rejected]
+        key = key_of(run_dir, models_of_tile, rejected_there, records, task.meshes, task.empty_tables)
         tasks[Place(stage, tile.key, key)] = task
     # tiles that a user removed from the run directory are published again
     drop_outcomes(scratch, stage, [place for place in tasks if place.unit in there])

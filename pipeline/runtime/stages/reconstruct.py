@@ -40,6 +40,8 @@ class Models:
     """Where the outcomes of the batches are stored, by owner tile."""
     scratch: Scratch
     """The run's scratch."""
+    contents: Mapping[Tile, str]
+    """Digest of all that is published of each tile's models, whichever batches they came in."""
     made: int
     """Number of models made now; the others were taken from earlier runs, since none of their input changed."""
 
@@ -108,10 +110,14 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
 
     brief: Callable[[Batch], tuple[Modelled, ...]] = operator.attrgetter("modelled")
     units = ProgressUnits(total=len(joined.candidates), done=len, failed=_failed_of, parts=_traced)
-    context.map_stored("reconstruct", model_batch, dict(largest_first), brief, units, count)
+    briefs = context.map_stored("reconstruct", model_batch, dict(largest_first), brief, units, count)
+    contents = {
+        tile: key_of(sorted(model.content for place in made_in for model in briefs[place]))
+        for tile, made_in in places.items()
+    }
     # only now: models whose input did not change are taken from the earlier batches
     drop_outcomes(scratch, stage, tasks)
-    return Models(places=places, scratch=scratch, made=made)
+    return Models(places=places, scratch=scratch, contents=contents, made=made)
 
 
 def _tell(context: RunContext, model: Modelled) -> None:

@@ -32,7 +32,7 @@ class Splits:
     places: Mapping[Tile, Place]
     """Where their descriptors are stored."""
     keys: Mapping[Tile, str]
-    """Digest of what lies in and around each tile: equal where later stages see no difference."""
+    """Digest of what lies in and near each tile: equal where later stages see no difference."""
     numbers: Mapping[Tile, Sequence[int]]
     """By tile, the numbers of the given footprints that meet it; empty where none were given."""
 
@@ -95,7 +95,13 @@ def split_windows(
     """Split some tiles, each with its own footprints."""
     content, points = content_by_tile(ingested), points_by_tile(ingested)
     plan_grid, grid, folder = context.plan.grid, windows.grid, windows.folder
-    seen = {tile: content_of_window(content, plan_grid, plan_grid.window(tile), tile) for tile in windows.outlines}
+    seen = {
+        tile: (
+            content_of_window(content, plan_grid, plan_grid.window(tile), tile),
+            terrain_of_window(ground, plan_grid, tile),
+        )
+        for tile in windows.outlines
+    }
     alike = key_of(grid, settings.scene, windows.classes, folder)
     tasks = {}
     for tile, outlines in windows.outlines.items():
@@ -108,21 +114,15 @@ def split_windows(
             folder=folder,
             memory_bytes=window_bytes(grid, tile, points),
         )
-        key = key_of(alike, tile, outlines, seen[tile], terrain_of_window(ground, plan_grid, tile))
+        key = key_of(alike, tile, outlines, seen[tile])
         tasks[Place(folder, tile.key, key)] = task
     clear_tiles(context.scratch, folder, tasks)
     function = functools.partial(split_window, settings=settings.scene)
     brief: Callable[[Split], SplitFigures] = operator.attrgetter("figures")
     found = context.map_stored(stage, function, tasks, brief)
-    outcomes = {figures.tile: (figures.outcome, ground.tiles[figures.tile].outcome) for figures in found.values()}
-    keys = {}
-    for tile in outcomes:
-        core = grid.core(tile)
-        around = [(other.key, outcomes.get(other, ())) for other in grid.tiles_over(core.grown(grid.size_mm))]
-        keys[tile] = key_of(around, seen[tile])
     return Splits(
         figures=tuple(found.values()),
         places={figures.tile: place for place, figures in found.items()},
-        keys=keys,
+        keys={figures.tile: key_of(figures.outcome, seen[figures.tile]) for figures in found.values()},
         numbers=windows.numbers,
     )
