@@ -37,9 +37,9 @@ from pipeline.runtime.cluster.dispatch import TASKS_PER_THREAD
 from pipeline.runtime.scratch.folder import POINT
 
 _SEED = 20
-_HALO_M = 240.0
-"""Halo of unclassified points; `SceneSettings.support_m`."""
-STAGES = ("ingest", "split", "join", "outline", "reconstruct", "publish")
+_HALO_M = 41.5
+"""Halo of a split; `SceneSettings.split_support_m`."""
+STAGES = ("ingest", "cells", "ground", "split", "join", "outline", "reconstruct", "publish")
 GROUPED = frozenset({"ingest", "join", "outline", "reconstruct"})
 REQUIRED = 0.80
 _LARGE = 5_000_000
@@ -361,6 +361,7 @@ def city_stages(engine: Engine, buildings: int, change: Change, seed: int = _SEE
     window = (1.0 + 2.0 * _HALO_M / engine.tile_m) ** 2
     stored = {
         "ingest": POINT.itemsize * points_a_file * 1.15 * change.tasks_a_batch,
+        "cells": POINT.itemsize * points_a_tile,
         "split": POINT.itemsize * points_a_tile * (window + 0.3),
         "reconstruct": POINT.itemsize * 20_000 * 1.5 * change.tasks_a_batch,
     }
@@ -378,7 +379,7 @@ def city_stages(engine: Engine, buildings: int, change: Change, seed: int = _SEE
         if name in GROUPED and change.tasks_a_batch != 1.0:
             count = max(1, round(count / change.tasks_a_batch))
             durations = np.array([part.sum() for part in np.array_split(durations, count)])
-        if name in {"split", "reconstruct"}:
+        if name in {"cells", "split", "reconstruct"}:
             durations = np.sort(durations)[::-1]
         in_tasks = {"join": (1.0 - change.joined_in_driver) * joining_s, "ingest": 0.0}.get(name, 0.0)
         if name == "ingest":

@@ -48,7 +48,7 @@ from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.split import split
 from pipeline.settings import RunSettings
 
-STAGES = ("ingest", "split", "join")
+STAGES = ("ingest", "cells", "ground", "split", "join")
 REQUIRED_POINTS_A_SECOND = 300_000.0
 WANTED_POINTS_A_SECOND = 1_000_000.0
 _MB = 1e6

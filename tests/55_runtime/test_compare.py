@@ -68,7 +68,8 @@ def test_the_presets_differ(compared: Compared) -> None:
 def test_candidates_are_found_once_and_modelled_once_a_variant(compared: Compared) -> None:
     summary, events = compared
     stages = [event.stage for event in events if event.kind == "stage"]
-    assert stages == ["ingest", "split", "join", "outline", "reconstruct", "reconstruct", "publish", "publish"]
+    once = ["ingest", "cells", "ground", "split", "join", "outline"]
+    assert stages == [*once, "reconstruct", "reconstruct", "publish", "publish"]
     candidates = summary.runs["fuzzy-sart"].counts["candidates"]
     modelled = [event for event in events if event.stage == "reconstruct"]
     counted = [(event.done, event.total) for event in modelled if event.kind == "progress"]

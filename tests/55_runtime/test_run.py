@@ -160,7 +160,7 @@ def test_progress_is_reported_by_stage_and_never_runs_backwards(suburb: Path, tm
     out = str(tmp_path / "run")
     run(RunRequest(inputs=(str(suburb),), out=out, settings=settings, resources=SERIAL), events.append)
     stages = [event.stage for event in events if event.kind == "stage"]
-    assert stages == ["ingest", "split", "join", "outline", "reconstruct", "publish"]
+    assert stages == ["ingest", "cells", "ground", "split", "join", "outline", "reconstruct", "publish"]
     for stage in ("ingest", "split", "reconstruct", "publish"):
         steps = [event for event in events if event.kind == "progress" and event.stage == stage]
         assert [s.done for s in steps] == sorted(s.done for s in steps)

@@ -103,7 +103,8 @@ def test_a_toml_file_and_the_command_line_meet(tmp_path: Path) -> None:
     assert settings.general.tile_size_m == 200.0
     assert settings.scene.ground.max_window_m == 30
     # the chain with both openings, 126 m, then looks farther than the search for wide objects, 122 m
-    assert settings.halo_m == RunSettings().halo_m + 4
+    assert settings.scene.ground.support_m == RunSettings().scene.ground.support_m + 4
+    assert settings.halo_m == RunSettings().halo_m, "the ground is found over cells, which no tile's halo holds"
 
 
 def test_a_settings_file_that_is_no_toml_is_named(tmp_path: Path) -> None:
