@@ -19,13 +19,14 @@ from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
-_POINTS_PER_WINDOW = 12_000_000
+_POINTS_PER_WINDOW = 4_000_000
+"""Points that a tile with its halo should not exceed: tiles of 500 m up to 11 points per m2."""
 _ASKED_AT_ONCE = 8
 """Remote files whose headers are read at once: a header takes some ten requests of tens of milliseconds each."""
 _BYTES_PER_POINT = 220
 """Bytes per point of the window: measured peak of a split above the size of its process, at 3 and 5 million points."""
 _BYTES_PER_JUDGED_POINT = 140
-"""The same of the search for duplicates and outliers."""
+"""The same of the search for duplicates and outliers, where several files share a tile; 80 with one."""
 _BYTES_PER_CELL = 120
 """The same per cell of 1 m of the ground filter."""
 LARGEST_TASK_BYTES = _POINTS_PER_WINDOW * _BYTES_PER_POINT
@@ -68,8 +69,8 @@ def tile_size_m(density_per_m2: float, halo_m: float, area_m2: float) -> float:
 
     Large tiles waste less on halos. Sizes up to 250 m suit any area; larger ones need an area of eight tiles.
 
-    >>> tile_size_m(1.0, 100.0, 1e8), tile_size_m(14.0, 100.0, 5e4), tile_size_m(50.0, 100.0, 1e6)
-    (1000.0, 250.0, 250.0)
+    >>> tile_size_m(1.0, 50.0, 1e8), tile_size_m(10.0, 50.0, 1e8), tile_size_m(10.0, 50.0, 5e4)
+    (1000.0, 500.0, 250.0)
     """
     for size in _TILE_SIZES_M:
         fits = density_per_m2 * (size + 2.0 * halo_m) ** 2 <= _POINTS_PER_WINDOW
