@@ -98,7 +98,8 @@ def _add(update: Callable[[bytes], None], value: object) -> None:
     elif isinstance(value, shapely.Geometry):
         _add(update, shapely.to_wkb(value, include_srid=True))
     elif isinstance(value, np.ndarray):
-        _add(update, (value.dtype.str, value.shape, np.ascontiguousarray(value).tobytes()))
+        update(f"array {value.dtype.str} {value.shape} ".encode())
+        update(np.ascontiguousarray(value).tobytes())
     elif isinstance(value, Sequence):
         update(f"sequence {len(value)} ".encode())
         for entry in value:

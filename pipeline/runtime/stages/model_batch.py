@@ -24,7 +24,7 @@ from pipeline.runtime.isolation.replay_bundle import Bundle, Incident, write_bun
 from pipeline.runtime.monitoring.logs import LOG
 from pipeline.runtime.monitoring.tallies import TALLIES
 from pipeline.runtime.overrides.overrides_file import OwnModelling
-from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import Place, key_of, result_of
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.sites import CandidateSite
@@ -218,6 +218,7 @@ def _is_rejected(task: BatchTask, site: CandidateSite, result: BuildingResult) -
 
 def _here(task: BatchTask) -> Iterator[tuple[int, Packed]]:
     """Models made in this process: one that runs out of memory becomes a record, one that crashes ends all."""
+    task = opened(task)
     for index, site in enumerate(task.sites):
         task.scratch.check_cancelled()
         try:
@@ -231,7 +232,7 @@ def _here(task: BatchTask) -> Iterator[tuple[int, Packed]]:
 
 def _in_child(task: BatchTask, limits: IsolationLimits) -> Iterator[tuple[int, Packed]]:
     """Models made in a supervised child process, so that a building can only harm itself."""
-    common = dataclasses.replace(task, sites=())
+    common = opened(dataclasses.replace(task, sites=()))
     cancelled = functools.partial(_cancelled, task)
     work = functools.partial(model_site, common)
     retried: dict[int, str] = {}
@@ -242,6 +243,11 @@ def _in_child(task: BatchTask, limits: IsolationLimits) -> Iterator[tuple[int, P
         if index in retried:
             found = dataclasses.replace(found, modelled=dataclasses.replace(found.modelled, retried=retried[index]))
         yield index, found
+
+
+def opened(task: BatchTask) -> BatchTask:
+    """The task with a scratch whose arrays stay open from building to building: neighbours share tiles."""
+    return dataclasses.replace(task, scratch=OpenScratch(task.scratch.root, task.scratch.attempt))
 
 
 def _loads(task: BatchTask) -> tuple[str, ...]:
