@@ -18,7 +18,7 @@ from pipeline.io.gps_time import GpsTimeKind
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.unit_outlines import unit_outlines
 from pipeline.runtime.run_context import RunContext
-from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, whole
 from pipeline.runtime.stages.gather import canonical_order, gather, stored_points
 from pipeline.runtime.stages.grouping import in_groups
@@ -111,6 +111,7 @@ def draw_outlines(task: OutlineTask) -> DrawnOutlines:
     """
     drawn: dict[str, MultiPolygon] = {}
     warnings = []
+    task = dataclasses.replace(task, scratch=OpenScratch(task.scratch.root, task.scratch.attempt))
     for units in task.blocks:
         task.scratch.check_cancelled()
         try:
