@@ -19,7 +19,7 @@ from pipeline.roof.arrangement.cells import (
 from pipeline.roof.arrangement.faces import rings_of_faces
 from pipeline.roof.arrangement.limits import Limits, limits_at
 from pipeline.roof.arrangement.minimum_cut import Allowed, every_label, expand_labels, neighbour_lists
-from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, Raster, _settle
+from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, CellCosts, Raster, _settle
 from pipeline.roof.arrangement.subdivision import (
     FACE,
     NEXT,
@@ -122,7 +122,13 @@ def test_cells_settle_as_if_all_were_looked_at_in_every_round(seed: int) -> None
                 expected[cell] = best
     number = np.full(columns * rows, -1, np.int32)
     number[place] = np.arange(len(place))
-    _settle(costs, Raster(0.0, 0.0, 1.0, columns, rows, number, place), 7, 5, labels)
+    stored = CellCosts(
+        starts=np.arange(0, costs.size + 1, k),
+        planes=np.tile(np.arange(k, dtype=np.int32), len(place)),
+        costs=costs.ravel(),
+        others=np.full(len(place), 40),
+    )
+    _settle(stored, Raster(0.0, 0.0, 1.0, columns, rows, number, place), 7, 5, labels)
     assert labels.tolist() == [expected[cell] for cell in place.tolist()]
 
 
