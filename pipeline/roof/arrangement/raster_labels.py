@@ -15,7 +15,7 @@ from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.merge_sort import in_order
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.roof.arrangement.minimum_cut import Allowed, expand_labels, neighbour_lists
+from pipeline.roof.arrangement.minimum_cut import Allowed, Costs, cost_of, expand_labels, neighbour_lists
 
 COST_SCALE = 1000
 """Integer cost of one unexplained point."""
@@ -78,25 +78,9 @@ def raster_cells(edges: FloatArray, west: float, south: float, cell_m: float, co
     return Raster(west, south, cell_m, columns, rows, number, place[:n].copy())
 
 
-class CellCosts(NamedTuple):
-    """Costs of planes in cells, in thousandths of a point, of those planes alone that explain a point of the cell.
-
-    A hall with hundreds of planes has hundreds of thousands of cells, and few planes explain anything in one of them.
-    """
-
-    starts: IntArray
-    """(n + 1,) int64, where the planes of each of n cells start."""
-    planes: LabelArray
-    """(m,) int32, planes, ascending in each cell."""
-    costs: IntArray
-    """(m,) int64, their costs."""
-    others: IntArray
-    """(n,) int64, cost of every other plane: all points of the cell, unexplained."""
-
-
 @kernel
-def _cell_costs(points: FloatArray, planes: FloatArray, cap_m: float, raster: Raster) -> CellCosts:
-    """Costs of k planes in n cells."""
+def _cell_costs(points: FloatArray, planes: FloatArray, cap_m: float, raster: Raster) -> Costs:
+    """Costs of k planes in n cells: other planes than those listed explain none of a cell's points."""
     n = len(raster.place)
     cell_of = np.full(len(points), -1, np.int32)
     for i in range(len(points)):
@@ -126,33 +110,11 @@ def _cell_costs(points: FloatArray, planes: FloatArray, cap_m: float, raster: Ra
                 explaining[m], costs[m] = label, cost
                 m += 1
         starts[cell + 1] = m
-    return CellCosts(starts, explaining[:m].copy(), costs[:m].copy(), others)
-
-
-@kernel(inline="always")
-def _cost(costs: CellCosts, cell: int, label: int) -> int:
-    """Cost of a plane in a cell."""
-    found = costs.others[cell]
-    for s in range(costs.starts[cell], costs.starts[cell + 1]):
-        if costs.planes[s] == label:
-            found = costs.costs[s]
-    return found
+    return Costs(starts, explaining[:m].copy(), costs[:m].copy(), others)
 
 
 @kernel
-def _of_all_planes(costs: CellCosts, k: int) -> IntArray:
-    """The costs of all k planes in all cells, (n, k)."""
-    n = len(costs.others)
-    filled = np.empty((n, k), np.int64)
-    for cell in range(n):
-        filled[cell] = costs.others[cell]
-        for s in range(costs.starts[cell], costs.starts[cell + 1]):
-            filled[cell, costs.planes[s]] = costs.costs[s]
-    return filled
-
-
-@kernel
-def _first_labels(costs: CellCosts, raster: Raster) -> LabelArray:
+def _first_labels(costs: Costs, raster: Raster) -> LabelArray:
     """The best label of every cell with points, (n,); from there outwards over those without."""
     number, place, columns, rows = raster.number, raster.place, raster.columns, raster.rows
     n = len(place)
@@ -166,7 +128,7 @@ def _first_labels(costs: CellCosts, raster: Raster) -> LabelArray:
             least = costs.others[i]
             for s in range(costs.starts[i], costs.starts[i + 1]):
                 if costs.costs[s] < least:
-                    labels[i], least = costs.planes[s], costs.costs[s]
+                    labels[i], least = costs.labels[s], costs.costs[s]
             queue[tail] = i
             tail += 1
     head = 0
@@ -212,14 +174,14 @@ def _raster_edges(raster: Raster, side: int, diagonal: int) -> tuple[IntArray, I
 
 
 @kernel
-def _near_own_points(costs: CellCosts, labels: LabelArray, raster: Raster, k: int) -> Allowed:
+def _near_own_points(costs: Costs, labels: LabelArray, raster: Raster, k: int) -> Allowed:
     """For each of k labels the cells within two cells of a point that it explains, and those that start with it."""
     number, place, columns, rows = raster.number, raster.place, raster.columns, raster.rows
     n = len(place)
-    cell_of = np.empty(len(costs.planes), np.int32)
+    cell_of = np.empty(len(costs.labels), np.int32)
     for i in range(n):
         cell_of[costs.starts[i] : costs.starts[i + 1]] = i
-    first, entries = counting_sort(costs.planes, k)
+    first, entries = counting_sort(costs.labels, k)
     first_own, own = counting_sort(labels, k)
     allowed = np.zeros(n, np.bool_)
     nodes = np.empty(min(n * k, n + 25 * len(cell_of)), np.int32)
@@ -257,7 +219,7 @@ def _border_cost(framed: LabelArray, here: int, around: IntArray, weight: IntArr
 
 
 @kernel
-def _settle(costs: CellCosts, raster: Raster, side: int, diagonal: int, labels: LabelArray) -> None:
+def _settle(costs: Costs, raster: Raster, side: int, diagonal: int, labels: LabelArray) -> None:
     """Give every cell the best label among its own and its neighbours', until none changes (Besag 1986).
 
     After the first round a cell is looked at again only if a neighbour has changed: else it would choose the same.
@@ -290,14 +252,14 @@ def _settle(costs: CellCosts, raster: Raster, side: int, diagonal: int, labels: 
             if not mixed:
                 continue
             best = own
-            least = _cost(costs, i, best) + _border_cost(framed, here, around, weight, own)
+            least = cost_of(costs, i, best) + _border_cost(framed, here, around, weight, own)
             tried = own
             for s in range(8):
                 label = framed[here + around[s]]
                 if label < 0 or label in (own, tried):
                     continue
                 tried = label
-                cost = _cost(costs, i, label) + _border_cost(framed, here, around, weight, label)
+                cost = cost_of(costs, i, label) + _border_cost(framed, here, around, weight, label)
                 if cost < least or (cost == least and label < best and best != own):
                     best = label
                     least = cost
@@ -344,7 +306,7 @@ def raster_labels(
         pairs, weights = _raster_edges(raster, side, diagonal)
         neighbours = neighbour_lists(len(raster.place), pairs, weights)
         allowed = _near_own_points(costs, coarse, raster, len(planes))
-        expand_labels(_of_all_planes(costs, len(planes)), allowed, neighbours, coarse, _ROUNDS)
+        expand_labels(costs, allowed, neighbours, coarse, _ROUNDS)
 
     fine = raster_cells(edges, west, south, 0.5 * cell_m, 2 * columns, 2 * rows)
     labels = np.full(len(fine.place), -1, np.int32)
