@@ -42,7 +42,8 @@ POINT = np.dtype(
 
 
 _CANCELLED = "cancelled"
-_ATTEMPTS = "attempts"
+ATTEMPTS = "attempts"
+"""Folder with the mark of the attempt at a run that works in scratch which outlives its runs."""
 _LONGEST_HEADER_BYTES = 256
 """Enough for the arrays stored here, numbers of up to three dimensions."""
 
@@ -81,7 +82,7 @@ class Scratch:
         """
         Path(self.root).mkdir(parents=True, exist_ok=True)
         if self.attempt:
-            folder = Path(self.root, _ATTEMPTS)
+            folder = Path(self.root, ATTEMPTS)
             folder.mkdir(exist_ok=True)
             for earlier in folder.iterdir():
                 earlier.unlink(missing_ok=True)
@@ -168,7 +169,7 @@ class Scratch:
 
     @property
     def _mark(self) -> Path:
-        return Path(self.root, _ATTEMPTS, self.attempt)
+        return Path(self.root, ATTEMPTS, self.attempt)
 
     @property
     def cancelled(self) -> bool:

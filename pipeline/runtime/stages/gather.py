@@ -19,7 +19,7 @@ from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.model import BoolArray, Candidate, IntArray
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages.sites import CandidateSite
+from pipeline.runtime.stages.sites import CandidateSite, PointRange
 from pipeline.runtime.stages.surroundings import Surroundings, surroundings_of
 from pipeline.runtime.stages.window_points import bucket_paths
 from pipeline.strip_alignment import aligned_mm
@@ -124,11 +124,14 @@ def _ascends(points: npt.NDArray[np.void]) -> bool:
 
 def stored_points(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]:
     """A candidate's points, range after range."""
-    pieces = []
-    for part in site.ranges:
-        first, last = part.start * POINT.itemsize, part.stop * POINT.itemsize
-        pieces.append(scratch.rows(f"{part.folder}/{part.tile.key}", "points", first, last).view(POINT))
+    pieces = [stored_bytes(scratch, part).view(POINT) for part in site.ranges]
     return np.concatenate(pieces) if pieces else np.empty(0, POINT)
+
+
+def stored_bytes(scratch: Scratch, part: PointRange) -> npt.NDArray[np.uint8]:
+    """The bytes of a range of points; raises ValueError if the file ends before them."""
+    first, last = part.start * POINT.itemsize, part.stop * POINT.itemsize
+    return scratch.rows(f"{part.folder}/{part.tile.key}", "points", first, last)
 
 
 def canonical_order(points: npt.NDArray[np.void]) -> IntArray:
