@@ -17,10 +17,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 
+from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.roof.lines import Run
 
@@ -44,6 +48,32 @@ _PRIOR_SPLITS = 4.0
 """With this many expected split pulses an edge's own count weighs as much as that of the whole building."""
 _STRAY_AGES = 4.0
 """A strip whose outermost point lies this many mean ways off the median strip does not belong to this edge."""
+
+
+class _Cells(NamedTuple):
+    """The fields of `EdgePoints` as kernels take them."""
+
+    xy_mm: IntArray
+    split: BoolArray
+    starts: IntArray
+    low_x: int
+    low_y: int
+    columns: int
+    rows: int
+    side: int
+
+
+class _Stretch(NamedTuple):
+    """A line's point and direction, the stretch of it in ways along it, how far to look to its right and its left."""
+
+    x: float
+    y: float
+    ux: float
+    uy: float
+    first: float
+    last: float
+    out: float
+    depth: float
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -93,27 +123,75 @@ class EdgePoints:
         """How far within a line split pulses belong to its edge."""
         return 2e3 * _LONGEST_REACH_M + _BAND_SPACINGS * self.spacing_mm
 
-    def along(self, run: Run, first_mm: float, last_mm: float) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Points by a line: ways along it from `first_mm` to `last_mm`, how far to its right, and which are split."""
-        ux, uy = math.cos(run.direction), math.sin(run.direction)
+    def along(
+        self, run: Run, first_mm: float, last_mm: float, strips: int
+    ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
+        """Points by a line from `first_mm` to `last_mm` along it, in strips of equal width square to it.
+
+        How far to the line's right they lie, which are split, the place of each strip's outermost one, and the
+        distances of successive ones of a strip up to its first gap.
+        """
         out, depth = _REACH_SPACINGS * self.spacing_mm, max(_DEPTH_SPACINGS * self.spacing_mm, 3.0 * self.band_mm)
-        corners_x = [run.x + t * ux + d * uy for t in (first_mm, last_mm) for d in (out, -depth)]
-        corners_y = [run.y + t * uy - d * ux for t in (first_mm, last_mm) for d in (out, -depth)]
-        first_row = max(0, math.floor((min(corners_y) - self.low_mm[1]) / self.cell_mm))
-        last_row = min(self.rows - 1, math.floor((max(corners_y) - self.low_mm[1]) / self.cell_mm))
-        first_column = max(0, math.floor((min(corners_x) - self.low_mm[0]) / self.cell_mm))
-        last_column = min(self.columns - 1, math.floor((max(corners_x) - self.low_mm[0]) / self.cell_mm))
-        if first_column > last_column or first_row > last_row:
-            return np.empty(0), np.empty(0), np.empty(0, np.bool_)
-        pieces = []
-        for row in range(first_row, last_row + 1):
-            start = self.starts[row * self.columns + first_column]
-            pieces.append(np.arange(start, self.starts[row * self.columns + last_column + 1]))
-        index = np.concatenate(pieces)
-        x, y = self.xy_mm[index, 0] - run.x, self.xy_mm[index, 1] - run.y
-        way, off = x * ux + y * uy, x * uy - y * ux
-        near = (way >= first_mm) & (way < last_mm) & (off <= out) & (off >= -depth)
-        return way[near], off[near], self.split[index[near]]
+        ux, uy = math.cos(run.direction), math.sin(run.direction)
+        cells = _Cells(self.xy_mm, self.split, self.starts, *self.low_mm, self.columns, self.rows, self.cell_mm)
+        stretch = _Stretch(run.x, run.y, ux, uy, first_mm, last_mm, out, depth)
+        found: tuple[FloatArray, BoolArray, FloatArray, FloatArray] = _along(
+            cells, stretch, strips, _GAP_SPACINGS * self.spacing_mm
+        )
+        return found
+
+
+@kernel
+def _along(
+    cells: _Cells, stretch: _Stretch, strips: int, gap: float
+) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
+    """The kernel of `EdgePoints.along`; a distance longer than `gap` is a gap."""
+    columns, starts, side = cells.columns, cells.starts, cells.side
+    x0, y0, ux, uy, first, last, out, depth = stretch
+    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+    for t in (first, last):
+        for d in (out, -depth):
+            x, y = x0 + t * ux + d * uy, y0 + t * uy - d * ux
+            low_x, low_y, high_x, high_y = min(low_x, x), min(low_y, y), max(high_x, x), max(high_y, y)
+    first_row = max(0, math.floor((low_y - cells.low_y) / side))
+    last_row = min(cells.rows - 1, math.floor((high_y - cells.low_y) / side))
+    first_column = max(0, math.floor((low_x - cells.low_x) / side))
+    last_column = min(columns - 1, math.floor((high_x - cells.low_x) / side))
+    if first_column > last_column or first_row > last_row:
+        return np.empty(0), np.empty(0, np.bool_), np.empty(0), np.empty(0)
+    most = 0
+    for row in range(first_row, last_row + 1):
+        most += starts[row * columns + last_column + 1] - starts[row * columns + first_column]
+    inward, is_split, strip = np.empty(most), np.empty(most, np.bool_), np.empty(most, np.int32)
+    width = (last - first) / strips
+    count = 0
+    for row in range(first_row, last_row + 1):
+        for i in range(starts[row * columns + first_column], starts[row * columns + last_column + 1]):
+            x, y = cells.xy_mm[i, 0] - x0, cells.xy_mm[i, 1] - y0
+            way, off = x * ux + y * uy, x * uy - y * ux
+            if first <= way < last and -depth <= off <= out:
+                inward[count], is_split[count] = -off, cells.split[i]
+                strip[count] = min(int((way - first) / width), strips - 1)
+                count += 1
+    inward, is_split = inward[:count], is_split[:count]
+    order = ascending_order(inward)
+    by_strip, members = counting_sort(strip[:count][order], strips)
+    places, distances = np.empty(strips), np.empty(count)
+    seen = found = 0
+    for s in range(strips):
+        if by_strip[s] == by_strip[s + 1]:
+            continue
+        before = inward[order[members[by_strip[s]]]]
+        places[seen] = -before
+        seen += 1
+        for k in range(by_strip[s] + 1, by_strip[s + 1]):
+            here = inward[order[members[k]]]
+            if here - before > gap:
+                break
+            distances[found] = here - before
+            found += 1
+            before = here
+    return -inward, is_split, places[:seen].copy(), distances[:found].copy()
 
 
 def mixed_pulse_reach_mm(outline_mm: shapely.Geometry, points: EdgePoints) -> float:
@@ -166,20 +244,13 @@ def outward_shift_mm(border: FloatArray, run: Run, points: EdgePoints, reach_mm:
         return None
     strips = math.floor((last - first) / (_STRIP_SPACINGS * spacing))
     width = (last - first) / strips
-    way, off, split = points.along(run, first, last)
+    off, split, places, distances = points.along(run, first, last, strips)
     if len(off) < 3:
         return None
-    strip = np.minimum(((way - first) / width).astype(np.int64), strips - 1)
-    order = np.lexsort((-off, strip))
-    strip, sorted_off = strip[order], off[order]
-    outermost = np.concatenate(([True], strip[1:] != strip[:-1]))
-    distances = sorted_off[:-1] - sorted_off[1:]
-    distances = distances[_before_gaps(outermost, distances, _GAP_SPACINGS * spacing)]
     prior = spacing * spacing / width
     total = math.fsum(distances.tolist()) + _PRIOR_COUNT * prior
     squares = math.fsum((distances**2).tolist()) + 2.0 * _PRIOR_AGE * _PRIOR_COUNT * prior * prior
     age = squares / (2.0 * total)
-    places = sorted_off[outermost]
     middle = np.sort(places)[len(places) // 2]
     near = np.abs(places - middle) <= max(_STRAY_AGES * age, spacing)
     edge: float = math.fsum(places[near].tolist()) / int(near.sum()) + age
@@ -198,14 +269,3 @@ def _own_reach(off: FloatArray, split: BoolArray, points_a_mm: float, band_mm: f
     # gamma prior about the building's reach, as heavy as so many split pulses
     reach = (count + _PRIOR_SPLITS) / (2.0 * points_a_mm + _PRIOR_SPLITS / reach_mm)
     return min(reach, 1e3 * _LONGEST_REACH_M)
-
-
-def _before_gaps(outermost: BoolArray, distances: FloatArray, gap: float) -> BoolArray:
-    """Which of the distances to the next point lie in one strip, before its first gap."""
-    gaps = distances > gap
-    gaps[outermost[1:]] = False
-    passed = np.concatenate(([0], np.cumsum(gaps)))
-    # gaps passed within the strip so far
-    at_start = np.maximum.accumulate(np.where(outermost, passed, 0))
-    counted: BoolArray = (passed[1:] == at_start[1:]) & ~outermost[1:]
-    return counted

@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.geometry import spacing_over_area_m
 from pipeline.model import (
@@ -143,6 +144,11 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     least one roof point has a label. Raises BuildingError `no_partition` where nothing is left, `too_complex` beyond
     1.9 km.
     """
+    return _traced_plan(roof, planes, settings, continued=True)
+
+
+def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettings, *, continued: bool) -> RoofPlan:
+    """The plan of `partition_roof`; where only its outline is wanted, faces need not be `continued` beyond it."""
     given = roof.footprint_mm
     margin = round(_MARGIN_SPACINGS * roof.spacing_m * 1e3)
     low, high = roof.xy_mm.min(axis=0) - margin, roof.xy_mm.max(axis=0) + margin
@@ -168,8 +174,8 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     else:
         counted[: n + m] = in_footprint(given, xy_mm[: n + m])
         # beyond the footprint the faces go on, within it they close gaps that are not too wide
-        continued = (counted[n : n + m] == 0) | (distance_m <= settings.void_distance_m)
-        labels[n : n + m][continued] = labels[nearest[continued]]
+        follows = (counted[n : n + m] == 0) | (distance_m <= settings.void_distance_m)
+        labels[n : n + m][follows] = labels[nearest[follows]]
     z = np.zeros(len(xy_mm))
     z[:n] = roof.points[:, 2]
     x, y = np.ascontiguousarray(xy_mm[:, 0]), np.ascontiguousarray(xy_mm[:, 1])
@@ -184,11 +190,13 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     around = outline(partition)
     if not settings.straight_eaves:
         return RoofPlan(planes=tuple(planes), faces=partition, outline_mm=around, raw=partition)
-    labels[:n] = fill_labels(roof.xy_mm, labels[:n])
-    outside = np.flatnonzero(labels[n : n + m] < 0)
-    labels[n + outside] = labels[nearest[outside]]
-    labels = continue_crossings(x, y, tin.facets, labels, known, coefficients)
-    continued_faces = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
+    faces = partition
+    if continued:
+        labels[:n] = fill_labels(roof.xy_mm, labels[:n])
+        outside = np.flatnonzero(labels[n : n + m] < 0)
+        labels[n + outside] = labels[nearest[outside]]
+        labels = continue_crossings(x, y, tin.facets, labels, known, coefficients)
+        faces = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
     drawn = roof.outline_mm
     if drawn is None:
         edge_points = EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m)
@@ -196,7 +204,7 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
         if roof.facades is not None and settings.at_walls:
             reach_m = 1e-3 * mixed_pulse_reach_mm(around, edge_points)
             drawn = walls_beneath(drawn, roof.facades, reach_m, settings.usual_overhang_m).outline_mm
-    return RoofPlan(planes=tuple(planes), faces=continued_faces, outline_mm=drawn, raw=partition)
+    return RoofPlan(planes=tuple(planes), faces=faces, outline_mm=drawn, raw=partition)
 
 
 def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:
@@ -212,7 +220,7 @@ def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:
     z = np.sort(roof.points[:, 2])
     level = Plane(a=0.0, b=0.0, c=float(z[len(z) // 2]), n_points=len(z), rmse_m=0.0)
     unlabelled = dataclasses.replace(roof, labels=np.zeros(len(roof.points), np.int32))
-    return partition_roof(unlabelled, [level], settings).outline_mm
+    return _traced_plan(unlabelled, [level], settings, continued=False).outline_mm
 
 
 def walls_of(footprint: Polygon | MultiPolygon, roof: RoofPoints, settings: RoofSettings) -> WallOutline | None:
@@ -356,27 +364,56 @@ def level_unsupported_faces(
     labels = partition.labels.copy()
     extended = list(planes)
     floor = ground_z_m + settings.min_clearance_m
-    known = roof.labels >= 0
-    lowest, highest = np.full(len(planes), np.inf), np.full(len(planes), -np.inf)
-    np.minimum.at(lowest, roof.labels[known], roof.points[known, 2])
-    np.maximum.at(highest, roof.labels[known], roof.points[known, 2])
-    # a side of a template can be without points: it is as high as the others
-    bare = np.isinf(lowest)
-    lowest[bare], highest[bare] = roof.points[:, 2].min(), roof.points[:, 2].max()
     xy, face = shapely.get_coordinates(np.array(partition.polygons, object), return_index=True)
-    a, b, c = np.array([plane.coefficients for plane in planes]).reshape(len(planes), 3)[labels[face]].T
-    z = a * (xy[:, 0] * 1e-3) + b * (xy[:, 1] * 1e-3) + c
-    starts = np.searchsorted(face, np.arange(len(labels)))
-    bottoms, tops = np.minimum.reduceat(z, starts), np.maximum.reduceat(z, starts)
-    tolerance = settings.max_overshoot_m
-    ends = np.maximum(bottoms, floor)
-    fits = (ends >= lowest[labels] - tolerance) & (tops <= highest[labels] + tolerance) & (tops > floor)
+    coefficients = np.array([plane.coefficients for plane in planes]).reshape(len(planes), 3)
+    tops, bottoms, highest, fits = _fitting_faces(
+        xy, face, labels, coefficients, roof.points, roof.labels, floor, settings.max_overshoot_m
+    )
     for k in np.flatnonzero(~fits).tolist():
         polygon, label = partition.polygons[k], int(labels[k])
         middle = 0.5 * (float(bottoms[k]) + float(tops[k]))
         labels[k] = len(extended)
         extended.append(_level_plane(polygon, label, roof, max(floor, min(middle, float(highest[label]))), floor))
     return RoofPartition(polygons=partition.polygons, labels=labels), extended
+
+
+@kernel
+def _fitting_faces(
+    xy_mm: FloatArray,
+    face: IntArray,
+    labels: LabelArray,
+    planes: FloatArray,
+    points: FloatArray,
+    label_of_point: LabelArray,
+    floor: float,
+    tolerance: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Top and bottom of every face, the highest point of every plane, and which faces stay near their planes' points.
+
+    Vertices `xy_mm` (v, 2) with the face of each; faces have the plane `labels` (f,), points (n, 3) `label_of_point`.
+    """
+    lowest, highest = np.full(len(planes), np.inf), np.full(len(planes), -np.inf)
+    low, high = np.inf, -np.inf
+    for i in range(len(points)):
+        z, label = points[i, 2], label_of_point[i]
+        low, high = min(low, z), max(high, z)
+        if label >= 0:
+            lowest[label], highest[label] = min(lowest[label], z), max(highest[label], z)
+    # a side of a template can be without points: it is as high as the others
+    for label in range(len(planes)):
+        if lowest[label] == np.inf:
+            lowest[label], highest[label] = low, high
+    tops, bottoms = np.full(len(labels), -np.inf), np.full(len(labels), np.inf)
+    for v in range(len(xy_mm)):
+        plane = planes[labels[face[v]]]
+        z = plane[0] * (xy_mm[v, 0] * 1e-3) + plane[1] * (xy_mm[v, 1] * 1e-3) + plane[2]
+        tops[face[v]], bottoms[face[v]] = max(tops[face[v]], z), min(bottoms[face[v]], z)
+    fits = np.empty(len(labels), np.bool_)
+    for f in range(len(labels)):
+        label = labels[f]
+        ends_well = max(bottoms[f], floor) >= lowest[label] - tolerance
+        fits[f] = ends_well and tops[f] <= highest[label] + tolerance and tops[f] > floor
+    return tops, bottoms, highest, fits
 
 
 def _level_plane(polygon: shapely.Polygon, label: int, roof: RoofPoints, otherwise: float, floor: float) -> Plane:

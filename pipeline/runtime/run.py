@@ -37,9 +37,9 @@ from pipeline.runtime.request import RunRequest, input_file, plan_inputs, reques
 from pipeline.runtime.run_context import RunContext, run_context
 from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import check_scratch, run_scratch
-from pipeline.runtime.scratch.work_folder import locked_work
+from pipeline.runtime.scratch.work_folder import is_known, locked_work
 from pipeline.runtime.stages.apply_overrides import apply_overrides
-from pipeline.runtime.stages.cleanup import tidy
+from pipeline.runtime.stages.cleanup import publishing, tidy
 from pipeline.runtime.stages.counts import Counted, run_counts
 from pipeline.runtime.stages.given_footprints import GivenFootprints, given_footprints
 from pipeline.runtime.stages.ground import Ground, find_ground
@@ -474,7 +474,8 @@ def _is_of_work(run_dir: str, work: str) -> bool:
     try:
         known = read_manifest(run_dir).request.get("work")
     except RunError:
-        return False
+        # missing or damaged
+        return is_known(work, publishing(run_dir))
     return known == str(Path(work).resolve())
 
 
@@ -512,9 +513,10 @@ def check_out(out: str, *, overwrite: bool, work: str | None = None) -> None:
     run_dir = storage.place
     try:
         left = storage.names()
-        if left and not overwrite and not (work is not None and _is_of_work(run_dir, work)):
+        of_work = work is not None and _is_of_work(run_dir, work)
+        if left and not overwrite and not of_work:
             raise RunError(f"{run_dir} is not empty ({left[0]} …): give another --out, or --overwrite")
-        if left and NAME not in left:
+        if left and NAME not in left and not of_work:
             raise RunError(f"{run_dir} holds {left[0]} and no run.json, so it is no run: give another --out")
     except OSError as error:
         raise RunError(f"{run_dir} cannot be read: {error.strerror or error}. Give another --out") from error

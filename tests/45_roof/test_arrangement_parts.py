@@ -18,7 +18,15 @@ from pipeline.roof.arrangement.cells import (
 )
 from pipeline.roof.arrangement.faces import rings_of_faces
 from pipeline.roof.arrangement.limits import Limits, limits_at
-from pipeline.roof.arrangement.minimum_cut import Allowed, every_label, expand_labels, neighbour_lists
+from pipeline.roof.arrangement.minimum_cut import (
+    Allowed,
+    Costs,
+    cost_of,
+    costs_of_all,
+    every_label,
+    expand_labels,
+    neighbour_lists,
+)
 from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, Raster, _settle
 from pipeline.roof.arrangement.subdivision import (
     FACE,
@@ -49,8 +57,19 @@ def cost(costs: IntArray, pairs: LabelArray, weights: IntArray, labels: LabelArr
 
 def expanded(costs: IntArray, pairs: LabelArray, weights: IntArray, labels: LabelArray) -> LabelArray:
     labels = labels.copy()
-    expand_labels(costs, every_label(*costs.shape), neighbour_lists(len(costs), pairs, weights), labels, 20)
+    expand_labels(
+        costs_of_all(costs), every_label(*costs.shape), neighbour_lists(len(costs), pairs, weights), labels, 20
+    )
     return labels
+
+
+def test_a_label_without_a_cost_of_its_own_costs_what_is_usual_at_the_node() -> None:
+    costs = Costs(np.array([0, 2, 2, 3]), np.array([1, 3, 0], np.int32), np.array([5, 7, 9]), np.array([20, 30, 40]))
+    found = [[cost_of(costs, node, label) for label in range(4)] for node in range(3)]
+    assert found == [[20, 5, 20, 7], [30] * 4, [9, 40, 40, 40]]
+    dense = np.array(found)
+    stored = costs_of_all(dense)
+    assert [[cost_of(stored, node, label) for label in range(4)] for node in range(3)] == found
 
 
 @pytest.mark.parametrize("seed", range(25))
@@ -77,7 +96,9 @@ def test_a_label_that_costs_the_same_is_not_taken_and_only_allowed_nodes_take_on
     costs = np.array([[9, 0], [9, 0]])
     labels = np.zeros(2, np.int32)
     lists = neighbour_lists(2, np.zeros((0, 2), np.int32), np.zeros(0, np.int64))
-    expand_labels(costs, Allowed(np.array([0, 1, 1], np.int32), np.array([0, 2, 3], np.int32)), lists, labels, 5)
+    expand_labels(
+        costs_of_all(costs), Allowed(np.array([0, 1, 1], np.int32), np.array([0, 2, 3], np.int32)), lists, labels, 5
+    )
     assert labels.tolist() == [0, 1]
 
 
@@ -90,7 +111,7 @@ def test_the_expansion_that_changes_least_is_taken_of_those_that_cost_the_same(s
     allowed = Allowed(np.arange(9, dtype=np.int32), np.array([0, 0, 9], np.int32))  # only label 1 expands
     lists = neighbour_lists(9, pairs, weights)
     labels = before.copy()
-    expand_labels(costs, allowed, lists, labels, 1)
+    expand_labels(costs_of_all(costs), allowed, lists, labels, 1)
     moves = [np.where(taken, 1, before).astype(np.int32) for taken in itertools.product((False, True), repeat=9)]
     least = min(cost(costs, pairs, weights, one) for one in moves)
     best = [one for one in moves if cost(costs, pairs, weights, one) == least]
@@ -122,7 +143,7 @@ def test_cells_settle_as_if_all_were_looked_at_in_every_round(seed: int) -> None
                 expected[cell] = best
     number = np.full(columns * rows, -1, np.int32)
     number[place] = np.arange(len(place))
-    _settle(costs, Raster(0.0, 0.0, 1.0, columns, rows, number, place), 7, 5, labels)
+    _settle(costs_of_all(costs), Raster(0.0, 0.0, 1.0, columns, rows, number, place), 7, 5, labels)
     assert labels.tolist() == [expected[cell] for cell in place.tolist()]
 
 

@@ -1,5 +1,6 @@
 """Scratch: arrays come back as they were stored, whole or mapped."""
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.scratch.folder import POINT, OpenScratch, Scratch
 
 ARRAYS: dict[str, npt.NDArray[Any]] = {
     "bytes": np.arange(POINT.itemsize * 7).astype(np.uint8),
@@ -58,3 +59,20 @@ def test_rows_that_a_file_does_not_hold_are_reported(tmp_path: Path) -> None:
     scratch.put_arrays("tiles/a", {"one": ARRAYS["lattice"]})
     with pytest.raises(ValueError, match="reshape"):
         scratch.rows("tiles/a", "one", 1, 4)
+
+
+def test_a_scratch_for_one_batch_opens_each_array_once_and_travels_closed(tmp_path: Path) -> None:
+    scratch = Scratch(str(tmp_path), "run")
+    scratch.create()
+    scratch.put_arrays("tiles/a", {"terrain": np.arange(12).reshape(6, 2)})
+    opened = OpenScratch(scratch.root, scratch.attempt)
+    terrain = opened.array("tiles/a", "terrain", mapped=True)
+    (tmp_path / "tiles" / "a" / "terrain.npy").unlink()
+    assert opened.array("tiles/a", "terrain", mapped=True) is terrain
+    assert np.array_equal(opened.rows("tiles/a", "terrain", 2, 4), np.array([[4, 5], [6, 7]]))
+    with pytest.raises(ValueError, match="ends before row 7"):
+        opened.rows("tiles/a", "terrain", 2, 7)
+    copy = pickle.loads(pickle.dumps(opened))
+    assert copy == opened
+    with pytest.raises(FileNotFoundError):
+        copy.array("tiles/a", "terrain")

@@ -4,6 +4,7 @@ import dataclasses
 import fcntl
 import json
 import os
+import pickle
 import shutil
 from collections import Counter
 from collections.abc import Callable, Generator, Sequence
@@ -30,7 +31,7 @@ TILE_M = 40.0
 
 
 class CountingExecutor(SerialExecutor):
-    """Counts the tasks of each stage."""
+    """Counts the tasks of each stage, and sends each through a pickle."""
 
     def __init__(self) -> None:
         self.tasks: Counter[str] = Counter()
@@ -39,8 +40,10 @@ class CountingExecutor(SerialExecutor):
         self, stage: str, function: Callable[[Any], Any], tasks: Sequence[Any], watch: Any
     ) -> Generator[Measured[Any], None, None]:
         for task in tasks:
-            self.tasks[stage] += 1
-            yield from super().map(stage, function, [task], watch)
+            if stage != "check":  # which makes nothing
+                self.tasks[stage] += 1
+            # as to another process
+            yield from super().map(stage, function, [pickle.loads(pickle.dumps(task))], watch)
 
 
 class Place:
@@ -284,34 +287,112 @@ def test_what_a_task_left_half_done_is_no_result(place: Place, finished: Finishe
     assert place.run().digest == finished.summary.digest
 
 
-@pytest.mark.slow
-def test_what_was_kept_shortly_before_a_loss_of_power_is_done_again(
-    used: Place, finished: Finished, monkeypatch: pytest.MonkeyPatch
+def cut(path: Path) -> None:
+    """Only the first half of a file reached the disk."""
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def emptied(path: Path) -> None:
+    """Nothing of it did."""
+    path.write_bytes(b"")
+
+
+def zeroed(path: Path) -> None:
+    """The file has its length, and the second half is zeros."""
+    content = path.read_bytes()
+    half = len(content) // 2
+    path.write_bytes(content[:half] + bytes(len(content) - half))
+
+
+def flipped(path: Path) -> None:
+    """One bit of the last byte is wrong."""
+    content = path.read_bytes()
+    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+
+
+TEARS = [cut, emptied, zeroed, flipped, Path.unlink]
+
+
+def torn(folder: Path, pattern: str, tear: Callable[[Path], object], number: int = 0) -> Path:
+    """Tear one of the files of a pattern, empty ones apart; its path."""
+    path = sorted(path for path in folder.glob(pattern) if path.stat().st_size)[number]
+    before = path.read_bytes() if path.is_file() else b""
+    tear(path)
+    assert not path.is_file() or path.read_bytes() != before
+    return path
+
+
+def has_warned(summary: RunSummary, where: str) -> bool:
+    """Whether a run said that something stored was damaged, and its task ran again."""
+    return any("were damaged and are made again" in line and where in line for line in summary.warnings)
+
+
+@pytest.mark.parametrize("tear", TEARS)
+def test_a_torn_outcome_or_published_file_costs_its_task(
+    used: Place, finished: Finished, tear: Callable[[Path], object]
 ) -> None:
-    whole = finished.summary
-    kept = sorted((used.folder / "work" / "scratch" / "kept").glob("*/*/*"))
-    old = [path for path in kept if path.parent.parent.name.startswith(("ingest", "tiles"))]
-    for path in old:
-        os.utime(path, ns=(0, path.stat().st_mtime_ns - 400 * 10**9))
-    late = next(path for path in kept if path.parent.parent.name.startswith("models-"))
-    late.write_bytes(late.read_bytes()[:20])
-    used.tasks.clear()
-    monkeypatch.setattr("pipeline.runtime.scratch.work_folder.boot_id", lambda: "another-boot")
-    assert used.run().digest == whole.digest
-    assert set(used.tasks) == {"join", "outline", "reconstruct", "publish"}
-    used.tasks.clear()
-    assert used.run().digest == whole.digest
+    kept, run_dir = used.folder / "work" / "scratch" / "kept", used.folder / "run"
+    for stage in ("ingest", "cells", "ground", "tiles", "units", "outline"):
+        torn(kept, f"{stage}/*/*", tear)
+    tiles = {torn(kept, "publish-*/*/*", tear, 1).parent.name}
+    tiles.add(torn(run_dir, "state/*.json", tear, 2).stem)
+    for number, table in enumerate(("buildings", "planes", "rejected", "decisions", "cityjson")):
+        tiles.add(torn(run_dir, f"{table}/*/*", tear, number % 3 + 2).parent.name.removeprefix("tile="))
+    tiles.add(torn(run_dir, "meshes/*/*", tear, 5).parent.name)
+    torn(run_dir, "run.json", tear)
+    torn(used.folder / "work", "work.json", tear)
+    again = used.run()
+    assert again.digest == finished.summary.digest
+    found = {"ingest": 1, "cells": 1, "ground": 1, "split": 1, "join": 1, "outline": 1}
+    assert used.tasks == {**found, "publish": len(tiles)}
+    assert files_of(run_dir) == files_of(finished.aside / "run")
+    assert has_warned(again, "publish")
+    assert used.run().digest == again.digest
     assert not used.tasks
 
 
-@pytest.mark.slow
-def test_another_machine_goes_on_with_all_that_was_kept(
-    used: Place, finished: Finished, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("tear", TEARS)
+def test_a_torn_file_of_points_or_terrain_costs_its_task_where_it_is_read(
+    used: Place, finished: Finished, tear: Callable[[Path], object]
 ) -> None:
-    monkeypatch.setattr("pipeline.runtime.scratch.work_folder.boot_id", lambda: "another-boot")
-    monkeypatch.setattr("socket.gethostname", lambda: "elsewhere")
+    scratch = used.folder / "work" / "scratch"
+    arrays = ("cells/*/states", "cells/*/lowest", "ground/*/terrain", "ground/*/corner")
+    files = [torn(scratch, f"{name}.npy", tear, 2 * k) for k, name in enumerate(arrays)]
+    files += [torn(scratch, "points/*/*.bin", tear, 5), torn(scratch, "units/*/*/points.npy", tear)]
+    used.run()
+    assert not used.tasks  # nothing reads them
+    for stage in ("outline", "models-*"):
+        for path in scratch.glob(f"kept/{stage}/*/*"):
+            path.unlink()
+    used.tasks.clear()
+    again = used.run()
+    whole = finished.tasks
+    assert again.digest == finished.summary.digest
+    repaired = {"ingest": 1, "cells": 2, "ground": 1, "join": 1}
+    assert used.tasks == {"outline": whole["outline"], "reconstruct": whole["reconstruct"], **repaired}
+    assert has_warned(again, "")
+    # the sorted points of a tile are read where units are divided
+    files.append(max(scratch.glob("tiles/*/points.npy"), key=lambda path: path.stat().st_size))
+    tear(files[-1])
+    for path in scratch.glob("kept/units/*/*"):
+        path.unlink()
+    used.tasks.clear()
     assert used.run().digest == finished.summary.digest
-    assert not used.tasks
+    assert used.tasks == {"split": 1, "join": whole["join"]}
+    for path in files:
+        assert path.read_bytes() == (finished.aside / path.relative_to(used.folder)).read_bytes()
+
+
+@pytest.mark.parametrize("tear", [flipped, zeroed])
+def test_a_torn_batch_of_models_is_made_again_where_it_is_published(
+    used: Place, finished: Finished, tear: Callable[[Path], object]
+) -> None:
+    path = torn(used.folder / "work" / "scratch" / "kept", "models-*/*/*", tear, 1)
+    shutil.rmtree(used.folder / "run" / "state")
+    again = used.run()
+    assert again.digest == finished.summary.digest
+    assert used.tasks == {"reconstruct": 1, "publish": finished.tasks["publish"]}
+    assert has_warned(again, path.parent.name)
 
 
 def test_a_check_whether_a_folder_is_locked_refuses_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,7 +26,7 @@ from pipeline.roof.arrangement.far_corners import (
 from pipeline.roof.arrangement.joined_planes import joined_planes
 from pipeline.roof.arrangement.limits import Limits, limits_at
 from pipeline.roof.arrangement.merged_vertices import Borders, edges_of_rings, merge_vertices, rings_with_merged
-from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, neighbour_lists
+from pipeline.roof.arrangement.minimum_cut import costs_of_all, every_label, expand_labels, neighbour_lists
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
 from pipeline.roof.arrangement.raster_labels import raster_labels
 from pipeline.roof.arrangement.subdivision import CELLS, EDGES, VERTICES, Subdivision, subdivide, subdivision_of
@@ -117,7 +117,7 @@ def _label_cells(
         if chosen[i] < 0:
             chosen[i] = np.argmin(costs[i])
     neighbours = neighbour_lists(n_cells, borders, weights)
-    expand_labels(costs, every_label(n_cells, len(planes)), neighbours, chosen, _ROUNDS)
+    expand_labels(costs_of_all(costs), every_label(n_cells, len(planes)), neighbours, chosen, _ROUNDS)
     held = points_per_cell(cells, n_cells)
     unite_faces(plan, misfits, held, borders, weights, chosen, limits)
     return cells

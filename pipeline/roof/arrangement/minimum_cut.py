@@ -37,6 +37,48 @@ class Allowed(NamedTuple):
     """(k + 1,) int32, first entry of every label."""
 
 
+class Costs(NamedTuple):
+    """Costs of k labels at n nodes, of which few differ from the node's usual one, in compressed rows.
+
+    A hall with hundreds of planes has hundreds of thousands of places, and few planes explain anything at one of them.
+    """
+
+    starts: IntArray
+    """(n + 1,) int64, first entry of every node."""
+    labels: LabelArray
+    """(m,) int32, labels with a cost of their own, ascending at each node."""
+    costs: IntArray
+    """(m,) int64, their costs."""
+    others: IntArray
+    """(n,) int64, cost of every other label."""
+
+
+@kernel
+def costs_of_all(costs: IntArray) -> Costs:
+    """Costs (n, k) in compressed rows, all of them."""
+    n, k = costs.shape
+    labels, starts = np.empty(n * k, np.int32), np.empty(n + 1, np.int64)
+    for i in range(n + 1):
+        starts[i] = i * k
+    for s in range(n * k):
+        labels[s] = s % k
+    return Costs(starts, labels, costs.ravel(), np.zeros(n, np.int64))
+
+
+@kernel(inline="always")
+def cost_of(costs: Costs, node: int, label: int) -> int:
+    """Cost of a label at a node."""
+    first, last = costs.starts[node], costs.starts[node + 1]
+    found: int = costs.others[node]
+    if first + label < last and costs.labels[first + label] == label:
+        found = costs.costs[first + label]
+    else:
+        for s in range(first, min(last, first + label)):
+            if costs.labels[s] == label:
+                found = costs.costs[s]
+    return found
+
+
 class _Flow(NamedTuple):
     """A graph with capacities: n nodes, the source n and the sink n + 1. Arcs a and a ^ 1 are each other's reverse."""
 
@@ -166,7 +208,7 @@ def _cut(flow: _Flow, n: int) -> None:
 
 @kernel(inline="always")
 def _mark_movable(
-    costs: IntArray, nodes: LabelArray, neighbours: Neighbours, labels: LabelArray, alpha: int, moves: _Moves
+    costs: Costs, nodes: LabelArray, neighbours: Neighbours, labels: LabelArray, alpha: int, moves: _Moves
 ) -> None:
     """Give the number 0 to the nodes, among those given, that can take alpha in a minimum cut.
 
@@ -177,13 +219,13 @@ def _mark_movable(
     starts, others, weights = neighbours
     number, change, queue, bound = moves
     for p in nodes:
-        if labels[p] != alpha and costs[p, alpha] - costs[p, labels[p]] < bound[p]:
+        if labels[p] != alpha and cost_of(costs, p, alpha) - cost_of(costs, p, labels[p]) < bound[p]:
             number[p] = 0
     tail = 0
     for p in nodes:
         if number[p] < 0:
             continue
-        cost = costs[p, alpha] - costs[p, labels[p]]
+        cost = cost_of(costs, p, alpha) - cost_of(costs, p, labels[p])
         for e in range(starts[p], starts[p + 1]):
             r = others[e]
             if number[r] >= 0:
@@ -229,7 +271,7 @@ def _add_arc(flow: _Flow, arc: int, tail: int, head: int, capacity: int) -> None
 
 @kernel(inline="always")
 def _build_flow(
-    costs: IntArray,
+    costs: Costs,
     nodes: LabelArray,
     neighbours: Neighbours,
     labels: LabelArray,
@@ -248,7 +290,7 @@ def _build_flow(
         i = number[p]
         if i < 0:
             continue
-        cost = costs[p, alpha] - costs[p, labels[p]]
+        cost = cost_of(costs, p, alpha) - cost_of(costs, p, labels[p])
         for e in range(starts[p], starts[p + 1]):
             r = others[e]
             j = number[r]
@@ -274,12 +316,12 @@ def _build_flow(
 
 
 @kernel
-def expand_labels(costs: IntArray, allowed: Allowed, neighbours: Neighbours, labels: LabelArray, rounds: int) -> None:
+def expand_labels(costs: Costs, allowed: Allowed, neighbours: Neighbours, labels: LabelArray, rounds: int) -> None:
     """Lower the cost of labels, in place, by expansions of every label in turn until none helps.
 
-    `costs` (n, k) are those of every label at every node. There are at most so many `rounds` through all labels.
+    `costs` are those of every label at every node. There are at most so many `rounds` through all labels.
     """
-    n, k = costs.shape
+    n, k = len(costs.others), len(allowed.starts) - 1
     n_arcs = 2 * (len(neighbours.others) // 2 + n)
     flow = _Flow(
         np.empty(n + 2, np.int32),

@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.merge_sort import in_order
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.roof.arrangement.minimum_cut import Allowed, expand_labels, neighbour_lists
+from pipeline.roof.arrangement.minimum_cut import Allowed, Costs, cost_of, expand_labels, neighbour_lists
 
 COST_SCALE = 1000
 """Integer cost of one unexplained point."""
@@ -78,36 +79,42 @@ def raster_cells(edges: FloatArray, west: float, south: float, cell_m: float, co
 
 
 @kernel
-def _cell_costs(
-    points: FloatArray, planes: FloatArray, cap_m: float, raster: Raster
-) -> tuple[IntArray, LabelArray, LabelArray]:
-    """Cost of k planes in n cells, (n, k); points in each, (n,); whether a plane explains one of them, (n, k)."""
+def _cell_costs(points: FloatArray, planes: FloatArray, cap_m: float, raster: Raster) -> Costs:
+    """Costs of k planes in n cells: other planes than those listed explain none of a cell's points."""
     n = len(raster.place)
-    k = len(planes)
-    costs = np.zeros((n, k), np.int64)
-    count = np.zeros(n, np.int32)
-    near = np.zeros((n, k), np.int32)
+    cell_of = np.full(len(points), -1, np.int32)
     for i in range(len(points)):
         c = int((points[i, 0] - raster.west) / raster.cell_m)
         r = int((points[i, 1] - raster.south) / raster.cell_m)
-        if c < 0 or r < 0 or c >= raster.columns or r >= raster.rows:
-            continue
-        cell = raster.number[r * raster.columns + c]
-        if cell < 0:
-            continue
-        count[cell] += 1
-        for label in range(k):
-            off = vertical_distance_m(points[i], planes[label])
-            if off < cap_m:
-                costs[cell, label] += int(COST_SCALE * off / cap_m)
-                near[cell, label] = 1
-            else:
-                costs[cell, label] += COST_SCALE
-    return costs, count, near
+        if c >= 0 and r >= 0 and c < raster.columns and r < raster.rows:
+            cell_of[i] = raster.number[r * raster.columns + c]
+    first, members = counting_sort(cell_of, n)
+    starts, others = np.zeros(n + 1, np.int64), np.empty(n, np.int64)
+    explaining, costs = np.empty(2 * n + 64, np.int32), np.empty(2 * n + 64, np.int64)
+    m = 0
+    for cell in range(n):
+        others[cell] = COST_SCALE * (first[cell + 1] - first[cell])
+        for label in range(len(planes)):
+            cost, explains = 0, False
+            for s in range(first[cell], first[cell + 1]):
+                off = vertical_distance_m(points[members[s]], planes[label])
+                if off < cap_m:
+                    cost += int(COST_SCALE * off / cap_m)
+                    explains = True
+                else:
+                    cost += COST_SCALE
+            if explains:
+                if m == len(costs):
+                    explaining = np.concatenate((explaining, np.empty(m, np.int32)))
+                    costs = np.concatenate((costs, np.empty(m, np.int64)))
+                explaining[m], costs[m] = label, cost
+                m += 1
+        starts[cell + 1] = m
+    return Costs(starts, explaining[:m].copy(), costs[:m].copy(), others)
 
 
 @kernel
-def _first_labels(costs: IntArray, count: LabelArray, raster: Raster) -> LabelArray:
+def _first_labels(costs: Costs, raster: Raster) -> LabelArray:
     """The best label of every cell with points, (n,); from there outwards over those without."""
     number, place, columns, rows = raster.number, raster.place, raster.columns, raster.rows
     n = len(place)
@@ -115,8 +122,13 @@ def _first_labels(costs: IntArray, count: LabelArray, raster: Raster) -> LabelAr
     queue = np.empty(n, np.int32)
     tail = 0
     for i in range(n):
-        if count[i] > 0:
-            labels[i] = np.argmin(costs[i])
+        if costs.others[i] > 0:
+            # of equal costs the first plane's; the first of all where none explains anything
+            labels[i] = 0
+            least = costs.others[i]
+            for s in range(costs.starts[i], costs.starts[i + 1]):
+                if costs.costs[s] < least:
+                    labels[i], least = costs.labels[s], costs.costs[s]
             queue[tail] = i
             tail += 1
     head = 0
@@ -162,32 +174,37 @@ def _raster_edges(raster: Raster, side: int, diagonal: int) -> tuple[IntArray, I
 
 
 @kernel
-def _near_own_points(near: LabelArray, labels: LabelArray, raster: Raster) -> Allowed:
-    """For every label the cells within two cells of a point that it explains, and those that start with it."""
+def _near_own_points(costs: Costs, labels: LabelArray, raster: Raster, k: int) -> Allowed:
+    """For each of k labels the cells within two cells of a point that it explains, and those that start with it."""
     number, place, columns, rows = raster.number, raster.place, raster.columns, raster.rows
-    n, k = near.shape
-    allowed = np.zeros((k, n), np.uint8)
+    n = len(place)
+    cell_of = np.empty(len(costs.labels), np.int32)
     for i in range(n):
-        r, c = place[i] // columns, place[i] % columns
-        allowed[labels[i], i] = 1
-        for label in range(k):
-            if near[i, label] == 0:
-                continue
+        cell_of[costs.starts[i] : costs.starts[i + 1]] = i
+    first, entries = counting_sort(costs.labels, k)
+    first_own, own = counting_sort(labels, k)
+    allowed = np.zeros(n, np.bool_)
+    nodes = np.empty(min(n * k, n + 25 * len(cell_of)), np.int32)
+    starts = np.zeros(k + 1, np.int32)
+    m = 0
+    for label in range(k):
+        allowed[:] = False
+        for s in range(first_own[label], first_own[label + 1]):
+            allowed[own[s]] = True
+        for s in range(first[label], first[label + 1]):
+            i = cell_of[entries[s]]
+            r, c = place[i] // columns, place[i] % columns
             for rr in range(max(r - 2, 0), min(r + 3, rows)):
                 for cc in range(max(c - 2, 0), min(c + 3, columns)):
                     j = number[rr * columns + cc]
                     if j >= 0:
-                        allowed[label, j] = 1
-    nodes = np.empty(k * n, np.int32)
-    starts = np.zeros(k + 1, np.int32)
-    m = 0
-    for label in range(k):
+                        allowed[j] = True
         for i in range(n):
-            if allowed[label, i] != 0:
+            if allowed[i]:
                 nodes[m] = i
                 m += 1
         starts[label + 1] = m
-    return Allowed(nodes[:m], starts)
+    return Allowed(nodes[:m].copy(), starts)
 
 
 @kernel(inline="always")
@@ -202,7 +219,7 @@ def _border_cost(framed: LabelArray, here: int, around: IntArray, weight: IntArr
 
 
 @kernel
-def _settle(costs: IntArray, raster: Raster, side: int, diagonal: int, labels: LabelArray) -> None:
+def _settle(costs: Costs, raster: Raster, side: int, diagonal: int, labels: LabelArray) -> None:
     """Give every cell the best label among its own and its neighbours', until none changes (Besag 1986).
 
     After the first round a cell is looked at again only if a neighbour has changed: else it would choose the same.
@@ -235,14 +252,14 @@ def _settle(costs: IntArray, raster: Raster, side: int, diagonal: int, labels: L
             if not mixed:
                 continue
             best = own
-            least = costs[i, best] + _border_cost(framed, here, around, weight, own)
+            least = cost_of(costs, i, best) + _border_cost(framed, here, around, weight, own)
             tried = own
             for s in range(8):
                 label = framed[here + around[s]]
                 if label < 0 or label in (own, tried):
                     continue
                 tried = label
-                cost = costs[i, label] + _border_cost(framed, here, around, weight, label)
+                cost = cost_of(costs, i, label) + _border_cost(framed, here, around, weight, label)
                 if cost < least or (cost == least and label < best and best != own):
                     best = label
                     least = cost
@@ -280,15 +297,16 @@ def raster_labels(
             east, north = max(east, edges[e, end]), max(north, edges[e, end + 1])
     columns, rows = int((east - west) / cell_m) + 1, int((north - south) / cell_m) + 1
     raster = raster_cells(edges, west, south, cell_m, columns, rows)
-    costs, count, near = _cell_costs(points, planes, cap_m, raster)
-    coarse = _first_labels(costs, count, raster)
+    costs = _cell_costs(points, planes, cap_m, raster)
+    coarse = _first_labels(costs, raster)
     side = int(COST_SCALE * cost_per_m * cell_m * _SIDE)
     diagonal = int(COST_SCALE * cost_per_m * cell_m * _DIAGONAL)
     if len(planes) > 1:
         _settle(costs, raster, side, diagonal, coarse)
         pairs, weights = _raster_edges(raster, side, diagonal)
         neighbours = neighbour_lists(len(raster.place), pairs, weights)
-        expand_labels(costs, _near_own_points(near, coarse, raster), neighbours, coarse, _ROUNDS)
+        allowed = _near_own_points(costs, coarse, raster, len(planes))
+        expand_labels(costs, allowed, neighbours, coarse, _ROUNDS)
 
     fine = raster_cells(edges, west, south, 0.5 * cell_m, 2 * columns, 2 * rows)
     labels = np.full(len(fine.place), -1, np.int32)
@@ -302,6 +320,6 @@ def raster_labels(
                         labels[i] = coarse[raster.number[rr * columns + cc]]
         labels[i] = max(labels[i], 0)
     if len(planes) > 1:
-        costs, _, _ = _cell_costs(points, planes, cap_m, fine)
+        costs = _cell_costs(points, planes, cap_m, fine)
         _settle(costs, fine, side // 2, diagonal // 2, labels)
     return labels, fine

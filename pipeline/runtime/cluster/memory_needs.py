@@ -17,10 +17,10 @@ DECLARED_FROM_BYTES = 2**29
 """Smaller needs are not declared: every usable worker has this much per thread."""
 BUILDING_BASE_BYTES = 280 * 2**20
 """Memory of a process that models buildings, before the first one."""
-BUILDING_BYTES_PER_POINT = 10_000
-"""Peak above it, in bytes per point. Measured by `benchmarks/giant_memory.py`: 300 for flat halls, 1,000 to 3,600 for
-saw-tooth roofs, 8,300 to 9,700 for roofs full of things. It depends on the number of faces, which is unknown before, so
-this is the maximum; the limit of a building's process bounds it."""
+BUILDING_BYTES_PER_POINT = 2_000
+"""Peak above it, in bytes per point. Measured by `benchmarks/giant_memory.py`: 390 to 430 for flat halls, up to 490 for
+saw-tooth roofs, 580 to 1,070 for roofs full of things. It depends on the number of faces, which is unknown before, so
+this is twice the maximum; the limit of a building's process bounds it."""
 WINDOW_BASE_BYTES = 300 * 2**20
 """Memory of a worker, before the first split."""
 
@@ -31,8 +31,8 @@ def building_bytes(points: int, limit_bytes: int | None = None) -> int:
     Examples
     --------
     >>> [round(building_bytes(points) / 2**30, 1) for points in (1_000, 50_000, 1_000_000)]
-    [0.3, 0.7, 9.6]
-    >>> building_bytes(1_000_000, 4 * 2**30) == 4 * 2**30
+    [0.3, 0.4, 2.1]
+    >>> building_bytes(4_000_000, 4 * 2**30) == 4 * 2**30
     True
     """
     need = BUILDING_BASE_BYTES + BUILDING_BYTES_PER_POINT * points

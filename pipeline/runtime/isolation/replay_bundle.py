@@ -15,6 +15,7 @@ import platform
 import zipfile
 import zlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,15 @@ class Bundle:
     incident: Incident
     reference: SpatialReference = dataclasses.field(default_factory=SpatialReference)
     """CRS and units of its outputs."""
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a bundle is as it was written, by its own checksums."""
+    try:
+        with zipfile.ZipFile(path) as parts:
+            return parts.testzip() is None
+    except (zipfile.BadZipFile, zlib.error, EOFError):
+        return False
 
 
 def write_bundle(folder: str, bundle: Bundle) -> str:

@@ -42,7 +42,8 @@ POINT = np.dtype(
 
 
 _CANCELLED = "cancelled"
-_ATTEMPTS = "attempts"
+ATTEMPTS = "attempts"
+"""Folder with the mark of the attempt at a run that works in scratch which outlives its runs."""
 _LONGEST_HEADER_BYTES = 256
 """Enough for the arrays stored here, numbers of up to three dimensions."""
 
@@ -81,7 +82,7 @@ class Scratch:
         """
         Path(self.root).mkdir(parents=True, exist_ok=True)
         if self.attempt:
-            folder = Path(self.root, _ATTEMPTS)
+            folder = Path(self.root, ATTEMPTS)
             folder.mkdir(exist_ok=True)
             for earlier in folder.iterdir():
                 earlier.unlink(missing_ok=True)
@@ -168,7 +169,7 @@ class Scratch:
 
     @property
     def _mark(self) -> Path:
-        return Path(self.root, _ATTEMPTS, self.attempt)
+        return Path(self.root, ATTEMPTS, self.attempt)
 
     @property
     def cancelled(self) -> bool:
@@ -182,3 +183,33 @@ class Scratch:
         """Raise `RunCancelledError` in a task of a run that was cancelled."""
         if self.cancelled:
             raise RunCancelledError("the run was cancelled")
+
+
+@dataclasses.dataclass(frozen=True)
+class OpenScratch(Scratch):
+    """The same folder for one batch of items, of which many read the same arrays: each array is opened once.
+
+    For as long as nothing writes to these arrays. It travels to other processes closed.
+    """
+
+    _held: dict[tuple[str, str], npt.NDArray[Any]] = dataclasses.field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    def __reduce__(self) -> tuple[type[OpenScratch], tuple[str, str]]:
+        """Only the place of the folder."""
+        return OpenScratch, (self.root, self.attempt)
+
+    def array(self, name: str, key: str, *, mapped: bool = False) -> npt.NDArray[Any]:
+        """One stored array, mapped once if it is large."""
+        found = self._held.get((name, key))
+        if found is None:
+            found = self._held[name, key] = super().array(name, key, mapped=mapped)
+        return found
+
+    def rows(self, name: str, key: str, start: int, stop: int) -> npt.NDArray[Any]:
+        """Some rows of a stored array; raises ValueError if the file ends before them."""
+        found = self.array(name, key, mapped=True)[start:stop]
+        if len(found) != stop - start:
+            raise ValueError(f"{name}/{key} ends before row {stop}")
+        return found

@@ -21,8 +21,10 @@ import enum
 import functools
 import hashlib
 import itertools
+import os
 import pickle
 import struct
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
@@ -40,12 +42,19 @@ Brief = TypeVar("Brief")
 
 FOLDER = "kept"
 """Folder of scratch for all outcomes."""
-_FORMAT = 6
+_FORMAT = 7
 """Part of every key, to be raised when the class of an outcome moves or gets another content: the pickles of an older
 checkout of the same version are then not read."""
 _KEY_DIGITS = 40
 """Hexadecimal digits of a key: 160 bits."""
-_OFFSET = struct.Struct("<Q")
+_HEAD = struct.Struct("<QQII")
+"""Before a stored outcome: the bytes of the whole file and of the brief, the checksums of brief and result."""
+_PART = struct.Struct("<QQI")
+"""Where a part begins and ends in the file, and its checksum."""
+
+
+class DamagedError(RunError):
+    """A stored outcome is not as it was written."""
 
 
 def key_of(*parts: object) -> str:
@@ -98,7 +107,8 @@ def _add(update: Callable[[bytes], None], value: object) -> None:
     elif isinstance(value, shapely.Geometry):
         _add(update, shapely.to_wkb(value, include_srid=True))
     elif isinstance(value, np.ndarray):
-        _add(update, (value.dtype.str, value.shape, np.ascontiguousarray(value).tobytes()))
+        update(f"array {value.dtype.str} {value.shape} ".encode())
+        update(np.ascontiguousarray(value).tobytes())
     elif isinstance(value, Sequence):
         update(f"sequence {len(value)} ".encode())
         for entry in value:
@@ -201,48 +211,98 @@ def run_and_store(work: OutcomeTask[Task, Result, Brief]) -> StoredOutcome[Brief
 def _packed(brief: object, result: object) -> bytes:
     """The two pickles one after the other, so that the brief can be read alone; in place of the second, the parts.
 
-    Before the parts is a table of where each begins in the file, and where the last one ends.
+    Before the parts is a table of where each lies in the file, with its checksum.
     """
     first = pickle.dumps(brief, protocol=pickle.HIGHEST_PROTOCOL)
-    head = len(first).to_bytes(8, "little") + first
     if isinstance(result, InParts):
         pieces = [pickle.dumps(part, protocol=pickle.HIGHEST_PROTOCOL) for part in result.parts]
-        begin = len(head) + _OFFSET.size * (len(pieces) + 1)
-        offsets = itertools.accumulate(map(len, pieces), initial=begin)
-        return b"".join((head, *map(_OFFSET.pack, offsets), *pieces))
-    second = b"" if result is brief else pickle.dumps(result, protocol=pickle.HIGHEST_PROTOCOL)
-    return head + second
+        begin = _HEAD.size + len(first) + _PART.size * len(pieces)
+        edges = itertools.pairwise(itertools.accumulate(map(len, pieces), initial=begin))
+        table = (_PART.pack(*edge, zlib.crc32(piece)) for edge, piece in zip(edges, pieces, strict=True))
+        second = b"".join((*table, *pieces))
+    else:
+        second = b"" if result is brief else pickle.dumps(result, protocol=pickle.HIGHEST_PROTOCOL)
+    size = _HEAD.size + len(first) + len(second)
+    return _HEAD.pack(size, len(first), zlib.crc32(first), zlib.crc32(second)) + first + second
 
 
 def brief_of(scratch: Scratch, place: Place) -> Any:
-    """The brief of a stored outcome. Only for our own scratch: pickles run code."""
+    """The brief of a stored outcome; raises DamagedError. Only for our own scratch: pickles run code."""
     with Path(scratch.root, place.name).open("rb") as stream:
-        size = int.from_bytes(stream.read(8), "little")
-        return pickle.loads(stream.read(size))  # noqa: S301
+        return pickle.loads(_first_of(stream, place)[0])  # noqa: S301
 
 
 def result_of(scratch: Scratch, place: Place) -> Any:
     """The result of a stored outcome. Only for our own scratch: pickles run code.
 
-    Raises RunCancelledError if the outcome is gone, and the run with it.
+    Raises
+    ------
+    RunCancelledError
+        The outcome is gone, and the run with it.
+    DamagedError
+        It is not as it was written.
     """
     with _opened(scratch, place) as stream:
-        content = stream.read()
-    first = 8 + int.from_bytes(content[:8], "little")
-    return pickle.loads(content[first:] or content[8:first])  # noqa: S301
+        first, second = _whole_of(stream, place)
+    return pickle.loads(second or first)  # noqa: S301
 
 
 def part_of(scratch: Scratch, place: Place, number: int) -> Any:
     """A part of a stored result that is `InParts`, counted from 0; the others are not read.
 
-    Raises RunCancelledError as `result_of`.
+    Raises the errors of `result_of`.
     """
     with _opened(scratch, place) as stream:
-        size = int.from_bytes(stream.read(8), "little")
-        stream.seek(8 + size + _OFFSET.size * number)
-        begin, end = (_OFFSET.unpack(stream.read(_OFFSET.size))[0] for _ in range(2))
-        stream.seek(begin)
-        return pickle.loads(stream.read(end - begin))  # noqa: S301
+        start = _HEAD.size + _head_of(stream, place)[0]
+        stream.seek(start + _PART.size * number)
+        entry = stream.read(_PART.size)
+        begin, end, checksum = _PART.unpack(entry) if len(entry) == _PART.size else (0, 0, 1)
+        content = b""
+        if begin <= end <= os.fstat(stream.fileno()).st_size:
+            stream.seek(begin)
+            content = stream.read(end - begin)
+    if zlib.crc32(content) != checksum:
+        raise _damaged(place)
+    return pickle.loads(content)  # noqa: S301
+
+
+def check_outcome(scratch: Scratch, place: Place) -> None:
+    """Raise DamagedError if a stored outcome is not as it was written; the errors of `result_of`."""
+    with _opened(scratch, place) as stream:
+        _whole_of(stream, place)
+
+
+def _head_of(stream: BinaryIO, place: Place) -> tuple[int, int, int]:
+    """Bytes of the brief, and the checksums of brief and result; the file has the length that it was written with."""
+    head = stream.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        raise _damaged(place)
+    size, first, *checksums = _HEAD.unpack(head)
+    if os.fstat(stream.fileno()).st_size != size or _HEAD.size + first > size:
+        raise _damaged(place)
+    return first, checksums[0], checksums[1]
+
+
+def _first_of(stream: BinaryIO, place: Place) -> tuple[bytes, int]:
+    """The pickled brief, and the checksum of what follows it."""
+    size, checksum, of_rest = _head_of(stream, place)
+    first = stream.read(size)
+    if zlib.crc32(first) != checksum:
+        raise _damaged(place)
+    return first, of_rest
+
+
+def _whole_of(stream: BinaryIO, place: Place) -> tuple[bytes, bytes]:
+    """The pickled brief and what follows it."""
+    first, checksum = _first_of(stream, place)
+    rest = stream.read()
+    if zlib.crc32(rest) != checksum:
+        raise _damaged(place)
+    return first, rest
+
+
+def _damaged(place: Place) -> DamagedError:
+    return DamagedError(f"{place.name} in the scratch folder is damaged. Run again: its task is then repeated")
 
 
 @contextlib.contextmanager

@@ -20,7 +20,7 @@ from uuid import uuid4
 
 from pipeline.errors import RunError
 from pipeline.io import LocalStorage
-from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.folder import ATTEMPTS, Scratch
 from pipeline.runtime.scratch.outcomes import FOLDER
 
 _LOCK = "lock"
@@ -34,9 +34,6 @@ _BESIDE = {_LOCK, "status.json"}
 _PATIENCE_S, _PAUSE_S = 0.5, 0.01
 """How long, and how often, a lock is tried again: a process that only checks a lock holds it for microseconds."""
 _FORMAT = 1
-_BOOT = "boot"
-_DISTRUSTED_S = 300.0
-"""Outcomes this young may be incomplete after a loss of power: ten times as long as systems delay writes."""
 _OF_A_RUN = ("dask", "fetched")
 """Folders of scratch that only a killed process leaves behind."""
 
@@ -53,37 +50,9 @@ def locked_work(folder: str) -> Iterator[Scratch]:
     with locked_file(root, _LOCK):
         scratch = Scratch(str(root / _SCRATCH), attempt=uuid4().hex)
         scratch.create()
-        _distrust_the_last(root, scratch)
         for left in _OF_A_RUN:
             shutil.rmtree(Path(scratch.root, left), ignore_errors=True)
         yield scratch
-
-
-def _distrust_the_last(root: Path, scratch: Scratch) -> None:
-    """Remove outcomes stored shortly before this machine was restarted.
-
-    What a process wrote survives the process, but not a loss of power: the system writes to the disk up to half a
-    minute later (`vm.dirty_expire_centisecs`), names before contents. An outcome stored within minutes of the end may
-    therefore be incomplete. Where another machine resumes, the folder is on a file server, which has all closed files.
-    """
-    file, host, now = root / _BOOT, socket.gethostname(), boot_id()
-    # a folder without the file is new, and has no outcomes yet
-    before = file.read_text(errors="replace").split() if file.is_file() else [host]
-    if before[:1] == [host] and before[1:] != [now]:
-        kept = [path for path in Path(scratch.root, FOLDER).glob("*/*/*") if path.name[0] != "."]
-        last = max((path.stat().st_mtime for path in kept), default=0.0)
-        for path in kept:
-            if path.stat().st_mtime > last - _DISTRUSTED_S:
-                path.unlink()
-    LocalStorage(root=root).put(_BOOT, f"{host} {now}".encode())
-
-
-def boot_id() -> str:
-    """An id that differs each time this machine starts; `unknown` where the system has none."""
-    try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    except OSError:
-        return "unknown"
 
 
 def make_work(root: Path) -> None:
@@ -154,6 +123,11 @@ def is_at_work(folder: str) -> bool:
     return any(is_locked(folder, name) for name in _LOCKS)
 
 
+def is_known(folder: str, stage: str) -> bool:
+    """Whether a work folder has outcomes of a stage, or had some."""
+    return Path(folder, _SCRATCH, FOLDER, stage).is_dir()
+
+
 def refuse_foreign(folder: str) -> None:
     """Refuse early a folder that cannot be a work folder; makes nothing.
 
@@ -195,21 +169,20 @@ def is_locked(folder: str, lock: str) -> bool:
 def _check_mark(root: Path) -> None:
     """Refuse a folder with files of others, or of another format; mark it as ours."""
     if not _is_marked(root):
-        (root / _MARK).write_text(json.dumps({"format": _FORMAT}) + "\n")
+        LocalStorage(root=root).put(_MARK, (json.dumps({"format": _FORMAT}) + "\n").encode())
 
 
 def _is_marked(root: Path) -> bool:
     """Whether a folder is ours already; raises `RunError` for one with files of others, or of another format."""
     mark = root / _MARK
     if mark.is_file():
-        try:
-            found = json.loads(mark.read_text()).get("format")
-        except (json.JSONDecodeError, AttributeError):
-            found = None
-        if found != _FORMAT:
-            raise RunError(f"{root} was made by another version (format {found!r}): remove it, or give another folder")
-        return True
+        with contextlib.suppress(ValueError):  # cut off, or full of zeros, after a loss of power
+            found = json.loads(mark.read_bytes())
+            kind = found.get("format") if isinstance(found, dict) else None
+            if kind == _FORMAT:
+                return True
+            raise RunError(f"{root} was made by another version (format {kind!r}): remove it, or give another folder")
     left = sorted(entry.name for entry in root.iterdir() if entry.name not in _BESIDE)
-    if left:
+    if left and not (root / _SCRATCH / ATTEMPTS).is_dir():
         raise RunError(f"{root} holds {left[0]} and is no work folder: give a new or empty one")
     return False

@@ -6,6 +6,7 @@ Candidates are first judged without overrides, so one override changes its own b
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -23,7 +24,14 @@ from pipeline.runtime.stages.given_footprints import numbers_by_tile
 from pipeline.runtime.stages.ground import Ground
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
 from pipeline.runtime.stages.join import join_footprints
-from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, RejectedSite, largest_first
+from pipeline.runtime.stages.sites import (
+    CandidateSite,
+    Joined,
+    PointRange,
+    RejectedSite,
+    folders_with_points,
+    largest_first,
+)
 from pipeline.runtime.stages.split import SplitWindows, split_windows
 from pipeline.settings import RunSettings
 from pipeline.terrain.candidates import Verdict
@@ -84,6 +92,7 @@ def apply_overrides(
 ) -> tuple[Joined, tuple[EntryOutcome, ...]]:
     """The candidates after the overrides, and the outcome of each entry; its time counts as join and redraw."""
     started = time.perf_counter()
+    context.check(_read(overrides, joined, context.plan.grid))
     outcomes = outcomes_of(overrides, joined, context.scratch, context.plan.grid)
     redrawn: dict[str, tuple[PointRange, ...]] = {}
     for number, layer in enumerate(_layers_of(outcomes)):
@@ -92,6 +101,20 @@ def apply_overrides(
     timings = context.progress.timings
     timings["join"] = timings.get("join", 0.0) + time.perf_counter() - started - timings.get("redraw", 0.0)
     return changed, outcomes
+
+
+def _read(overrides: Sequence[Override], joined: Joined, grid: TileGrid) -> set[str]:
+    """The folders of scratch with the points of all sites that the overrides name, or that lie near a place of one."""
+    names = {name for one in overrides for name in (one.building_id, one.source_id) if name is not None}
+    reach = round(NEAREST_M * MM)
+    places = [tuple(round(value * MM) for value in one.point_m) for one in overrides if one.point_m is not None]
+    squares = [Window(x0_mm=x, y0_mm=y, x1_mm=x + 1, y1_mm=y + 1).grown(reach) for x, y in places]
+    near = {tile for square in squares for tile in grid.tiles_over(square)}
+    named = [site.ranges for site in joined.candidates if not names.isdisjoint((site.building_id, site.source_id))]
+    named += [site.ranges for site in joined.rejected if site.object_id in names]
+    every = itertools.chain((site.ranges for site in joined.candidates), (site.ranges for site in joined.rejected))
+    named += [ranges for ranges in every if any(part.tile in near for part in ranges)]
+    return folders_with_points(part for ranges in named for part in ranges)
 
 
 def _redrawn(

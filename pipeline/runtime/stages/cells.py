@@ -10,8 +10,9 @@ import dataclasses
 import functools
 import hashlib
 import math
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
 from pipeline.runtime.plan import points_bytes
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.cleanup import clear_tiles
 from pipeline.runtime.stages.ingested import Ingested, content_by_tile, points_by_tile
@@ -63,6 +65,8 @@ class TileCells:
     """Gross outliers among the others."""
     outcome: str
     """Digest of the cells."""
+    states: int
+    """CRC-32 of the states of its points."""
 
 
 def find_all_cells(
@@ -92,8 +96,20 @@ def find_all_cells(
             memory_bytes=points_bytes(points[tile]),
         )
     clear_tiles(context.scratch, FOLDER, tasks)
-    found_cells = context.map_stored("cells", functools.partial(find_cells, settings=settings), tasks, whole)
+    function = functools.partial(find_cells, settings=settings)
+    stored: Files[CellsTask, TileCells] = Files(reads=_read, leaves=_left, intact=is_intact)
+    found_cells = context.map_stored("cells", function, tasks, whole, files=stored)
     return {cells.tile: cells for cells in found_cells.values()}
+
+
+def _read(task: CellsTask) -> list[str]:
+    """The folders of scratch with the points that a tile's cells depend on."""
+    return [f"points/{tile.key}" for tile in task.grid.tiles_over(task.grid.window(task.tile))]
+
+
+def _left(task: CellsTask, _: TileCells) -> list[str]:
+    """The folder of scratch with a tile's cells."""
+    return [f"{FOLDER}/{task.tile.key}"]
 
 
 def find_cells(task: CellsTask, settings: OutlierSettings) -> TileCells:
@@ -124,16 +140,28 @@ def find_cells(task: CellsTask, settings: OutlierSettings) -> TileCells:
         "lowest": lowest_per_cell(points.x_mm, points.y_mm, points.z_mm, usable, *lattice),
         "occupied": lowest_per_cell(points.x_mm, points.y_mm, points.z_mm, kept, *lattice) != NO_DATA,
     }
-    digest = hashlib.sha256()
-    for raster in rasters.values():
-        digest.update(raster.tobytes())
     scratch.put_arrays(f"{FOLDER}/{task.tile.key}", {"states": states, **rasters})
     return TileCells(
         tile=task.tile,
         duplicates=len(first) - n,
         outliers=int(n - np.count_nonzero(kept)),
-        outcome=digest.hexdigest(),
+        outcome=_digest_of(*rasters.values()),
+        states=zlib.crc32(states.data),
     )
+
+
+def _digest_of(*rasters: npt.NDArray[Any]) -> str:
+    digest = hashlib.sha256()
+    for raster in rasters:
+        digest.update(np.ascontiguousarray(raster).data)
+    return digest.hexdigest()
+
+
+def is_intact(task: CellsTask, found: TileCells, folder: str) -> bool:
+    """Whether what was found of a tile is in a folder of scratch as it was stored."""
+    rasters = (task.scratch.array(folder, name) for name in ("lowest", "occupied"))
+    states = task.scratch.array(folder, "states")
+    return _digest_of(*rasters) == found.outcome and zlib.crc32(states.data) == found.states
 
 
 def _around(task: CellsTask, window: Window) -> list[Columns]:

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.outcomes import FOLDER, Place, brief_of, drop_outcomes, key_of
+from pipeline.runtime.scratch.outcomes import FOLDER, DamagedError, Place, brief_of, drop_outcomes, key_of
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.sites import Joined
 
@@ -23,7 +23,10 @@ def clear_points(scratch: Scratch, wanted: Iterable[Place]) -> None:
     tiles_of: dict[str, set[str]] = {}
     for place in wanted:
         if scratch.has(place.name):
-            found: Ingested = brief_of(scratch, place)
+            try:
+                found: Ingested = brief_of(scratch, place)
+            except DamagedError:
+                continue  # its file is read again
             tiles_of[place.unit] = {tile.key for tile in found.points_by_tile}
     for bucket in Path(scratch.root, "points").glob("*/*"):
         part = bucket.name.removesuffix(".bin")

@@ -13,12 +13,13 @@ import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon, Polygon
 
+from pipeline.compiler import kernel
 from pipeline.export.facts import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.model import BoolArray, Candidate, IntArray
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages.sites import CandidateSite
+from pipeline.runtime.stages.sites import CandidateSite, PointRange
 from pipeline.runtime.stages.surroundings import Surroundings, surroundings_of
 from pipeline.runtime.stages.window_points import bucket_paths
 from pipeline.strip_alignment import aligned_mm
@@ -44,38 +45,93 @@ _HEIGHT_WITHOUT_TERRAIN_MM = 2500
 """Assumed height of the lowest point above ground where no terrain is known."""
 
 
+@kernel
 def _grown(mask: BoolArray, cells: int) -> BoolArray:
-    """Dilation by a square of 2 cells + 1: where the box around a cell holds any True (integral image)."""
+    """Dilation by a square of 2 cells + 1: where the box around a cell holds any True."""
     rows, columns = mask.shape
-    side = 2 * cells + 1
-    sums = np.zeros((rows + side, columns + side), np.int32)
-    sums[cells + 1 : cells + 1 + rows, cells + 1 : cells + 1 + columns] = mask
-    np.cumsum(sums, axis=0, out=sums)
-    np.cumsum(sums, axis=1, out=sums)
-    inside = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
-    grown: BoolArray = inside > 0
+    wide, grown = np.zeros((rows, columns), np.bool_), np.zeros((rows, columns), np.bool_)
+    for r in range(rows):
+        until = -1
+        for c in range(columns + cells):
+            if c < columns and mask[r, c]:
+                until = c + 2 * cells
+            if c >= cells and c <= until:
+                wide[r, c - cells] = True
+    for c in range(columns):
+        until = -1
+        for r in range(rows + cells):
+            if r < rows and wide[r, c]:
+                until = r + 2 * cells
+            if r >= cells and r <= until:
+                grown[r - cells, c] = True
     return grown
 
 
-def _touches_data_edge(roof: BoolArray, empty_around: BoolArray) -> bool:
-    """Whether a 9 m square without points, by the mask of such squares' centres, begins within 5 m of the roof."""
-    return bool(empty_around.any()) and bool((empty_around & _grown(roof, _EDGE_CELLS + _EMPTY_CELLS)).any())
+@kernel
+def _terrain_by(x_mm: IntArray, y_mm: IntArray, around: Surroundings) -> tuple[IntArray, IntArray, BoolArray, bool]:
+    """The terrain at the points (n,) of a candidate, or all where there are none.
+
+    Samples (m, 3) of the terrain in millimetres, row after row; the lowest elevation at the outline, (1,) or none; the
+    cells that hold the points; whether a square without points begins near one of these.
+    """
+    rows, columns = around.occupied.shape
+    own = np.zeros((rows, columns), np.bool_)
+    for i in range(len(x_mm)):
+        own[y_mm[i] // CELL_MM - around.row0, x_mm[i] // CELL_MM - around.column0] = True
+    # terrain far from all points may lie in a tile without points, which is never made
+    points_near = _grown(around.occupied, _EMPTY_CELLS)
+    outline, sampled, edge = (
+        _grown(own, _OUTLINE_CELLS),
+        _grown(own, _GROUND_MARGIN_M),
+        _grown(own, _EDGE_CELLS + _EMPTY_CELLS),
+    )
+    samples, lowest = np.empty((rows * columns, 3), np.int64), np.empty(1, np.int64)
+    count, known, touches = 0, 0, False
+    for r in range(rows):
+        for c in range(columns):
+            touches = touches or (edge[r, c] and not points_near[r, c])
+            z = around.elevation_mm[r, c]
+            if z == NO_DATA or not points_near[r, c]:
+                continue
+            if outline[r, c] and not own[r, c] and (known == 0 or z < lowest[0]):
+                lowest[0], known = z, 1
+            if sampled[r, c] or len(x_mm) == 0:
+                samples[count, 0] = (c + around.column0) * CELL_MM + CELL_MM // 2
+                samples[count, 1] = (r + around.row0) * CELL_MM + CELL_MM // 2
+                samples[count, 2] = z
+                count += 1
+    return samples[:count].copy(), lowest[:known], own, touches
 
 
 def points_of(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]:
     """A candidate's points in canonical order: X, Y, Z, return, GPS time, source."""
     points = stored_points(scratch, site)
+    if _ascends(points):
+        return points
     sorted_points: npt.NDArray[np.void] = np.take(points, canonical_order(points))
     return sorted_points
 
 
+@kernel
+def _ascends(points: npt.NDArray[np.void]) -> bool:
+    """Whether all points (n,) are in order by X and Y, no two at the same place."""
+    for i in range(1, len(points)):
+        before, point = points[i - 1], points[i]
+        if point.x < before.x or (point.x == before.x and point.y <= before.y):
+            return False
+    return True
+
+
 def stored_points(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]:
     """A candidate's points, range after range."""
-    pieces = []
-    for part in site.ranges:
-        first, last = part.start * POINT.itemsize, part.stop * POINT.itemsize
-        pieces.append(scratch.rows(f"{part.folder}/{part.tile.key}", "points", first, last).view(POINT))
+    pieces = [stored_bytes(scratch, part).view(POINT) for part in site.ranges]
     return np.concatenate(pieces) if pieces else np.empty(0, POINT)
+
+
+def stored_bytes(scratch: Scratch, part: PointRange) -> npt.NDArray[np.uint8]:
+    """The bytes of a range of points; raises ValueError if the file ends before them."""
+    first, last = part.start * POINT.itemsize, part.stop * POINT.itemsize
+    return scratch.rows(f"{part.folder}/{part.tile.key}", "points", first, last)
 
 
 def canonical_order(points: npt.NDArray[np.void]) -> IntArray:
@@ -126,26 +182,10 @@ def gather(
     margin = _VIEW_M * MM
     view = Window(x0_mm=int(low[0]), y0_mm=int(low[1]), x1_mm=int(high[0]) + 1, y1_mm=int(high[1]) + 1).grown(margin)
     around = surroundings_of(scratch, grid, view)
-    own = np.zeros(around.occupied.shape, np.bool_)
-    own[columns_mm[1] // CELL_MM - around.row0, columns_mm[0] // CELL_MM - around.column0] = True
-    # terrain far from all points may lie in a tile without points, which is never made
-    points_near = _grown(around.occupied, _EMPTY_CELLS)
-    known = (around.elevation_mm != NO_DATA) & points_near
-    outline = _grown(own, _OUTLINE_CELLS) & ~own & known
-    sampled = known & _grown(own, _GROUND_MARGIN_M)
-    if not own.any():
-        sampled = known
-    rows, columns = np.nonzero(sampled)
-    ground_mm = np.column_stack(
-        (
-            (columns + around.column0) * CELL_MM + CELL_MM // 2,
-            (rows + around.row0) * CELL_MM + CELL_MM // 2,
-            around.elevation_mm[rows, columns].astype(np.int64),
-        )
-    )
-    ground_z = _ground_mm(around.elevation_mm[outline], ground_mm[:, 2], xyz[:, 2])
+    ground_mm, lowest_mm, own, touches_data_edge = _terrain_by(columns_mm[0], columns_mm[1], around)
+    ground_z = _ground_mm(lowest_mm, ground_mm[:, 2], xyz[:, 2])
     digest = hashlib.sha256(points.tobytes())
-    digest.update(np.ascontiguousarray(ground_mm).tobytes())
+    digest.update(ground_mm.tobytes())
     beside_mm = later_mm = np.empty((0, 3), np.int64)
     if roof is not None and footprint is None and roof.needs_facades(is_drawn=site.outline is not None):
         beside_mm, later_mm = _beside(scratch, grid, xyz, _grown(own, _BESIDE_CELLS), around)
@@ -169,7 +209,7 @@ def gather(
         outline=None if site.outline is None else _moved(site.outline, origin_mm),
         beside=(beside_mm - origin_mm) / MM,
         beside_later=(later_mm - origin_mm) / MM,
-        touches_data_edge=_touches_data_edge(own, ~points_near),
+        touches_data_edge=touches_data_edge,
         strip_offset_m=strip_offset_m,
     )
     first, last = _acquired(points, gps_kind)

@@ -18,6 +18,7 @@ from pipeline.model import BoolArray
 from pipeline.runtime.plan import ground_bytes
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.cells import TileCells, digests_of, find_all_cells
 from pipeline.runtime.stages.cleanup import clear_tiles
@@ -121,8 +122,30 @@ def find_ground(
             memory_bytes=ground_bytes(window),
         )
     clear_tiles(context.scratch, FOLDER, tasks, {tile.key for tile in drawn})
-    found = context.map_stored("ground", functools.partial(draw_ground, settings=scene.ground), tasks, whole)
+    function = functools.partial(draw_ground, settings=scene.ground)
+    files: Files[GroundTask, tuple[TileGround, ...]] = Files(reads=_read, leaves=_left, intact=is_intact)
+    found = context.map_stored("ground", function, tasks, whole, files=files)
     return Ground(cells=cells, tiles={one.tile: one for tiles in found.values() for one in tiles})
+
+
+def _read(task: GroundTask) -> list[str]:
+    """The folders of scratch with the cells that a block sees."""
+    return [f"{CELLS}/{tile.key}" for tile in task.seen]
+
+
+def _left(task: GroundTask, _: Sequence[TileGround]) -> list[str]:
+    """The folders of scratch with the terrain of a block."""
+    return [f"{FOLDER}/{tile.key}" for tile in task.tiles]
+
+
+def is_intact(task: GroundTask, found: Sequence[TileGround], folder: str) -> bool:
+    """Whether the terrain of a tile in a folder of scratch is as it was stored."""
+    (zones,) = (one.zones for one in found if f"{FOLDER}/{one.tile.key}" == folder)
+    tile = Tile.from_key(folder.rpartition("/")[2])
+    elevations, occupied, corner = (task.scratch.array(folder, name) for name in ("terrain", "occupied", "corner"))
+    column0, row0, columns, rows = lattice_of(task.grid.core(tile).grown(APRON_M * MM))
+    is_in_place = corner.tolist() == [column0, row0] and elevations.shape == occupied.shape == (rows, columns)
+    return is_in_place and _zones(elevations, occupied, task.grid).tobytes() == zones
 
 
 def terrain_window(grid: TileGrid, tile: Tile) -> Window:

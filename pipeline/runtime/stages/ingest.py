@@ -23,6 +23,7 @@ from pipeline.io.storage import sha256_of
 from pipeline.model import IntArray, PointCloud
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.cleanup import clear_points
 from pipeline.runtime.stages.ingested import Ingested, points_by_tile, spread_m
@@ -77,7 +78,8 @@ def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
         key = key_of(path, file.file_size, written, task.options, task.grid)
         tasks[Place("ingest", task.part, key)] = task
     clear_points(context.scratch, tasks)
-    ingested = list(context.map_stored("ingest", ingest_file, tasks, whole).values())
+    buckets: Files[IngestTask, Ingested] = Files(leaves=_buckets, intact=is_intact)
+    ingested = list(context.map_stored("ingest", ingest_file, tasks, whole, files=buckets).values())
     for found in ingested:
         for warning in found.warnings:
             progress.warn("ingest", f"{shown(found.path)}: {warning}")
@@ -100,6 +102,24 @@ def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
             "Check the columns and the scale of the file",
         )
     return ingested
+
+
+def _buckets(_: IngestTask, found: Ingested) -> list[str]:
+    """The folders of scratch with a file's buckets."""
+    return [f"points/{tile.key}" for tile in found.points_by_tile]
+
+
+def is_intact(task: IngestTask, found: Ingested, folder: str) -> bool:
+    """Whether a file's bucket in a folder of scratch holds the points that were read; raises OSError without it."""
+    tile = Tile.from_key(folder.rpartition("/")[2])
+    path = Path(task.scratch.root, folder, f"{task.part}.bin")
+    if path.stat().st_size != found.points_by_tile[tile] * POINT.itemsize:
+        return False
+    sums = np.zeros((3, 3, 3), np.uint64)
+    for start in range(0, found.points_by_tile[tile], _CHUNK_POINTS):
+        points = np.fromfile(path, POINT, _CHUNK_POINTS, offset=start * POINT.itemsize)
+        sums += _content_of(points, tile, task.grid)
+    return sums.tobytes() == found.content[tile]
 
 
 def part_of(path: str) -> str:
@@ -222,10 +242,14 @@ def _append_by_tile(
         tile = Tile(west + column, south + row)
         with task.scratch.path("points", tile.key, f"{task.part}{suffix}").open("ab") as part:
             ordered[start:stop].tofile(part)
-        core = task.grid.core(tile)
-        points = ordered[start:stop]
-        bits = np.ascontiguousarray(points["gps_time"]).view(np.uint64)
-        sums = zone_sums(points, bits, core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm, task.grid.halo_mm)
+        sums = _content_of(ordered[start:stop], tile, task.grid)
         content[tile] = content[tile] + sums if tile in content else sums
         counts[tile] += int(stop - start)
     return counts
+
+
+def _content_of(points: npt.NDArray[np.void], tile: Tile, grid: TileGrid) -> ZoneSums:
+    """The content of some points of a tile."""
+    core = grid.core(tile)
+    bits = np.ascontiguousarray(points["gps_time"]).view(np.uint64)
+    return zone_sums(points, bits, core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm, grid.halo_mm)

@@ -7,7 +7,8 @@ import functools
 import math
 import pickle
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 import shapely
@@ -20,12 +21,12 @@ from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, Reason, Status
 from pipeline.runtime.cluster.memory_needs import building_bytes
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
-from pipeline.runtime.isolation.replay_bundle import Bundle, Incident, write_bundle
+from pipeline.runtime.isolation.replay_bundle import SUFFIX, Bundle, Incident, is_whole, write_bundle
 from pipeline.runtime.monitoring.logs import LOG
 from pipeline.runtime.monitoring.tallies import TALLIES
 from pipeline.runtime.overrides.overrides_file import OwnModelling
-from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.outcomes import Place, key_of, result_of
+from pipeline.runtime.scratch.folder import OpenScratch, Scratch
+from pipeline.runtime.scratch.outcomes import DamagedError, Place, key_of, result_of
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.sites import CandidateSite
 from pipeline.tiling import Tile, TileGrid
@@ -161,6 +162,12 @@ def model_batch(task: BatchTask) -> Batch:
     )
 
 
+def bundles_are_whole(task: BatchTask, modelled: Iterable[Modelled], _: str) -> bool:
+    """Whether the bundles that a batch left in the quarantine are whole; not each loss has one."""
+    bundles = [Path(task.quarantine, f"{one.building_id}{SUFFIX}") for one in modelled if one.reason in LOST]
+    return all(is_whole(bundle) for bundle in bundles if bundle.is_file())
+
+
 def stored_results(scratch: Scratch, place: Place, only: Collection[str] | None = None) -> list[StoredResult]:
     """The models of a stored batch, or those of some building_ids. Only for our own scratch: pickles run code."""
     batch: Batch = result_of(scratch, place)
@@ -218,6 +225,7 @@ def _is_rejected(task: BatchTask, site: CandidateSite, result: BuildingResult) -
 
 def _here(task: BatchTask) -> Iterator[tuple[int, Packed]]:
     """Models made in this process: one that runs out of memory becomes a record, one that crashes ends all."""
+    task = opened(task)
     for index, site in enumerate(task.sites):
         task.scratch.check_cancelled()
         try:
@@ -231,7 +239,7 @@ def _here(task: BatchTask) -> Iterator[tuple[int, Packed]]:
 
 def _in_child(task: BatchTask, limits: IsolationLimits) -> Iterator[tuple[int, Packed]]:
     """Models made in a supervised child process, so that a building can only harm itself."""
-    common = dataclasses.replace(task, sites=())
+    common = opened(dataclasses.replace(task, sites=()))
     cancelled = functools.partial(_cancelled, task)
     work = functools.partial(model_site, common)
     retried: dict[int, str] = {}
@@ -242,6 +250,11 @@ def _in_child(task: BatchTask, limits: IsolationLimits) -> Iterator[tuple[int, P
         if index in retried:
             found = dataclasses.replace(found, modelled=dataclasses.replace(found.modelled, retried=retried[index]))
         yield index, found
+
+
+def opened(task: BatchTask) -> BatchTask:
+    """The task with a scratch whose arrays stay open from building to building: neighbours share tiles."""
+    return dataclasses.replace(task, scratch=OpenScratch(task.scratch.root, task.scratch.attempt))
 
 
 def _loads(task: BatchTask) -> tuple[str, ...]:
@@ -311,11 +324,14 @@ def _modelled_before(task: BatchTask, building_id: str, made_from: str) -> Build
 
 @functools.lru_cache(maxsize=8)
 def _batch_of(scratch: Scratch, place: Place) -> Mapping[str, tuple[str, bytes]]:
-    """The models of an earlier batch; none where it has been removed since."""
+    """The models of an earlier batch; none where it has been removed since, or is damaged."""
     try:
         batch: Batch = result_of(scratch, place)
     except RunCancelledError:
         scratch.check_cancelled()
+        return {}
+    except DamagedError as fault:
+        LOG.warning("models of an earlier run are made again", extra={"tile": place.unit, "reason": str(fault)})
         return {}
     return batch.stored
 

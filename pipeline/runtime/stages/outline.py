@@ -18,11 +18,12 @@ from pipeline.io.gps_time import GpsTimeKind
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.unit_outlines import unit_outlines
 from pipeline.runtime.run_context import RunContext
-from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.folder import OpenScratch, Scratch
+from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, whole
 from pipeline.runtime.stages.gather import canonical_order, gather, stored_points
 from pipeline.runtime.stages.grouping import in_groups
-from pipeline.runtime.stages.sites import CandidateSite, Joined
+from pipeline.runtime.stages.sites import CandidateSite, Joined, folders_around
 from pipeline.tiling import Tile, TileGrid
 
 _POINTS_PER_TASK = 50_000
@@ -51,7 +52,8 @@ def outline(context: RunContext, settings: RoofSettings, joined: Joined) -> Join
             sites = [site for block in task.blocks for site in block]
             tasks[Place("outline", tile.key, key_of(alike, task.blocks, joined.around(sites, grid)))] = task
     drop_outcomes(scratch, "outline", tasks)
-    drawn = context.map_stored("outline", draw_outlines, tasks, whole)
+    files: Files[OutlineTask, DrawnOutlines] = Files(reads=_read)
+    drawn = context.map_stored("outline", draw_outlines, tasks, whole, files=files)
     outlines: dict[str, MultiPolygon] = {}
     for found in drawn.values():
         outlines |= found.outlines
@@ -62,6 +64,11 @@ def outline(context: RunContext, settings: RoofSettings, joined: Joined) -> Join
         for site in joined.candidates
     )
     return dataclasses.replace(joined, candidates=tuple(outlined))
+
+
+def _read(task: OutlineTask) -> set[str]:
+    """The folders of scratch from which the units of a task are gathered."""
+    return folders_around([site for block in task.blocks for site in block], task.grid)
 
 
 def _blocks_by_tile(sites: Sequence[CandidateSite]) -> dict[Tile, list[CandidateSite]]:
@@ -111,6 +118,7 @@ def draw_outlines(task: OutlineTask) -> DrawnOutlines:
     """
     drawn: dict[str, MultiPolygon] = {}
     warnings = []
+    task = dataclasses.replace(task, scratch=OpenScratch(task.scratch.root, task.scratch.attempt))
     for units in task.blocks:
         task.scratch.check_cancelled()
         try:

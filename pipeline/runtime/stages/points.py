@@ -11,6 +11,8 @@ from pipeline.io import storage_at
 from pipeline.model import Reason
 from pipeline.runtime.plan import window_bytes
 from pipeline.runtime.run_context import ProgressUnits, RunContext
+from pipeline.runtime.scratch.kept_files import Files
+from pipeline.runtime.scratch.outcomes import FOLDER as KEPT
 from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of
 from pipeline.runtime.stages.cleanup import writing_points
 from pipeline.runtime.stages.coarse_points import coarse_levels, write_coarse_points
@@ -18,7 +20,7 @@ from pipeline.runtime.stages.coarse_terrain import terrain_spacing
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
 from pipeline.runtime.stages.label import LabelTask, by_tile, label_halo_m, neighbourhood
 from pipeline.runtime.stages.reconstruct import Models
-from pipeline.runtime.stages.sites import CandidateSite, Joined
+from pipeline.runtime.stages.sites import CandidateSite, Joined, folders_with_points
 from pipeline.runtime.stages.split import Splits
 from pipeline.runtime.stages.tile_points import (
     PointsTask,
@@ -27,6 +29,7 @@ from pipeline.runtime.stages.tile_points import (
     TilePoints,
     write_tile_points,
 )
+from pipeline.runtime.stages.window_points import folders_of
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile
 
@@ -63,7 +66,8 @@ def write_points(
     # points that a user removed from the run directory are written again
     drop_outcomes(scratch, stage, [place for place in tasks if place.unit in there])
     units = ProgressUnits[TilePoints](failed=lambda one: int(bool(one.error)))
-    written = context.map_stored("octree", write_tile_points, tasks, _brief, units)
+    files: Files[PointsTask, TilePoints] = Files(reads=_read, results=True)
+    written = context.map_stored("octree", write_tile_points, tasks, _brief, units, files=files)
     failed = {place: tile for place, tile in written.items() if tile.error}
     for place, tile in failed.items():
         context.progress.warn("octree", f"the points of tile {tile.tile.key} could not be written: {tile.error}")
@@ -77,6 +81,16 @@ def write_points(
         if key not in wanted and key.split("/")[1] not in wanted:
             storage.delete(key)
     return tuple(sorted(tile.tile.key for tile in failed.values()))
+
+
+def _read(task: PointsTask) -> set[str]:
+    """The folders of scratch with the points, the terrain and the models that a tile's points need."""
+    label = task.label
+    near = label.grid.tiles_over(neighbourhood(label.tile, label.grid, label.settings).grown(label.grid.size_mm))
+    parts = (*label.buildings, *label.decks, *(part for one in task.buildings for part in one.ranges))
+    return (
+        folders_of(near) | folders_with_points(parts) | {f"{KEPT}/{place.stage}/{place.unit}" for place in task.batches}
+    )
 
 
 def _brief(stored: StoredTilePoints) -> TilePoints:

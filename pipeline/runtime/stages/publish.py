@@ -15,14 +15,15 @@ from pipeline import __version__
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.putting import Put
-from pipeline.io import Storage, storage_at
-from pipeline.io.storage import Puts
+from pipeline.io import LocalStorage, Storage, is_url, storage_at
+from pipeline.io.storage import Puts, sha256_of
 from pipeline.model import BuildingResult, Reason, Status
 from pipeline.runtime.isolation.replay_bundle import SUFFIX
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.outcomes import Place, brief_of, drop_outcomes, key_of, whole
+from pipeline.runtime.scratch.kept_files import Files
+from pipeline.runtime.scratch.outcomes import FOLDER, Place, brief_of, drop_outcomes, key_of, whole
 from pipeline.runtime.stages.cleanup import publishing
 from pipeline.runtime.stages.model_batch import StoredResult, stored_results
 from pipeline.runtime.stages.reconstruct import QUARANTINE, Models
@@ -161,7 +162,12 @@ def publish(
     # tiles that a user removed from the run directory are published again
     drop_outcomes(scratch, stage, [place for place in tasks if place.unit in there])
     units = ProgressUnits[Published](failed=lambda found: int(bool(found.error)))
-    published = context.map_stored("publish", publish_tile, tasks, whole, units)
+    files: Files[PublishTask, Published] = Files(
+        reads=lambda task: {f"{FOLDER}/{place.stage}/{place.unit}" for place in task.batches},
+        intact=is_published,
+        at_once=True,
+    )
+    published = context.map_stored("publish", publish_tile, tasks, whole, units, files=files)
     for tile_key in sorted(there - {tile.key for tile in owners}):
         retire(storage, Tile.from_key(tile_key))
     for place, outcome in published.items():
@@ -171,6 +177,15 @@ def publish(
             context.progress.warn("publish", f"tile {outcome.tile.key} failed: {outcome.error}")
             Path(scratch.root, place.name).unlink(missing_ok=True)  # so that a resumed run tries it again
     return list(published.values())
+
+
+def is_published(task: PublishTask, _: Published, __: str) -> bool:
+    """Whether the files of a tile are those that its state names; only in a folder, since stores keep checksums."""
+    if is_url(task.run_dir):
+        return True
+    storage = LocalStorage(root=Path(task.run_dir))
+    files = json.loads(storage.get(f"state/{task.tile.key}.json"))["files"]
+    return all(sha256_of(storage.path(name)) == digest for name, digest in files.items())
 
 
 def publish_tile(task: PublishTask) -> Published:
@@ -223,9 +238,12 @@ def _tables_last(puts: Puts) -> Put:
 
 
 def files_of(storage: Storage, tile: Tile) -> set[str]:
-    """The files that a tile's state names; none where it has no state yet."""
+    """The files that a tile's state names; none where it has no state yet, or a damaged one."""
     key = f"state/{tile.key}.json"
-    return set(json.loads(storage.get(key))["files"]) if storage.has(key) else set()
+    try:
+        return set(json.loads(storage.get(key))["files"]) if storage.has(key) else set()
+    except ValueError:
+        return set()
 
 
 def retire(storage: Storage, tile: Tile) -> None:

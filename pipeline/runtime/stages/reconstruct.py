@@ -12,17 +12,19 @@ from pipeline.runtime.monitoring.tracing import Part, slow_building_s
 from pipeline.runtime.overrides.overrides_file import own_modelling
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.outcomes import Place, brief_of, drop_outcomes, key_of, keys_of
+from pipeline.runtime.scratch.kept_files import Files
+from pipeline.runtime.scratch.outcomes import FOLDER, Place, brief_of, drop_outcomes, key_of, keys_of
 from pipeline.runtime.stages.model_batch import (
     LOST,
     Batch,
     BatchTask,
     Modelled,
     StoredResult,
+    bundles_are_whole,
     model_batch,
     stored_results,
 )
-from pipeline.runtime.stages.sites import CandidateSite, Joined, by_owner
+from pipeline.runtime.stages.sites import CandidateSite, Joined, by_owner, folders_around
 from pipeline.settings import RunSettings
 from pipeline.tiling import Tile
 
@@ -109,8 +111,15 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
             _tell(context, model)
 
     brief: Callable[[Batch], tuple[Modelled, ...]] = operator.attrgetter("modelled")
-    units = ProgressUnits(total=len(joined.candidates), done=len, failed=_failed_of, parts=_traced)
-    briefs = context.map_stored("reconstruct", model_batch, dict(largest_first), brief, units, count)
+    units = ProgressUnits[tuple[Modelled, ...]](
+        total=len(joined.candidates), done=len, failed=_failed_of, parts=_traced
+    )
+    files: Files[BatchTask, tuple[Modelled, ...]] = Files(
+        reads=lambda task: folders_around(task.sites, task.grid),
+        leaves=lambda task, _: [f"{FOLDER}/{stage}/{task.sites[0].owner.key}"],
+        intact=bundles_are_whole,
+    )
+    briefs = context.map_stored("reconstruct", model_batch, dict(largest_first), brief, units, count, files)
     contents = {
         tile: key_of(sorted(model.content for place in made_in for model in briefs[place]))
         for tile, made_in in places.items()

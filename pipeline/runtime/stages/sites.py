@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from shapely import MultiPolygon, Polygon
 
 from pipeline.runtime.overrides.overrides_file import Override
+from pipeline.runtime.stages.window_points import folders_of
 from pipeline.terrain.candidates import Verdict
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
@@ -23,6 +24,13 @@ class PointRange:
     stop: int
     folder: str = "tiles"
     """Folder of the scratch that holds the tile's points."""
+    checksum: int = 0
+    """CRC-32 of the points, where they were stored again; 0 where the tile's outcome has a digest of all."""
+
+    @property
+    def left_in(self) -> str:
+        """The folder of scratch that the task which stored the points left."""
+        return self.folder if "/" in self.folder else f"{self.folder}/{self.tile.key}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
@@ -88,13 +96,30 @@ class Joined:
 
     def around(self, sites: Sequence[CandidateSite], grid: TileGrid) -> list[str]:
         """Digests of what lies in and around the tiles of some candidates."""
-        tiles = {part.tile for site in sites for part in site.ranges}
-        for site in sites:
-            for area in (site.footprint, site.outline):
-                if area is not None and not area.is_empty:
-                    x0, y0, x1, y1 = (round(value * MM) for value in area.bounds)
-                    tiles.update(grid.tiles_over(Window(x0_mm=x0, y0_mm=y0, x1_mm=x1 + 1, y1_mm=y1 + 1)))
-        return [self.keys.get(tile, "") for tile in sorted(tiles)]
+        return [self.keys.get(tile, "") for tile in sorted(tiles_of(sites, grid))]
+
+
+def tiles_of(sites: Iterable[CandidateSite], grid: TileGrid) -> set[Tile]:
+    """The tiles in which some candidates lie: their points, their footprints, their outlines."""
+    tiles = set[Tile]()
+    for site in sites:
+        tiles.update(part.tile for part in site.ranges)
+        for area in (site.footprint, site.outline):
+            if area is not None and not area.is_empty:
+                x0, y0, x1, y1 = (round(value * MM) for value in area.bounds)
+                tiles.update(grid.tiles_over(Window(x0_mm=x0, y0_mm=y0, x1_mm=x1 + 1, y1_mm=y1 + 1)))
+    return tiles
+
+
+def folders_with_points(ranges: Iterable[PointRange]) -> set[str]:
+    """The folders of scratch from which some points are read."""
+    return {part.left_in for part in ranges}
+
+
+def folders_around(sites: Sequence[CandidateSite], grid: TileGrid) -> set[str]:
+    """The folders of scratch from which some candidates are gathered: their points, and what lies around them."""
+    tiles = {near for tile in tiles_of(sites, grid) for near in grid.tiles_over(grid.core(tile).grown(grid.size_mm))}
+    return folders_of(tiles) | folders_with_points(part for site in sites for part in site.ranges)
 
 
 def object_id(crs_name: str, lowest_point_mm: Sequence[int]) -> str:

@@ -11,13 +11,15 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pipeline.runtime.plan import check_windows, split_grid, window_bytes
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, key_of, result_of
 from pipeline.runtime.stages.cleanup import clear_tiles
 from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline, numbers_by_tile
-from pipeline.runtime.stages.ground import Ground, terrain_of_window
+from pipeline.runtime.stages.ground import Ground, terrain_of_window, terrain_window
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, content_by_tile, points_by_tile
-from pipeline.runtime.stages.split_window import Split, SplitFigures, SplitTask, split_window
+from pipeline.runtime.stages.split_window import Split, SplitFigures, SplitTask, is_intact, split_window
 from pipeline.runtime.stages.tile_content import content_of_window
+from pipeline.runtime.stages.window_points import folders_of
 from pipeline.settings import RunSettings
 from pipeline.terrain.scene_settings import ClassesInUse
 from pipeline.tiling import Tile, TileGrid
@@ -84,6 +86,16 @@ def split(
     return split_windows(context, "split", windows, settings, ingested, ground)
 
 
+def _read(task: SplitTask) -> set[str]:
+    """The folders of scratch with the points and the terrain that the split of a tile sees."""
+    return folders_of(task.grid.tiles_over(terrain_window(task.grid, task.tile)))
+
+
+def _stored(task: SplitTask, _: SplitFigures) -> tuple[str, ...]:
+    """The folder of scratch with the sorted points of a tile."""
+    return (f"{task.folder}/{task.tile.key}",)
+
+
 def split_windows(
     context: RunContext,
     stage: str,
@@ -119,7 +131,8 @@ def split_windows(
     clear_tiles(context.scratch, folder, tasks)
     function = functools.partial(split_window, settings=settings.scene)
     brief: Callable[[Split], SplitFigures] = operator.attrgetter("figures")
-    found = context.map_stored(stage, function, tasks, brief)
+    stored = Files(reads=_read, leaves=_stored, intact=is_intact, results=True)
+    found = context.map_stored(stage, function, tasks, brief, files=stored)
     return Splits(
         figures=tuple(found.values()),
         places={figures.tile: place for place, figures in found.items()},

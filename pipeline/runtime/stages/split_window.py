@@ -143,6 +143,12 @@ def split_window(task: SplitTask, settings: SceneSettings) -> Split:
     return Split(tile=task.tile, surfaces=surfaces, footprints=footprints, figures=figures)
 
 
+def is_intact(task: SplitTask, figures: SplitFigures, folder: str) -> bool:
+    """Whether a tile's points in a folder of scratch are as they were stored."""
+    stored = task.scratch.array(folder, "points", mapped=True)
+    return hashlib.sha256(np.ascontiguousarray(stored).data).hexdigest() == figures.outcome
+
+
 def _store(task: SplitTask, records: npt.NDArray[np.void], owner: IntArray) -> tuple[IntArray, IntArray, IntArray, str]:
     """Store points sorted by owner; the owners, where each one's points start, their smallest points, and a digest."""
     order = _order_by_owner(records, owner)

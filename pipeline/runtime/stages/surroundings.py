@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +17,7 @@ FOLDER = "ground"
 """Folder of scratch with the terrain of each tile and of an apron around it."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Surroundings:
+class Surroundings(NamedTuple):
     """Terrain of a window, on the 1 m lattice."""
 
     column0: int

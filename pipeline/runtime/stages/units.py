@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import zlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,10 +17,19 @@ import numpy.typing as npt
 from pipeline.model import IntArray
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, whole
-from pipeline.runtime.stages.gather import canonical_order
+from pipeline.runtime.stages.gather import canonical_order, stored_bytes
 from pipeline.runtime.stages.grouping import in_groups
-from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, by_owner, largest_first, object_id
+from pipeline.runtime.stages.sites import (
+    CandidateSite,
+    Joined,
+    PointRange,
+    by_owner,
+    folders_with_points,
+    largest_first,
+    object_id,
+)
 from pipeline.strip_alignment import strip_offsets_m
 from pipeline.terrain.settings import UnitSettings
 from pipeline.terrain.units import smallest_points, units_of
@@ -59,8 +69,29 @@ def divide_units(
             key = key_of(alike, task.sites, joined.around(task.sites, grid))
             tasks[Place("units", tile.key, key)] = task
     drop_outcomes(scratch, "units", tasks)
-    divided = context.map_stored("join", divide, tasks, whole, quiet=True)
+    files: Files[UnitTask, tuple[CandidateSite, ...]] = Files(reads=_read, leaves=_left, intact=is_intact)
+    divided = context.map_stored("join", divide, tasks, whole, files=files, quiet=True)
     return dataclasses.replace(joined, candidates=largest_first(itertools.chain(*divided.values())))
+
+
+def _read(task: UnitTask) -> set[str]:
+    """The folders of scratch with the points of a task's candidates."""
+    return folders_with_points(part for site in task.sites for part in site.ranges)
+
+
+def _left(_: UnitTask, units: Sequence[CandidateSite]) -> set[str]:
+    """The folders of scratch with the points of the units."""
+    return folders_with_points(part for site in units if site.block is not None for part in site.ranges)
+
+
+def is_intact(task: UnitTask, units: Sequence[CandidateSite], folder: str) -> bool:
+    """Whether the points of the units below a folder of scratch are as they were stored."""
+    return all(
+        zlib.crc32(stored_bytes(task.scratch, part).data) == part.checksum
+        for site in units
+        for part in site.ranges
+        if part.left_in == folder
+    )
 
 
 def unit_tasks(
@@ -129,16 +160,18 @@ def _units_of_site(site: CandidateSite, task: UnitTask) -> list[CandidateSite]:
     firsts = smallest_points(x, y, z, unit)
     ranges: list[list[PointRange]] = [[] for _ in range(count)]
     folder = f"units/{site.building_id}"
-    start = 0
+    done = 0
     for tile, piece in zip(tiles, pieces, strict=True):
-        own = unit[start : start + len(piece)]
-        start += len(piece)
+        own = unit[done : done + len(piece)]
+        done += len(piece)
         by_unit = np.argsort(own, kind="stable")
-        task.scratch.put_arrays(f"{folder}/{tile.key}", {"points": piece[by_unit].view(np.uint8)})
+        ordered = piece[by_unit]
+        task.scratch.put_arrays(f"{folder}/{tile.key}", {"points": ordered.view(np.uint8)})
         borders = np.searchsorted(own[by_unit], np.arange(count + 1)).tolist()
-        for k in range(count):
-            if borders[k] < borders[k + 1]:
-                ranges[k].append(PointRange(tile=tile, start=borders[k], stop=borders[k + 1], folder=folder))
+        for k, (start, stop) in enumerate(itertools.pairwise(borders)):
+            if start < stop:
+                checksum = zlib.crc32(ordered[start:stop].view(np.uint8).data)
+                ranges[k].append(PointRange(tile=tile, start=start, stop=stop, folder=folder, checksum=checksum))
     return [
         CandidateSite(
             building_id=object_id(task.crs_name, (int(x[first]), int(y[first]), int(z[first]))),

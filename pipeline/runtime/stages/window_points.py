@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from enum import IntEnum
 from pathlib import Path
 from typing import TypeAlias
@@ -112,3 +112,8 @@ def _buckets(scratch: Scratch, tile: Tile) -> Iterator[tuple[npt.NDArray[np.void
 def bucket_paths(scratch: Scratch, tile: Tile) -> list[Path]:
     """The buckets of a tile, in the order of the inputs."""
     return sorted(Path(scratch.root, "points", tile.key).glob("*.bin"))
+
+
+def folders_of(tiles: Iterable[Tile]) -> set[str]:
+    """The folders of scratch with all that was found of some tiles before they are split: points, states, terrain."""
+    return {f"{kind}/{tile.key}" for kind in ("points", FOLDER, "ground") for tile in tiles}
