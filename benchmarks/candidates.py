@@ -17,6 +17,7 @@ from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.given_footprints import given_footprints
+from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.outline import outline
@@ -44,7 +45,7 @@ class FoundScene:
 def found_scene(
     tiles: Sequence[str], crs: str | None, settings: RunSettings, footprints: str | None = None
 ) -> FoundScene:
-    """Ingest, split and join point files, serially and in this process, with given footprints where there are any."""
+    """The stages of point files up to the join, serially in this process, with given footprints if there are any."""
     plan = make_plan(tiles, ReadOptions(crs=crs), settings)
     given = None if footprints is None else given_footprints(footprints, plan)
     progress = Progress(ignore)
@@ -52,7 +53,9 @@ def found_scene(
         scratch = Scratch(str(Path(folder, "scratch")))
         scratch.create()
         context = RunContext(plan=plan, progress=progress, executor=SerialExecutor(), scratch=scratch)
-        splits = split(context, settings, ingest(context, tiles), given)
+        ingested = ingest(context, tiles)
+        ground = find_ground(context, settings, ingested, footprints=given is not None)
+        splits = split(context, settings, ingested, ground, given)
         roof = settings.building.roof
         joined = outline(context, roof, join(context, settings.scene, roof.min_strip_offset_m, splits, given))
         return FoundScene(

@@ -43,6 +43,7 @@ from pipeline.runtime.plan import Plan, make_plan
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.join import NOWHERE, join, join_tiles
 from pipeline.runtime.stages.open_fragments import BorderFacets
@@ -150,7 +151,9 @@ def splits_of(folder: Path, tile_size_m: float) -> tuple[Plan, list[Split], int]
         scratch = Scratch(str(Path(place, "scratch")))
         scratch.create()
         context = RunContext(plan=plan, progress=Progress(ignore), executor=executor, scratch=scratch)
-        found = split(context, settings, ingest(context, tiles), None)
+        ingested = ingest(context, tiles)
+        ground = find_ground(context, settings, ingested, footprints=False)
+        found = split(context, settings, ingested, ground, None)
         splits = list(found.stored(scratch))
         joined = join(context, settings.scene, settings.building.roof.min_strip_offset_m, found, None)
     return plan, splits, len(joined.candidates)

@@ -43,6 +43,7 @@ from pipeline.runtime.plan import Plan, make_plan
 from pipeline.runtime.resources import SERIAL, Resources
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.split import split
@@ -83,14 +84,16 @@ def settings_without_classes() -> RunSettings:
 
 
 def one_lap(tiles: Sequence[str], plan: Plan, settings: RunSettings, executor: Executor, folder: str) -> Lap:
-    """Ingest, split and join once, in a scratch of its own below `folder`."""
+    """Ingest, ground, split and join once, in a scratch of its own below `folder`."""
     progress = Progress(ignore)
     with tempfile.TemporaryDirectory(prefix="gablework-", dir=folder) as place:
         scratch = Scratch(str(Path(place, "scratch")))
         scratch.create()
         context = RunContext(plan=plan, progress=progress, executor=executor, scratch=scratch)
         began = time.process_time()
-        splits = split(context, settings, ingest(context, tiles), None)
+        ingested = ingest(context, tiles)
+        ground = find_ground(context, settings, ingested, footprints=False)
+        splits = split(context, settings, ingested, ground, None)
         joined = join(context, settings.scene, settings.building.roof.min_strip_offset_m, splits, None)
         cpu_s = time.process_time() - began
         held = sum(path.stat().st_size for path in Path(place).rglob("*") if path.is_file())

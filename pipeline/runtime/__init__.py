@@ -1,1 +1,1 @@
-"""A run: plan, ingest, split, join, reconstruct, publish; serial or on Dask."""
+"""A run: plan, ingest, ground, split, join, reconstruct, publish; serial or on Dask."""

@@ -173,7 +173,7 @@ def classify(
         cancelled=cancelled,
     ) as context:
         ingested = ingest(context, paths)
-        ground = find_ground(context, request.settings, ingested)
+        ground = find_ground(context, request.settings, ingested, footprints=footprints is not None)
         splits = split(context, request.settings, ingested, ground, footprints)
         joined = join(
             context, request.settings.scene, request.settings.building.roof.min_strip_offset_m, splits, footprints
@@ -181,7 +181,7 @@ def classify(
         tiles = sorted(splits.places)
         _label_all(context, request.settings, tiles, joined, ingested, given=footprints is not None)
         files = _write_all(context, paths, ingested, out)
-        rasters = _draw_all(context, request.settings, tiles, ingested, cell, out) if request.rasters else []
+        rasters = _draw_all(context, tiles, ingested, cell, out) if request.rasters else []
     return _summary(progress, out, files, rasters, len(joined.candidates), began)
 
 
@@ -270,7 +270,6 @@ def _write_all(
 
 def _draw_all(
     context: RunContext,
-    settings: RunSettings,
     tiles: Sequence[Tile],
     ingested: Sequence[Ingested],
     cell: float,
@@ -286,7 +285,6 @@ def _draw_all(
             tile=tile,
             grid=context.plan.grid,
             lattice=lattice,
-            settings=settings.scene,
             scratch=context.scratch,
             vertical_unit_m=reference.vertical_unit_m,
         )

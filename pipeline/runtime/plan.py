@@ -15,7 +15,10 @@ from pipeline.io.area_of_use import refuse_far_outside
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.io.source import IMPOSSIBLE_DENSITY
 from pipeline.runtime.cluster.memory_needs import WINDOW_BASE_BYTES
+from pipeline.runtime.scratch.folder import POINT
 from pipeline.settings import RunSettings
+from pipeline.terrain.scene_settings import APRON_M, ClassesInUse
+from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
@@ -27,8 +30,10 @@ _BYTES_PER_POINT = 220
 """Bytes per point of the window: measured peak of a split above the size of its process, at 3 and 5 million points."""
 _BYTES_PER_JUDGED_POINT = 140
 """The same of the search for duplicates and outliers, where several files share a tile; 80 with one."""
-_BYTES_PER_CELL = 120
-"""The same per cell of 1 m of the ground filter."""
+_BYTES_PER_CELL = {"morphological": 150, "hierarchical": 210}
+"""The same per cell of 1 m of each ground filter: 144 and 207 measured, all cells filled."""
+_BLOCK_M = 1000.0
+"""About the side of a block of the ground stage. Wider ones look at fewer cells twice, and need more memory."""
 LARGEST_TASK_BYTES = _POINTS_PER_WINDOW * _BYTES_PER_POINT
 """Peak of the largest task of plans that choose their tile size."""
 
@@ -126,9 +131,24 @@ def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings)
         options=options,
         points=sum(info.point_count for info in sources),
         density_per_m2=density,
-        window_bytes=int(density * (size + 2.0 * halo_m) ** 2 * _BYTES_PER_POINT),
+        window_bytes=max(
+            int(density * (size + 2.0 * halo_m) ** 2 * _BYTES_PER_POINT), _block_bytes(grid, sources, settings)
+        ),
         warnings=tuple(warnings),
     )
+
+
+def _block_bytes(grid: TileGrid, sources: Sequence[SourceInfo], settings: RunSettings) -> int:
+    """Estimated peak of the largest task of the ground stage, above the process's own size."""
+    low, high = (
+        [pick(info.bounds_m[axis + k] for info in sources) for axis in (0, 1)] for pick, k in ((min, 0), (max, 3))
+    )
+    size_m = grid.size_mm / MM
+    # what the inputs cover, and the tile that their edge may cut
+    widths = [min(tiles_per_block(grid.size_mm) * size_m, high[axis] - low[axis] + size_m) for axis in (0, 1)]
+    beyond_m = 2.0 * (APRON_M + settings.scene.ground_support_m(ClassesInUse()))
+    cells = (widths[0] + beyond_m) * (widths[1] + beyond_m)
+    return int(cells * _BYTES_PER_CELL[settings.scene.ground.filter])
 
 
 def _looked_at(paths: Sequence[str], options: ReadOptions) -> tuple[SourceInfo, ...]:
@@ -238,15 +258,24 @@ def check_windows(plan: Plan, grid: TileGrid, points_by_tile: Mapping[Tile, int]
             )
 
 
-def points_bytes(points: int) -> int:
-    """Estimated peak memory of a process that judges so many points of a tile."""
-    return WINDOW_BASE_BYTES + points * _BYTES_PER_JUDGED_POINT
+def points_bytes(points: int, beside: int) -> int:
+    """Estimated peak memory of a process that judges the points of a tile, beside neighbours of at most so many."""
+    return WINDOW_BASE_BYTES + points * _BYTES_PER_JUDGED_POINT + beside * POINT.itemsize
 
 
-def ground_bytes(window: Window) -> int:
+def ground_bytes(window: Window, settings: GroundSettings) -> int:
     """Estimated peak memory of a process that finds the ground of a window."""
     cells = (window.x1_mm - window.x0_mm) * (window.y1_mm - window.y0_mm) // MM**2
-    return WINDOW_BASE_BYTES + cells * _BYTES_PER_CELL
+    return WINDOW_BASE_BYTES + cells * _BYTES_PER_CELL[settings.filter]
+
+
+def tiles_per_block(size_mm: int) -> int:
+    """Tiles along the side of a block of the ground stage.
+
+    >>> [tiles_per_block(size_mm) for size_mm in (2_000_000, 1_000_000, 500_000, 62_500)]
+    [1, 1, 2, 16]
+    """
+    return max(1, round(_BLOCK_M * MM / size_mm))
 
 
 def window_bytes(grid: TileGrid, tile: Tile, points_by_tile: Mapping[Tile, int]) -> int:

@@ -159,7 +159,7 @@ def _rerun(
         request.resources,
         run_scratch(str(earlier.run_dir), None),
         # a few tiles are split, which are not known yet; all inputs are read
-        dataclasses.replace(expected(plan, 0), seen_points=0.0),
+        dataclasses.replace(expected(plan, 0), seen_points=0.0, area_km2=0.0),
         loads=loads_of("reconstruct", footprints=False, method=wanted.settings.general.method),
         executor=executor,
         cancelled=cancelled,
@@ -253,7 +253,7 @@ class _Search:
     def _candidates(self, tiles: frozenset[Tile] | None) -> _Found:
         """The candidates of some tiles; of all tiles for None."""
         context, settings = self.context, self.request.settings
-        ground = find_ground(context, settings, self.ingested, tiles)
+        ground = find_ground(context, settings, self.ingested, footprints=self.footprints is not None, only=tiles)
         splits = split(context, settings, self.ingested, ground, self.footprints, tiles)
         roof = settings.building.roof
         found = join(context, settings.scene, roof.min_strip_offset_m, splits, self.footprints)

@@ -174,7 +174,7 @@ def run_variants(
     cancelled: Callable[[], bool] = never,
     outdated: Sequence[Path] = (),
 ) -> list[VariantOutcome]:
-    """Model the same candidates in several ways: ingest, split and join run once, the rest once per variant, in order.
+    """Model the same candidates in several ways: all up to the join runs once, the rest once per variant, in order.
 
     Raises the errors of `run`.
 
@@ -260,7 +260,7 @@ def _find_candidates(
 ) -> _Candidates:
     """The stages up to the candidates."""
     ingested = ingest(context, paths)
-    ground = find_ground(context, settings, ingested)
+    ground = find_ground(context, settings, ingested, footprints=footprints is not None)
     splits = split(context, settings, ingested, ground, footprints)
     roof = settings.building.roof
     joined = join(context, settings.scene, roof.min_strip_offset_m, splits, footprints)

@@ -7,7 +7,7 @@ from pipeline.terrain.filter_settings import HierarchicalFilterSettings, Morphol
 from pipeline.terrain.support import NEAR_CELLS, PLANARITY_SCALES
 
 _MAX_SUPPORT_M = 500
-"""A filter that looks farther makes a tile nearly all halo."""
+"""A filter that looks farther makes a block nearly all halo."""
 
 
 class OutlierSettings(Parameters):
@@ -74,7 +74,7 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
     )
 
     def cross_faults(self) -> list[str]:
-        """A filter that looks so far that tiles would be nearly all halo."""
+        """A filter that looks so far that blocks would be nearly all halo."""
         if self.filter == "hierarchical":
             counts = [self.seed_cell_m, self.level_ratio, self.passes, self.min_reach_m, self.clump_m]
             cause = f"seed_cell_m {self.seed_cell_m}, level_ratio {self.level_ratio}, passes {self.passes}"

@@ -1,4 +1,4 @@
-"""How far the steps of the ground filter and of planarity look: lengths that settings add up to the halo of a tile.
+"""How far the steps of the ground filter and of planarity look: lengths that settings add up.
 
 They are not settings: each belongs to the definition of its step, as a few cells of a lattice or a number of rounds.
 """

@@ -18,7 +18,7 @@ class Event:
     kind: EventKind
     """Kind of the event; `waiting` means that no worker is there, `detail` is for logs: about one building or task."""
     stage: str = ""
-    """plan, ingest, split, join, reconstruct or publish; empty for the run as a whole."""
+    """The name of a stage, such as ingest or reconstruct; empty for the run as a whole."""
     done: int = 0
     """Finished units of this stage (files, tiles or candidates)."""
     total: int = 0

@@ -1,1 +1,1 @@
-"""The stages of a run, in the order in which they run: ingest, split, join, outline, reconstruct, publish."""
+"""The stages of a run in their order: ingest, cells, ground, split, join, outline, reconstruct, publish."""

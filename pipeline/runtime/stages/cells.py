@@ -93,7 +93,7 @@ def find_all_cells(
             grid=grid,
             classes=classes,
             scratch=context.scratch,
-            memory_bytes=points_bytes(points[tile]),
+            memory_bytes=points_bytes(points[tile], max(points[other] for other in grid.tiles_over(grid.window(tile)))),
         )
     clear_tiles(context.scratch, FOLDER, tasks)
     function = functools.partial(find_cells, settings=settings)

@@ -1,6 +1,6 @@
 """Ground: the terrain of a run, found once over the cells of all tiles, in blocks.
 
-The filter looks 200 m far. Over the cells of a block of one to two kilometres that costs little; a tile that looked for
+The filter looks 200 m far. Over the cells of a block of a kilometre or two that costs little; a tile that looked for
 its own ground would read several times its own points instead.
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from pipeline.model import BoolArray
-from pipeline.runtime.plan import ground_bytes
+from pipeline.runtime.plan import check_windows, ground_bytes, split_grid, tiles_per_block
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
@@ -34,8 +34,6 @@ from pipeline.terrain.scene_settings import APRON_M
 from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
-BLOCK_M = 1500
-"""About the side of a block. Wider ones look at fewer cells twice, and need more memory."""
 _SLOPE_CELLS = 3
 """Cells beyond a point that its height and slope depend on, with one to spare."""
 
@@ -49,7 +47,7 @@ class GroundTask:
     seen: tuple[Tile, ...]
     """All tiles with points that its filter sees, its own among them."""
     grid: TileGrid
-    """The lattice; the halo is how far the split of a tile looks."""
+    """The lattice of the plan, whose halo is how far points matter to the split of a tile."""
     reach_mm: int
     """How far an elevation looks."""
     trusted: bool
@@ -81,18 +79,28 @@ class Ground:
 
 
 def find_ground(
-    context: RunContext, settings: RunSettings, ingested: Sequence[Ingested], only: Collection[Tile] | None = None
+    context: RunContext,
+    settings: RunSettings,
+    ingested: Sequence[Ingested],
+    *,
+    footprints: bool,
+    only: Collection[Tile] | None = None,
 ) -> Ground:
-    """The ground of all tiles, or of some and of what their splits see."""
+    """The ground of all tiles, or of some and of what their splits see; `footprints` says whether they are given.
+
+    Raises InputError if the points of a tile do not fit into a worker, now that they are counted.
+    """
     grid, scene = context.plan.grid, settings.scene
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
     reach_mm = math.ceil(scene.ground_support_m(classes) * MM)
     points = points_by_tile(ingested)
+    split_lattice = split_grid(context.plan, settings, footprints=footprints)
+    check_windows(context.plan, split_lattice, points, context.executor.memory_limit_bytes)
     drawn = set(points)
     if only is not None:
         drawn &= {other for tile in only for other in grid.tiles_over(terrain_window(grid, tile))}
     blocks: dict[tuple[int, int], list[Tile]] = {}
-    side = max(1, round(BLOCK_M * MM / grid.size_mm))
+    side = tiles_per_block(grid.size_mm)
     for tile in sorted(drawn):
         blocks.setdefault((tile.column // side, tile.row // side), []).append(tile)
     seen = {
@@ -119,7 +127,7 @@ def find_ground(
             reach_mm=reach_mm,
             trusted=classes.ground,
             scratch=context.scratch,
-            memory_bytes=ground_bytes(window),
+            memory_bytes=ground_bytes(window, scene.ground),
         )
     clear_tiles(context.scratch, FOLDER, tasks, {tile.key for tile in drawn})
     function = functools.partial(draw_ground, settings=scene.ground)

@@ -23,7 +23,6 @@ from pipeline.terrain.elevation_rasters import FILL_M, closed, columns_of, fille
 from pipeline.terrain.ground import slopes_of
 from pipeline.terrain.lattice import CELL_MM, height_above
 from pipeline.terrain.point_classes import PIT_REACH_MM, noise_of
-from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 FOLDER = "rasters"
@@ -55,8 +54,6 @@ class RasterTask:
     """The lattice of tiles."""
     lattice: RasterLattice
     """That of the raster."""
-    settings: SceneSettings
-    """Outliers and ground."""
     scratch: Scratch
     """Points and terrain in, cells out."""
     vertical_unit_m: float

@@ -8,7 +8,7 @@ import operator
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
-from pipeline.runtime.plan import check_windows, split_grid, window_bytes
+from pipeline.runtime.plan import split_grid, window_bytes
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
@@ -72,7 +72,6 @@ def split(
     tiles = points_by_tile(ingested)
     classes, why = classes_in_use(ingested, trust=settings.general.classes == "trust")
     grid = split_grid(plan, settings, footprints=footprints is not None)
-    check_windows(plan, grid, tiles, context.executor.memory_limit_bytes)
     if only is not None:
         tiles = Counter({tile: points for tile, points in tiles.items() if tile in only})
     if why:
