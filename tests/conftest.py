@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import os
+import signal
 import shutil
 from collections.abc import Callable, Generator
 from pathlib import Path
@@ -93,8 +94,13 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
 
 
 def pytest_configure() -> None:
-    """Look for cycles more rarely: as `start_own_process` has it, and why."""
+    """Look for cycles more rarely, as `start_own_process` has it; have Ctrl-C reach what the tests start.
+
+    A shell has the commands that it starts in the background ignore Ctrl-C, and their children inherit that.
+    """
     gc.set_threshold(100_000, *gc.get_threshold()[1:])
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_finish() -> None:
