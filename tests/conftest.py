@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 import gc
 import os
-import signal
 import shutil
+import signal
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import TYPE_CHECKING
