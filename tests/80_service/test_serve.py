@@ -168,7 +168,7 @@ def test_numbers_of_workers_that_cannot_be_are_refused_as_option_and_in_the_envi
 
 @pytest.mark.parametrize(
     ("reported", "gib", "started"),
-    [("auto", 64, 7), (None, 64, 7), ("3", 64, 3), ("auto", 15, 5), ("auto", 1, 2), ("7", 1, 7)],
+    [("auto", 64, 7), (None, 64, 7), ("3", 64, 3), ("auto", 6, 5), ("auto", 1, 2), ("7", 1, 7)],
 )
 def test_the_embedded_cluster_has_a_worker_per_core_with_memory_for_each_unless_a_number_is_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reported: str | None, gib: int, started: int
