@@ -91,7 +91,7 @@ def percent(stage: str, done: int, total: int, weights: Mapping[str, int] = WEIG
     Examples
     --------
     >>> percent("inputs", 0, 1), percent("reconstruct", 0, 80), percent("reconstruct", 40, 80), percent("outputs", 3, 3)
-    (0, 49, 65, 99)
+    (0, 45, 63, 99)
     """
     if stage not in weights:
         return 0
