@@ -252,7 +252,7 @@ def _content(folder: Path, left_out: Iterable[str] = ()) -> dict[str, tuple[int,
     Raises
     ------
     FileNotFoundError
-        There is no such folder, or it is being removed.
+        The folder is missing or is being removed.
     """
     found: dict[str, tuple[int, int]] = {}
     folder.stat()
@@ -302,7 +302,7 @@ def _check_target(folder: StateFolder, target: Path) -> None:
     if place == root or root in place.parents or place in root.parents:
         raise StartUpError(f"the backup would go to {target}, and the state folder is {folder.root}: keep them apart")
     if not folder.root.is_dir():
-        raise StartUpError(f"there is no state folder {folder.root}: name the one of the service with --state")
+        raise StartUpError(f"the state folder {folder.root} does not exist: give that of the service with --state")
     if target.exists() and not target.is_dir():
         raise StartUpError(f"{target} is not a folder: name a new one")
     if target.is_dir() and not (target / MARK).exists() and any(target.iterdir()):

@@ -39,7 +39,7 @@ class ModelsSoFar:
     def of_run(cls, run_dir: Path) -> ModelsSoFar | None:
         """The models of the run into a local directory, whose scratch is there, too.
 
-        None if the run has not begun, or is over: then there is no scratch.
+        None before the run begins and after it ends: scratch exists only in between.
 
         Raises
         ------

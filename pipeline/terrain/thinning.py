@@ -39,7 +39,7 @@ def _highest_per_cell(
     if n > 0:
         column0, row0 = x_mm.min() // cell_mm, y_mm.min() // cell_mm
         columns, rows = x_mm.max() // cell_mm - column0 + 1, y_mm.max() // cell_mm - row0 + 1
-    # a lattice that is no larger than the table of a hash is the table: neighbours in space are neighbours in memory
+    # where the lattice is no larger than a hash table it takes its place: neighbours in space are then near in memory
     is_lattice = columns * rows <= size
     mask = size - 1
     keys = np.full(columns * rows if is_lattice else size, -1, np.int64)

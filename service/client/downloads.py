@@ -30,7 +30,7 @@ async def outputs_of(session: Session, job_id: str, kinds: Sequence[str], method
     JobFailedError, JobDismissedError
         There are none, since the job has failed or was dismissed.
     NotFoundError
-        There is no such job, or it is not over, or has no such output.
+        The job is unknown, still runs, or lacks this output.
     """
     path = path_of("jobs", job_id, "results", outputs=tuple(kinds), method=method)
     try:

@@ -71,7 +71,7 @@ class ForbiddenError(RefusedError):
 
 
 class NotFoundError(RefusedError):
-    """There is no such thing, or it belongs to another key, or it is not ready."""
+    """The service does not have it, has it for another key, or does not have it yet."""
 
 
 class JobFailedError(RemoteError):

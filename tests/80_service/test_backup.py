@@ -415,7 +415,7 @@ def test_places_that_cannot_hold_a_backup_are_refused(site: Site, tmp_path: Path
     assert [path.name for path in other.iterdir()] == ["a.jpg"]
     code, _, complaint = invoke("backup", "--to", str(site.target), "--state", str(tmp_path / "nowhere"))
     assert code == 2
-    assert "there is no state folder" in complaint
+    assert "does not exist: give that of the service with --state" in complaint
 
 
 def test_two_backups_into_one_folder_do_not_mix(site: Site) -> None:

@@ -52,7 +52,7 @@ _Columns: TypeAlias = tuple[IntArray, IntArray, IntArray, ByteArray, ByteArray, 
 
 @kernel
 def _columns_inside(records: npt.NDArray[np.void], states: ByteArray, x0: int, y0: int, x1: int, y1: int) -> _Columns:
-    """Columns of the (n,) records with x0 <= x < x1 and y0 <= y < y1 in mm that are no duplicates, in their order."""
+    """Columns of the records (n,) with x0 <= x < x1 and y0 <= y < y1 in mm, without duplicates, in their order."""
     size = records.size
     # room for all records, though only what is written takes memory: records are wide, and this reads them once
     x, y, z = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
