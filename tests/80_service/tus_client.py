@@ -5,6 +5,7 @@ from typing import Any
 
 import httpx
 from live_service import las_bytes
+from processes import wait_for
 
 from service.files import StateFolder
 
@@ -37,6 +38,18 @@ def send(client: httpx.Client, url: str, at: int, content: bytes, **headers: str
 
 def offset(client: httpx.Client, url: str, **headers: str) -> int:
     answer = client.head(url, headers={**TUS, **headers})
+    assert answer.status_code == 200, answer.status_code
+    return int(answer.headers["upload-offset"])
+
+
+def offset_once_free(client: httpx.Client, url: str) -> int:
+    """The same, asked again while the service has not yet noticed that an earlier request has ended."""
+
+    def answered() -> httpx.Response | None:
+        answer = client.head(url, headers=TUS)
+        return None if answer.status_code == 423 else answer
+
+    answer = wait_for(answered, "the end of the request before")
     assert answer.status_code == 200, answer.status_code
     return int(answer.headers["upload-offset"])
 
