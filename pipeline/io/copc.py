@@ -58,6 +58,18 @@ def octree_info(header: laspy.LasHeader) -> OctreeInfo | None:
     )
 
 
+_FIX = "Get the file again, or rewrite it as LAZ"
+
+
+def root_node(path: Readable, stream: BinaryIO, info: OctreeInfo, file_size: int) -> npt.NDArray[np.void]:
+    """The coarsest node, a sample of the whole file, as an array of at most one `ENTRY`.
+
+    Raises UnreadableInputError if the root page or the node lies outside the file.
+    """
+    entries = _page(path, stream, info.root_offset, info.root_size, file_size)
+    return _checked(path, entries[(entries["level"] == 0) & (entries["count"] > 0)][:1], file_size)
+
+
 def nodes_within(
     path: Readable, stream: BinaryIO, info: OctreeInfo, window: Window, file_size: int
 ) -> npt.NDArray[np.void]:
@@ -65,7 +77,6 @@ def nodes_within(
 
     Raises UnreadableInputError if a page or node lies outside the file.
     """
-    fix = "Get the file again, or rewrite it as LAZ"
     pages, seen = [(info.root_offset, info.root_size)], set()
     found = []
     while pages:
@@ -73,12 +84,7 @@ def nodes_within(
         if offset in seen:
             continue
         seen.add(offset)
-        if size <= 0 or size % ENTRY.itemsize or offset + size > file_size:
-            raise UnreadableInputError(
-                str(path), f"the octree page at byte {offset} with {size} bytes is damaged or truncated", fix
-            )
-        stream.seek(offset)
-        entries = np.frombuffer(stream.read(size), dtype=ENTRY)
+        entries = _page(path, stream, offset, size, file_size)
         edge = info.width / np.exp2(entries["level"].astype(np.float64))
         west, south = info.x_min + entries["x"] * edge, info.y_min + entries["y"] * edge
         # One micrometre of slack: points sit on node borders by rounding.
@@ -87,9 +93,24 @@ def nodes_within(
         meets &= (south - slack <= window.y_max) & (south + edge + slack >= window.y_min)
         pages.extend((int(page["offset"]), int(page["size"])) for page in entries[meets & (entries["count"] == -1)])
         found.append(entries[meets & (entries["count"] > 0)])
-    nodes = np.concatenate(found)
-    ends = nodes["offset"].astype(np.float64) + nodes["size"]
-    if len(nodes) and (ends.max() > file_size or nodes["size"].min() <= 0 or nodes["count"].max() > CHUNK_SIZE_LIMIT):
-        raise UnreadableInputError(str(path), "an octree node is damaged or lies outside the file", fix)
+    nodes = _checked(path, np.concatenate(found), file_size)
     ordered: npt.NDArray[np.void] = nodes[np.argsort(nodes["offset"], kind="stable")]
     return ordered
+
+
+def _page(path: Readable, stream: BinaryIO, offset: int, size: int, file_size: int) -> npt.NDArray[np.void]:
+    """The entries of a page."""
+    if size <= 0 or size % ENTRY.itemsize or offset + size > file_size:
+        raise UnreadableInputError(
+            str(path), f"the octree page at byte {offset} with {size} bytes is damaged or truncated", _FIX
+        )
+    stream.seek(offset)
+    return np.frombuffer(stream.read(size), dtype=ENTRY)
+
+
+def _checked(path: Readable, nodes: npt.NDArray[np.void], file_size: int) -> npt.NDArray[np.void]:
+    """The same nodes, if all lie in the file and can be decoded at once."""
+    ends = nodes["offset"].astype(np.float64) + nodes["size"]
+    if len(nodes) and (ends.max() > file_size or nodes["size"].min() <= 0 or nodes["count"].max() > CHUNK_SIZE_LIMIT):
+        raise UnreadableInputError(str(path), "an octree node is damaged or lies outside the file", _FIX)
+    return nodes

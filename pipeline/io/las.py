@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import struct
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import laspy
@@ -20,9 +21,17 @@ from pipeline.errors import InconsistentInputError, UnreadableInputError
 from pipeline.io import copc
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.las_header import REWRITE, header_crs, read_header_block
-from pipeline.io.laz_chunks import CHUNK_SIZE_LIMIT, ChunkTable, check_chunks, read_chunk_table
+from pipeline.io.laz_chunks import (
+    CHUNK_SIZE_LIMIT,
+    LAYERED_FORMAT,
+    ChunkTable,
+    check_chunks,
+    check_layers,
+    read_chunk_table,
+)
 from pipeline.io.readable import Readable
-from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
+from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Share, Window
+from pipeline.io.remote_file import bytes_of
 from pipeline.io.strays import typical_bounds
 
 if TYPE_CHECKING:
@@ -71,45 +80,66 @@ class LasFile:
             if self._block.compressed:
                 self._laszip_record = self._read_laszip_record()
                 self._chunks = read_chunk_table(path, stream, self._block, self._laszip_record)
-                if facts is None:
-                    check_chunks(path, stream, self._block, self._laszip_record, self._chunks)
                 self._copc = copc.octree_info(self._header)
+                # the nodes of a remote octree are checked when they are read: mostly few of them
+                if facts is None and (self._copc is None or isinstance(path, Path)):
+                    check_chunks(path, stream, self._block, self._laszip_record, self._chunks)
             else:
                 self._check_room()
         self.facts = self._read_facts() if facts is None else facts
 
-    def records(self, chunk_size: int, window: Window | None) -> Iterator[PointRecords]:
+    def records(self, chunk_size: int, window: Window | None, share: Share | None = None) -> Iterator[PointRecords]:
         """The records in file order, in pieces of `chunk_size`; of COPC with a window only the nodes that meet it.
 
-        Raises UnreadableInputError if the data end or break before the promised count.
+        With a share only its stretch of them: whole compressed chunks or nodes. Raises UnreadableInputError if the
+        data end or break before the promised count.
         """
-        if window is not None and self._copc is not None:
-            yield from self._octree_records(chunk_size, window)
+        if self._chunks is not None and (share is not None or (window is not None and self._copc is not None)):
+            yield from self._chunk_records(chunk_size, window, share)
             return
-        for raw in self._raw(chunk_size, USED_FIELDS):
+        for raw in self._raw(chunk_size, USED_FIELDS, share):
             yield self._to_records(raw)
 
     def whole_records(self, chunk_size: int) -> Iterator[tuple[npt.NDArray[np.uint8], PointRecords]]:
         """As `records`, without a window, but each piece also as its bytes with every field."""
-        for raw in self._raw(chunk_size, lazrs.SELECTIVE_DECOMPRESS_ALL):
+        for raw in self._raw(chunk_size, lazrs.SELECTIVE_DECOMPRESS_ALL, None):
             yield raw, self._to_records(raw)
 
-    def _raw(self, chunk_size: int, fields: int) -> Iterator[npt.NDArray[np.uint8]]:
-        """The bytes of the records in file order; of compressed files with some of the fields only."""
+    def _raw(self, chunk_size: int, fields: int, share: Share | None) -> Iterator[npt.NDArray[np.uint8]]:
+        """The bytes of the records in file order; of compressed files some of the fields only, and no share."""
+        first, end = 0, self._block.point_count
+        if share is not None:
+            first, end = (end * k // share.of for k in (share.number, share.number + 1))
         with self._path.open("rb") as stream:
-            decoder = self._decoder(stream, fields)
-            for begin in range(0, self._block.point_count, chunk_size):
-                count = min(chunk_size, self._block.point_count - begin)
-                yield self._decode(decoder, count, begin)
+            if self._chunks is not None and self._copc is not None:
+                check_chunks(self._path, stream, self._block, self._laszip_record, self._chunks)
+            decoder = self._decoder(stream, fields, first)
+            for begin in range(first, end, chunk_size):
+                yield self._decode(decoder, min(chunk_size, end - begin), begin)
 
-    def _octree_records(self, chunk_size: int, window: Window) -> Iterator[PointRecords]:
-        """Records of the octree nodes that meet the window, small nodes together and large ones in pieces."""
-        assert self._copc is not None
+    def _chunk_records(self, chunk_size: int, window: Window | None, share: Share | None) -> Iterator[PointRecords]:
+        """Records of whole compressed chunks, small ones together and large ones in pieces.
+
+        They are the octree nodes that meet a window, or all chunks; with a share its stretch of them.
+        """
+        table = self._chunks
+        assert table is not None
+        if table.largest > CHUNK_SIZE_LIMIT:
+            # such chunks are never decoded at once, so the first share is the whole file
+            yield from () if share is not None and share.number else self.records(chunk_size, None)
+            return
         with self._path.open("rb") as stream:
-            nodes = copc.nodes_within(self._path, stream, self._copc, window, self._block.file_size)
+            if window is not None and self._copc is not None:
+                nodes = copc.nodes_within(self._path, stream, self._copc, window, self._block.file_size)
+                chunks = np.column_stack([nodes[name].astype(np.int64) for name in ("offset", "size", "count")])
+            else:
+                chunks = np.column_stack((table.offsets, table.sizes, table.counts))
+            chunks = chunks[chunks[:, 2] > 0]
+            if share is not None:
+                ends = np.cumsum(chunks[:, 2])
+                chunks = chunks[share.pieces(ends - chunks[:, 2], int(chunks[:, 2].sum()))]
             batch: list[npt.NDArray[np.uint8]] = []
-            for node in nodes:
-                offset, size, count = int(node["offset"]), int(node["size"]), int(node["count"])
+            for offset, size, count in chunks.tolist():
                 held = sum(map(len, batch)) // self._block.point_size
                 if batch and held + count > chunk_size:
                     yield from self._pieces(batch, chunk_size)
@@ -119,7 +149,7 @@ class LasFile:
                 yield from self._pieces(batch, chunk_size)
 
     def _pieces(self, batch: list[npt.NDArray[np.uint8]], chunk_size: int) -> Iterator[PointRecords]:
-        """Records of some decoded nodes, at most so many a piece."""
+        """Records of some decoded chunks, at most so many a piece."""
         raw, step = np.concatenate(batch), chunk_size * self._block.point_size
         for begin in range(0, len(raw), step):
             yield self._to_records(raw[begin : begin + step])
@@ -170,10 +200,11 @@ class LasFile:
         if spare:
             self._warnings.append(f"{spare} bytes follow the points and are not read")
 
-    def _decoder(self, stream: io.BufferedReader, fields: int) -> Any:
-        """The thing that gives the next records: lazrs where compressed, else the stream itself."""
+    def _decoder(self, stream: io.BufferedReader, fields: int, first: int) -> Any:
+        """The thing that gives the next records: lazrs where compressed, else the stream, at the first wanted one."""
         stream.seek(self._block.offset_to_points)
         if self._chunks is None:
+            stream.seek(first * self._block.point_size, io.SEEK_CUR)
             return stream
         # The parallel one makes room for a whole chunk, so chunks without measure go to the sequential one.
         parallel = self._chunks.largest <= CHUNK_SIZE_LIMIT
@@ -197,13 +228,13 @@ class LasFile:
 
     def _decode_chunk(self, stream: io.BufferedReader, offset: int, size: int, count: int) -> npt.NDArray[np.uint8]:
         """The bytes of the first records of a compressed chunk."""
-        stream.seek(offset)
+        chunk = bytes_of(self._path, stream, offset, size)
+        if self._block.point_format >= LAYERED_FORMAT:
+            check_layers(self._path, chunk, self._block, offset, size)
         raw = np.empty(count * self._block.point_size, dtype=np.uint8)
         try:
             fields = lazrs.DecompressionSelection(USED_FIELDS)
-            lazrs.decompress_points_with_chunk_table(
-                stream.read(size), self._laszip_record, raw, [(count, size)], fields
-            )
+            lazrs.decompress_points_with_chunk_table(chunk, self._laszip_record, raw, [(count, size)], fields)
         except DECODING_ERRORS as fault:
             raise self._broken(fault, f"in the chunk at byte {offset}") from fault
         return raw
@@ -232,9 +263,13 @@ class LasFile:
         )
 
     def _sample(self) -> PointRecords:
-        """Points from some places spread over the file, in file order."""
+        """Points from some places spread over the file, in file order; of COPC the coarsest node."""
         pieces = []
         with self._path.open("rb") as stream:
+            root = None if self._copc is None else copc.root_node(self._path, stream, self._copc, self._block.file_size)
+            if root is not None and len(root):
+                offset, size, count = (int(root[name][0]) for name in ("offset", "size", "count"))
+                return self._to_records(self._decode_chunk(stream, offset, size, count))
             if self._chunks is None:
                 last = max(self._block.point_count - SAMPLE_SIZE, 0)
                 for start in _places(last):

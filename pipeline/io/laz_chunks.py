@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 CHUNK_SIZE_LIMIT = 4_000_000
 """Points a chunk beyond which chunks are not decoded at once: writers use 50,000, COPC some 100,000."""
+LAYERED_FORMAT = 6
+"""The first point format whose chunks have layers."""
 LAYERS = {6: (30, 9), 7: (36, 10), 8: (38, 11), 9: (59, 10), 10: (67, 12)}
 """Bytes a record without extra bytes, and compressed layers, by point format; each extra byte is a layer of its own."""
 FIX = "Get the file again, or rewrite it with a LAZ tool"
@@ -132,41 +134,50 @@ def check_chunks(path: Readable, stream: BinaryIO, block: HeaderBlock, laszip_re
 
     Raises InconsistentInputError if the chunks hold another number of points, UnreadableInputError if one is damaged.
     """
-    if block.point_format >= 6:
+    if block.point_format >= LAYERED_FORMAT:
         _check_layers(path, stream, block, table)
     elif not table.variable and table.counts[-1] <= CHUNK_SIZE_LIMIT:
         _check_last_chunk(path, stream, block, laszip_record, table)
 
 
 def _check_layers(path: Readable, stream: BinaryIO, block: HeaderBlock, table: ChunkTable) -> None:
-    """Point formats 6 and above: a chunk has one record, its count, the sizes of its layers, and the layers.
-
-    lazrs asks for as much memory as a layer's size says, so a damaged one must not get there.
-    """
-    base_size, layers = LAYERS[block.point_format]
-    layers += table.item_size - base_size
-    head = np.dtype([("count", "<u4"), ("sizes", "<u4", (layers,))])
-    rows = zip(table.offsets.tolist(), table.sizes.tolist(), table.counts.tolist(), strict=True)
+    """Point formats 6 and above: the layers and counts of all chunks, and the header's count."""
     held = 0
+    rows = zip(table.offsets.tolist(), table.sizes.tolist(), table.counts.tolist(), strict=True)
     for offset, size, count in rows:
         if count == 0:
             continue
-        stream.seek(offset + table.item_size)
-        raw = stream.read(head.itemsize)
-        if len(raw) < head.itemsize:
-            raise UnreadableInputError(str(path), f"truncated: the chunk at byte {offset} has no layers", FIX)
-        found = np.frombuffer(raw, dtype=head)[0]
-        if table.item_size + head.itemsize + int(found["sizes"].sum(dtype=np.int64)) != size:
-            raise UnreadableInputError(str(path), f"the layers of the chunk at byte {offset} are damaged", FIX)
-        held += int(found["count"])
-        if found["count"] != count and offset != table.offsets[-1]:
+        stream.seek(offset)
+        found = check_layers(path, stream.read(layers_end(block)), block, offset, size)
+        held += found
+        if found != count and offset != table.offsets[-1]:
             raise InconsistentInputError(
-                str(path), f"the chunk at byte {offset} has {found['count']} points, the chunk table says {count}", FIX
+                str(path), f"the chunk at byte {offset} has {found} points, the chunk table says {count}", FIX
             )
     if held != block.point_count:
         raise InconsistentInputError(
             str(path), f"the header promises {block.point_count} points, its chunks hold {held}", FIX
         )
+
+
+def layers_end(block: HeaderBlock) -> int:
+    """Bytes at the start of a chunk of point formats 6 and above: one record, its count, the sizes of its layers."""
+    base_size, layers = LAYERS[block.point_format]
+    return block.point_size + 4 * (1 + layers + block.point_size - base_size)
+
+
+def check_layers(path: Readable, chunk: bytes, block: HeaderBlock, offset: int, size: int) -> int:
+    """Points of a chunk of point formats 6 and above, by itself; `chunk` holds its first bytes at least.
+
+    lazrs asks for as much memory as a layer's size says, so a damaged one must not get there.
+    """
+    end = layers_end(block)
+    if len(chunk) < end:
+        raise UnreadableInputError(str(path), f"truncated: the chunk at byte {offset} has no layers", FIX)
+    count, *sizes = np.frombuffer(chunk[block.point_size : end], "<u4").tolist()
+    if end + sum(sizes) != size:
+        raise UnreadableInputError(str(path), f"the layers of the chunk at byte {offset} are damaged", FIX)
+    return int(count)
 
 
 def _check_last_chunk(

@@ -41,6 +41,26 @@ class Window:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Share:
+    """One of some nearly equal stretches of a file, so that several processes can read it at once."""
+
+    number: int
+    """Which one, from 0."""
+    of: int
+    """How many there are."""
+
+    def pieces(self, starts: npt.NDArray[np.int64], total: int) -> slice:
+        """Which of the file's pieces belong to it, given the number of points before each, and of all.
+
+        >>> starts = np.array([0, 40, 80])
+        >>> [Share(number=k, of=2).pieces(starts, 100) for k in (0, 1)]
+        [slice(0, 2, None), slice(2, 3, None)]
+        """
+        first, end = (np.searchsorted(starts * self.of, total * k) for k in (self.number, self.number + 1))
+        return slice(int(first), int(end))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PointRecords:
     """Points as the file has them. All arrays have one length n; None where the file has no such field."""
 
@@ -107,3 +127,10 @@ class PointFile(Protocol):
 
     def records(self, chunk_size: int, window: Window | None) -> Iterator[PointRecords]:
         """The records in pieces of at most `chunk_size`; those outside the window may be left out, but need not."""
+
+
+class DivisibleFile(PointFile, Protocol):
+    """A file of which any part can be read alone."""
+
+    def records(self, chunk_size: int, window: Window | None, share: Share | None = None) -> Iterator[PointRecords]:
+        """The records; with a share only those that belong to it."""

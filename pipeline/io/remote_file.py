@@ -1,8 +1,9 @@
-"""A file behind a URL: read by ranges, as far as its header and some samples go, or fetched whole.
+"""A file behind a URL: read by ranges, as far as its header and some parts go, or fetched whole.
 
 LAZ is decoded from its first byte to its last, and a fetched file can be read again at no cost, so a run fetches each
 input into its scratch when its turn comes, and removes it when its points are there. The plan reads by ranges: headers
-and a few chunks are a small part of a tile. docs/how_to/object_storage.md has the measurement behind this.
+and a few chunks are a small part of a tile. So is a window of COPC, whose nodes are read by ranges, too.
+docs/how_to/object_storage.md has the measurement behind this.
 """
 
 from __future__ import annotations
@@ -115,6 +116,13 @@ class RemoteFile:
             parts.append(part)
             begin += len(part)
         return b"".join(parts)
+
+    def read_once(self, begin: int, length: int) -> bytes:
+        """The same, for what is read once and alone: unless some of it is in memory, one request for no more."""
+        end = min(begin + length, self.stat().st_size)
+        if any(number in self._blocks for number in range(begin // BLOCK_BYTES, -(-end // BLOCK_BYTES))):
+            return self.read_at(begin, length)
+        return self._range(begin, end)
 
     def _block(self, number: int) -> bytes:
         """One block, from memory or, with those that will be wanted next, from the server."""
@@ -259,6 +267,14 @@ def _time_ns(info: dict[str, Any]) -> int:
 def file_at(location: str | Path) -> Readable:
     """A file of this machine, or behind a URL."""
     return RemoteFile(str(location)) if is_url(location) else Path(location)
+
+
+def bytes_of(file: Readable, stream: io.BufferedReader, begin: int, length: int) -> bytes:
+    """Some bytes of an open file, which are read once; of a remote one no others are fetched."""
+    if isinstance(file, RemoteFile):
+        return file.read_once(begin, length)
+    stream.seek(begin)
+    return stream.read(length)
 
 
 @contextlib.contextmanager

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 import shapely
@@ -17,7 +18,7 @@ from pipeline.io.crs import SpatialReference, resolve_reference
 from pipeline.io.formats import recognise_format
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.io.readable import Readable
-from pipeline.io.records import FileFacts, PointFile, PointRecords, Window
+from pipeline.io.records import DivisibleFile, FileFacts, PointFile, PointRecords, Share, Window
 from pipeline.io.remote_file import file_at
 from pipeline.io.strays import MOST_STRAYS, off_earth, without_strays
 from pipeline.model import BoolArray, ByteArray, FloatArray, PointCloud
@@ -31,6 +32,10 @@ ROUNDING = 0.02
 """Units of the CRS by which writers round the bounds in their headers."""
 IMPOSSIBLE_DENSITY = 1e5
 """Points a square unit that no airborne survey has in metres or feet; one point a square metre is 1e10 a degree."""
+
+
+CAUSES = ("withheld", "noise_class", "outside", "off_earth")
+"""Why points are left out."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -128,6 +133,11 @@ class SourceInfo:
     """What the file says about itself."""
 
     @property
+    def is_divisible(self) -> bool:
+        """Whether each share of it can be read alone: text can only be read from its first line on."""
+        return self.format in {"las", "laz", "copc"}
+
+    @property
     def location(self) -> Location | None:
         """The place on Earth; None without a CRS, or for one without such places."""
         if self.reference.wkt is None:
@@ -143,6 +153,47 @@ class SourceInfo:
         except OSError:  # opening it reports the fault
             return False
         return (now.st_size, now.st_mtime_ns) == (self.file_size, self.modified_ns)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Findings:
+    """What a pass over the points of a file, or over a share of them, found."""
+
+    n_read: int = 0
+    """Points that were read."""
+    dropped: Counter[str] = dataclasses.field(default_factory=Counter)
+    """Points left out, by cause: outside, then off_earth, withheld, noise_class."""
+    beyond_bounds: int = 0
+    """Points outside the bounds in the header."""
+    off_earth: tuple[float, ...] = ()
+    """x, y, z of the first point that does not lie on Earth."""
+
+    def __add__(self, other: Findings) -> Findings:
+        """Those of two shares, in the order of the file."""
+        return Findings(
+            n_read=self.n_read + other.n_read,
+            dropped=self.dropped + other.dropped,
+            beyond_bounds=self.beyond_bounds + other.beyond_bounds,
+            off_earth=self.off_earth or other.off_earth,
+        )
+
+    def of_whole(self, info: SourceInfo) -> Findings:
+        """The same of a whole file, where a window of COPC left nodes unread: their points lie outside."""
+        unread = Findings(dropped=Counter(outside=info.point_count - self.n_read))
+        return self + unread
+
+    def warnings(self, path: str) -> tuple[str, ...]:
+        """What is odd but usable in a whole file; raises InconsistentInputError if many points do not lie on Earth."""
+        found = []
+        if self.beyond_bounds:
+            found.append(f"{self.beyond_bounds} points lie outside the bounds in the header")
+        if count := self.dropped["off_earth"]:
+            x, y, z = self.off_earth
+            problem = f"{count} of {self.n_read} points do not lie on Earth, such as x {x:.10g}, y {y:.10g}, z {z:.10g}"
+            if count > max(1, MOST_STRAYS * self.n_read):
+                raise InconsistentInputError(path, problem, "Check the columns, the scale and the units")
+            found.append(f"{problem}: left out")
+        return tuple(found)
 
 
 class Reader(Protocol):
@@ -194,9 +245,9 @@ class Source:
             known = None
         self._file = READERS[recognise_format(path)](path, options, None if known is None else known.facts)
         self._info = _info_of(path, self._file, options) if known is None else known
-        self._dropped = dict.fromkeys(("withheld", "noise_class", "outside", "off_earth"), 0)
-        self._first_off_earth: list[float] = []
-        self._warnings: list[str] = []
+        self.findings = Findings()
+        """What the last pass of `chunks` found."""
+        self._warnings: tuple[str, ...] = ()
 
     @property
     def info(self) -> SourceInfo:
@@ -205,54 +256,45 @@ class Source:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Points left out by the last pass of `chunks`, by cause: outside, then off_earth, withheld, noise_class."""
-        return dict(self._dropped)
+        """Points left out by the last pass of `chunks`, by cause."""
+        return {cause: self.findings.dropped[cause] for cause in CAUSES}
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Those of `info`, and what the last pass of `chunks` found."""
-        return self._info.warnings + tuple(self._warnings)
+        """Those of `info`, and what the last pass of `chunks` over the whole file found."""
+        return self._info.warnings + self._warnings
 
-    def chunks(self, chunk_size: int = 1_000_000) -> Iterator[PointCloud]:
+    def chunks(self, chunk_size: int = 1_000_000, share: Share | None = None) -> Iterator[PointCloud]:
         """The wanted points in metres, in the file's order (COPC with a window: in the octree's), in pieces.
 
-        A piece has at least one and at most `chunk_size` points, which bounds the memory. Raises UnreadableInputError
-        if the data end or break before the promised count, InconsistentInputError if a coordinate is NaN or infinite,
-        or if many points do not lie on Earth.
+        A piece has at least one and at most `chunk_size` points, which bounds the memory. Only divisible files have
+        shares; what was found of all shares together is judged by `Findings`. Raises UnreadableInputError if the data
+        end or break before the promised count, InconsistentInputError if a coordinate is NaN or infinite, or if many
+        points of a whole file do not lie on Earth.
         """
         if chunk_size < 1:
             raise SettingsError([f"chunk_size is {chunk_size}: use 1 or more"])
-        self._dropped = dict.fromkeys(self._dropped, 0)
-        self._warnings = []
-        window, n_beyond = self._options.window, 0
+        self.findings, self._warnings = Findings(), ()
+        window = self._options.window
         if self._options.aoi is not None:
             shapely.prepare(self._options.aoi)
-        if window is not None and (window.x_min > window.x_max or window.y_min > window.y_max):
-            self._dropped["outside"] = self._info.point_count
-            return
-        factors, n_read = self._factors, 0
-        for records in self._file.records(chunk_size, window):
-            n_read += len(records)
-            n_beyond += self._count_beyond_bounds(records)
-            classed = self._classed(records)
-            kept = _select(classed, self._wanted(classed, window))
-            if len(kept):
-                yield _to_cloud(kept, factors)
-        # A window of COPC leaves whole nodes unread.
-        self._dropped["outside"] += self._info.point_count - n_read
-        if n_beyond:
-            self._warnings.append(f"{n_beyond} points lie outside the bounds in the header")
-        if self._dropped["off_earth"]:
-            self._judge_off_earth(n_read)
+        if window is None or (window.x_min <= window.x_max and window.y_min <= window.y_max):
+            factors = self._factors
+            for records in self._records(chunk_size, window, share):
+                self.findings.n_read += len(records)
+                self.findings.beyond_bounds += self._count_beyond_bounds(records)
+                classed = self._classed(records)
+                kept = _select(classed, self._wanted(classed, window))
+                if len(kept):
+                    yield _to_cloud(kept, factors)
+        if share is None:
+            self.findings = self.findings.of_whole(self._info)
+            self._warnings = self.findings.warnings(str(self._path))
 
-    def _judge_off_earth(self, n_read: int) -> None:
-        """Warn of single points that do not lie on Earth; refuse a file with many of them."""
-        count = self._dropped["off_earth"]
-        x, y, z = self._first_off_earth
-        problem = f"{count} of {n_read} points do not lie on Earth, such as x {x:.10g}, y {y:.10g}, z {z:.10g}"
-        if count > max(1, MOST_STRAYS * n_read):
-            raise InconsistentInputError(str(self._path), problem, "Check the columns, the scale and the units")
-        self._warnings.append(f"{problem}: left out")
+    def _records(self, chunk_size: int, window: Window | None, share: Share | None) -> Iterator[PointRecords]:
+        if share is None:
+            return self._file.records(chunk_size, window)
+        return cast("DivisibleFile", self._file).records(chunk_size, window, share)
 
     @property
     def file(self) -> PointFile:
@@ -293,22 +335,22 @@ class Source:
             if options.aoi is not None:
                 inside = np.flatnonzero(keep)
                 keep[inside] = shapely.intersects_xy(options.aoi, records.xyz[inside, 0], records.xyz[inside, 1])
-            self._dropped["outside"] += int(len(keep) - keep.sum())
+            self.findings.dropped["outside"] += int(len(keep) - keep.sum())
         stray = off_earth(records.xyz, self._factors) if len(records) else None
         if stray is not None:
             stray &= keep
-            self._dropped["off_earth"] += int(stray.sum())
-            if stray.any() and not self._first_off_earth:
-                self._first_off_earth = records.xyz[np.argmax(stray)].tolist()
+            self.findings.dropped["off_earth"] += int(stray.sum())
+            if stray.any() and not self.findings.off_earth:
+                self.findings.off_earth = tuple(records.xyz[np.argmax(stray)].tolist())
             keep &= ~stray
         if records.withheld is not None and not options.keep_withheld:
-            self._dropped["withheld"] += int((keep & records.withheld).sum())
+            self.findings.dropped["withheld"] += int((keep & records.withheld).sum())
             keep &= ~records.withheld
         if records.classification is not None and options.drop_classes:
             table = np.zeros(256, dtype=np.bool_)
             table[list(options.drop_classes)] = True
             noise = table[records.classification]
-            self._dropped["noise_class"] += int((keep & noise).sum())
+            self.findings.dropped["noise_class"] += int((keep & noise).sum())
             keep &= ~noise
         return keep
 

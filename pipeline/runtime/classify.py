@@ -27,7 +27,7 @@ from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
 from pipeline.runtime.stages.given_footprints import given_footprints
 from pipeline.runtime.stages.ground import find_ground
-from pipeline.runtime.stages.ingest import ingest, part_of
+from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.label import LabelTask, by_tile, label, neighbourhood
@@ -254,7 +254,7 @@ def _write_all(
     """All files, in the inputs' order."""
     tasks = [
         ClassifiedTask(
-            part=part_of(path),
+            parts=found.parts,
             path=path,
             used=sum(found.points_by_tile.values()),
             name=output_name(path),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
-from pipeline.runtime.plan import Plan
+from pipeline.runtime.plan import Plan, shares_of, wanted_bounds_m, wanted_points
 from pipeline.tiling import MM, Tile, Window
 
 
@@ -57,6 +57,8 @@ class Expected:
     the window."""
     tiles: int
     """Tiles of the lattice that these files meet."""
+    readers: int = 1
+    """Tasks that read the files."""
     seen_points: float
     """Points of the tiles' windows, halos included."""
     buildings: int
@@ -88,7 +90,7 @@ class Expected:
 
     def wall_s(self, hands: int) -> dict[str, float]:
         """Wall seconds by stage with so many processes."""
-        at_once = {"ingest": len(self.points_by_file), "join": 1, "ground": max(1, round(self.area_km2))}
+        at_once = {"ingest": self.readers, "join": 1, "ground": max(1, round(self.area_km2))}
         at_once |= dict.fromkeys(("cells", "split", "publish"), self.tiles)
         return {
             stage: seconds / max(1, min(hands, at_once.get(stage, hands))) for stage, seconds in self.cpu_s().items()
@@ -99,25 +101,21 @@ def expected(plan: Plan, buildings: int | None = None) -> Expected:
     """The work of a plan; by default with as many buildings as so many points usually have."""
     tiles: set[Tile] = set()
     points: dict[str, int] = {}
+    readers = 0
     for info in plan.sources:
-        x_min, y_min, _, x_max, y_max, _ = info.bounds_m
-        left, bottom, right, top = x_min, y_min, x_max, y_max
-        if plan.options.window is not None:
-            unit = info.reference.horizontal_unit_m
-            window = plan.options.window
-            left, bottom = max(left, window.x_min * unit), max(bottom, window.y_min * unit)
-            right, top = min(right, window.x_max * unit), min(top, window.y_max * unit)
-        if left > right or bottom > top:
+        box = wanted_bounds_m(info, plan.options)
+        if box is None:
             continue
-        whole = (x_max - x_min) * (y_max - y_min)
-        points[info.path] = round(info.point_count * ((right - left) * (top - bottom) / whole if whole > 0.0 else 1.0))
-        x0, y0, x1, y1 = (round(value * MM) for value in (left, bottom, right, top))
+        points[info.path] = wanted_points(info, plan.options)
+        readers += len(shares_of(info, plan.options))
+        x0, y0, x1, y1 = (round(value * MM) for value in box)
         tiles.update(plan.grid.tiles_over(Window(x0_mm=x0, y0_mm=y0, x1_mm=x1 + 1, y1_mm=y1 + 1)))
     total = sum(points.values())
     side = plan.grid.size_mm / MM
     halo_share = ((side + 2.0 * plan.grid.halo_mm / MM) / side) ** 2
     return Expected(
         points_by_file=points,
+        readers=readers,
         tiles=len(tiles),
         # tiles at the edge of the data see less, and no window sees more points than there are
         seen_points=total * min(halo_share, max(1.0, len(tiles))),

@@ -57,7 +57,7 @@ class InputFile:
     path: str
     """As the user gave it, or as it was found in a folder."""
     sha256: str
-    """Digest of the whole file, hexadecimal."""
+    """Digest of the whole file, hexadecimal; of the points in the window where only its nodes were fetched."""
     size_bytes: int
     """Its size."""
     n_points: int | None = None

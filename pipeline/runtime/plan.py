@@ -13,6 +13,7 @@ from pipeline.errors import CrsError, EmptyInputError, InconsistentInputError, I
 from pipeline.io import ReadOptions, SourceInfo, SpatialReference, is_url, open_source, shown
 from pipeline.io.area_of_use import refuse_far_outside
 from pipeline.io.gps_time import GpsTimeKind
+from pipeline.io.records import Share
 from pipeline.io.source import IMPOSSIBLE_DENSITY
 from pipeline.runtime.cluster.memory_needs import WINDOW_BASE_BYTES
 from pipeline.runtime.scratch.folder import POINT
@@ -24,6 +25,10 @@ from pipeline.tiling import MM, Tile, TileGrid, Window
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
 _POINTS_PER_WINDOW = 4_000_000
 """Points that a tile with its halo should not exceed: tiles of 500 m up to 11 points per m2."""
+_POINTS_PER_SHARE = 2_000_000
+"""Points of a file that a task of ingest takes: some seconds of work."""
+_MOST_SHARES = 128
+"""Tasks of ingest per file: each leaves a file in every tile that it meets."""
 _ASKED_AT_ONCE = 8
 """Remote files whose headers are read at once: a header takes some ten requests of tens of milliseconds each."""
 _BYTES_PER_POINT = 220
@@ -136,6 +141,44 @@ def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings)
         ),
         warnings=tuple(warnings),
     )
+
+
+def wanted_bounds_m(info: SourceInfo, options: ReadOptions) -> tuple[float, float, float, float] | None:
+    """What the window leaves of a file's bounds: x_min, y_min, x_max, y_max; None for nothing."""
+    left, bottom, _, right, top, _ = info.bounds_m
+    if options.window is not None:
+        unit, window = info.reference.horizontal_unit_m, options.window
+        left, bottom = max(left, window.x_min * unit), max(bottom, window.y_min * unit)
+        right, top = min(right, window.x_max * unit), min(top, window.y_max * unit)
+    return (left, bottom, right, top) if left <= right and bottom <= top else None
+
+
+def wanted_points(info: SourceInfo, options: ReadOptions) -> int:
+    """Points of a file in the window, as if they were spread evenly over its bounds."""
+    box, (x_min, y_min, _, x_max, y_max, _) = wanted_bounds_m(info, options), info.bounds_m
+    if box is None:
+        return 0
+    whole = (x_max - x_min) * (y_max - y_min)
+    return round(info.point_count * ((box[2] - box[0]) * (box[3] - box[1]) / whole if whole > 0.0 else 1.0))
+
+
+def shares_of(info: SourceInfo, options: ReadOptions) -> list[Share | None]:
+    """The shares in which a file is read, each by a task; None stands for a file that is read whole.
+
+    A remote file is fetched whole, and read then, except for COPC with a window: its nodes are fetched one by one.
+    """
+    in_place = not is_url(info.path) or is_fetched_by_nodes(info, options)
+    if not (info.is_divisible and in_place):
+        return [None]
+    # only of COPC is less than all of it read
+    points = wanted_points(info, options) if info.format == "copc" else info.point_count
+    of = min(_MOST_SHARES, -(-points // _POINTS_PER_SHARE))
+    return [Share(number=k, of=of) for k in range(of)] if of > 1 else [None]
+
+
+def is_fetched_by_nodes(info: SourceInfo, options: ReadOptions) -> bool:
+    """Whether only a part of a remote file is fetched: the nodes of its octree that meet a window."""
+    return is_url(info.path) and info.format == "copc" and options.window is not None
 
 
 def _block_bytes(grid: TileGrid, sources: Sequence[SourceInfo], settings: RunSettings) -> int:

@@ -1,16 +1,14 @@
 """Small files of every format, made where a test needs them."""
 
-import io
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import laspy
-import lazrs
 import numpy as np
 import pyproj
 import pytest
+from las_files import copc_of
 
 from pipeline.model import FloatArray
 
@@ -67,66 +65,9 @@ def write_las() -> WriteLas:
 
 @pytest.fixture
 def write_copc() -> WriteLas:
-    """Writes COPC: two levels, the root with every fifth point and its eight children; the root page names a second."""
+    """Writes COPC of two levels."""
 
     def write(path: Path, xyz: FloatArray, *, crs: str = "EPSG:7415", **fields: Any) -> Path:
-        las = _record(xyz, "1.4", 6, crs, fields)
-        center = (xyz.min(axis=0) + xyz.max(axis=0)) / 2.0
-        halfsize = float(np.ptp(xyz, axis=0).max()) / 2.0 + 0.01
-        child = ((xyz > center) * np.array([1, 2, 4])).sum(axis=1)
-        node = np.where(np.arange(len(xyz)) % 5 == 0, 0, child + 1)
-        laz_vlr = lazrs.LazVlr.new_for_compression(6, 0, True)
-        info_size = 54 + 160
-        laszip_record = bytes(laz_vlr.record_data())
-        wkt = pyproj.CRS.from_user_input(crs).to_wkt() + "\0"
-        offset = 375 + info_size + 54 + len(laszip_record) + 54 + len(wkt)
-
-        body = io.BytesIO()
-        body.write(b"\0" * offset)
-        compressor = lazrs.LasZipCompressor(body, laz_vlr)
-        raw = las.points.array
-        keys: list[tuple[int, int, int, int]] = []
-        for number in range(9):
-            chosen = raw[node == number]
-            if len(chosen) == 0:
-                continue
-            if keys:
-                compressor.finish_current_chunk()
-            compressor.compress_many(np.frombuffer(chosen.tobytes(), dtype=np.uint8))
-            bits = number - 1
-            keys.append((0, 0, 0, 0) if number == 0 else (1, bits & 1, bits >> 1 & 1, bits >> 2 & 1))
-        compressor.done()
-        content = bytearray(body.getvalue())
-        stream = io.BytesIO(content)
-        stream.seek(offset)
-        chunks = lazrs.read_chunk_table(stream, laz_vlr)
-        at, entries = offset + 8, []
-        for key, (count, size) in zip(keys, chunks, strict=True):
-            entries.append(struct.pack("<iiiiQii", *key, at, size, count))
-            at += size
-        evlr_at = len(content)
-        page_at = evlr_at + 60
-        # The second page holds the children from 4 on.
-        second_at = page_at + 32 * 6
-        page = b"".join(entries[:5]) + struct.pack("<iiiiQii", *keys[5], second_at, 32 * len(entries[5:]), -1)
-        page += b"".join(entries[5:])
-        content += struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(page), b"") + page
-
-        info = struct.pack("<5dQQ2d", *center, halfsize, 1.0, page_at, 32 * 6, 0.0, 0.0) + b"\0" * 88
-        head = bytearray(375)
-        struct.pack_into("<4sHH", head, 0, b"LASF", 0, 16)
-        head[24], head[25] = 1, 4
-        struct.pack_into("<HHHIIBH", head, 90, 10, 2024, 375, offset, 3, 6 | 0x80, 30)
-        struct.pack_into("<6d", head, 131, *las.header.scales, *las.header.offsets)
-        low, high = xyz.min(axis=0), xyz.max(axis=0)
-        struct.pack_into("<6d", head, 179, high[0], low[0], high[1], low[1], high[2], low[2])
-        struct.pack_into("<QQIQ", head, 227, 0, evlr_at, 1, len(xyz))
-        head += struct.pack("<H16sHH32s", 0, b"copc", 1, 160, b"") + info
-        head += struct.pack("<H16sHH32s", 0, b"laszip encoded", 22204, len(laszip_record), b"") + laszip_record
-        head += struct.pack("<H16sHH32s", 0, b"LASF_Projection", 2112, len(wkt), b"") + wkt.encode()
-        content[: len(head)] = head
-        assert len(head) == offset
-        path.write_bytes(content)
-        return path
+        return copc_of(path, _record(xyz, "1.4", 6, None, fields), crs)
 
     return write

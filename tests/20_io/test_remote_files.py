@@ -1,13 +1,11 @@
 """Files behind URLs: read by ranges or fetched, from servers of every temper."""
 
-import http.server
 import os
-import re
-import threading
 
 import laspy
 import numpy as np
 import pytest
+from one_file_site import CONTENT, one_file_site
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io import ReadOptions, open_source
@@ -15,70 +13,12 @@ from pipeline.io.remote_file import BLOCK_BYTES, BLOCKS_KEPT, RemoteFile, file_a
 from pipeline.io.retries import RetryPolicy
 
 QUICK = RetryPolicy(attempts=3, first_wait_s=0.01, longest_wait_s=0.01)
-CONTENT = np.random.default_rng(3).bytes(3_000_000)
-
-
-class Site:
-    """A web server for one file, and how it behaves."""
-
-    def __init__(self) -> None:
-        self.content = CONTENT
-        self.ranges = True
-        self.says_size = True
-        self.faults: list[int] = []
-        self.etag = '"1"'
-        self.asked: list[tuple[str, str | None]] = []
-        site = self
-
-        class Handler(http.server.BaseHTTPRequestHandler):
-            protocol_version = "HTTP/1.1"
-
-            def do_HEAD(self) -> None:
-                self._answer(with_body=False)
-
-            def do_GET(self) -> None:
-                self._answer(with_body=True)
-
-            def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the library's name
-                pass
-
-            def _answer(self, *, with_body: bool) -> None:
-                wanted = self.headers.get("Range")
-                site.asked.append((self.command, wanted))
-                body, status = site.content, 200
-                if site.faults:
-                    body, status = b"", site.faults.pop(0)
-                elif wanted and site.ranges:
-                    first, last = (int(v) for v in re.fullmatch(r"bytes=(\d+)-(\d+)", wanted).groups())
-                    body, status = body[first : last + 1], 206
-                self.send_response(status)
-                self.send_header("ETag", site.etag)
-                if site.says_size:
-                    self.send_header("Content-Length", str(len(body)))
-                    self.send_header("Accept-Ranges", "bytes" if site.ranges else "none")
-                else:
-                    self.send_header("Connection", "close")
-                    self.close_connection = True
-                if status == 206:
-                    self.send_header("Content-Range", f"bytes {first}-{last}/{len(site.content)}")
-                self.end_headers()
-                if with_body:
-                    self.wfile.write(body)
-
-        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.server.daemon_threads = True
-        self.url = f"http://127.0.0.1:{self.server.server_address[1]}/tiles/a.laz"
 
 
 @pytest.fixture
 def site():
-    site = Site()
-    thread = threading.Thread(target=site.server.serve_forever, args=(0.02,), daemon=True)
-    thread.start()
-    yield site
-    site.server.shutdown()
-    site.server.server_close()
-    thread.join()
+    with one_file_site() as site:
+        yield site
 
 
 def test_a_part_is_read_without_the_rest(site):
@@ -96,9 +36,8 @@ def test_anyone_who_reads_on_reads_larger_pieces_and_each_byte_once(site):
     with file_at(site.url).open("rb") as stream:
         parts = list(iter(lambda: stream.read(10_000), b""))
     assert b"".join(parts) == CONTENT
-    requests = [asked for method, asked in site.asked if method == "GET"]
-    assert len(requests) < len(CONTENT) / BLOCK_BYTES / 2
-    spans = [[int(v) for v in asked.removeprefix("bytes=").split("-")] for asked in requests]
+    spans = site.spans()
+    assert len(spans) < len(CONTENT) / BLOCK_BYTES / 2
     assert sum(last - first + 1 for first, last in spans) == len(CONTENT)
 
 
@@ -208,9 +147,40 @@ def test_the_header_and_the_points_of_a_remote_tile_are_those_of_the_local_one(s
     assert there.info.bounds_m == here.info.bounds_m
     assert there.info.point_count == here.info.point_count
     assert there.info.path == site.url
-    looked_at = sum(
-        int(last) - int(first) + 1 for _, asked in site.asked if asked for first, last in [asked[6:].split("-")]
-    )
+    looked_at = sum(last - first + 1 for first, last in site.spans())
     assert looked_at <= len(site.content)
     clouds = [np.vstack([cloud.xyz for cloud in source.chunks()]) for source in (here, there)]
     assert np.array_equal(*clouds)
+
+
+def test_of_a_remote_octree_only_the_nodes_in_the_window_are_fetched(site, tmp_path, points, write_copc):
+    path = write_copc(tmp_path / "a.copc.laz", points(600_000))
+    site.content = path.read_bytes()
+    box = ReadOptions(bbox=(84_010.0, 447_020.0, 84_030.0, 447_040.0))
+    here, there = (open_source(place, box) for place in (path, site.url))
+    assert there.info.facts == here.info.facts
+    read = [np.concatenate([piece.xyz for piece in source.chunks()]) for source in (here, there)]
+    np.testing.assert_array_equal(*read)
+    assert here.findings == there.findings
+    chunks = here.file._chunks
+    spans, fetched = site.spans(), []
+    for offset, size in zip(chunks.offsets.tolist(), chunks.sizes.tolist(), strict=True):
+        middle = range(offset + BLOCK_BYTES, offset + size - BLOCK_BYTES)
+        fetched.append(any(first < middle.stop and last >= middle.start for first, last in spans))
+    # the root, and the two children above one another in the south-west
+    assert sum(fetched) == 3
+    assert fetched[0]
+
+
+def test_a_damaged_node_of_a_remote_octree_is_reported_when_it_is_read(site, tmp_path, points, write_copc):
+    path = write_copc(tmp_path / "a.copc.laz", points(20_000))
+    chunks = open_source(path).file._chunks
+    raw = bytearray(path.read_bytes())
+    at = int(chunks.offsets[3]) + chunks.item_size + 4
+    raw[at : at + 4] = b"\xff\xff\xff\x7f"
+    site.content = bytes(raw)
+    with pytest.raises(UnreadableInputError, match="layers of the chunk at byte"):
+        list(open_source(site.url).chunks())
+    whole = ReadOptions(bbox=(84_000.0, 447_000.0, 84_100.0, 447_100.0))
+    with pytest.raises(UnreadableInputError, match="layers of the chunk at byte"):
+        list(open_source(site.url, whole).chunks())

@@ -134,10 +134,10 @@ def test_children_of_a_server_that_is_killed_die_and_the_work_is_done_by_others(
     found: list[Any] = []
     thread = threading.Thread(target=lambda: found.append(ask(order)))
     thread.start()
-    wait_for(mark.exists, "the item")
+    wait_for(lambda: mark.exists() and mark.read_text() == "1", "the first trial")
     (server,) = servers()
     server.kill()
-    wait_for(lambda: len(mark.read_text()) == 2, "the second trial")
+    wait_for(lambda: mark.read_text() == "11", "the second trial")
     go.touch()
     thread.join(LONG_S)
     assert len(found) == 1

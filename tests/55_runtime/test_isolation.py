@@ -212,10 +212,11 @@ def test_a_child_killed_from_outside_costs_nothing(orders: Order, tmp_path: Path
     found: list[Any] = []
     thread = threading.Thread(target=lambda: found.extend(outcomes(orders, ["1", waits, "2"])))
     thread.start()
-    wait_for((tmp_path / "reached").exists, "the item")
+    reached = tmp_path / "reached"
+    wait_for(lambda: reached.exists() and reached.read_text() == "1", "the first trial")
     (victim,) = child_processes()
     victim.kill()
-    wait_for(lambda: len((tmp_path / "reached").read_text()) == 2, "the second trial")
+    wait_for(lambda: reached.read_text() == "11", "the second trial")
     (tmp_path / "go").touch()
     thread.join(LONG_S)
     assert found == ["1", waits, "2"]

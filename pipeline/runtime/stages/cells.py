@@ -79,10 +79,10 @@ def find_all_cells(
     """The cells of some tiles with points, the fullest first."""
     grid, points, content = context.plan.grid, points_by_tile(ingested), content_by_tile(ingested)
     # the marks of points are in the order of the buckets, which equal points do not imply
-    files: dict[Tile, list[tuple[str, str]]] = {}
+    files: dict[Tile, list[tuple[tuple[str, ...], str]]] = {}
     for found in ingested:
         for tile in found.points_by_tile:
-            files.setdefault(tile, []).append((found.part, found.sha256))
+            files.setdefault(tile, []).append((found.parts, found.sha256))
     alike = key_of(grid, settings, classes)
     tasks = {}
     for tile in sorted(tiles, key=lambda tile: (-points[tile], tile)):

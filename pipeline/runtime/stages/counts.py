@@ -7,6 +7,7 @@ import heapq
 from collections import Counter
 from collections.abc import Sequence
 
+from pipeline.io.source import CAUSES
 from pipeline.runtime.manifest import SLOWEST, SlowBuilding
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.stages.ground import Ground
@@ -78,11 +79,11 @@ def run_counts(
     by_status = found.statuses
     dropped: Counter[str] = Counter()
     for entry in ingested:
-        dropped.update(entry.dropped)
+        dropped.update(entry.findings.dropped)
     return {
         "points_promised": plan.points,
         "points": sum(s.points for s in splits.figures),
-        **{f"dropped_{cause}": count for cause, count in sorted(dropped.items())},
+        **{f"dropped_{cause}": dropped[cause] for cause in sorted(CAUSES)},
         "duplicates": sum(cells.duplicates for cells in ground.cells.values()),
         "outliers": sum(cells.outliers for cells in ground.cells.values()),
         "tiles": len(splits.figures),

@@ -1,6 +1,7 @@
 """Ingest: one streamed read of each input file, which buckets its points on the lattice of tiles.
 
-LAZ has no spatial index, so reading windows would decode the file again for every tile.
+LAZ has no spatial index, so reading windows would decode the file again for every tile. Several tasks read a large file
+at once, each a share of it.
 """
 
 from __future__ import annotations
@@ -16,17 +17,19 @@ from uuid import uuid4
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import EmptyInputError, InconsistentInputError, InputError
+from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, UnreadableInputError
 from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
-from pipeline.io.remote_file import RemoteFile
+from pipeline.io.records import Share
+from pipeline.io.remote_file import RemoteFile, file_at
 from pipeline.io.storage import sha256_of
 from pipeline.model import IntArray, PointCloud
+from pipeline.runtime.plan import is_fetched_by_nodes, shares_of
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.cleanup import clear_points
-from pipeline.runtime.stages.ingested import Ingested, points_by_tile, spread_m
+from pipeline.runtime.stages.ingested import Ingested, of_shares, points_by_tile, spread_m
 from pipeline.runtime.stages.tile_content import ZoneSums, zone_sums
 from pipeline.tiling import MM, Tile, TileGrid
 
@@ -39,10 +42,10 @@ _TWO_BYTES = 2**16
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class IngestTask:
-    """One input file."""
+    """One input file, or a share of it."""
 
     part: str
-    """Names the file's parts in scratch; no two inputs share one."""
+    """Names its buckets in scratch; no two tasks have one name."""
     path: str
     """The file, or its URL with its query."""
     options: ReadOptions
@@ -53,6 +56,8 @@ class IngestTask:
     """Where the buckets go."""
     known: SourceInfo | None = None
     """Header facts from the plan."""
+    share: Share | None = None
+    """The share; None for the whole file."""
 
 
 def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
@@ -65,21 +70,27 @@ def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
     tasks = {}
     for path in paths:
         file = known[shown(path)]
-        task = IngestTask(
-            part=part_of(path),
-            path=path,
-            options=plan.options,
-            grid=plan.grid,
-            scratch=context.scratch,
-            known=file,
-        )
         # a file without a time of modification may have changed unnoticed: read it again
         written = file.modified_ns or uuid4().hex
-        key = key_of(path, file.file_size, written, task.options, task.grid)
-        tasks[Place("ingest", task.part, key)] = task
+        for share in shares_of(file, plan.options):
+            task = IngestTask(
+                part=part_of(path) if share is None else f"{part_of(path)}-{share.number:03d}",
+                path=path,
+                options=plan.options,
+                grid=plan.grid,
+                scratch=context.scratch,
+                known=file,
+                share=share,
+            )
+            key = key_of(path, file.file_size, written, task.options, task.grid, share)
+            tasks[Place("ingest", task.part, key)] = task
     clear_points(context.scratch, tasks)
     buckets: Files[IngestTask, Ingested] = Files(leaves=_buckets, intact=is_intact)
-    ingested = list(context.map_stored("ingest", ingest_file, tasks, whole, files=buckets).values())
+    stored = context.map_stored("ingest", ingest_file, tasks, whole, files=buckets)
+    shares: dict[str, list[Ingested]] = {path: [] for path in paths}
+    for place, found in stored.items():
+        shares[tasks[place].path].append(found)
+    ingested = [of_shares(known[shown(path)], of_file) for path, of_file in shares.items()]
     for found in ingested:
         for warning in found.warnings:
             progress.warn("ingest", f"{shown(found.path)}: {warning}")
@@ -87,7 +98,7 @@ def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
     if points == 0:
         causes = Counter[str]()
         for found in ingested:
-            causes.update(found.dropped)
+            causes.update(found.findings.dropped)
         lost = ", ".join(f"{count} {cause}" for cause, count in causes.items() if count)
         raise EmptyInputError(
             shown(paths[0]),
@@ -147,13 +158,15 @@ def to_records(cloud: PointCloud) -> npt.NDArray[np.void]:
 
 
 def ingest_file(task: IngestTask) -> Ingested:
-    """Read one file and bucket its points by tile; a file behind a URL is fetched into scratch meanwhile.
+    """Read one file, or a share of it, and bucket its points by tile; a file behind a URL is fetched meanwhile.
 
     The points are in scratch under `points/<tile>/<part>.bin`. Raises InputError if the file cannot be used.
     """
     task.scratch.check_cancelled()
     if not is_url(task.path):
         return _ingested(task)
+    if task.known is not None and is_fetched_by_nodes(task.known, task.options):
+        return dataclasses.replace(_ingested(task), path=shown(task.path))
     file = RemoteFile(task.path)
     copy = task.scratch.path("fetched", uuid4().hex, f"points{file.suffix}")
     try:
@@ -171,8 +184,17 @@ def ingest_file(task: IngestTask) -> Ingested:
         shutil.rmtree(copy.parent, ignore_errors=True)
 
 
+def _check_unchanged(task: IngestTask) -> None:
+    """Refuse a file of which different tasks would see different states; a task that reads it whole sees one."""
+    if task.share is not None and task.known is not None and not task.known.is_of(file_at(task.path)):
+        raise UnreadableInputError(
+            shown(task.path), "it changed after the run began", "Run again when it is no longer being written"
+        )
+
+
 def _ingested(task: IngestTask) -> Ingested:
-    """As `ingest_file`, for a file of this machine."""
+    """As `ingest_file`, for a file that is read where it is."""
+    _check_unchanged(task)
     source = open_source(task.path, task.options, task.known)
     suffix = f".{uuid4().hex}.part"
     counts: Counter[Tile] = Counter()
@@ -183,9 +205,12 @@ def _ingested(task: IngestTask) -> Ingested:
     moments = np.zeros(6)
     first: tuple[int, int] | None = None
     multiple = False
-    for cloud in source.chunks(_CHUNK_POINTS):
+    nodes = None if not is_url(task.path) else hashlib.sha256()
+    for cloud in source.chunks(_CHUNK_POINTS, task.share):
         task.scratch.check_cancelled()
         records = to_records(cloud)
+        if nodes is not None:
+            nodes.update(records.data)
         x, y, z = (np.ascontiguousarray(records[name]) for name in "xyz")
         for axis, values in enumerate((x, y, z)):
             low[axis] = min(low[axis], int(values.min()))
@@ -198,24 +223,30 @@ def _ingested(task: IngestTask) -> Ingested:
         classes.update({int(c): int(histogram[c]) for c in np.flatnonzero(histogram)})
         multiple = multiple or bool((records["return_count"] > 1).any())
         counts.update(_append_by_tile(records, x, y, task, suffix, content))
+    _check_unchanged(task)
     for tile in counts:
         part = task.scratch.path("points", tile.key, f"{task.part}{suffix}")
         task.scratch.check_cancelled()
         part.replace(task.scratch.path("points", tile.key, f"{task.part}.bin"))
     return Ingested(
         path=task.path,
-        part=task.part,
+        parts=(task.part,),
         points_by_tile=dict(counts),
         content={tile: sums.tobytes() for tile, sums in content.items()},
         classes=dict(classes),
-        dropped=source.dropped,
+        findings=source.findings,
         warnings=source.warnings,
         bounds_mm=None if first is None else (*(int(v) for v in low), *(int(v) for v in high)),  # type: ignore[arg-type]
         moments=tuple(float(v) for v in moments),
         first_mm=first or (0, 0),
         multiple_returns=multiple,
-        sha256=sha256_of(Path(task.path)),
+        sha256=_digest_of(task) if nodes is None else nodes.hexdigest(),
     )
+
+
+def _digest_of(task: IngestTask) -> str:
+    """The digest of a file of this machine, by the task of its first share."""
+    return "" if task.share is not None and task.share.number else sha256_of(Path(task.path))
 
 
 def _append_by_tile(

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import hashlib
 import math
+import operator
 from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.io import SourceInfo
+from pipeline.io.source import Findings
+from pipeline.model import FloatArray
 from pipeline.runtime.stages.tile_content import ZoneSums, zone_sums_of
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
 from pipeline.terrain.scene_settings import ClassesInUse
@@ -21,20 +27,20 @@ and that of real ground will do, and the setting `classes` overrules it."""
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Ingested:
-    """What one input file held."""
+    """What one input file held, or a share of it."""
 
     path: str
     """The file."""
-    part: str
-    """Name of its buckets."""
+    parts: tuple[str, ...]
+    """Names of its buckets, in the order of its points."""
     points_by_tile: dict[Tile, int]
     """Points in each tile's bucket."""
     content: dict[Tile, bytes]
     """Which points those are: the bytes of the tile's `ZoneSums`."""
     classes: dict[int, int]
     """Kept points by ASPRS class."""
-    dropped: dict[str, int]
-    """Points left out, by cause."""
+    findings: Findings
+    """What was left out, and why."""
     warnings: tuple[str, ...]
     """What is odd but usable."""
     bounds_mm: tuple[int, int, int, int, int, int] | None
@@ -46,7 +52,37 @@ class Ingested:
     multiple_returns: bool
     """Whether any kept pulse has more than one return."""
     sha256: str
-    """Digest of the file."""
+    """Digest of the file, empty for its shares but the first; of the wanted points where only these were fetched."""
+
+
+def of_shares(info: SourceInfo, shares: Sequence[Ingested]) -> Ingested:
+    """What a file held, of what its shares held, in the order of the file.
+
+    Raises InconsistentInputError if many points do not lie on Earth.
+    """
+    if len(shares) == 1:
+        return shares[0]
+    findings = functools.reduce(operator.add, (share.findings for share in shares)).of_whole(info)
+    first_mm = next((share.first_mm for share in shares if share.bounds_mm is not None), (0, 0))
+    boxes = np.array([share.bounds_mm for share in shares if share.bounds_mm is not None])
+    classes, digests = Counter[int](), [share.sha256 for share in shares]
+    for share in shares:
+        classes.update(share.classes)
+    return Ingested(
+        path=shares[0].path,
+        parts=tuple(part for share in shares for part in share.parts),
+        points_by_tile=dict(points_by_tile(shares)),
+        content={tile: sums.tobytes() for tile, sums in content_by_tile(shares).items()},
+        classes={code: classes[code] for code in sorted(classes)},
+        findings=findings,
+        warnings=info.warnings + findings.warnings(info.path),
+        bounds_mm=(*boxes[:, :3].min(axis=0).tolist(), *boxes[:, 3:].max(axis=0).tolist()) if len(boxes) else None,
+        moments=tuple(sum((_moments_about(share, first_mm) for share in shares), np.zeros(6)).tolist()),
+        first_mm=first_mm,
+        multiple_returns=any(share.multiple_returns for share in shares),
+        # each share of a file that is not read whole has a digest of its own
+        sha256=hashlib.sha256("".join(digests).encode()).hexdigest() if all(digests) else digests[0],
+    )
 
 
 def points_by_tile(ingested: Sequence[Ingested]) -> Counter[Tile]:
@@ -92,17 +128,21 @@ def classes_in_use(ingested: Sequence[Ingested], *, trust: bool) -> tuple[Classe
 
 def spread_m(results: Sequence[Ingested]) -> float:
     """Standard deviation of all points, in metres, across the line that fits them best: 0 where they lie on it."""
-    total = np.zeros(6)
-    anchor: tuple[int, int] | None = None
-    for result in results:
-        n, sx, sy, sxx, sxy, syy = result.moments
-        if n == 0:
-            continue
-        if anchor is None:
-            anchor = result.first_mm
-        # move the moments to the first file's first point
-        dx, dy = (result.first_mm[0] - anchor[0]) / MM, (result.first_mm[1] - anchor[1]) / MM
-        total += (
+    anchor = next((result.first_mm for result in results if result.moments[0]), (0, 0))
+    n, sx, sy, sxx, sxy, syy = sum((_moments_about(result, anchor) for result in results), np.zeros(6))
+    if n == 0:
+        return 0.0
+    xx, xy, yy = sxx / n - (sx / n) ** 2, sxy / n - sx * sy / n**2, syy / n - (sy / n) ** 2
+    smallest = (xx + yy) / 2 - math.hypot((xx - yy) / 2, xy)
+    return math.sqrt(max(0.0, smallest))
+
+
+def _moments_about(found: Ingested, anchor_mm: tuple[int, int]) -> FloatArray:
+    """Moments (6,) of an input's points about another point than its first."""
+    n, sx, sy, sxx, sxy, syy = found.moments
+    dx, dy = (found.first_mm[0] - anchor_mm[0]) / MM, (found.first_mm[1] - anchor_mm[1]) / MM
+    return np.array(
+        (
             n,
             sx + n * dx,
             sy + n * dy,
@@ -110,9 +150,4 @@ def spread_m(results: Sequence[Ingested]) -> float:
             sxy + dx * sy + dy * sx + n * dx * dy,
             syy + 2 * dy * sy + n * dy * dy,
         )
-    n, sx, sy, sxx, sxy, syy = total
-    if n == 0:
-        return 0.0
-    xx, xy, yy = sxx / n - (sx / n) ** 2, sxy / n - sx * sy / n**2, syy / n - (sy / n) ** 2
-    smallest = (xx + yy) / 2 - math.hypot((xx - yy) / 2, xy)
-    return math.sqrt(max(0.0, smallest))
+    )

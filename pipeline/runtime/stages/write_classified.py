@@ -52,8 +52,8 @@ _SCALE = 0.001
 class ClassifiedTask:
     """One input file."""
 
-    part: str
-    """As ingest names it in scratch."""
+    parts: tuple[str, ...]
+    """As ingest names its buckets in scratch."""
     path: str
     """The file."""
     used: int
@@ -117,6 +117,7 @@ class _Labels:
     def __init__(self, task: ClassifiedTask) -> None:
         self._task = task
         self._done: Counter[Tile] = Counter()
+        self._sizes: dict[Tile, dict[Path, int]] = {}
 
     def of(self, kept: npt.NDArray[np.bool_], cloud: PointCloud) -> ByteArray:
         """Classes of the next points of the file, `KEEP` for those that ingest left out."""
@@ -137,17 +138,28 @@ class _Labels:
         return labels
 
     def _next(self, tile: Tile, count: int) -> ByteArray:
-        """The next classes of a tile."""
-        path = class_path(self._task.scratch, tile, f"{self._task.part}.bin")
-        found = np.fromfile(path, np.uint8, count, offset=self._done[tile])
-        if len(found) < count:
+        """The next classes of a tile: its buckets of the file follow one another."""
+        begin, missing, found = self._done[tile], count, []
+        self._done[tile] += count
+        for path, size in self._buckets(tile).items():
+            if begin < size and missing:
+                found.append(np.fromfile(path, np.uint8, missing, offset=begin))
+                missing -= len(found[-1])
+            begin = max(0, begin - size)
+        if missing:
             raise InconsistentInputError(
                 self._task.path,
                 f"it has more points in tile {tile.key} than when it was first read",
                 _FIX,
             )
-        self._done[tile] += count
-        return found
+        return np.concatenate(found)
+
+    def _buckets(self, tile: Tile) -> dict[Path, int]:
+        """The buckets of the file in a tile, with their numbers of points."""
+        if tile not in self._sizes:
+            paths = (class_path(self._task.scratch, tile, f"{part}.bin") for part in self._task.parts)
+            self._sizes[tile] = {path: path.stat().st_size for path in paths if path.exists()}
+        return self._sizes[tile]
 
     def check_all_given(self) -> None:
         """Refuse a file that ended early."""
