@@ -102,6 +102,7 @@ def _is_last(points: WindowPoints) -> BoolArray:
 
 def _vertices(
     points: WindowPoints,
+    core: Window,
     height_mm: IntArray,
     terrain: Terrain,
     building: BoolArray,
@@ -109,7 +110,7 @@ def _vertices(
     settings: SceneSettings,
     classes: ClassesInUse,
 ) -> SceneVertices:
-    """The vertices of the scene's TIN: thinned points with what is known of them."""
+    """The vertices of a core's TIN: thinned points with what is known of them."""
     used = (height_mm != NO_DATA) & (_is_last(points) | building)
     # equal coordinates of different classes must not be decided by the order of the points
     preferred = np.zeros(len(points), np.int8)
@@ -133,12 +134,23 @@ def _vertices(
     if classes.ground:
         kind[points.classification[chosen] == GROUND_CLASS] = VertexKind.GROUND
     kind[building[chosen]] = VertexKind.BUILDING
-    planar = planarity(x, y, z, kind == VertexKind.OBJECT, settings.vegetation)
+    # farther points are evidence only
+    facets_m, crowns_m = settings.surfaces.support_m, settings.vegetation.crowns_support_m
+    judged = core.grown(round(1000 * (facets_m + crowns_m))).contains(x, y)
+    planar = planarity(x, y, z, judged & (kind == VertexKind.OBJECT), settings.vegetation)
     stands = used & (height_mm >= round(1000 * settings.ground.tolerance_m))
     floor = lowest_below(points.x_mm, points.y_mm, points.z_mm, stands, chosen, cell, settings.vegetation.level_m)
     planar[_has_floor(points, height_mm, floor, planar == 0, settings)] = 1
     kind[crowns(x, y, z, planar, several[chosen], settings.vegetation)] = VertexKind.CROWN
-    return SceneVertices(x_mm=x, y_mm=y, z_mm=z, height_mm=height_mm[chosen], kind=kind, planar=planar)
+    near = np.flatnonzero(core.grown(round(1000 * facets_m)).contains(x, y))
+    return SceneVertices(
+        x_mm=x[near],
+        y_mm=y[near],
+        z_mm=z[near],
+        height_mm=height_mm[chosen[near]],
+        kind=kind[near],
+        planar=planar[near],
+    )
 
 
 def _has_floor(
@@ -193,7 +205,7 @@ def split_tile(
         excluded = ~np.isin(points.classification, (*NEUTRAL_CLASSES, GROUND_CLASS, BUILDING_CLASS))
     elif classes.vegetation:
         excluded = np.isin(points.classification, VEGETATION_CLASSES)
-    vertices = _vertices(points, height, terrain, building, excluded, settings, classes)
+    vertices = _vertices(points, core, height, terrain, building, excluded, settings, classes)
     core_index = np.flatnonzero(core.contains(points.x_mm, points.y_mm) & (height != NO_DATA))
     owned = points.take(core_index)
     allowed = np.where(_thin(owned, height[core_index], vertices, settings), Allowed.EVIDENCE, Allowed.ANY)

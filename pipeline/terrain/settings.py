@@ -175,7 +175,12 @@ class VegetationSettings(Parameters):
     @property
     def support_m(self) -> float:
         """How far the judgement looks: the shifted windows of the widest scale, around the vertices of a sphere."""
-        return (2.0 * self.radius_m + self.company_m) * 2.0 ** (PLANARITY_SCALES - 1)
+        return 2.0 * self.radius_m * 2.0 ** (PLANARITY_SCALES - 1) + self.crowns_support_m
+
+    @property
+    def crowns_support_m(self) -> float:
+        """How far the search for crowns looks at judged vertices: the widest sphere."""
+        return self.company_m * 2.0 ** (PLANARITY_SCALES - 1)
 
 
 class SurfaceSettings(Parameters):
