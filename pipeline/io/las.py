@@ -81,8 +81,8 @@ class LasFile:
                 self._laszip_record = self._read_laszip_record()
                 self._chunks = read_chunk_table(path, stream, self._block, self._laszip_record)
                 self._copc = copc.octree_info(self._header)
-                # the nodes of a remote octree are checked when they are read: mostly few of them
-                if facts is None and (self._copc is None or isinstance(path, Path)):
+                # the layers of a remote file are checked when its chunks are read: a plan needs few of these
+                if facts is None and (isinstance(path, Path) or self._block.point_format < LAYERED_FORMAT):
                     check_chunks(path, stream, self._block, self._laszip_record, self._chunks)
             else:
                 self._check_room()
@@ -111,7 +111,7 @@ class LasFile:
         if share is not None:
             first, end = (end * k // share.of for k in (share.number, share.number + 1))
         with self._path.open("rb") as stream:
-            if self._chunks is not None and self._copc is not None:
+            if self._chunks is not None and self._block.point_format >= LAYERED_FORMAT:
                 check_chunks(self._path, stream, self._block, self._laszip_record, self._chunks)
             decoder = self._decoder(stream, fields, first)
             for begin in range(first, end, chunk_size):

@@ -140,15 +140,15 @@ def test_the_header_and_the_points_of_a_remote_tile_are_those_of_the_local_one(s
     las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
     las.header.scales, las.header.offsets = [0.01] * 3, [0.0] * 3
     for name in "xyz":
-        setattr(las, name, rng.uniform(0.0, 300.0, 400_000))
+        setattr(las, name, rng.uniform(0.0, 300.0, 1_200_000))
     las.write(tmp_path / "a.laz")
     site.content = (tmp_path / "a.laz").read_bytes()
     here, there = (open_source(place, ReadOptions(crs="EPSG:28992")) for place in (tmp_path / "a.laz", site.url))
     assert there.info.bounds_m == here.info.bounds_m
     assert there.info.point_count == here.info.point_count
     assert there.info.path == site.url
-    looked_at = sum(last - first + 1 for first, last in site.spans())
-    assert looked_at <= len(site.content)
+    # eight of its 24 chunks are sampled
+    assert sum(last - first + 1 for first, last in site.spans()) < 0.5 * len(site.content)
     clouds = [np.vstack([cloud.xyz for cloud in source.chunks()]) for source in (here, there)]
     assert np.array_equal(*clouds)
 
