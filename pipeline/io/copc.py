@@ -14,7 +14,6 @@ import numpy.typing as npt
 from laspy.copc import CopcInfoVlr
 
 from pipeline.errors import UnreadableInputError
-from pipeline.io.laz_chunks import CHUNK_SIZE_LIMIT
 from pipeline.io.readable import Readable
 
 if TYPE_CHECKING:
@@ -58,16 +57,19 @@ def octree_info(header: laspy.LasHeader) -> OctreeInfo | None:
     )
 
 
+_DEEPEST = 31
+"""No octree is deeper: the numbers of its nodes have 32 bits."""
 _FIX = "Get the file again, or rewrite it as LAZ"
 
 
 def root_node(path: Readable, stream: BinaryIO, info: OctreeInfo, file_size: int) -> npt.NDArray[np.void]:
     """The coarsest node, a sample of the whole file, as an array of at most one `ENTRY`.
 
-    Raises UnreadableInputError if the root page or the node lies outside the file.
+    Raises UnreadableInputError if the root page lies outside the file.
     """
     entries = _page(path, stream, info.root_offset, info.root_size, file_size)
-    return _checked(path, entries[(entries["level"] == 0) & (entries["count"] > 0)][:1], file_size)
+    root: npt.NDArray[np.void] = entries[(entries["level"] == 0) & (entries["count"] > 0)][:1]
+    return root
 
 
 def nodes_within(
@@ -75,7 +77,7 @@ def nodes_within(
 ) -> npt.NDArray[np.void]:
     """The nodes that hold points and meet the window, in file order, as an array of `ENTRY`.
 
-    Raises UnreadableInputError if a page or node lies outside the file.
+    Raises UnreadableInputError if a page lies outside the file. What the nodes say is not checked.
     """
     pages, seen = [(info.root_offset, info.root_size)], set()
     found = []
@@ -93,7 +95,7 @@ def nodes_within(
         meets &= (south - slack <= window.y_max) & (south + edge + slack >= window.y_min)
         pages.extend((int(page["offset"]), int(page["size"])) for page in entries[meets & (entries["count"] == -1)])
         found.append(entries[meets & (entries["count"] > 0)])
-    nodes = _checked(path, np.concatenate(found), file_size)
+    nodes = np.concatenate(found)
     ordered: npt.NDArray[np.void] = nodes[np.argsort(nodes["offset"], kind="stable")]
     return ordered
 
@@ -105,12 +107,7 @@ def _page(path: Readable, stream: BinaryIO, offset: int, size: int, file_size: i
             str(path), f"the octree page at byte {offset} with {size} bytes is damaged or truncated", _FIX
         )
     stream.seek(offset)
-    return np.frombuffer(stream.read(size), dtype=ENTRY)
-
-
-def _checked(path: Readable, nodes: npt.NDArray[np.void], file_size: int) -> npt.NDArray[np.void]:
-    """The same nodes, if all lie in the file and can be decoded at once."""
-    ends = nodes["offset"].astype(np.float64) + nodes["size"]
-    if len(nodes) and (ends.max() > file_size or nodes["size"].min() <= 0 or nodes["count"].max() > CHUNK_SIZE_LIMIT):
-        raise UnreadableInputError(str(path), "an octree node is damaged or lies outside the file", _FIX)
-    return nodes
+    entries = np.frombuffer(stream.read(size), dtype=ENTRY)
+    if entries["level"].min() < 0 or entries["level"].max() > _DEEPEST:
+        raise UnreadableInputError(str(path), f"the octree page at byte {offset} names impossible levels", _FIX)
+    return entries

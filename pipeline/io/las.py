@@ -25,8 +25,8 @@ from pipeline.io.laz_chunks import (
     CHUNK_SIZE_LIMIT,
     LAYERED_FORMAT,
     ChunkTable,
+    check_chunk,
     check_chunks,
-    check_layers,
     read_chunk_table,
 )
 from pipeline.io.readable import Readable
@@ -129,24 +129,36 @@ class LasFile:
             yield from () if share is not None and share.number else self.records(chunk_size, None)
             return
         with self._path.open("rb") as stream:
+            chunks = np.flatnonzero(table.counts)
             if window is not None and self._copc is not None:
                 nodes = copc.nodes_within(self._path, stream, self._copc, window, self._block.file_size)
-                chunks = np.column_stack([nodes[name].astype(np.int64) for name in ("offset", "size", "count")])
-            else:
-                chunks = np.column_stack((table.offsets, table.sizes, table.counts))
-            chunks = chunks[chunks[:, 2] > 0]
+                chunks = self._chunks_of(nodes)
             if share is not None:
-                ends = np.cumsum(chunks[:, 2])
-                chunks = chunks[share.pieces(ends - chunks[:, 2], int(chunks[:, 2].sum()))]
+                ends = np.cumsum(table.counts[chunks])
+                chunks = chunks[share.pieces(ends - table.counts[chunks], int(table.counts[chunks].sum()))]
             batch: list[npt.NDArray[np.uint8]] = []
-            for offset, size, count in chunks.tolist():
+            for chunk in chunks.tolist():
                 held = sum(map(len, batch)) // self._block.point_size
-                if batch and held + count > chunk_size:
+                if batch and held + table.counts[chunk] > chunk_size:
                     yield from self._pieces(batch, chunk_size)
                     batch = []
-                batch.append(self._decode_chunk(stream, offset, size, count))
+                batch.append(self._decode_chunk(stream, chunk, int(table.counts[chunk])))
             if batch:
                 yield from self._pieces(batch, chunk_size)
+
+    def _chunks_of(self, nodes: npt.NDArray[np.void]) -> npt.NDArray[np.int64]:
+        """Numbers of the chunks of some octree nodes; raises UnreadableInputError unless each has one of its own."""
+        table = self._chunks
+        assert table is not None
+        filled = np.flatnonzero(table.counts)
+        place = np.minimum(np.searchsorted(table.offsets[filled], nodes["offset"].astype(np.int64)), len(filled) - 1)
+        chunks = filled[place]
+        is_right = table.offsets[chunks] == nodes["offset"].astype(np.int64)
+        is_right &= (table.sizes[chunks] == nodes["size"]) & (table.counts[chunks] == nodes["count"])
+        if not is_right.all() or len(np.unique(chunks)) < len(chunks):
+            problem = "the octree is damaged: its nodes are not the compressed chunks of the file"
+            raise UnreadableInputError(str(self._path), problem, "Get the file again, or rewrite it as LAZ")
+        return chunks
 
     def _pieces(self, batch: list[npt.NDArray[np.uint8]], chunk_size: int) -> Iterator[PointRecords]:
         """Records of some decoded chunks, at most so many a piece."""
@@ -226,15 +238,21 @@ class LasFile:
             raise self._broken(fault, f"between points {begin} and {begin + count}") from fault
         return raw
 
-    def _decode_chunk(self, stream: io.BufferedReader, offset: int, size: int, count: int) -> npt.NDArray[np.uint8]:
+    def _decode_chunk(self, stream: io.BufferedReader, chunk: int, count: int) -> npt.NDArray[np.uint8]:
         """The bytes of the first records of a compressed chunk."""
-        chunk = bytes_of(self._path, stream, offset, size)
+        table = self._chunks
+        assert table is not None
+        offset, size = int(table.offsets[chunk]), int(table.sizes[chunk])
+        packed = bytes_of(self._path, stream, offset, size)
+        if len(packed) < size:
+            problem = f"truncated: {len(packed)} of the {size} bytes of the chunk at byte {offset} are there"
+            raise UnreadableInputError(str(self._path), problem, REWRITE)
         if self._block.point_format >= LAYERED_FORMAT:
-            check_layers(self._path, chunk, self._block, offset, size)
+            check_chunk(self._path, packed, self._block, table, chunk)
         raw = np.empty(count * self._block.point_size, dtype=np.uint8)
         try:
             fields = lazrs.DecompressionSelection(USED_FIELDS)
-            lazrs.decompress_points_with_chunk_table(chunk, self._laszip_record, raw, [(count, size)], fields)
+            lazrs.decompress_points_with_chunk_table(packed, self._laszip_record, raw, [(count, size)], fields)
         except DECODING_ERRORS as fault:
             raise self._broken(fault, f"in the chunk at byte {offset}") from fault
         return raw
@@ -266,10 +284,9 @@ class LasFile:
         """Points from some places spread over the file, in file order; of COPC the coarsest node."""
         pieces = []
         with self._path.open("rb") as stream:
-            root = None if self._copc is None else copc.root_node(self._path, stream, self._copc, self._block.file_size)
-            if root is not None and len(root):
-                offset, size, count = (int(root[name][0]) for name in ("offset", "size", "count"))
-                return self._to_records(self._decode_chunk(stream, offset, size, count))
+            root = self._root_chunk(stream)
+            if self._chunks is not None and root is not None:
+                return self._to_records(self._decode_chunk(stream, root, int(self._chunks.counts[root])))
             if self._chunks is None:
                 last = max(self._block.point_count - SAMPLE_SIZE, 0)
                 for start in _places(last):
@@ -280,9 +297,18 @@ class LasFile:
                 filled = np.flatnonzero(self._chunks.counts)
                 for chunk in filled[_places(len(filled) - 1)].tolist():
                     count = min(SAMPLE_SIZE, int(self._chunks.counts[chunk]))
-                    offset, size = int(self._chunks.offsets[chunk]), int(self._chunks.sizes[chunk])
-                    pieces.append(self._decode_chunk(stream, offset, size, count))
+                    pieces.append(self._decode_chunk(stream, chunk, count))
         return self._to_records(np.concatenate(pieces))
+
+    def _root_chunk(self, stream: io.BufferedReader) -> int | None:
+        """The chunk of an octree's root; None without one, or where it is damaged: the file can still be read whole."""
+        if self._copc is None:
+            return None
+        try:
+            root = self._chunks_of(copc.root_node(self._path, stream, self._copc, self._block.file_size))
+        except UnreadableInputError:
+            return None
+        return int(root[0]) if len(root) else None
 
     def _read_facts(self) -> FileFacts:
         """The facts from header and sample."""

@@ -143,41 +143,45 @@ def check_chunks(path: Readable, stream: BinaryIO, block: HeaderBlock, laszip_re
 def _check_layers(path: Readable, stream: BinaryIO, block: HeaderBlock, table: ChunkTable) -> None:
     """Point formats 6 and above: the layers and counts of all chunks, and the header's count."""
     held = 0
-    rows = zip(table.offsets.tolist(), table.sizes.tolist(), table.counts.tolist(), strict=True)
-    for offset, size, count in rows:
-        if count == 0:
-            continue
-        stream.seek(offset)
-        found = check_layers(path, stream.read(layers_end(block)), block, offset, size)
-        held += found
-        if found != count and offset != table.offsets[-1]:
-            raise InconsistentInputError(
-                str(path), f"the chunk at byte {offset} has {found} points, the chunk table says {count}", FIX
-            )
+    for chunk in np.flatnonzero(table.counts).tolist():
+        stream.seek(int(table.offsets[chunk]))
+        held += check_chunk(path, stream.read(_layers_end(block)), block, table, chunk)
     if held != block.point_count:
         raise InconsistentInputError(
             str(path), f"the header promises {block.point_count} points, its chunks hold {held}", FIX
         )
 
 
-def layers_end(block: HeaderBlock) -> int:
+def _layers_end(block: HeaderBlock) -> int:
     """Bytes at the start of a chunk of point formats 6 and above: one record, its count, the sizes of its layers."""
     base_size, layers = LAYERS[block.point_format]
     return block.point_size + 4 * (1 + layers + block.point_size - base_size)
 
 
-def check_layers(path: Readable, chunk: bytes, block: HeaderBlock, offset: int, size: int) -> int:
-    """Points of a chunk of point formats 6 and above, by itself; `chunk` holds its first bytes at least.
+def check_chunk(path: Readable, packed: bytes, block: HeaderBlock, table: ChunkTable, chunk: int) -> int:
+    """Check a chunk of point formats 6 and above, of which `packed` has the first bytes at least; the points it holds.
 
     lazrs asks for as much memory as a layer's size says, so a damaged one must not get there.
+
+    Raises
+    ------
+    UnreadableInputError
+        If its layers are damaged.
+    InconsistentInputError
+        If it holds another number of points than the table says; only all chunks together tell this of the last one.
     """
-    end = layers_end(block)
-    if len(chunk) < end:
+    offset, size, count = int(table.offsets[chunk]), int(table.sizes[chunk]), int(table.counts[chunk])
+    end = _layers_end(block)
+    if len(packed) < end:
         raise UnreadableInputError(str(path), f"truncated: the chunk at byte {offset} has no layers", FIX)
-    count, *sizes = np.frombuffer(chunk[block.point_size : end], "<u4").tolist()
+    held, *sizes = np.frombuffer(packed[block.point_size : end], "<u4").tolist()
     if end + sum(sizes) != size:
         raise UnreadableInputError(str(path), f"the layers of the chunk at byte {offset} are damaged", FIX)
-    return int(count)
+    if held != count and (table.variable or offset != table.offsets[-1]):
+        raise InconsistentInputError(
+            str(path), f"the chunk at byte {offset} has {held} points, the chunk table says {count}", FIX
+        )
+    return int(held)
 
 
 def _check_last_chunk(

@@ -20,7 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from pipeline.errors import UnreadableInputError
-from pipeline.io.readable import Readable
+from pipeline.io.readable import FileStatus, Readable
 from pipeline.io.retries import POLICY, GaveUpError, RetryPolicy, ShortReadError, persistently
 from pipeline.io.urls import filesystem_of, is_url, name_in, shown
 
@@ -118,11 +118,14 @@ class RemoteFile:
         return b"".join(parts)
 
     def read_once(self, begin: int, length: int) -> bytes:
-        """The same, for what is read once and alone: unless some of it is in memory, one request for no more."""
+        """The same, for what is read once and alone: one request for no more than is wanted, and nothing is kept."""
         end = min(begin + length, self.stat().st_size)
-        if any(number in self._blocks for number in range(begin // BLOCK_BYTES, -(-end // BLOCK_BYTES))):
-            return self.read_at(begin, length)
-        return self._range(begin, end)
+        parts = []
+        while begin < end and begin // BLOCK_BYTES in self._blocks:
+            block, at = divmod(begin, BLOCK_BYTES)
+            parts.append(self._blocks[block][at : at + end - begin])
+            begin += len(parts[-1])
+        return b"".join([*parts, self._range(begin, end)] if begin < end else parts)
 
     def _block(self, number: int) -> bytes:
         """One block, from memory or, with those that will be wanted next, from the server."""
@@ -168,6 +171,11 @@ class RemoteFile:
         with Path(self._held()).open("rb") as stream:
             stream.seek(begin)
             return stream.read(end - begin)
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the server does not send parts, so that a whole copy had to be fetched."""
+        return self._whole is not None
 
     def _held(self) -> str:
         """A whole copy in a temporary file, removed with this object; for servers without range requests."""
@@ -262,6 +270,11 @@ def _time_ns(info: dict[str, Any]) -> int:
         except ValueError:
             return 0
     return int(written.timestamp()) * 1_000_000_000 if isinstance(written, dt.datetime) else 0
+
+
+def etag_of(status: FileStatus) -> str:
+    """What a server calls a state of a file; empty for files of this machine."""
+    return status.etag if isinstance(status, RemoteStatus) else ""
 
 
 def file_at(location: str | Path) -> Readable:

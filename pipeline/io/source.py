@@ -19,7 +19,7 @@ from pipeline.io.formats import recognise_format
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.io.readable import Readable
 from pipeline.io.records import DivisibleFile, FileFacts, PointFile, PointRecords, Share, Window
-from pipeline.io.remote_file import file_at
+from pipeline.io.remote_file import RemoteFile, etag_of, file_at
 from pipeline.io.strays import MOST_STRAYS, off_earth, without_strays
 from pipeline.model import BoolArray, ByteArray, FloatArray, PointCloud
 
@@ -131,6 +131,10 @@ class SourceInfo:
     """When the file was last written, nanoseconds since 1970."""
     facts: FileFacts
     """What the file says about itself."""
+    etag: str = ""
+    """What a server calls this state of the file; empty if it says nothing, and for files of this machine."""
+    in_parts: bool = True
+    """Whether a part of it can be read alone: some servers send whole files only."""
 
     @property
     def is_divisible(self) -> bool:
@@ -147,12 +151,12 @@ class SourceInfo:
         return location_of(self.reference.wkt, (x_min / unit, y_min / unit, x_max / unit, y_max / unit))
 
     def is_of(self, path: Readable) -> bool:
-        """Whether a file is still the one that was looked at, by its size and its time."""
+        """Whether a file is still the one that was looked at, by its size, its time and its server's word."""
         try:
             now = path.stat()
         except OSError:  # opening it reports the fault
             return False
-        return (now.st_size, now.st_mtime_ns) == (self.file_size, self.modified_ns)
+        return (now.st_size, now.st_mtime_ns, etag_of(now)) == (self.file_size, self.modified_ns, self.etag)
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -428,6 +432,8 @@ def _info_of(path: Readable, file: PointFile, options: ReadOptions) -> SourceInf
         file_size=now.st_size,
         modified_ns=now.st_mtime_ns,
         facts=facts,
+        etag=etag_of(now),
+        in_parts=not (isinstance(path, RemoteFile) and path.is_held),
     )
 
 

@@ -165,7 +165,7 @@ def wanted_points(info: SourceInfo, options: ReadOptions) -> int:
 def shares_of(info: SourceInfo, options: ReadOptions) -> list[Share | None]:
     """The shares in which a file is read, each by a task; None stands for a file that is read whole.
 
-    A remote file is fetched whole, and read then, except for COPC with a window: its nodes are fetched one by one.
+    A remote file is fetched whole, and read then, except for a window of COPC: its nodes are read where they are.
     """
     in_place = not is_url(info.path) or is_fetched_by_nodes(info, options)
     if not (info.is_divisible and in_place):
@@ -178,7 +178,9 @@ def shares_of(info: SourceInfo, options: ReadOptions) -> list[Share | None]:
 
 def is_fetched_by_nodes(info: SourceInfo, options: ReadOptions) -> bool:
     """Whether only a part of a remote file is fetched: the nodes of its octree that meet a window."""
-    return is_url(info.path) and info.format == "copc" and options.window is not None
+    x_min, y_min, _, x_max, y_max, _ = info.bounds_m
+    is_cut = wanted_bounds_m(info, options) != (x_min, y_min, x_max, y_max)
+    return is_url(info.path) and info.format == "copc" and info.in_parts and is_cut
 
 
 def _block_bytes(grid: TileGrid, sources: Sequence[SourceInfo], settings: RunSettings) -> int:

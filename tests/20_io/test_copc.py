@@ -10,7 +10,7 @@ from shapely import Polygon
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io import ReadOptions, open_source
-from pipeline.io.copc import nodes_within, octree_info
+from pipeline.io.copc import ENTRY, nodes_within, octree_info
 from pipeline.io.records import Window
 
 BOX = (84_010.0, 447_020.0, 84_030.0, 447_040.0)
@@ -87,5 +87,56 @@ def test_a_hierarchy_outside_the_file_is_refused(tmp_path, points, write_copc):
     raw = bytearray(path.read_bytes())
     struct.pack_into("<Q", raw, 375 + 54 + 40, len(raw) + 1_000)
     path.write_bytes(raw)
+    source = open_source(path, ReadOptions(bbox=BOX))
     with pytest.raises(UnreadableInputError, match="octree page at byte"):
-        open_source(path, ReadOptions(bbox=BOX))
+        list(source.chunks())
+    assert sum(map(len, open_source(path).chunks())) == 500
+
+
+def first_entry(raw):
+    """Byte of the first entry of the root page."""
+    return struct.unpack_from("<Q", raw, 375 + 54 + 40)[0]
+
+
+@pytest.mark.parametrize(("field", "value"), [("count", 57), ("size", 2**31 - 1), ("offset", 7)])
+def test_nodes_that_are_not_the_chunks_of_the_file_are_refused(tmp_path, points, write_copc, field, value):
+    path = write_copc(tmp_path / "a.copc.laz", points(500))
+    raw = bytearray(path.read_bytes())
+    struct.pack_into({"offset": "<Q"}.get(field, "<i"), raw, first_entry(raw) + ENTRY.fields[field][1], value)
+    path.write_bytes(raw)
+    source = open_source(path, ReadOptions(bbox=BOX))
+    with pytest.raises(UnreadableInputError, match="its nodes are not the compressed chunks of the file"):
+        list(source.chunks())
+    assert sum(map(len, open_source(path).chunks())) == 500
+
+
+def test_a_chunk_that_two_nodes_name_is_refused(tmp_path, points, write_copc):
+    path = write_copc(tmp_path / "a.copc.laz", points(500))
+    raw = bytearray(path.read_bytes())
+    at = first_entry(raw)
+    # the place, the size and the count of the root instead of those of its first child
+    raw[at + 32 + 16 : at + 64] = raw[at + 16 : at + 32]
+    path.write_bytes(raw)
+    whole = ReadOptions(bbox=(84_000.0, 447_000.0, 84_100.0, 447_100.0))
+    with pytest.raises(UnreadableInputError, match="its nodes are not the compressed chunks of the file"):
+        list(open_source(path, whole).chunks())
+
+
+def test_impossible_levels_are_refused(tmp_path, points, write_copc):
+    path = write_copc(tmp_path / "a.copc.laz", points(500))
+    raw = bytearray(path.read_bytes())
+    struct.pack_into("<i", raw, first_entry(raw), 2_000)
+    path.write_bytes(raw)
+    with pytest.raises(UnreadableInputError, match="impossible levels"):
+        list(open_source(path, ReadOptions(bbox=BOX)).chunks())
+
+
+def test_a_file_without_its_hierarchy_is_read_whole_like_laz(tmp_path, points, write_copc):
+    path = write_copc(tmp_path / "a.copc.laz", points(500))
+    raw = bytearray(path.read_bytes())
+    (evlr_at,) = struct.unpack_from("<Q", raw, 235)
+    struct.pack_into("<QI", raw, 235, 0, 0)
+    path.write_bytes(raw[:evlr_at])
+    assert sum(map(len, open_source(path).chunks())) == 500
+    with pytest.raises(UnreadableInputError, match="octree page at byte"):
+        list(open_source(path, ReadOptions(bbox=BOX)).chunks())

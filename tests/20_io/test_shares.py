@@ -98,3 +98,13 @@ def test_a_damaged_chunk_fails_the_share_that_holds_it_and_no_other(written, nam
     assert sum(map(len, source.chunks(7_000, Share(number=0, of=2)))) > 0
     with pytest.raises(UnreadableInputError, match="layers of the chunk at byte"):
         list(source.chunks(7_000, Share(number=1, of=2)))
+
+
+@pytest.mark.parametrize("name", ["laz.1", "laz.6", "copc"])
+def test_a_file_that_shrinks_while_a_share_is_read_is_reported(written, name):
+    path = written(name)
+    source = open_source(path)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 20])
+    with pytest.raises(UnreadableInputError, match="truncated"):
+        list(source.chunks(7_000, Share(number=0, of=1)))

@@ -1,7 +1,7 @@
 """A large file is read by several tasks at once, and the run is the same."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +9,18 @@ import laspy
 import numpy as np
 import pytest
 from las_files import copc_of
-from one_file_site import one_file_site
+from one_file_site import Site, one_file_site
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io import ReadOptions, open_source
 from pipeline.io.records import Share
 from pipeline.runtime.manifest import read_manifest
-from pipeline.runtime.plan import shares_of
+from pipeline.runtime.plan import is_fetched_by_nodes, shares_of
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.ingest import IngestTask, ingest_file
 from pipeline.tiling import TileGrid
+
+Box = tuple[float, float, float, float]
 
 
 @pytest.fixture(scope="module")
@@ -81,38 +83,80 @@ def test_classes_of_a_file_in_shares_come_back_in_its_order(
     assert contents[0] == contents[1]
 
 
+def share_of(folder: Path, path: str, options: ReadOptions, share: Share | None) -> IngestTask:
+    """The task of a share, planned now."""
+    scratch = Scratch(str(folder / "scratch"))
+    scratch.create()
+    return IngestTask(
+        part="a",
+        path=path,
+        options=options,
+        grid=TileGrid(size_mm=30_000, halo_mm=10_000),
+        scratch=scratch,
+        known=open_source(path, options).info,
+        share=share,
+    )
+
+
 def test_a_file_that_changes_between_its_shares_is_refused(plain: Path, tmp_path: Path) -> None:
     path = tmp_path / "suburb.las"
     path.write_bytes(plain.read_bytes())
-    scratch = Scratch(str(tmp_path / "scratch"))
-    scratch.create()
-    task = IngestTask(
-        part="a-001",
-        path=str(path),
-        options=ReadOptions(),
-        grid=TileGrid(size_mm=30_000, halo_mm=10_000),
-        scratch=scratch,
-        known=open_source(path).info,
-        share=Share(number=1, of=2),
-    )
+    task = share_of(tmp_path, str(path), ReadOptions(), Share(number=1, of=2))
     assert sum(ingest_file(task).points_by_tile.values()) > 0
     os.utime(path, ns=(1, 1))
     with pytest.raises(UnreadableInputError, match=r"suburb\.las: it changed after the run began\. Run again"):
         ingest_file(task)
 
 
-def test_a_window_of_a_remote_octree_is_the_window_of_the_file(octree: Path, reconstruct: Any) -> None:
+@pytest.fixture
+def half(octree: Path) -> tuple[float, float, float, float]:
+    """The western half of the suburb."""
     x_min, y_min, _, x_max, y_max, _ = open_source(octree).info.bounds_m
-    bbox = (x_min, y_min, (x_min + x_max) / 2.0, y_max)
-    here = reconstruct(octree, bbox=bbox)
+    return x_min, y_min, (x_min + x_max) / 2.0, y_max
+
+
+@pytest.fixture
+def site(octree: Path) -> Iterator[Site]:
+    """A server of the octree."""
     with one_file_site() as site:
         site.content = octree.read_bytes()
-        there = reconstruct(site.url, bbox=bbox)
-        again = reconstruct(site.url, bbox=bbox)
-    assert there.digest == here.digest
-    assert {k: there.counts[k] for k in ("points", "dropped_outside")} == {
-        k: here.counts[k] for k in ("points", "dropped_outside")
-    }
-    (of_there,), (of_again,) = (read_manifest(summary.run_dir).inputs for summary in (there, again))
+        yield site
+
+
+def test_a_window_of_a_remote_octree_is_the_window_of_the_file(
+    octree: Path, half: Box, site: Site, reconstruct: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = reconstruct(octree, bbox=half)
+    there = reconstruct(site.url, bbox=half)
+    monkeypatch.setattr("pipeline.runtime.plan._POINTS_PER_SHARE", 3_000)
+    cut = reconstruct(site.url, bbox=half)
+    assert here.digest == there.digest == cut.digest
+    figures = [[summary.counts[k] for k in ("points", "dropped_outside")] for summary in (here, there, cut)]
+    assert figures[0] == figures[1] == figures[2]
+    (of_there,), (of_cut,) = (read_manifest(summary.run_dir).inputs for summary in (there, cut))
+    assert of_there == of_cut
     assert len(of_there.sha256) == 64
-    assert of_there == of_again
+
+
+def test_a_remote_octree_is_fetched_whole_where_no_part_of_it_will_do(
+    site: Site, half: Box, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.io.remote_file.BLOCK_BYTES", 4096)
+    window = ReadOptions(bbox=half)
+    assert is_fetched_by_nodes(open_source(site.url, window).info, window)
+    x_min, y_min, _, x_max, y_max, _ = open_source(site.url).info.bounds_m
+    for options in (ReadOptions(), ReadOptions(bbox=(x_min - 1.0, y_min - 1.0, x_max + 1.0, y_max + 1.0))):
+        assert not is_fetched_by_nodes(open_source(site.url, options).info, options)
+    site.ranges = False
+    assert not is_fetched_by_nodes(open_source(site.url, window).info, window)
+
+
+def test_a_remote_octree_that_changes_while_its_nodes_are_read_is_refused(
+    site: Site, half: Box, tmp_path: Path
+) -> None:
+    window = ReadOptions(bbox=half)
+    task = share_of(tmp_path, site.url, window, None)
+    assert sum(ingest_file(task).points_by_tile.values()) > 0
+    site.etag = '"2"'
+    with pytest.raises(UnreadableInputError, match=r"a\.laz: it changed after the run began"):
+        ingest_file(task)

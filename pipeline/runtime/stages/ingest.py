@@ -29,7 +29,7 @@ from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.cleanup import clear_points
-from pipeline.runtime.stages.ingested import Ingested, of_shares, points_by_tile, spread_m
+from pipeline.runtime.stages.ingested import Ingested, of_file, points_by_tile, spread_m
 from pipeline.runtime.stages.tile_content import ZoneSums, zone_sums
 from pipeline.tiling import MM, Tile, TileGrid
 
@@ -70,8 +70,8 @@ def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
     tasks = {}
     for path in paths:
         file = known[shown(path)]
-        # a file without a time of modification may have changed unnoticed: read it again
-        written = file.modified_ns or uuid4().hex
+        # a file without any mark of its state may have changed unnoticed: read it again
+        written = (file.modified_ns, file.etag) if file.modified_ns or file.etag else uuid4().hex
         for share in shares_of(file, plan.options):
             task = IngestTask(
                 part=part_of(path) if share is None else f"{part_of(path)}-{share.number:03d}",
@@ -90,7 +90,7 @@ def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
     shares: dict[str, list[Ingested]] = {path: [] for path in paths}
     for place, found in stored.items():
         shares[tasks[place].path].append(found)
-    ingested = [of_shares(known[shown(path)], of_file) for path, of_file in shares.items()]
+    ingested = [of_file(known[shown(path)], found) for path, found in shares.items()]
     for found in ingested:
         for warning in found.warnings:
             progress.warn("ingest", f"{shown(found.path)}: {warning}")
@@ -175,7 +175,7 @@ def ingest_file(task: IngestTask) -> Ingested:
         if known is not None:
             now = copy.stat()
             same = (now.st_size, file.stat().st_mtime_ns) == (known.file_size, known.modified_ns)
-            known = dataclasses.replace(known, modified_ns=now.st_mtime_ns) if same else None
+            known = dataclasses.replace(known, modified_ns=now.st_mtime_ns, etag="") if same else None
         found = _ingested(dataclasses.replace(task, path=str(copy), known=known))
         return dataclasses.replace(found, path=shown(task.path))
     except InputError as fault:
@@ -185,8 +185,12 @@ def ingest_file(task: IngestTask) -> Ingested:
 
 
 def _check_unchanged(task: IngestTask) -> None:
-    """Refuse a file of which different tasks would see different states; a task that reads it whole sees one."""
-    if task.share is not None and task.known is not None and not task.known.is_of(file_at(task.path)):
+    """Refuse a file of which different states would be read; raises UnreadableInputError.
+
+    A task that reads a file of this machine alone opens it once.
+    """
+    is_alone = task.share is None and not is_url(task.path)
+    if not is_alone and task.known is not None and not task.known.is_of(file_at(task.path)):
         raise UnreadableInputError(
             shown(task.path), "it changed after the run began", "Run again when it is no longer being written"
         )
@@ -205,12 +209,9 @@ def _ingested(task: IngestTask) -> Ingested:
     moments = np.zeros(6)
     first: tuple[int, int] | None = None
     multiple = False
-    nodes = None if not is_url(task.path) else hashlib.sha256()
     for cloud in source.chunks(_CHUNK_POINTS, task.share):
         task.scratch.check_cancelled()
         records = to_records(cloud)
-        if nodes is not None:
-            nodes.update(records.data)
         x, y, z = (np.ascontiguousarray(records[name]) for name in "xyz")
         for axis, values in enumerate((x, y, z)):
             low[axis] = min(low[axis], int(values.min()))
@@ -223,6 +224,7 @@ def _ingested(task: IngestTask) -> Ingested:
         classes.update({int(c): int(histogram[c]) for c in np.flatnonzero(histogram)})
         multiple = multiple or bool((records["return_count"] > 1).any())
         counts.update(_append_by_tile(records, x, y, task, suffix, content))
+    sha256 = "" if is_url(task.path) else _digest_of(task)
     _check_unchanged(task)
     for tile in counts:
         part = task.scratch.path("points", tile.key, f"{task.part}{suffix}")
@@ -240,7 +242,7 @@ def _ingested(task: IngestTask) -> Ingested:
         moments=tuple(float(v) for v in moments),
         first_mm=first or (0, 0),
         multiple_returns=multiple,
-        sha256=_digest_of(task) if nodes is None else nodes.hexdigest(),
+        sha256=sha256,
     )
 
 

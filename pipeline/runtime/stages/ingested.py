@@ -24,6 +24,8 @@ _CLASSIFIED_SHARE = 0.05
 """Smallest share of ground points (class 2) in a classified file. Not a setting: any share between that of stray codes
 and that of real ground will do, and the setting `classes` overrules it."""
 
+_NO_POINTS = np.zeros(3, np.uint64)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Ingested:
@@ -52,20 +54,33 @@ class Ingested:
     multiple_returns: bool
     """Whether any kept pulse has more than one return."""
     sha256: str
-    """Digest of the file, empty for its shares but the first; of the wanted points where only these were fetched."""
+    """Digest of the file, empty for its shares but the first; of the points in the window where only its nodes were
+    fetched."""
 
 
-def of_shares(info: SourceInfo, shares: Sequence[Ingested]) -> Ingested:
+def of_file(info: SourceInfo, shares: Sequence[Ingested]) -> Ingested:
     """What a file held, of what its shares held, in the order of the file.
 
     Raises InconsistentInputError if many points do not lie on Earth.
     """
-    if len(shares) == 1:
-        return shares[0]
+    whole = shares[0] if len(shares) == 1 else _together(info, shares)
+    return whole if whole.sha256 else dataclasses.replace(whole, sha256=_digest_of_points(whole))
+
+
+def _digest_of_points(found: Ingested) -> str:
+    """The digest of an input's points, however they are cut into shares and tiles."""
+    sums = sum(
+        (zone_sums_of(stored).sum(axis=(0, 1), dtype=np.uint64) for stored in found.content.values()), _NO_POINTS
+    )
+    return hashlib.sha256(sums.astype("<u8").tobytes()).hexdigest()
+
+
+def _together(info: SourceInfo, shares: Sequence[Ingested]) -> Ingested:
+    """What several shares of a file held."""
     findings = functools.reduce(operator.add, (share.findings for share in shares)).of_whole(info)
     first_mm = next((share.first_mm for share in shares if share.bounds_mm is not None), (0, 0))
     boxes = np.array([share.bounds_mm for share in shares if share.bounds_mm is not None])
-    classes, digests = Counter[int](), [share.sha256 for share in shares]
+    classes = Counter[int]()
     for share in shares:
         classes.update(share.classes)
     return Ingested(
@@ -80,8 +95,7 @@ def of_shares(info: SourceInfo, shares: Sequence[Ingested]) -> Ingested:
         moments=tuple(sum((_moments_about(share, first_mm) for share in shares), np.zeros(6)).tolist()),
         first_mm=first_mm,
         multiple_returns=any(share.multiple_returns for share in shares),
-        # each share of a file that is not read whole has a digest of its own
-        sha256=hashlib.sha256("".join(digests).encode()).hexdigest() if all(digests) else digests[0],
+        sha256=shares[0].sha256,
     )
 
 
