@@ -23,8 +23,16 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.union_find import root_of, unite, united
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.terrain.ridge_steps import cut_at_ridge_steps
-from pipeline.terrain.roof_patches import MIN_POINTS, Borders, Patches, RoofVertices, grown_patches, measured_patches
+from pipeline.terrain.ridge_steps import Rows, cut_at_ridge_steps
+from pipeline.terrain.roof_patches import (
+    MIN_COSINE,
+    MIN_POINTS,
+    Borders,
+    Patches,
+    RoofVertices,
+    grown_patches,
+    measured_patches,
+)
 from pipeline.terrain.settings import UnitSettings
 from pipeline.terrain.thinning import highest_per_cell
 from pipeline.tin.delaunay import MAX_WINDOW_MM, triangulate
@@ -38,8 +46,8 @@ _LEVEL_SHARE = 0.5
 """Share of a border along which planes that meet are level."""
 _SHORTEST_BORDER_M = 2.0
 """Shorter borders join nothing: at a step, opposite slopes of two houses touch over a metre or so."""
-_SHORTEST_GUTTER_M = 3.0
-"""Shorter valleys lie between dormers."""
+_SHORTEST_VALLEY_M = 3.0
+"""Shorter valleys lie between dormers, or where two houses touch at the inner corner of a block."""
 _SLOPED = math.tan(math.radians(10.0))
 """Rise over run from which a patch has a direction: flat roofs drain at less."""
 _ALONG = 0.5
@@ -60,6 +68,8 @@ class _Facing:
     """Both rise towards the border."""
     valley: bool
     """Both fall towards the border."""
+    alike: bool
+    """They slope in one direction, about as steeply: one slope goes on in the other."""
 
 
 def _facing(patches: Patches, borders: Borders, row: int) -> _Facing | None:
@@ -78,24 +88,39 @@ def _facing(patches: Patches, borders: Borders, row: int) -> _Facing | None:
     rise_p, rise_q = (ax * nx + ay * ny) / steep_p, (bx * nx + by * ny) / steep_q
     along = abs(ax * dx + ay * dy) <= _ALONG * steep_p and abs(bx * dx + by * dy) <= _ALONG * steep_q
     opposite = (ax * bx + ay * by) / (steep_p * steep_q) <= _OPPOSITE
-    return _Facing(along, opposite, along and rise_p > 0.0 > rise_q, along and rise_p < 0.0 < rise_q)
+    between = (1.0 + ax * bx + ay * by) / math.sqrt((1.0 + steep_p**2) * (1.0 + steep_q**2))
+    ridge, valley = along and rise_p > 0.0 > rise_q, along and rise_p < 0.0 < rise_q
+    return _Facing(along, opposite, ridge, valley, between >= MIN_COSINE)
 
 
 def _clear_borders(patches: Patches, borders: Borders) -> dict[int, _Facing | None]:
     """Rows of the borders that are long enough, between patches that are large enough, and how these face them."""
     large = (patches.areas_m2 >= _PART_M2) & ~np.isnan(patches.levels_mm)
-    is_clear = large[borders.first] & large[borders.second] & (borders.length_m >= _SHORTEST_BORDER_M)
+    is_clear = large[borders.first] & large[borders.second] & (borders.extent_m >= _SHORTEST_BORDER_M)
     return {row: _facing(patches, borders, row) for row in np.flatnonzero(is_clear).tolist()}
 
 
-def units_of_patches(patches: Patches, borders: Borders, origin: IntArray, settings: UnitSettings) -> LabelArray:
+def _meets(borders: Borders, row: int) -> bool:
+    """Whether the planes of two patches meet along their border."""
+    return bool(borders.level_m[row] >= _LEVEL_SHARE * borders.length_m[row])
+
+
+def _joins(seen: _Facing | None, meets: bool, extent_m: float) -> bool:
+    """Whether two patches that face their border like this belong to one unit."""
+    if seen is None:
+        return meets
+    return seen.along_contours or (meets and (seen.alike or extent_m >= _SHORTEST_VALLEY_M))
+
+
+def units_of_patches(
+    patches: Patches, borders: Borders, roof: IntArray, house: IntArray, settings: UnitSettings
+) -> LabelArray:
     """The unit of every patch of a candidate's roof, (k,) int32, numbered by one of its patches.
 
-    `origin` (k,) is the patch that each was cut from at ridge steps; patches of one origin lie in different houses.
+    `roof` and `house` (k,) are those of `cut_at_ridge_steps`: two houses of one roof are two units.
     """
     count = len(patches.areas_m2)
     unit = np.arange(count)
-    meets = borders.level_m >= _LEVEL_SHARE * borders.length_m
     facing = _clear_borders(patches, borders)
     has_ridge = set()
     for row, seen in facing.items():
@@ -112,12 +137,12 @@ def units_of_patches(patches: Patches, borders: Borders, origin: IntArray, setti
             and seen.opposite
             and p in has_ridge
             and q in has_ridge
-            and borders.length_m[row] >= _SHORTEST_GUTTER_M
+            and borders.length_m[row] >= _SHORTEST_VALLEY_M
         )
-        if is_gutter or origin[p] == origin[q]:
+        if is_gutter or (roof[p] == roof[q] and house[p] != house[q]):
             apart[p].add(q)
             apart[q].add(p)
-        elif meets[row] or (seen is not None and seen.along_contours):
+        elif _joins(seen, _meets(borders, row), float(borders.extent_m[row])):
             joining.append(row)
     # the longest first, so that what runs along several houses does not unite them across their gutters
     for row in sorted(joining, key=lambda row: (-borders.length_m[row], row)):
@@ -265,12 +290,29 @@ def smallest_points(x: IntArray, y: IntArray, z: IntArray, label: LabelArray) ->
     return found
 
 
-def units_of(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSettings) -> LabelArray:
+def _rows(patches: Patches, borders: Borders) -> Rows:
+    """The borders along which a row of houses goes on."""
+    ridges, continued = [], []
+    for row, seen in _clear_borders(patches, borders).items():
+        if seen is None:
+            continue
+        if seen.ridge and seen.opposite:
+            ridges.append(row)
+        elif _meets(borders, row) and (seen.alike or (seen.along_contours and not seen.opposite)):
+            continued.append(row)
+    return Rows(ridges=np.array(ridges, np.int64), continued=np.array(continued, np.int64))
+
+
+def units_of(
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSettings, strips: IntArray | None = None
+) -> LabelArray:
     """Unit of every point of one candidate, (n,) int32, numbered by their lexicographically smallest points.
 
-    All its points are in absolute millimetres, in any order.
+    All its points are in absolute millimetres, in any order. `strips` (n,) are their flight strips; without them, all
+    are taken for one.
     """
     n = len(x_mm)
+    strips = np.zeros(n, np.int64) if strips is None else strips
     one = np.zeros(n, np.int32)
     if settings.split == "nothing" or n < 2 * MIN_POINTS:
         return one
@@ -287,11 +329,12 @@ def units_of(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSetti
         return one
     grown = grown_patches(vx, vy, vz, tin)
     patches, borders = measured_patches(grown, settings.min_step_m)
-    ridges = [row for row, seen in _clear_borders(patches, borders).items() if seen and seen.ridge and seen.opposite]
-    grown, origin = cut_at_ridge_steps(grown, borders, np.array(ridges, np.int64), settings.min_ridge_step_m)
-    if len(origin) > len(patches.areas_m2):
+    grown, roof, house = cut_at_ridge_steps(
+        grown, borders, _rows(patches, borders), strips[chosen], settings.min_ridge_step_m
+    )
+    if len(roof) > len(patches.areas_m2):
         patches, borders = measured_patches(grown, settings.min_step_m)
-    unit_of_patch = units_of_patches(patches, borders, origin, settings)
+    unit_of_patch = units_of_patches(patches, borders, roof, house, settings)
     if (unit_of_patch == unit_of_patch[0]).all():
         return one
     planes = np.column_stack((patches.slopes, patches.levels_mm))

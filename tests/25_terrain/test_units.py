@@ -41,6 +41,35 @@ def _row(eaves: tuple[float, ...]) -> Roof:
     return roof
 
 
+def _mansard(across: FloatArray, width: float, eave: float | FloatArray) -> FloatArray:
+    """Elevation of a mansard roof: 62 deg over a sixth of the width, 24 deg above."""
+    inside = width / 2 - np.abs(across - width / 2)
+    return (
+        eave
+        + math.tan(math.radians(62.0)) * np.minimum(inside, width / 6)
+        + 0.445 * np.maximum(inside - width / 6, 0.0)
+    )
+
+
+def _mansard_row(x: FloatArray, y: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Mansard roofs that differ by 0.15 m."""
+    house = np.where(_inside(x, y, 0, 0, 24, 12), x // 8, -1).astype(np.int64)
+    return _mansard(y, 12, np.array([6.0, 6.15, 6.0])[house]), house
+
+
+def _gable_beside_mansard(x: FloatArray, y: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Two houses side by side, whose slopes cross half a metre above the eave of one."""
+    house = np.where(_inside(x, y, 0, 0, 18, 12), x // 9, -1).astype(np.int64)
+    return np.where(house == 0, _mansard(y, 12, 6.0), _gable(y, 12, 6.5, 0.966)), house
+
+
+def _corner_of_a_block(x: FloatArray, y: FloatArray) -> tuple[FloatArray, IntArray]:
+    """A high corner house and its two neighbours, which touch each other over a metre behind it."""
+    corner, front, side = _inside(x, y, 0, 0, 10, 10), _inside(x, y, 10, 0, 20, 10), _inside(x, y, 0, 10, 11, 21)
+    z = np.where(corner, _gable(y, 10, 9.0), np.where(front, _gable(y, 10, 6.0), _gable(x, 11, 6.05)))
+    return z, np.where(corner, 0, np.where(front, 1, np.where(side, 2, -1)))
+
+
 def _flat_between_gables(x: FloatArray, y: FloatArray) -> tuple[FloatArray, IntArray]:
     z, house = _row((6.0, 6.0, 6.0))(x, y)
     return np.where(house == 1, 8.0, z), house
@@ -144,15 +173,25 @@ def _sloping_ridge(x: FloatArray, y: FloatArray) -> tuple[FloatArray, IntArray]:
     return z + 0.02 * x, house
 
 
+def _sagging_ridge(x: FloatArray, y: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Two bays that sag by 0.12 m between three walls."""
+    z, house = _row((6.0, 6.0, 6.0))(x, y)
+    return z - 0.12 * np.abs(np.sin(math.pi * x / 12)), house
+
+
 SEPARATED = {
     "a row with steps": _row((6.0, 7.0, 5.5, 6.2)),
     "a row with small steps of the ridge": _row((6.0, 6.15, 6.0, 6.18)),
+    "a row with steps of the ridge as large as what a patch takes": _row((6.0, 6.2, 5.97, 6.19)),
+    "a mansard row": _mansard_row,
+    "the corner of a block": _corner_of_a_block,
     "a flat house between gables": _flat_between_gables,
     "parallel gables": _parallel_gables,
 }
 TOGETHER = {
     "a row under one ridge": _row((6.0, 6.0, 6.0)),
     "a row under a sloping ridge": _sloping_ridge,
+    "a row under a sagging ridge": _sagging_ridge,
     "panels on one slope": _panels_on_one_slope,
     "strips shifted in plan": _strips_shifted_in_plan,
     "an L-shaped house": _l_house,
@@ -180,9 +219,9 @@ class Cloud:
     house: IntArray
     """(n,) the house of each."""
 
-    def units(self, own: UnitSettings = SETTINGS) -> LabelArray:
+    def units(self, own: UnitSettings = SETTINGS, strips: IntArray | None = None) -> LabelArray:
         x, y, z = np.ascontiguousarray(self.xyz.T)
-        return units_of(x, y, z, own)
+        return units_of(x, y, z, own, strips)
 
 
 def cloud_of(
@@ -220,6 +259,14 @@ def test_houses_with_a_step_or_a_gutter_between_them_are_separated(name: str, pe
     found = cloud.units()
     assert found.max() == cloud.house.max()
     assert agreement(found, cloud.house) > (0.98 if per_m2 < 2 else 0.99)
+
+
+@pytest.mark.parametrize("per_m2", [4.0, 25.0])
+def test_slopes_that_cross_at_a_party_wall_do_not_meet(per_m2: float) -> None:
+    cloud = cloud_of(_gable_beside_mansard, per_m2=per_m2)
+    found = cloud.units()
+    assert found.max() == 1
+    assert agreement(found, cloud.house) > 0.99
 
 
 @pytest.mark.parametrize("per_m2", [1.5, 6.0, 25.0])
@@ -274,7 +321,10 @@ def test_units_are_numbered_by_their_smallest_points() -> None:
         (_row((6.0, 7.0)), {"split": "steps"}, 1),
         (_row((6.0, 7.0)), {"split": "nothing"}, 0),
         (_row((6.0, 6.6)), {"min_step_m": 0.5}, 1),
-        (_row((6.0, 6.6)), {"min_step_m": 0.8}, 0),
+        (_row((6.0, 6.6)), {"min_step_m": 0.8, "min_ridge_step_m": 0.8}, 0),
+        (_row((6.0, 6.6)), {"min_step_m": 0.8}, 1),  # both slopes step
+        (_row((6.0, 6.08)), {}, 1),
+        (_row((6.0, 6.08)), {"min_ridge_step_m": 0.12}, 0),
         (_row((6.0, 7.0)), {"min_area_m2": 60.0}, 1),
         (_row((6.0, 7.0)), {"min_area_m2": 90.0}, 0),  # too small a unit joins its neighbour
         (_lower_wing, {"annex_share": 0.0}, 1),
@@ -282,6 +332,23 @@ def test_units_are_numbered_by_their_smallest_points() -> None:
 )
 def test_the_settings_say_what_parts_units(roof: Roof, own: dict[str, Any], last: int) -> None:
     assert cloud_of(roof).units(UnitSettings(**own)).max() == last
+
+
+def test_strips_that_differ_in_elevation_part_nothing() -> None:
+    cloud = cloud_of(_row((6.0, 6.0, 6.0)), turn_deg=0.0)
+    strips = (cloud.xyz[:, 0] > 1000 * (85_123.4 + 13.0)).astype(np.int64)
+    cloud.xyz[:, 2] += 100 * strips
+    assert cloud.units().max() == 1  # as one strip, the seam is a step of both slopes
+    assert cloud.units(strips=strips).max() == 0
+
+
+def test_a_step_shows_in_two_strips_that_differ_in_elevation() -> None:
+    cloud = cloud_of(_row((6.0, 6.1)), turn_deg=0.0)
+    strips = np.arange(len(cloud.xyz)) % 2
+    cloud.xyz[:, 2] += 100 * strips
+    found = cloud.units(strips=strips)
+    assert found.max() == 1
+    assert agreement(found, cloud.house) > 0.97
 
 
 def test_a_gap_in_the_data_parts_nothing() -> None:

@@ -153,7 +153,8 @@ def _units_of_site(site: CandidateSite, task: UnitTask) -> list[CandidateSite]:
         return [site]
     points = np.concatenate(pieces)
     x, y, z = points["x"].astype(np.int64), points["y"].astype(np.int64), points["z"].astype(np.int64)
-    unit = units_of(*_aligned_mm(points, (x, y, z), task.min_strip_offset_m), task.settings)
+    aligned = _aligned_mm(points, (x, y, z), task.min_strip_offset_m)
+    unit = units_of(*aligned, task.settings, points["source"].astype(np.int64))
     count = int(unit.max(initial=0)) + 1
     if count == 1:
         return [site]
