@@ -131,7 +131,7 @@ def cell_costs(
             continue
         lacking[cell] -= 1.0
         for label in range(k):
-            share = min(vertical_distance_m(points[i], planes[label]) / limits.cap_m, 1.0)
+            share = min(vertical_distance_m(points, i, planes, label) / limits.cap_m, 1.0)
             costs[cell, label] += int(COST_SCALE * share)
             if share > _TOLERANCE:
                 misfits[cell, label] += int(COST_SCALE * (share - _TOLERANCE) / (1.0 - _TOLERANCE))
