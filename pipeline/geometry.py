@@ -6,6 +6,7 @@ result has the same bits on every machine. Equations are those of Shorter & Kasp
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -334,13 +335,18 @@ def spacing_over_area_m(points: FloatArray) -> float:
     return over_area if over_area > _UNEVEN * usual else usual
 
 
-def _plan(points: FloatArray) -> FloatArray:
-    """Positions in plan, (n, 2), without gaps in memory."""
-    return np.ascontiguousarray(points[:, :2], dtype=np.float64)
+def _plan(points: FloatArray) -> bytes:
+    """Positions in plan, (n, 2) float64."""
+    return np.ascontiguousarray(points[:, :2], dtype=np.float64).tobytes()
 
 
-def _spacings(points: FloatArray) -> tuple[float, float]:
-    """1 / sqrt(density) in plan, by medians over the points and over their area; nan for fewer than two points."""
+@functools.lru_cache(maxsize=1)
+def _spacings(plan: bytes) -> tuple[float, float]:
+    """1 / sqrt(density) of `_plan`, by medians over the points and over their area; nan for fewer than two points.
+
+    Cached, since the points of a roof are mostly all that see the sky, whose spacing is asked for next.
+    """
+    points = np.frombuffer(plan).reshape(-1, 2).copy()
     n = len(points)
     k = min(_SPACING_NEIGHBOURS, n - 1)
     if k < 1:
