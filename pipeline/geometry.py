@@ -6,6 +6,7 @@ result has the same bits on every machine. Equations are those of Shorter & Kasp
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -181,27 +182,28 @@ def _keep_least(least: FloatArray, square: float) -> None:
 
 
 @kernel(inline="always")
-def _name_nearest(limit: float, held: FloatArray, holder: LabelArray, nearest: LabelArray) -> None:
-    """Write the points of the k least squares to `nearest` (k,), of equal ones the lower index first.
+def _name_nearest(least: FloatArray, held: FloatArray, holder: LabelArray, nearest: LabelArray) -> None:
+    """Write the points of the squares in `least` (k,), ascending, to `nearest`, of equal ones the lower index first.
 
-    `holder` has the point of each square in `held`; both are overwritten. No more than k squares are below `limit`.
+    `nearest` (k,) is -1 before. `holder` has the point of each square in `held`; both are overwritten.
     """
     k = len(nearest)
     ranked = 0
     for c in range(len(held)):
         held[ranked], holder[ranked] = held[c], holder[c]
-        ranked += held[c] <= limit
+        ranked += held[c] <= least[k - 1]
     for c in range(ranked):
         square, j = held[c], holder[c]
-        m = min(c, k)
-        while m > 0 and (held[m - 1] > square or (held[m - 1] == square and nearest[m - 1] > j)):
-            if m < k:
-                held[m] = held[m - 1]
-                nearest[m] = nearest[m - 1]
-            m -= 1
-        if m < k:
-            held[m] = square
-            nearest[m] = j
+        rank = 0
+        for m in range(k):
+            rank += least[m] < square
+        while rank < k and least[rank] == square:
+            other = nearest[rank]
+            if other < 0 or j < other:
+                nearest[rank], j = j, other
+            if other < 0:
+                break
+            rank += 1
 
 
 @kernel
@@ -269,7 +271,7 @@ def _nearest_neighbours(
             squares[members[s], m] = least[m]
         if not named:
             continue
-        _name_nearest(least[k - 1], held[:count], holder, neighbours[members[s]])
+        _name_nearest(least, held[:count], holder, neighbours[members[s]])
     return neighbours, squares
 
 
@@ -334,13 +336,18 @@ def spacing_over_area_m(points: FloatArray) -> float:
     return over_area if over_area > _UNEVEN * usual else usual
 
 
-def _plan(points: FloatArray) -> FloatArray:
-    """Positions in plan, (n, 2), without gaps in memory."""
-    return np.ascontiguousarray(points[:, :2], dtype=np.float64)
+def _plan(points: FloatArray) -> bytes:
+    """Positions in plan, (n, 2) float64."""
+    return np.ascontiguousarray(points[:, :2], dtype=np.float64).tobytes()
 
 
-def _spacings(points: FloatArray) -> tuple[float, float]:
-    """1 / sqrt(density) in plan, by medians over the points and over their area; nan for fewer than two points."""
+@functools.lru_cache(maxsize=1)
+def _spacings(plan: bytes) -> tuple[float, float]:
+    """1 / sqrt(density) of `_plan`, by medians over the points and over their area; nan for fewer than two points.
+
+    Cached, since the points of a roof are mostly all that see the sky, whose spacing is asked for next.
+    """
+    points = np.frombuffer(plan).reshape(-1, 2).copy()
     n = len(points)
     k = min(_SPACING_NEIGHBOURS, n - 1)
     if k < 1:

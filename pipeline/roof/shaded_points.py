@@ -47,6 +47,8 @@ def with_shaded_points(roof: RoofPoints, cloud: PreparedCloud, planes: Sequence[
         close = close[distance_m <= _REACH_M]
         best[close], label[close] = off[close], number
     added = np.flatnonzero(label >= 0)
+    if len(added) == 0:
+        return roof
     added = added[np.argsort(-points[added, 2], kind="stable")]
     together = np.concatenate((roof.xy_mm, xy_mm[added]))
     _, first = np.unique((together[:, 0] << 32) + together[:, 1], return_index=True)

@@ -66,8 +66,6 @@ class DetectedPlanes:
     """(k, 3) float64, (a, b, c) of z = a x + b y + c, in the order of their first points; each has points."""
     labels: LabelArray
     """(n,) int32, index of the plane of every point; -1 for none."""
-    sigma_m: float
-    """Robust standard deviation of the points across their planes, metres; nan without planes."""
 
 
 def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneSettings) -> DetectedPlanes:
@@ -82,9 +80,7 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     if len(points) < MIN_PLANE_POINTS or not spacing_m > 0.0:
-        return DetectedPlanes(
-            coefficients=np.zeros((0, 3)), labels=np.full(len(points), -1, np.int32), sigma_m=math.nan
-        )
+        return DetectedPlanes(coefficients=np.zeros((0, 3)), labels=np.full(len(points), -1, np.int32))
     if spacing_m < _DENSE_SPACING_M:
         nodes, node_of = mean_nodes(points, _NODE_CELL_M, settings.max_distance_m)
         spacing_m = _NODE_CELL_M
@@ -99,8 +95,8 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
         normal_cosine=math.cos(math.radians(settings.normal_angle_deg)),
     )
     neighbours = nearest_neighbours(nodes, _NEIGHBOURS)
-    coefficients, labels, sigma_m = _detect(points, nodes, node_of, neighbours, spacing_m, limits)
-    return DetectedPlanes(coefficients=coefficients, labels=labels, sigma_m=sigma_m)
+    coefficients, labels = _detect(points, nodes, node_of, neighbours, spacing_m, limits)
+    return DetectedPlanes(coefficients=coefficients, labels=labels)
 
 
 class _Limits(NamedTuple):
@@ -311,7 +307,7 @@ def _labels_of_points(
 
 
 @kernel
-def _noise_about(points: FloatArray, labels: LabelArray, planes: FloatArray) -> float:
+def noise_about(points: FloatArray, labels: LabelArray, planes: FloatArray) -> float:
     """1.4826 times the median absolute distance of the points to their planes; nan where no point has one."""
     distances = np.empty(len(points))
     known = 0
@@ -358,8 +354,8 @@ def _detect(
     neighbours: LabelArray,
     spacing_m: float,
     limits: _Limits,
-) -> tuple[FloatArray, LabelArray, float]:
-    """Kernel of `detect_planes`: planes, labels of the points, noise."""
+) -> tuple[FloatArray, LabelArray]:
+    """Kernel of `detect_planes`: planes, labels of the points."""
     noises, min_distance_m, max_distance_m, fewest_points, min_cosine, normal_cosine = limits
     surroundings = local_planes(nodes, neighbours)
     sigma_m = noise_of_local_planes(surroundings.variances, surroundings.order)
@@ -383,8 +379,7 @@ def _detect(
         if labels[i] >= 0 and not usable[labels[i]]:
             labels[i] = -1
     if len(nodes) < len(points):
-        sigma_m = _noise_about(points, labels[node_of], planes)
+        sigma_m = noise_about(points, labels[node_of], planes)
         distance_m = min(max(noises * sigma_m, min_distance_m), max_distance_m)
         labels = _labels_of_points(points, node_of, neighbours, labels, planes, distance_m)
-    planes = _numbered(points, labels, planes, min_cosine)
-    return planes, labels, _noise_about(points, labels, planes)
+    return _numbered(points, labels, planes, min_cosine), labels

@@ -188,7 +188,8 @@ def _grow(
                 least = min_normal_cosine / cosine_of_slope(a, b)
                 refused[n] += 1
             refit = math.floor(_REFIT_GROWTH * sums[0]) + 1.0
-        for j in neighbours[i]:
+        for q in range(neighbours.shape[1]):
+            j = neighbours[i, q]
             if j < 0 or labels[j] >= 0 or asked[j] == mark or refused[j] == refused[n]:
                 continue
             if _joins(surroundings, cosines, j, a, b, c, reach, least):
@@ -245,7 +246,8 @@ def take_regions(surroundings: Surroundings, labels: LabelArray, first_label: in
             beside = 2.0 * distance_m / cosine_of_slope(a, b)
             for q in range(held):
                 reached[queue[q]] += 1
-                for j in neighbours[queue[q]]:
+                for s in range(neighbours.shape[1]):
+                    j = neighbours[queue[q], s]
                     if j >= 0 and asked[j] != mark and abs(height_above(surroundings.points, j, a, b, c)) <= beside:
                         asked[j] = mark
                         reached[j] += 1

@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from pipeline.errors import SettingsError
 from pipeline.geometry import nearest_neighbours, point_spacing_m
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.segmentation.adaptive_planes import DetectedPlanes, detect_planes, mean_nodes, merge_by_f_test
+from pipeline.segmentation.adaptive_planes import (
+    DetectedPlanes,
+    detect_planes,
+    mean_nodes,
+    merge_by_f_test,
+    noise_about,
+)
 from pipeline.segmentation.plane_regression import cluster_sums
 from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
 from pipeline.segmentation.trial_regions import TrialLimits, local_planes, noise_of_local_planes, take_regions
@@ -93,9 +99,12 @@ def test_the_ends_of_a_hip_roof_are_planes_of_their_own(density_per_m2: float) -
 
 @pytest.mark.parametrize("noise_m", [0.03, 0.06, 0.10])
 @pytest.mark.parametrize("density_per_m2", [4.0, 40.0])
-def test_the_noise_is_reported(density_per_m2: float, noise_m: float) -> None:
+def test_the_noise_about_the_planes_is_that_of_the_points(density_per_m2: float, noise_m: float) -> None:
     cosine = 1 / math.hypot(1, 0.7)
-    assert detected(gable(density_per_m2, noise_m)).sigma_m == pytest.approx(noise_m * cosine, rel=0.15)
+    points = gable(density_per_m2, noise_m)
+    found = detected(points)
+    sigma_m = noise_about(points, found.labels, found.coefficients)
+    assert sigma_m == pytest.approx(noise_m * cosine, rel=0.15)
 
 
 def test_a_superstructure_is_found_where_points_are_dense_and_it_is_not_below_the_least_area() -> None:
@@ -182,10 +191,11 @@ def test_points_far_from_every_plane_have_none() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 4])
 def test_too_few_points_have_no_plane(count: int) -> None:
-    found = detected(gable(0.5, 0.02)[:count])
+    points = gable(0.5, 0.02)[:count]
+    found = detected(points)
     assert found.coefficients.shape == (0, 3)
     assert found.labels.tolist() == [-1] * count
-    assert math.isnan(found.sigma_m)
+    assert math.isnan(noise_about(points, found.labels, found.coefficients))
 
 
 @pytest.mark.parametrize(

@@ -153,8 +153,8 @@ def _best_band(
 @kernel
 def _parting_shift(
     points: FloatArray,
-    one: FloatArray,
-    other: FloatArray,
+    planes: FloatArray,
+    pair: tuple[int, int],
     line: FloatArray,
     low: float,
     high: float,
@@ -165,6 +165,7 @@ def _parting_shift(
 
     `low` and `high` bound the step along its direction (-ny, nx). nan where too few points show it.
     """
+    one, other = pair
     offsets = np.empty(len(points))
     gains = np.empty(len(points))
     m = 0
@@ -175,7 +176,7 @@ def _parting_shift(
         along = -line[1] * points[i, 0] + line[0] * points[i, 1]
         if along < low or along > high:
             continue
-        to_one, to_other = vertical_distance_m(points[i], one), vertical_distance_m(points[i], other)
+        to_one, to_other = vertical_distance_m(points, i, planes, one), vertical_distance_m(points, i, planes, other)
         if to_one >= cap_m and to_other >= cap_m:
             continue
         offsets[m] = off
@@ -256,10 +257,10 @@ def candidate_lines(
         last = first
         while last < m and pairs[last] == pairs[first]:
             last += 1
-        one, other = planes[pairs[first] // k], planes[pairs[first] % k]
+        one, other = pairs[first] // k, pairs[first] % k
         free = last - first
         for axis in range(3):
-            difference[axis] = one[axis] - other[axis]
+            difference[axis] = planes[one, axis] - planes[other, axis]
         turn = math.hypot(difference[0], difference[1])
         if turn > _MIN_SLOPE:
             # where the planes differ by less than the cap the points do not show on which side they are
@@ -277,8 +278,8 @@ def candidate_lines(
         n = len(outline)
         for q in range(n):
             directions[q] = outline[q]
-        n = _with_directions_of(one, directions, n)
-        n = _with_directions_of(other, directions, n)
+        n = _with_directions_of(planes[one], directions, n)
+        n = _with_directions_of(planes[other], directions, n)
         while free >= least:
             most, angle, offset = _best_band(places, first, last, line_of, directions, n, _BAND_CELLS * cell_m)
             if most < least:
@@ -295,7 +296,7 @@ def candidate_lines(
                     low, high = min(low, along), max(high, along)
             reach_m = 0.6 * cell_m + _NEAR_CROSSING_M
             half = 0.5 * cell_m
-            shift = _parting_shift(points, one, other, line, low - half, high + half, cap_m, reach_m)
+            shift = _parting_shift(points, planes, (one, other), line, low - half, high + half, cap_m, reach_m)
             if not math.isnan(shift):
                 line[2] -= shift
             elif turn > _MIN_SLOPE:

@@ -24,7 +24,7 @@ from pipeline.roof.arrangement.subdivision import CELLS, EDGES, FACE, ORIGIN, Su
 
 _MIN_BEYOND = 3.0
 """Points that a cell counts for at least where a plane leaves the heights of its own: splinters hold none."""
-_ROW_MM = 500.0
+_ROW_MM = 200.0
 """Height of the rows by which edges are sorted; changes the speed only."""
 _TOLERANCE = 0.5
 """Share of the cap: points nearer than this to a plane fit it; from there to the cap they misfit more and more."""
@@ -59,6 +59,14 @@ def cells_of_points(plan: Subdivision, points: FloatArray) -> IntArray:
                 held[m], row_of[m] = h, r
                 m += 1
     starts, in_row = counting_sort(row_of, rows)
+    # the ends of these edges, row by row: every point looks at all of its row
+    ends, cell_of = np.empty((m, 4)), np.empty(m, np.int64)
+    for s in range(m):
+        h = held[in_row[s]]
+        cell_of[s] = graph[h, FACE]
+        for end in range(2):
+            v = graph[h ^ end, ORIGIN]
+            ends[s, 2 * end], ends[s, 2 * end + 1] = xy[v, 0], xy[v, 1]
     cells = np.full(len(points), -1, np.int64)
     for i in range(len(points)):
         x, y = points[i, 0] * 1e3, between_vertices(points[i, 1] * 1e3)
@@ -67,13 +75,12 @@ def cells_of_points(plan: Subdivision, points: FloatArray) -> IntArray:
         r = int((y - low) / _ROW_MM)
         nearest = -math.inf
         for s in range(starts[r], starts[r + 1]):
-            h = held[in_row[s]]
-            p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
-            if xy[p, 1] > y >= xy[q, 1]:
-                at = xy[p, 0] + (y - xy[p, 1]) * (xy[q, 0] - xy[p, 0]) / (xy[q, 1] - xy[p, 1])
+            x0, y0, x1, y1 = ends[s, 0], ends[s, 1], ends[s, 2], ends[s, 3]
+            if y0 > y >= y1:
+                at = x0 + (y - y0) * (x1 - x0) / (y1 - y0)
                 if nearest < at <= x:
                     nearest = at
-                    cells[i] = graph[h, FACE]
+                    cells[i] = cell_of[s]
     return cells
 
 
@@ -131,7 +138,7 @@ def cell_costs(
             continue
         lacking[cell] -= 1.0
         for label in range(k):
-            share = min(vertical_distance_m(points[i], planes[label]) / limits.cap_m, 1.0)
+            share = min(vertical_distance_m(points, i, planes, label) / limits.cap_m, 1.0)
             costs[cell, label] += int(COST_SCALE * share)
             if share > _TOLERANCE:
                 misfits[cell, label] += int(COST_SCALE * (share - _TOLERANCE) / (1.0 - _TOLERANCE))

@@ -240,8 +240,8 @@ def _plane_beyond(
         gain = 0.0
         for i in range(len(points)):
             if cells[i] == cell and up * (a * points[i, 0] + b * points[i, 1] + c) > 0.0:
-                gain += min(vertical_distance_m(points[i], planes[own]), cap_m)
-                gain -= min(vertical_distance_m(points[i], planes[k]), cap_m)
+                gain += min(vertical_distance_m(points, i, planes, own), cap_m)
+                gain -= min(vertical_distance_m(points, i, planes, k), cap_m)
         if gain > saved:
             best, saved = k, gain
     return best

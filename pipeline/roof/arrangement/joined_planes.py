@@ -65,7 +65,7 @@ def _moments(
     sums = np.zeros((len(planes), 6))
     for i in range(len(points)):
         label = labels[i]
-        if label >= 0 and vertical_distance_m(points[i], planes[label]) < cap_m:
+        if label >= 0 and vertical_distance_m(points, i, planes, label) < cap_m:
             x, y = points[i, 0] - middle[0], points[i, 1] - middle[1]
             sums[label, 0] += x * x
             sums[label, 1] += x * y

@@ -84,7 +84,13 @@ def _buckets_of(points: FloatArray) -> _Buckets:
 
 @kernel(inline="always")
 def _change_in_triangle(
-    buckets: _Buckets, xy: IntArray, corners: tuple[int, int, int], own: FloatArray, other: FloatArray, cap_m: float
+    buckets: _Buckets,
+    xy: IntArray,
+    corners: tuple[int, int, int],
+    planes: FloatArray,
+    own: int,
+    other: int,
+    cap_m: float,
 ) -> float:
     """By how many unexplained points the costs rise where a triangle goes from its own plane to another."""
     p, q, r = corners
@@ -100,14 +106,14 @@ def _change_in_triangle(
         for column in range(low_column, high_column + 1):
             square = row * buckets.columns + column
             for s in range(buckets.starts[square], buckets.starts[square + 1]):
-                point = buckets.points[buckets.order[s]]
-                x, y = point[0], point[1]
+                i = buckets.order[s]
+                x, y = buckets.points[i, 0], buckets.points[i, 1]
                 one = (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0)
                 two = (x2 - x1) * (y - y1) - (y2 - y1) * (x - x1)
                 three = (x0 - x2) * (y - y2) - (y0 - y2) * (x - x2)
                 if (one >= 0.0 and two >= 0.0 and three >= 0.0) or (one <= 0.0 and two <= 0.0 and three <= 0.0):
-                    change += min(vertical_distance_m(point, other) / cap_m, 1.0)
-                    change -= min(vertical_distance_m(point, own) / cap_m, 1.0)
+                    change += min(vertical_distance_m(buckets.points, i, planes, other) / cap_m, 1.0)
+                    change -= min(vertical_distance_m(buckets.points, i, planes, own) / cap_m, 1.0)
     return change
 
 
@@ -336,8 +342,8 @@ def _gain_of_merging(
         # what lies between the old edge and the new one goes from the face on that side to the other
         if starts_here != (turn_of(xy, u, w, v) >= 0):
             left, right = right, left
-        own, other = planes[borders.plane_of_face[left]], planes[borders.plane_of_face[right]]
-        gain -= _change_in_triangle(buckets, xy, (u, w, v), own, other, limits.cap_m)
+        own, other = borders.plane_of_face[left], borders.plane_of_face[right]
+        gain -= _change_in_triangle(buckets, xy, (u, w, v), planes, own, other, limits.cap_m)
     if gain > 0.0 and not _star_is_sound(borders, planes, v, u, found, m + m_v):
         return 0.0
     return gain

@@ -65,18 +65,18 @@ def costs_of_all(costs: IntArray) -> Costs:
     return Costs(starts, labels, costs.ravel(), np.zeros(n, np.int64))
 
 
-@kernel(inline="always")
+@kernel
 def cost_of(costs: Costs, node: int, label: int) -> int:
     """Cost of a label at a node."""
-    first, last = costs.starts[node], costs.starts[node + 1]
-    found: int = costs.others[node]
-    if first + label < last and costs.labels[first + label] == label:
-        found = costs.costs[first + label]
-    else:
-        for s in range(first, min(last, first + label)):
-            if costs.labels[s] == label:
-                found = costs.costs[s]
-    return found
+    usual: int = costs.others[node]
+    first = costs.starts[node]
+    # labels ascend: so many can precede this one at most
+    last = min(costs.starts[node + 1], first + label + 1)
+    for s in range(last - 1, first - 1, -1):
+        if costs.labels[s] == label:
+            own: int = costs.costs[s]
+            return own
+    return usual
 
 
 class _Flow(NamedTuple):

@@ -34,12 +34,14 @@ def labels_of_points(points: FloatArray, labels: LabelArray, raster: Raster) -> 
 
 
 @kernel
-def _fit(points: FloatArray, chosen: LabelArray, plane: FloatArray, cap_m: float, fitted: FloatArray) -> bool:
-    """Least squares over the chosen points nearer than the cap to a plane; whether they determine one."""
+def _fit(
+    points: FloatArray, chosen: LabelArray, planes: FloatArray, label: int, cap_m: float, fitted: FloatArray
+) -> bool:
+    """Least squares over the chosen points nearer than the cap to one of the planes; whether they determine one."""
     near = np.empty(len(chosen), np.int32)
     n = 0
     for i in chosen:
-        if vertical_distance_m(points[i], plane) < cap_m:
+        if vertical_distance_m(points, i, planes, label) < cap_m:
             near[n] = i
             n += 1
     if n < _FEWEST_POINTS:
@@ -49,7 +51,7 @@ def _fit(points: FloatArray, chosen: LabelArray, plane: FloatArray, cap_m: float
     if found.xx * found.yy - found.xy * found.xy < n * _MIN_WIDTH_M**2 * (found.xx + found.yy):
         return False
     a, b = solve_plane_moments(found.xx, found.xy, found.yy, found.xz, found.yz)
-    fitted[0], fitted[1], fitted[2] = a, b, found.z - a * found.x - b * found.y
+    fitted[0, 0], fitted[0, 1], fitted[0, 2] = a, b, found.z - a * found.x - b * found.y
     return True
 
 
@@ -61,7 +63,7 @@ def refitted_planes(points: FloatArray, labels: LabelArray, planes: FloatArray, 
     (n, 3) are in local metres, in a canonical order; `labels` has the plane of the place of each, -1 for none.
     """
     better = planes.copy()
-    fitted = np.empty(3)
+    fitted = np.empty((1, 3))
     chosen = np.empty(len(points), np.int32)
     for label in range(len(planes)):
         n = 0
@@ -70,15 +72,15 @@ def refitted_planes(points: FloatArray, labels: LabelArray, planes: FloatArray, 
                 chosen[n] = i
                 n += 1
         for _ in range(_ROUNDS):
-            if not _fit(points, chosen[:n], better[label], cap_m, fitted):
+            if not _fit(points, chosen[:n], better, label, cap_m, fitted):
                 break
             change = 0.0
             for i in chosen[:n]:
-                change += min(vertical_distance_m(points[i], fitted), cap_m)
-                change -= min(vertical_distance_m(points[i], better[label]), cap_m)
+                change += min(vertical_distance_m(points, i, fitted, 0), cap_m)
+                change -= min(vertical_distance_m(points, i, better, label), cap_m)
             if change >= 0.0:
                 break
-            better[label, 0], better[label, 1], better[label, 2] = fitted[0], fitted[1], fitted[2]
+            better[label] = fitted[0]
     return better
 
 
@@ -88,7 +90,7 @@ def support_of_planes(points: FloatArray, labels: LabelArray, planes: FloatArray
     support = np.zeros((len(planes), 2))
     for i in range(len(points)):
         if labels[i] >= 0:
-            off = vertical_distance_m(points[i], planes[labels[i]])
+            off = vertical_distance_m(points, i, planes, labels[i])
             if off < cap_m:
                 support[labels[i], 0] += 1.0
                 support[labels[i], 1] += off * off

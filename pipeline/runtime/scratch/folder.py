@@ -175,9 +175,8 @@ class Scratch:
     def cancelled(self) -> bool:
         """Whether the run was cancelled, or is over: then its folder is gone, or another attempt took it over."""
         if self.attempt:
-            return not self._mark.exists()
-        root = Path(self.root)
-        return (root / _CANCELLED).exists() or not root.exists()
+            return not self.has(f"{ATTEMPTS}/{self.attempt}")
+        return self.has(_CANCELLED) or not self.has(".")
 
     def check_cancelled(self) -> None:
         """Raise `RunCancelledError` in a task of a run that was cancelled."""
