@@ -175,8 +175,12 @@ def _steps(slopes: Slopes, place: IntArray, bins: int, side: int) -> _Steps:
     weight, step, variance, tt, th, left, points = np.zeros((7, bins))
     inner = np.arange(_WINDOW_BINS, bins - _WINDOW_BINS + 1)
     inner = inner[inner < bins]
-    for strip in np.unique(slopes.strip):
-        on = np.flatnonzero((slopes.side == side) & (slopes.strip == strip))
+    on_side = np.flatnonzero(slopes.side == side)
+    order = np.argsort(slopes.strip[on_side], kind="stable")
+    _, counts = np.unique(slopes.strip[on_side], return_counts=True)
+    for on in np.split(on_side[order], np.cumsum(counts)[:-1]):
+        if len(on) < 2 * _FEWEST:
+            continue
         t, h = slopes.way_m[on] - slopes.way_m[0], slopes.height_m[on] - slopes.height_m[0]
         sums = np.zeros((6, bins + 1))
         for k, values in enumerate((np.ones(len(on)), h, h * h, t, t * t, t * h)):

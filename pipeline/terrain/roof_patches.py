@@ -37,6 +37,8 @@ _DISTANCE_MM = 150.0
 """A patch takes what lies this near to its plane: three times the noise of a good survey."""
 _NOISE_MM = 50.0
 """Noise of a good survey, orthogonal to a roof."""
+_NARROW_MM = 300.0
+"""Standard deviation across of points about a metre wide."""
 MIN_COSINE = math.cos(math.radians(18.0))
 """Cosine of the largest angle between a patch and the surroundings of its vertices, or another patch of its slope."""
 _UNKNOWN = 1e30
@@ -100,7 +102,10 @@ class Borders:
 
 @kernel
 def solve_plane(s: FloatArray) -> tuple[float, float, float, bool]:
-    """Slopes and level at the sums' origin, from sums of 1, x, y, z, xx, xy, yy, xz, yz; False where there is none."""
+    """Slopes and level at the sums' origin, from sums of 1, x, y, z, xx, xy, yy, xz, yz; False where there is none.
+
+    Points show no slope across their length if they are 32 times longer than wide and narrower than `_NARROW_MM`.
+    """
     n = s[0]
     if n < 3:
         return 0.0, 0.0, 0.0, False
@@ -108,7 +113,7 @@ def solve_plane(s: FloatArray) -> tuple[float, float, float, bool]:
     xx, xy, yy = s[4] / n - mx * mx, s[5] / n - mx * my, s[6] / n - my * my
     xz, yz = s[7] / n - mx * mz, s[8] / n - my * mz
     det = xx * yy - xy * xy
-    if det <= 1e-3 * (xx + yy) * (xx + yy) or det <= 0.0:
+    if det <= min(1e-3 * (xx + yy), _NARROW_MM * _NARROW_MM) * (xx + yy) or det <= 0.0:
         return 0.0, 0.0, 0.0, False
     a, b = solve_plane_moments(xx, xy, yy, xz, yz)
     return a, b, mz - a * mx - b * my, True
@@ -244,6 +249,8 @@ def grow_patches(vertices: RoofVertices, local: FloatArray, order: IntArray) -> 
         if tail < MIN_POINTS or not found:
             for k in range(tail):
                 label[queue[k]] = -1
+                # each other seed of a narrow strip would grow it again
+                tried[queue[k]] = tail >= MIN_POINTS
             tried[seed] = True
             continue
         planes[count, 0], planes[count, 1] = na, nb

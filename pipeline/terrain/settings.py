@@ -366,7 +366,7 @@ class UnitSettings(Parameters):
     min_step_m: float = parameter(0.2, "Least step between the roofs of two units.", unit="m", minimum=0.1, maximum=5.0)
     min_ridge_step_m: float = parameter(
         0.06,
-        "Least step between two units of one gable roof; both slopes step there, by the same amount, in one strip.",
+        "Least mean step between two units of one gable roof; both slopes step there, by about the same amount.",
         unit="m",
         minimum=0.05,
         maximum=5.0,

@@ -137,7 +137,7 @@ def units_of_patches(
             and seen.opposite
             and p in has_ridge
             and q in has_ridge
-            and borders.length_m[row] >= _SHORTEST_VALLEY_M
+            and borders.extent_m[row] >= _SHORTEST_VALLEY_M
         )
         if is_gutter or (roof[p] == roof[q] and house[p] != house[q]):
             apart[p].add(q)
@@ -318,7 +318,12 @@ def units_of(
         return one
     if max(int(np.ptp(x_mm)), int(np.ptp(y_mm))) >= MAX_WINDOW_MM:
         return one
-    chosen, _ = highest_per_cell(x_mm, y_mm, z_mm, np.zeros(n, np.int8), np.ones(n, np.bool_), THINNING_M)
+    chosen, cell = highest_per_cell(x_mm, y_mm, z_mm, np.zeros(n, np.int8), np.ones(n, np.bool_), THINNING_M)
+    # points of several strips may lie at one place, in any order
+    top = chosen[cell]
+    at_top = np.flatnonzero((x_mm == x_mm[top]) & (y_mm == y_mm[top]) & (z_mm == z_mm[top]))
+    strip = np.full(len(chosen), np.iinfo(np.int64).max)
+    np.minimum.at(strip, cell[at_top], strips[at_top])
     cell_mm = round(THINNING_M * 1000)
     # whole cells are left out, so that the lattice keeps its place
     x0, y0 = int(x_mm.min()) // cell_mm * cell_mm, int(y_mm.min()) // cell_mm * cell_mm
@@ -329,9 +334,8 @@ def units_of(
         return one
     grown = grown_patches(vx, vy, vz, tin)
     patches, borders = measured_patches(grown, settings.min_step_m)
-    grown, roof, house = cut_at_ridge_steps(
-        grown, borders, _rows(patches, borders), strips[chosen], settings.min_ridge_step_m
-    )
+    rows = _rows(patches, borders)
+    grown, roof, house = cut_at_ridge_steps(grown, borders, rows, strip, settings.min_ridge_step_m)
     if len(roof) > len(patches.areas_m2):
         patches, borders = measured_patches(grown, settings.min_step_m)
     unit_of_patch = units_of_patches(patches, borders, roof, house, settings)

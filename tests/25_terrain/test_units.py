@@ -225,13 +225,19 @@ class Cloud:
 
 
 def cloud_of(
-    roof: Roof, *, per_m2: float = 6.0, turn_deg: float = 23.0, mirrored: bool = False, seed: int = 1
+    roof: Roof,
+    *,
+    per_m2: float = 6.0,
+    turn_deg: float = 23.0,
+    mirrored: bool = False,
+    seed: int = 1,
+    east_m: float = 42.0,
 ) -> Cloud:
     """Points of a roof, with noise of 2 cm, somewhere in a country."""
     random = np.random.default_rng(seed)
     side = 1 / math.sqrt(per_m2)
-    grid = np.arange(-1.0, 42.0, side)
-    x, y = (v.ravel() + random.uniform(-0.45, 0.45, v.size) * side for v in np.meshgrid(grid, grid))
+    grid = (np.arange(-1.0, most_m, side) for most_m in (east_m, 42.0))
+    x, y = (v.ravel() + random.uniform(-0.45, 0.45, v.size) * side for v in np.meshgrid(*grid))
     z, house = roof(x, y)
     z += random.normal(0, 0.02, len(z))
     there = house >= 0
@@ -304,6 +310,26 @@ def test_neither_the_order_nor_a_move_by_whole_cells_changes_anything(
     order = np.random.default_rng(seed).permutation(len(cloud.xyz))
     moved = Cloud(xyz=cloud.xyz[order] + np.array([500 * columns, 500 * rows, lift_mm]), house=cloud.house[order])
     assert np.array_equal(moved.units(), cloud.units()[order])
+
+
+@pytest.mark.parametrize("step_m", [0.07, 0.12])
+def test_the_order_of_points_at_one_place_in_two_strips_changes_nothing(step_m: float) -> None:
+    cloud = cloud_of(_row((6.0, 6.0 + step_m, 6.0)), per_m2=2.0, turn_deg=0.0)
+    twice = Cloud(xyz=np.concatenate((cloud.xyz, cloud.xyz)), house=np.concatenate((cloud.house, cloud.house)))
+    strips = np.repeat(np.array([4, 9]), len(cloud.xyz))
+    expected = twice.units(strips=strips)
+    for seed in range(5):
+        order = np.random.default_rng(seed).permutation(len(strips))
+        shuffled = Cloud(xyz=twice.xyz[order], house=twice.house[order])
+        assert np.array_equal(shuffled.units(strips=strips[order]), expected[order])
+
+
+@pytest.mark.parametrize("houses", [16, 24])
+def test_the_slopes_of_a_long_row_are_patches_too(houses: int) -> None:
+    cloud = cloud_of(_row((6.0, 6.08) * (houses // 2)), east_m=8.0 * houses + 1.0)
+    found = cloud.units()
+    assert found.max() + 1 == houses
+    assert agreement(found, cloud.house) > 0.98
 
 
 def test_units_are_numbered_by_their_smallest_points() -> None:

@@ -175,8 +175,16 @@ class Scratch:
     def cancelled(self) -> bool:
         """Whether the run was cancelled, or is over: then its folder is gone, or another attempt took it over."""
         if self.attempt:
-            return not self.has(f"{ATTEMPTS}/{self.attempt}")
-        return self.has(_CANCELLED) or not self.has(".")
+            return not self._holds(f"{ATTEMPTS}/{self.attempt}")
+        return self._holds(_CANCELLED) or not self._holds(".")
+
+    def _holds(self, name: str) -> bool:
+        """As `has`, but raises OSError where a file system that fails does not say: that is no cancellation."""
+        try:
+            os.stat(f"{self.root}/{name}")  # noqa: PTH116 - asked for every item, and a path takes longer to make
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        return True
 
     def check_cancelled(self) -> None:
         """Raise `RunCancelledError` in a task of a run that was cancelled."""
