@@ -133,7 +133,10 @@ def ridge_steps(slopes: Slopes, min_step_m: float) -> FloatArray:
     first, bins = int(place.min()), int(np.ptp(place)) + 1
     if bins < 2 * _WINDOW_BINS:
         return np.empty(0)
-    one, other = (_steps(slopes, place - first, bins, side) for side in (0, 1))
+    one = _steps(slopes, place - first, bins, 0)
+    if not (np.abs(one.step) >= _SIGNIFICANT * one.error).any():  # as on most roofs
+        return np.empty(0)
+    other = _steps(slopes, place - first, bins, 1)
     mean = 0.5 * (one.step + other.step)
     is_step = (np.abs(mean) >= min_step_m) & (np.abs(one.step - other.step) <= _ALIKE * np.abs(mean))
     is_step &= (np.abs(one.step) >= _SIGNIFICANT * one.error) & (np.abs(other.step) >= _SIGNIFICANT * other.error)
