@@ -27,6 +27,9 @@ LISTED = "http://127.0.0.1:9"
 PAGE_MS = 60_000.0
 """A deadline for what takes a moment on a quiet machine; not a promise of speed."""
 
+OWN_SERVERS = {"driverless", "gate", "locked", "with_tiles"}
+"""Fixtures with a server of one test."""
+
 SWITCHES = (
     "--no-sandbox",
     "--disable-quic",
@@ -174,8 +177,11 @@ def browser(playwright: Playwright) -> Iterator[Browser]:
 
 
 @pytest.fixture
-def visit(browser: Browser) -> Iterator[Callable[..., Visit]]:
+def visit(browser: Browser, request: pytest.FixtureRequest) -> Iterator[Callable[..., Visit]]:
     """Opens pages; at the end each must have been without errors and without a request to elsewhere."""
+    # a server of this test alone starts before the pages and ends after them: they may ask it to the last
+    for name in sorted(OWN_SERVERS & set(request.fixturenames)):
+        request.getfixturevalue(name)
     visits: list[Visit] = []
 
     def open_page(url: str, **options: object) -> Visit:
