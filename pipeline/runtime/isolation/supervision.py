@@ -26,6 +26,8 @@ _TICK_S = 0.05
 _CANCEL_TICK_S = 0.25
 _TRACE_WAIT_S = 2.0
 _STDERR_KEPT_BYTES = 8 * 2**20
+_CUTS = 5
+"""Trials to cut its standard error while it writes nothing."""
 _STDERR_REPORTED_BYTES = 6000
 _DATA_MARGIN_BYTES = 2**30
 """Allowance above the limit: a process reserves more address space than it uses."""
@@ -276,10 +278,16 @@ class SupervisedChild:
 
     def _cut_stderr(self) -> None:
         """Keep a child from filling the disk: only the end of its standard error stays."""
-        if os.fstat(self._stderr.fileno()).st_size > _STDERR_KEPT_BYTES:
+        for trial in range(_CUTS):
+            size = os.fstat(self._stderr.fileno()).st_size
+            if size <= _STDERR_KEPT_BYTES:
+                return
             tail = self._end_of_stderr()
-            os.ftruncate(self._stderr.fileno(), 0)
-            os.write(self._stderr.fileno(), tail)
+            # what it wrote meanwhile would be lost, and may be its last words
+            if os.fstat(self._stderr.fileno()).st_size == size or trial == _CUTS - 1:
+                os.ftruncate(self._stderr.fileno(), 0)
+                os.write(self._stderr.fileno(), tail)
+                return
 
     def _end_of_stderr(self) -> bytes:
         size = os.fstat(self._stderr.fileno()).st_size
