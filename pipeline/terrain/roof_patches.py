@@ -44,7 +44,7 @@ MIN_COSINE = math.cos(math.radians(18.0))
 _UNKNOWN = 1e30
 """Deviation where a vertex has no plane around it."""
 _MAX_BESIDE_MM = 750.0
-"""A fold's border is no farther than this beside the line in which its planes intersect: half an edge, and a gutter."""
+"""Farthest that the border of a fold lies from the line in which its planes intersect: half an edge, and a gutter."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

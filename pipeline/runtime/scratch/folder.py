@@ -139,8 +139,12 @@ class Scratch:
             return np.fromfile(stream, dtype, (stop - start) * width).reshape(stop - start, *shape[1:])
 
     def has(self, name: str) -> bool:
-        """Whether anything is stored under a name."""
-        return os.path.exists(f"{self.root}/{name}")  # noqa: PTH110 - a Path takes longer
+        """Whether anything is stored under a name; raises OSError if the file system fails, which is no answer."""
+        try:
+            os.stat(f"{self.root}/{name}")  # noqa: PTH116 - asked for every item, and a path takes longer to make
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        return True
 
     def put_bytes(self, name: str, content: bytes) -> None:
         """Store bytes under a name, whole or not at all.
@@ -175,16 +179,8 @@ class Scratch:
     def cancelled(self) -> bool:
         """Whether the run was cancelled, or is over: then its folder is gone, or another attempt took it over."""
         if self.attempt:
-            return not self._holds(f"{ATTEMPTS}/{self.attempt}")
-        return self._holds(_CANCELLED) or not self._holds(".")
-
-    def _holds(self, name: str) -> bool:
-        """As `has`, but raises OSError where a file system that fails does not say: that is no cancellation."""
-        try:
-            os.stat(f"{self.root}/{name}")  # noqa: PTH116 - asked for every item, and a path takes longer to make
-        except (FileNotFoundError, NotADirectoryError):
-            return False
-        return True
+            return not self.has(f"{ATTEMPTS}/{self.attempt}")
+        return self.has(_CANCELLED) or not self.has(".")
 
     def check_cancelled(self) -> None:
         """Raise `RunCancelledError` in a task of a run that was cancelled."""

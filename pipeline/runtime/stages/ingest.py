@@ -192,7 +192,7 @@ def _check_unchanged(task: IngestTask) -> None:
     is_alone = task.share is None and not is_url(task.path)
     if not is_alone and task.known is not None and not task.known.is_of(file_at(task.path)):
         raise UnreadableInputError(
-            shown(task.path), "it changed after the run began", "Run again when it is no longer being written"
+            shown(task.path), "it changed after the run began", "Run again once nothing writes to it any more"
         )
 
 
