@@ -20,7 +20,6 @@ from pipeline.runtime.stages.given_footprints import given_footprints
 from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.join import join
-from pipeline.runtime.stages.outline import outline
 from pipeline.runtime.stages.sites import RejectedSite
 from pipeline.runtime.stages.split import split
 from pipeline.settings import RunSettings
@@ -57,12 +56,11 @@ def found_scene(
         ground = find_ground(context, settings, ingested, footprints=given is not None)
         splits = split(context, settings, ingested, ground, given)
         roof = settings.building.roof
-        joined = outline(context, roof, join(context, settings.scene, roof.min_strip_offset_m, splits, given))
+        joined = join(context, settings.scene, roof, splits, given)
+        found = joined.found(scratch)
         return FoundScene(
-            candidates=tuple(
-                gather(scratch, plan.grid, site, plan.gps_kind, settings.building.roof)[0] for site in joined.candidates
-            ),
-            rejected=joined.rejected,
+            candidates=tuple(gather(scratch, plan.grid, site, plan.gps_kind, roof)[0] for site in found.candidates),
+            rejected=found.rejected,
             small_fragments=joined.small_fragments,
             points=sum(found.points for found in splits.figures),
             seconds=progress.timings,

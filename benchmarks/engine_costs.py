@@ -154,9 +154,9 @@ def splits_of(folder: Path, tile_size_m: float) -> tuple[Plan, list[Split], int]
         ingested = ingest(context, tiles)
         ground = find_ground(context, settings, ingested, footprints=False)
         found = split(context, settings, ingested, ground, None)
-        splits = list(found.stored(scratch))
-        joined = join(context, settings.scene, settings.building.roof.min_strip_offset_m, found, None)
-    return plan, splits, len(joined.candidates)
+        splits = list(found.stored(context))
+        joined = join(context, settings.scene, settings.building.roof, found, None)
+    return plan, splits, joined.candidates
 
 
 def moved(one: Split, columns: int, size_mm: int) -> Split:

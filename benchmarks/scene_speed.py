@@ -94,14 +94,14 @@ def one_lap(tiles: Sequence[str], plan: Plan, settings: RunSettings, executor: E
         ingested = ingest(context, tiles)
         ground = find_ground(context, settings, ingested, footprints=False)
         splits = split(context, settings, ingested, ground, None)
-        joined = join(context, settings.scene, settings.building.roof.min_strip_offset_m, splits, None)
+        joined = join(context, settings.scene, settings.building.roof, splits, None)
         cpu_s = time.process_time() - began
         held = sum(path.stat().st_size for path in Path(place).rglob("*") if path.is_file())
     return Lap(
         seconds={stage: progress.timings[stage] for stage in STAGES},
         cpu_s=cpu_s if isinstance(executor, SerialExecutor) else None,
         points=sum(found.points for found in splits.figures),
-        candidates=len(joined.candidates),
+        candidates=joined.candidates,
         peaks=dict(progress.peaks),
         scratch_bytes=held,
     )

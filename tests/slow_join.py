@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.model import IntArray, Reason
-from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, RejectedSite, object_id
+from pipeline.runtime.stages.sites import CandidateSite, FoundSites, PointRange, RejectedSite, object_id
 from pipeline.terrain.candidates import NOWHERE, Surfaces, Verdict
 from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.fragment_sums import N_SUMS, Sum
@@ -343,7 +343,9 @@ def _ranges_by_key(splits: Sequence[WholeSplit], surface_of: dict[tuple[int, int
     return ranges
 
 
-def whole_join(splits: Sequence[WholeSplit], grid: TileGrid, settings: CandidateSettings, crs_name: str) -> Joined:
+def whole_join(
+    splits: Sequence[WholeSplit], grid: TileGrid, settings: CandidateSettings, crs_name: str
+) -> tuple[FoundSites, int]:
     """Unite, judge, and say where each candidate's points lie."""
     splits = sorted(splits, key=lambda s: s.tile)
     surfaces, surface_of_fragment, offsets = whole_surfaces(splits)
@@ -404,8 +406,8 @@ def whole_join(splits: Sequence[WholeSplit], grid: TileGrid, settings: Candidate
                 ranges=tuple(ranges.get(k, ())),
             )
         )
-    return Joined(
+    found = FoundSites(
         candidates=tuple(sorted(candidates, key=lambda c: (-c.points, c.building_id))),
         rejected=tuple(sorted(rejected, key=lambda r: r.object_id)),
-        small_fragments=small,
     )
+    return found, small

@@ -13,7 +13,6 @@ from uuid import uuid4
 from pipeline.errors import InputError, RunError, SettingsError
 from pipeline.export.raster import RasterLattice
 from pipeline.io import is_url, shown
-from pipeline.model import Reason
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.preloading import loads_of
@@ -30,7 +29,7 @@ from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use
 from pipeline.runtime.stages.join import join
-from pipeline.runtime.stages.label import LabelTask, by_tile, label, neighbourhood
+from pipeline.runtime.stages.label import LabelTask, SitesNear, label, neighbourhood
 from pipeline.runtime.stages.rasters import (
     RASTERS,
     MosaicTask,
@@ -175,14 +174,13 @@ def classify(
         ingested = ingest(context, paths)
         ground = find_ground(context, request.settings, ingested, footprints=footprints is not None)
         splits = split(context, request.settings, ingested, ground, footprints)
-        joined = join(
-            context, request.settings.scene, request.settings.building.roof.min_strip_offset_m, splits, footprints
-        )
+        roof = request.settings.building.roof
+        joined = join(context, request.settings.scene, roof, splits, footprints, outlines=False)
         tiles = sorted(splits.places)
         _label_all(context, request.settings, tiles, joined, ingested, given=footprints is not None)
         files = _write_all(context, paths, ingested, out)
         rasters = _draw_all(context, tiles, ingested, cell, out) if request.rasters else []
-    return _summary(progress, out, files, rasters, len(joined.candidates), began)
+    return _summary(progress, out, files, rasters, joined.candidates, began)
 
 
 @contextlib.contextmanager
@@ -229,8 +227,7 @@ def _label_all(
     """The classes of all tiles' points, in scratch; buildings may be `given` by footprints."""
     grid = context.plan.grid
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
-    buildings = by_tile(joined.candidates)
-    decks = by_tile([site for site in joined.rejected if site.verdict.reason is Reason.BRIDGE])
+    sites = SitesNear.of(joined)
     tasks = [
         LabelTask(
             tile=tile,
@@ -239,8 +236,8 @@ def _label_all(
             classes=classes,
             given=given or classes.building,
             scratch=context.scratch,
-            buildings=tuple(part for other in near for part in buildings.get(other, ())),
-            decks=tuple(part for other in near for part in decks.get(other, ())),
+            buildings=sites.groups_in(near),
+            rejected=sites.rejected_in(near),
         )
         for tile in tiles
         for near in [tuple(grid.tiles_over(neighbourhood(tile, grid, settings.scene)))]

@@ -20,8 +20,8 @@ from pipeline.io.urls import has_mark, is_url, shown
 from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
 from pipeline.runtime.request import RunRequest, input_file
 from pipeline.runtime.run import OVERRIDES
+from pipeline.runtime.stages.batch_figures import REJECTED
 from pipeline.runtime.stages.ingested import Ingested
-from pipeline.runtime.stages.model_batch import REJECTED
 from pipeline.settings import RunSettings
 
 _AGAIN = "Run the whole again"

@@ -50,18 +50,19 @@ from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import run_scratch
 from pipeline.runtime.stages.apply_overrides import WARNING, EntryOutcome, apply_overrides
+from pipeline.runtime.stages.batch_figures import REJECTED, Modelled
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.given_footprints import GivenFootprints, given_footprints
 from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested, points_by_tile
 from pipeline.runtime.stages.join import join
-from pipeline.runtime.stages.model_batch import REJECTED, Modelled, StoredResult
-from pipeline.runtime.stages.outline import outline
+from pipeline.runtime.stages.model_batch import StoredResult
 from pipeline.runtime.stages.publish import buildings_and_rejected, record_context, rejected_object
 from pipeline.runtime.stages.reconstruct import QUARANTINE, Models, reconstruct
-from pipeline.runtime.stages.sites import CandidateSite, Joined, RejectedSite
+from pipeline.runtime.stages.sites import CandidateSite, FoundSites, RejectedSite
 from pipeline.runtime.stages.split import Splits, split
+from pipeline.runtime.stages.stored_sites import joined_of, store_sites
 from pipeline.tiling import MM, Tile
 
 AROUND_M = 30.0
@@ -181,7 +182,8 @@ def _rerun(
                 progress.warn("join", outcome.warning)
         if earlier.manifest.request.get("points"):
             progress.warn("publish", _POINTS_GONE)
-        models = reconstruct(context, wanted.settings, found.again)
+        again = joined_of(store_sites(context, "again", found.again), 0, found.splits.keys)
+        models = reconstruct(context, wanted.settings, again)
         modelled = list(models.each())
         new = LocalStorage(root=Path(context.scratch.root, _NEW))
         prepared = _prepared(search, found, models, new)
@@ -212,12 +214,12 @@ class _Found:
     """The candidates of some tiles, or of all."""
 
     splits: Splits
-    judged: Joined
+    judged: FoundSites
     """The candidates before the overrides."""
     outcomes: tuple[EntryOutcome, ...]
     changed: frozenset[str]
     """Buildings to model again."""
-    again: Joined
+    again: FoundSites
     """Only these, after the overrides."""
 
 
@@ -255,10 +257,9 @@ class _Search:
         context, settings = self.context, self.request.settings
         ground = find_ground(context, settings, self.ingested, footprints=self.footprints is not None, only=tiles)
         splits = split(context, settings, self.ingested, ground, self.footprints, tiles)
-        roof = settings.building.roof
-        found = join(context, settings.scene, roof.min_strip_offset_m, splits, self.footprints)
-        judged = outline(context, roof, found)
-        joined, outcomes = apply_overrides(context, settings, judged, self.overrides, self.ingested, ground)
+        joined = join(context, settings.scene, settings.building.roof, splits, self.footprints)
+        judged = joined.found(context.scratch)
+        sites, outcomes = apply_overrides(context, settings, judged, self.overrides, self.ingested, ground)
         now = {o.building_id: o.effective.fingerprint for o in outcomes if o.building_id and o.effective is not None}
         before = self.earlier.fingerprints
         changed = frozenset({name for name in {*now, *before} if now.get(name) != before.get(name)} | set(self.only))
@@ -267,10 +268,9 @@ class _Search:
             judged=judged,
             outcomes=outcomes,
             changed=changed,
-            again=dataclasses.replace(
-                joined,
-                candidates=tuple(site for site in joined.candidates if site.building_id in changed),
-                rejected=tuple(site for site in joined.rejected if site.object_id in changed),
+            again=FoundSites(
+                candidates=tuple(site for site in sites.candidates if site.building_id in changed),
+                rejected=tuple(site for site in sites.rejected if site.object_id in changed),
             ),
         )
 

@@ -39,18 +39,19 @@ from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import check_scratch, run_scratch
 from pipeline.runtime.scratch.work_folder import is_known, locked_work
 from pipeline.runtime.stages.apply_overrides import apply_overrides
+from pipeline.runtime.stages.batch_figures import Counted
 from pipeline.runtime.stages.cleanup import publishing, tidy
-from pipeline.runtime.stages.counts import Counted, run_counts
+from pipeline.runtime.stages.counts import run_counts
 from pipeline.runtime.stages.given_footprints import GivenFootprints, given_footprints
 from pipeline.runtime.stages.ground import Ground, find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.join import join
-from pipeline.runtime.stages.outline import outline
 from pipeline.runtime.stages.publish import Published, RunOutput, publish
 from pipeline.runtime.stages.reconstruct import QUARANTINE, Models, models_stage, reconstruct
 from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import Splits, split
+from pipeline.runtime.stages.stored_sites import joined_of, store_sites
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM
 
@@ -236,7 +237,7 @@ def run_variants(
             raise
         if resources.work is not None:
             stages = {models_stage(variant.settings_in(request.settings)) for variant in variants}
-            tidy(context.scratch, found.joined, stages, [one.run_dir for one in runs])
+            tidy(context.scratch, stages, [one.run_dir for one in runs])
     inputs = _input_files(request, paths, found.ingested, plan)
     # a single run took all the time; of several, each took that of the shared stages and its own
     outcomes = [one.finish(context, found, inputs, began if len(runs) == 1 else None) for one in runs]
@@ -262,9 +263,8 @@ def _find_candidates(
     ingested = ingest(context, paths)
     ground = find_ground(context, settings, ingested, footprints=footprints is not None)
     splits = split(context, settings, ingested, ground, footprints)
-    roof = settings.building.roof
-    joined = join(context, settings.scene, roof.min_strip_offset_m, splits, footprints)
-    return _Candidates(ingested=ingested, ground=ground, splits=splits, joined=outline(context, roof, joined))
+    joined = join(context, settings.scene, settings.building.roof, splits, footprints)
+    return _Candidates(ingested=ingested, ground=ground, splits=splits, joined=joined)
 
 
 def _override(
@@ -275,12 +275,17 @@ def _override(
     runs: Sequence[_VariantRun],
 ) -> _Candidates:
     """The candidates after the overrides; the outcome of each entry goes into the run directories."""
-    joined, entries = apply_overrides(context, settings, found.joined, overrides, found.ingested, found.ground)
+    context.check(listed.place.folder for listed in (*found.joined.groups, *found.joined.rejected))
+    sites, entries = apply_overrides(
+        context, settings, found.joined.found(context.scratch), overrides, found.ingested, found.ground
+    )
     for entry in entries:
         if entry.warning:
             context.progress.warn("join", entry.warning)
     for one in runs:
         put_json(one.run_dir, OVERRIDES, [entry.as_dict() for entry in entries])
+    stored = store_sites(context, "overridden", sites)
+    joined = joined_of(stored, found.joined.small_fragments, found.joined.keys)
     return dataclasses.replace(found, joined=joined)
 
 
@@ -300,8 +305,6 @@ def _model(context: RunContext, request: RunRequest, found: _Candidates, runs: S
         one.published = publish(part, settings, found.splits, found.joined, one.models, output)
         if request.points:
             one.without_points = _write_points(part, settings, found, one, given=request.footprints is not None)
-    for one in runs:
-        one.counted = Counted.of(one.models, each=several)
 
 
 def _write_points(
@@ -324,7 +327,6 @@ class _VariantRun:
     progress: Progress
     models: Models = dataclasses.field(init=False)
     published: list[Published] = dataclasses.field(init=False)
-    counted: Counted = dataclasses.field(init=False)
     without_points: tuple[str, ...] = ()
     """Keys of tiles whose points could not be written."""
 
@@ -355,6 +357,11 @@ class _VariantRun:
             ),
             progress=progress,
         )
+
+    @property
+    def counted(self) -> Counted:
+        """The counts of its models."""
+        return self.models.counted
 
     @property
     def storage(self) -> Storage:
@@ -411,12 +418,15 @@ class _VariantRun:
             content_sha256=digest,
         )
         write_manifest(self.run_dir, manifest, self.storage.put)
+        rejected = Counter(self.counted.rejected)
+        for listed in found.joined.rejected:
+            rejected.update(listed.figures.reasons)
         summary = RunSummary(
             run_dir=self.run_dir,
             digest=digest,
             statuses=dict(self.counted.statuses),
             reasons=dict(self.counted.reasons),
-            rejected=dict(self.counted.rejected + Counter(site.verdict.reason.value for site in found.joined.rejected)),
+            rejected=dict(rejected),
             roof_types=dict(self.counted.roof_types),
             counts=counts,
             timings_s=timings,
@@ -487,7 +497,9 @@ def _with_tables(run_dir: str, joined: Joined, models: Models, published: Sequen
     """
     tiles = sorted(outcome.tile.key for outcome in published)
     failed = {outcome.tile.key for outcome in published if outcome.error}
-    owners = {tile.key for tile in models.places} | {site.owner.key for site in joined.rejected} or set(tiles[:1])
+    owners = {tile.key for tile in models.places} | {listed.figures.owner.key for listed in joined.rejected} or set(
+        tiles[:1]
+    )
     if not is_url(run_dir) or (failed and not owners <= failed):
         return None
     return sorted(owners - failed)

@@ -20,10 +20,10 @@ from whole_scene import seen_m, split_alone
 from pipeline.kernels.union_find import united
 from pipeline.model import IntArray, Tin
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.stages.border_facets import facet_names, shared_facets, united_by_name
+from pipeline.runtime.stages.border_facets import are_beyond, facet_names, shared_facets, united_by_name
 from pipeline.runtime.stages.join import join_tiles
 from pipeline.runtime.stages.open_fragments import open_fragments
-from pipeline.runtime.stages.sites import Joined
+from pipeline.runtime.stages.sites import FoundSites
 from pipeline.runtime.stages.split_window import Split, SplitFigures
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints
 from pipeline.terrain.candidates import NOWHERE
@@ -65,10 +65,18 @@ def handed_on(whole: WholeSplit, grid: TileGrid, cut: SurfaceSettings, judging: 
 
 def both_joins(
     wholes: Sequence[WholeSplit], grid: TileGrid, cut: SurfaceSettings, judging: CandidateSettings
-) -> tuple[Joined, Joined]:
-    """The slow join of all fragments, and the join of what is handed on, in another order of the tiles."""
+) -> tuple[FoundSites, FoundSites]:
+    """The slow join of all fragments, and the join of what is handed on, in another order of the tiles.
+
+    Blocks of any size give the same: of all tiles, of two across, of one.
+    """
     handed = [handed_on(whole, grid, cut, judging) for whole in wholes]
-    return whole_join(wholes, grid, judging, CRS), join_tiles(reversed(handed), grid, judging, CRS)
+    slow, slow_small = whole_join(wholes, grid, judging, CRS)
+    found, small = join_tiles(reversed(handed), grid, judging, CRS)
+    assert small == slow_small
+    for across in (1, 2):
+        assert join_tiles(handed, grid, judging, CRS, across) == (found, small)
+    return slow, found
 
 
 def sorted_points(tile: Tile, fragments: Fragments, point_fragment: npt.NDArray[np.int32]) -> WholeSplit:
@@ -180,14 +188,15 @@ def test_patches_of_many_levels_in_all_or_some_tiles_are_joined_as_by_the_slow_j
 def test_the_tiles_do_not_decide_what_is_found(scene: Patchwork, grid: TileGrid) -> None:
     everything = TileGrid(size_mm=200_000, halo_mm=8_000, origin_x_mm=-90_000, origin_y_mm=-90_000)
     (alone,) = [handed_on(whole, everything, CUT, EASY) for whole in scene.cut(everything)]
-    assert len(alone.surfaces.kind) == alone.surfaces.steps == len(alone.surfaces.facets.names) == 0
-    whole = join_tiles([alone], everything, EASY, CRS)
-    cut = join_tiles([handed_on(one, grid, CUT, EASY) for one in scene.cut(grid)], grid, EASY, CRS)
+    waiting = alone.surfaces.open
+    assert len(waiting.kind) == len(waiting.step_reach) == len(waiting.facets.names) == 0
+    whole, small = join_tiles([alone], everything, EASY, CRS)
+    cut, cut_small = join_tiles([handed_on(one, grid, CUT, EASY) for one in scene.cut(grid)], grid, EASY, CRS)
     counts = [Counter((c.building_id, c.points) for c in found.candidates) for found in (cut, whole)]
     assert counts[0] == counts[1]
     nowhere = [[dataclasses.replace(r, owner=Tile(0, 0), ranges=()) for r in found.rejected] for found in (cut, whole)]
     assert nowhere[0] == nowhere[1]
-    assert cut.small_fragments == whole.small_fragments
+    assert cut_small == small
 
 
 def test_the_patches_have_what_the_join_is_for() -> None:
@@ -198,7 +207,7 @@ def test_the_patches_have_what_the_join_is_for() -> None:
         grid = TileGrid(size_mm=14_000, halo_mm=8_000, origin_x_mm=1000 * seed)
         wholes = scene.cut(grid)
         handed = [handed_on(whole, grid, CUT, EASY) for whole in wholes]
-        found = join_tiles(handed, grid, EASY, CRS)
+        found, small = join_tiles(handed, grid, EASY, CRS)
         tiles_of = [{part.tile for part in site.ranges} for site in found.candidates]
         surfaces, surface, offsets = whole_surfaces(wholes)
         tile_of = np.repeat(np.arange(len(wholes)), np.diff(offsets))
@@ -210,9 +219,9 @@ def test_the_patches_have_what_the_join_is_for() -> None:
         )
         seen["steps through three tiles"] += sum(len(set(tile_of[surface == k].tolist())) > 2 for k in steps)
         seen["reasons"] += len({site.verdict.reason for site in found.rejected})
-        seen["small"] += found.small_fragments
+        seen["small"] += small
         seen["finished in their tile"] += sum(len(s.surfaces.done.kind) for s in handed if s.surfaces)
-        named = sum(len(s.surfaces.facets.names) for s in handed if s.surfaces)
+        named = sum(len(s.surfaces.open.facets.names) for s in handed if s.surfaces)
         kinds = [w.fragments.kind[w.fragments.crossing_fragment] for w in wholes]
         seen["facets that need not be named"] += (
             sum(int(((kind != FacetKind.GROUND) & (kind != FacetKind.STEP)).sum()) for kind in kinds) - named
@@ -342,7 +351,7 @@ def test_a_step_unites_roofs_of_two_tiles_through_a_third_in_which_nothing_lies_
 
 
 def test_no_tiles_have_no_sites() -> None:
-    assert join_tiles([], CORNER, EASY, CRS) == Joined(candidates=(), rejected=(), small_fragments=0)
+    assert join_tiles([], CORNER, EASY, CRS) == (FoundSites(candidates=(), rejected=()), 0)
 
 
 # -- towns -------------------------------------------------------------------------------------------------------------
@@ -447,8 +456,8 @@ def shared(
 ) -> tuple[list[bool], list[bool]]:
     keys: IntArray = np.array(facets, np.int64)
     kind = np.full(len(keys), FacetKind.OBJECT, np.int8) if kinds is None else np.array(kinds, np.int8)
-    seen, named = shared_facets(keys, facet_names(keys), kind, tile, CORNER, CUT)
-    return seen.tolist(), named.tolist()
+    reach, named = shared_facets(keys, facet_names(keys), kind, tile, CORNER, CUT)
+    return are_beyond(reach, (tile.column, tile.row, tile.column, tile.row)).tolist(), named.tolist()
 
 
 def along_border(x: int, count: int) -> list[list[int]]:

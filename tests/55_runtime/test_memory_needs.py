@@ -162,14 +162,17 @@ def test_embedded_workers_announce_their_share_of_the_machine() -> None:
 
 def test_a_batch_declares_its_largest_building_up_to_the_limit_of_its_process() -> None:
     given = {f.name: None for f in dataclasses.fields(BatchTask)} | {"own": {}}
-    sites = tuple(SimpleNamespace(points=points) for points in (160_000, 20_000))
+
+    def group(largest: int) -> SimpleNamespace:
+        return SimpleNamespace(figures=SimpleNamespace(largest=largest))
+
     limits = IsolationLimits(memory_bytes=GIB)
-    task = BatchTask(**{**given, "sites": sites, "isolation": limits})
+    task = BatchTask(**{**given, "group": group(160_000), "isolation": limits})
     assert task.memory_bytes == BUILDING_BASE_BYTES + 160_000 * BUILDING_BYTES_PER_POINT == declared_bytes(task)
-    giant = dataclasses.replace(task, sites=(SimpleNamespace(points=1_000_000),))
+    giant = dataclasses.replace(task, group=group(1_000_000))
     assert giant.memory_bytes == GIB
     assert dataclasses.replace(giant, isolation=None).memory_bytes == building_bytes(1_000_000) > 2 * GIB
-    small = dataclasses.replace(task, sites=(SimpleNamespace(points=2000),))
+    small = dataclasses.replace(task, group=group(2000))
     assert 0 < small.memory_bytes < DECLARED_FROM_BYTES
     assert declared_bytes(small) == declared_bytes(object()) == 0
 

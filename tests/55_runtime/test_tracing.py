@@ -15,7 +15,7 @@ from pipeline.runtime.monitoring import tracing
 from pipeline.runtime.monitoring.measurement import Measured
 from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.monitoring.tracing import Parent
-from pipeline.runtime.stages.model_batch import Modelled
+from pipeline.runtime.stages.batch_figures import Modelled
 from pipeline.runtime.stages.reconstruct import _traced
 from pipeline.tiling import Tile
 

@@ -12,7 +12,6 @@ import shapely
 from examples import examples
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from shapely import MultiPolygon
 
 from pipeline.errors import RunCancelledError
 from pipeline.io.gps_time import GpsTimeKind
@@ -21,12 +20,14 @@ from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages import outline
 from pipeline.runtime.stages.gather import gather, points_of
-from pipeline.runtime.stages.outline import draw_outlines, outline_tasks
-from pipeline.runtime.stages.sites import CandidateSite, PointRange, object_id
-from pipeline.runtime.stages.units import divide, unit_tasks
+from pipeline.runtime.stages.outline import outlined
+from pipeline.runtime.stages.sites import CandidateSite, PointRange, largest_first, object_id
+from pipeline.runtime.stages.stored_sites import SitesBrief
+from pipeline.runtime.stages.units import UnitTask, divide, is_intact, shares_of
 from pipeline.terrain.lattice import CELL_MM
+from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.terrain.settings import UnitSettings
-from pipeline.tiling import TileGrid
+from pipeline.tiling import Tile, TileGrid
 
 CRS = "EPSG:28992"
 EAVES_M = (6.0, 7.0, 5.5, 6.4)
@@ -71,12 +72,30 @@ def stored(points: npt.NDArray[np.void], grid: TileGrid, root: Path, fragments: 
     return CandidateSite(building_id=name, owner=owner, ranges=tuple(ranges), points=len(points)), scratch
 
 
+def task_of(grid: TileGrid, scratch: Scratch, own: UnitSettings) -> UnitTask:
+    """A task whose candidates are given to it."""
+    return UnitTask(
+        tile=Tile(0, 0),
+        share=0,
+        shares=1,
+        split=None,
+        borders=(),
+        scene=SceneSettings(units=own),
+        roof=RoofSettings(),
+        outlines=True,
+        grid=grid,
+        scratch=scratch,
+        crs_name=CRS,
+        scale=1,
+        folder="units/x0_y0/some",
+    )
+
+
 def divided(site: CandidateSite, grid: TileGrid, scratch: Scratch, own: UnitSettings) -> list[CandidateSite]:
-    units = [unit for task in unit_tasks([site], own, 0.1, grid, scratch, CRS) for unit in divide(task)]
-    drawn: dict[str, MultiPolygon] = {}
-    for task in outline_tasks(units, RoofSettings(), grid, scratch):
-        drawn |= draw_outlines(task).outlines
-    return [dataclasses.replace(unit, outline=drawn.get(unit.building_id)) for unit in units]
+    units, _ = divide([site], task_of(grid, scratch, own))
+    drawn, warnings = outlined(largest_first(units), RoofSettings(), grid, scratch)
+    assert warnings == []
+    return drawn
 
 
 ONE_TILE = TileGrid(size_mm=1_000_000, halo_mm=0)
@@ -146,25 +165,25 @@ def test_a_block_that_cannot_be_drawn_costs_only_its_outlines_and_is_reported(
     terrace: Terrace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, scratch, units = terrace
-    (task,) = outline_tasks(units, RoofSettings(), ONE_TILE, scratch)
 
     def broken(*_: object) -> None:
         raise ValueError("a ring of two corners")
 
     monkeypatch.setattr(outline, "unit_outlines", broken)
-    drawn = draw_outlines(task)
-    assert drawn.outlines == {}
-    (warning,) = drawn.warnings
+    drawn, (warning,) = outlined(units, RoofSettings(), ONE_TILE, scratch)
+    assert [unit.building_id for unit in drawn] == [unit.building_id for unit in units]
+    assert {unit.outline for unit in drawn} == {None}
     assert warning.endswith("are drawn one by one: ValueError: a ring of two corners")
     assert all(unit.building_id in warning for unit in units)
     scratch.cancel()
     with pytest.raises(RunCancelledError):
-        draw_outlines(task)
+        outlined(units, RoofSettings(), ONE_TILE, scratch)
 
 
 def test_raw_outlines_are_not_drawn_together(terrace: Terrace) -> None:
     _, scratch, units = terrace
-    assert outline_tasks(units, RoofSettings(straight_eaves=False), ONE_TILE, scratch) == []
+    alone = [dataclasses.replace(unit, outline=None) for unit in units]
+    assert outlined(alone, RoofSettings(straight_eaves=False), ONE_TILE, scratch) == (alone, [])
 
 
 def test_units_keep_every_point_once_in_the_tile_that_holds_it(row: npt.NDArray[np.void], tmp_path: Path) -> None:
@@ -191,14 +210,33 @@ def test_a_candidate_of_one_unit_stays_as_it_is(terrace: Terrace) -> None:
     assert divided(empty, ONE_TILE, scratch, UnitSettings()) == [empty]
 
 
-def test_large_candidates_get_tasks_of_their_own() -> None:
-    def site(points: int) -> CandidateSite:
-        return CandidateSite(building_id=str(points), owner=ONE_TILE.tile_of(0, 0), ranges=(), points=points)
+def test_shares_of_a_tile_have_about_as_many_points_and_each_candidate_once() -> None:
+    def site(number: int, points: int) -> CandidateSite:
+        return CandidateSite(building_id=str(number), owner=Tile(0, 0), ranges=(), points=points)
 
-    sites = [site(n) for n in (900_000, 40_000, 9_000, 5_000, 5)]
-    tasks = unit_tasks(sites, UnitSettings(), 0.1, ONE_TILE, Scratch("nowhere"), CRS)
-    assert [[s.points for s in task.sites] for task in tasks] == [[900_000], [40_000, 9_000], [5_000, 5]]
-    assert unit_tasks([], UnitSettings(), 0.1, ONE_TILE, Scratch("nowhere"), CRS) == []
+    random = np.random.default_rng(3)
+    sites = largest_first(site(k, int(n)) for k, n in enumerate(random.integers(0, 9_000, 80)))
+    shares = shares_of(sites, 3)
+    assert sorted(one.building_id for share in shares for one in share) == sorted(one.building_id for one in sites)
+    points = [sum(one.points for one in share) for share in shares]
+    assert max(points) - min(points) <= max(one.points for one in sites)
+    assert shares_of([], 2) == [[], []]
+
+
+def test_points_of_units_that_were_damaged_are_noticed(row: npt.NDArray[np.void], tmp_path: Path) -> None:
+    grid = TileGrid(size_mm=7_000, halo_mm=0)
+    site, scratch = stored(row, grid, tmp_path, 2)
+    task = task_of(grid, scratch, UnitSettings())
+    _, checksums = divide([site], task)
+    assert set(checksums) == {part.tile.key for part in site.ranges}
+    brief = SitesBrief(groups=(), rejected=(), checksums=checksums)
+    assert is_intact(task, brief, task.folder)
+    for tile in checksums:
+        file = next(scratch.path(task.folder, tile).glob("*"))
+        content = file.read_bytes()
+        file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+        assert not is_intact(task, brief, task.folder)
+        file.write_bytes(content)
 
 
 # --- strips that do not fit

@@ -12,7 +12,7 @@ from pipeline.runtime.manifest import RunStatus
 from pipeline.runtime.models_so_far import ModelsSoFar
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import OutcomeTask, Place, run_and_store
-from pipeline.runtime.stages.model_batch import Batch, StoredResult
+from pipeline.runtime.stages.model_batch import Batch, StoredResult, figures_of
 from pipeline.runtime.stages.reconstruct import stage_of_models
 from service.outputs.buildings_so_far import BuildingsSoFar
 
@@ -36,7 +36,8 @@ class RunningRun:
             )
             for result in buildings
         }
-        batch = Batch(modelled=(), stored={name: ("", pickle.dumps(entry)) for name, entry in entries.items()})
+        stored = {name: ("", pickle.dumps(entry)) for name, entry in entries.items()}
+        batch = Batch(modelled=(), stored=stored, compared=False, slow_s=1.0)
         place = Place(STAGE, tile, key)
         run_and_store(
             OutcomeTask(
@@ -44,7 +45,7 @@ class RunningRun:
                 task=None,
                 place=place,
                 scratch=self.scratch,
-                brief=lambda found: found.modelled,
+                brief=figures_of,
                 stage="reconstruct",
             )
         )

@@ -60,7 +60,7 @@ def facts_of_task(task: object) -> dict[str, object]:
     run = getattr(getattr(task, "scratch", None), "name", None)
     tile = getattr(getattr(task, "tile", None), "key", None)
     batch = None
-    if place is not None and hasattr(task, "sites"):
+    if place is not None and hasattr(task, "group"):
         tile, batch = place.unit, place.key[:_KEY_DIGITS]
     return {"run": run, "tile": tile, "batch": batch}
 

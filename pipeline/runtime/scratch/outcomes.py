@@ -42,7 +42,7 @@ Brief = TypeVar("Brief")
 
 FOLDER = "kept"
 """Folder of scratch for all outcomes."""
-_FORMAT = 7
+_FORMAT = 8
 """Part of every key, to be raised when the class of an outcome moves or gets another content: the pickles of an older
 checkout of the same version are then not read."""
 _KEY_DIGITS = 40
@@ -131,7 +131,12 @@ class Place:
     @property
     def name(self) -> str:
         """Name in scratch."""
-        return f"{FOLDER}/{self.stage}/{self.unit}/{self.key}"
+        return f"{self.folder}/{self.key}"
+
+    @property
+    def folder(self) -> str:
+        """Folder in scratch of the outcomes of its unit."""
+        return f"{FOLDER}/{self.stage}/{self.unit}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -26,7 +26,7 @@ from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by
 from pipeline.runtime.stages.join import join_footprints
 from pipeline.runtime.stages.sites import (
     CandidateSite,
-    Joined,
+    FoundSites,
     PointRange,
     RejectedSite,
     folders_with_points,
@@ -85,34 +85,34 @@ class EntryOutcome:
 def apply_overrides(
     context: RunContext,
     settings: RunSettings,
-    joined: Joined,
+    found: FoundSites,
     overrides: Sequence[Override],
     ingested: Sequence[Ingested],
     ground: Ground,
-) -> tuple[Joined, tuple[EntryOutcome, ...]]:
+) -> tuple[FoundSites, tuple[EntryOutcome, ...]]:
     """The candidates after the overrides, and the outcome of each entry; its time counts as join and redraw."""
     started = time.perf_counter()
-    context.check(_read(overrides, joined, context.plan.grid))
-    outcomes = outcomes_of(overrides, joined, context.scratch, context.plan.grid)
+    context.check(_read(overrides, found, context.plan.grid))
+    outcomes = outcomes_of(overrides, found, context.scratch, context.plan.grid)
     redrawn: dict[str, tuple[PointRange, ...]] = {}
     for number, layer in enumerate(_layers_of(outcomes)):
         redrawn |= _redrawn(context, settings, layer, ingested, ground, f"redrawn-{number}")
-    changed = _overridden(joined, outcomes, redrawn, context.scratch)
+    changed = _overridden(found, outcomes, redrawn, context.scratch)
     timings = context.progress.timings
     timings["join"] = timings.get("join", 0.0) + time.perf_counter() - started - timings.get("redraw", 0.0)
     return changed, outcomes
 
 
-def _read(overrides: Sequence[Override], joined: Joined, grid: TileGrid) -> set[str]:
+def _read(overrides: Sequence[Override], found: FoundSites, grid: TileGrid) -> set[str]:
     """The folders of scratch with the points of all sites that the overrides name, or that lie near a place of one."""
     names = {name for one in overrides for name in (one.building_id, one.source_id) if name is not None}
     reach = round(NEAREST_M * MM)
     places = [tuple(round(value * MM) for value in one.point_m) for one in overrides if one.point_m is not None]
     squares = [Window(x0_mm=x, y0_mm=y, x1_mm=x + 1, y1_mm=y + 1).grown(reach) for x, y in places]
     near = {tile for square in squares for tile in grid.tiles_over(square)}
-    named = [site.ranges for site in joined.candidates if not names.isdisjoint((site.building_id, site.source_id))]
-    named += [site.ranges for site in joined.rejected if site.object_id in names]
-    every = itertools.chain((site.ranges for site in joined.candidates), (site.ranges for site in joined.rejected))
+    named = [site.ranges for site in found.candidates if not names.isdisjoint((site.building_id, site.source_id))]
+    named += [site.ranges for site in found.rejected if site.object_id in names]
+    every = itertools.chain((site.ranges for site in found.candidates), (site.ranges for site in found.rejected))
     named += [ranges for ranges in every if any(part.tile in near for part in ranges)]
     return folders_with_points(part for ranges in named for part in ranges)
 
@@ -143,19 +143,19 @@ def _redrawn(
     )
     splits = split_windows(context, "redraw", windows, settings, ingested, ground)
     names = [name for name, _ in named]
-    sites = join_footprints(splits.stored(context.scratch), grid, splits.numbers, polygons, names, "").candidates
+    sites = join_footprints(splits.stored(context), grid, splits.numbers, polygons, names, "").candidates
     return {
         str(site.source_id): tuple(dataclasses.replace(part, folder=folder) for part in site.ranges) for site in sites
     }
 
 
 def outcomes_of(
-    overrides: Sequence[Override], joined: Joined, scratch: Scratch, grid: TileGrid
+    overrides: Sequence[Override], sites: FoundSites, scratch: Scratch, grid: TileGrid
 ) -> tuple[EntryOutcome, ...]:
     """Find the building of each entry, and which part of the entry takes effect."""
-    candidates: Sites = {site.building_id: site for site in joined.candidates}
-    rejected: Sites = {site.object_id: site for site in joined.rejected}
-    by_source = {site.source_id: site.building_id for site in joined.candidates if site.source_id is not None}
+    candidates: Sites = {site.building_id: site for site in sites.candidates}
+    rejected: Sites = {site.object_id: site for site in sites.rejected}
+    by_source = {site.source_id: site.building_id for site in sites.candidates if site.source_id is not None}
     found: list[EntryOutcome] = []
     entry_of: dict[str, int] = {}
     for override in overrides:
@@ -273,14 +273,14 @@ def _outline(outcome: EntryOutcome) -> shapely.Geometry:
 
 
 def _overridden(
-    joined: Joined,
+    found: FoundSites,
     outcomes: Sequence[EntryOutcome],
     redrawn: Mapping[str, tuple[PointRange, ...]],
     scratch: Scratch,
-) -> Joined:
+) -> FoundSites:
     """The candidates and rejected objects after the overrides; `redrawn` has the points in other footprints, by id."""
-    candidates = {site.building_id: site for site in joined.candidates}
-    rejected = {site.object_id: site for site in joined.rejected}
+    candidates = {site.building_id: site for site in found.candidates}
+    rejected = {site.object_id: site for site in found.rejected}
     for outcome in outcomes:
         name, effective = outcome.building_id, outcome.effective
         if name is None or effective is None:
@@ -294,8 +294,7 @@ def _overridden(
             points = sum(part.stop - part.start for part in ranges)
             site = dataclasses.replace(site, footprint=effective.footprint, ranges=ranges, points=points)
         candidates[name] = dataclasses.replace(site, override=effective)
-    return dataclasses.replace(
-        joined,
+    return FoundSites(
         candidates=largest_first(candidates.values()),
         rejected=tuple(sorted(rejected.values(), key=lambda r: r.object_id)),
     )

@@ -58,8 +58,8 @@ def shared_facets(
     tile: Tile,
     grid: TileGrid,
     settings: SurfaceSettings,
-) -> tuple[BoolArray, BoolArray]:
-    """Which facets another tile may see, and which of them suffice to connect the same fragments.
+) -> tuple[IntArray, BoolArray]:
+    """Which tiles may see each facet, and which facets suffice to connect the same fragments.
 
     Facets have names (j, 2) uint64, and only facets of one `FacetKind` are connected.
 
@@ -70,18 +70,19 @@ def shared_facets(
 
     Returns
     -------
-    seen : (j,) bool
-        Another tile may see the facet.
+    reach : (j, 4) int64
+        First column, first row, last column and last row of the tiles that may see the facet.
     named : (j,) bool
-        The facet is named to other tiles: all of the former, except that facets connected in a strip which exactly two
-        tiles see are represented by the one with the smallest name.
+        The facet is named to other tiles: all that another tile may see, except that facets connected in a strip which
+        exactly two tiles see are represented by the one with the smallest name.
     """
     x, y = keys[:, 0::2], keys[:, 1::2]
     # a tile sees a facet if a vertex is near its core, or in another facet that reaches into the core
     reach_mm = max(settings.far_mm, round(2000 * settings.max_circumradius_m) + _SLACK_MM)
     west, south = grid.columns_rows(x.min(axis=1) - reach_mm, y.min(axis=1) - reach_mm)
     east, north = grid.columns_rows(x.max(axis=1) + reach_mm, y.max(axis=1) + reach_mm)
-    seen = (west < tile.column) | (east > tile.column) | (south < tile.row) | (north > tile.row)
+    reach = np.column_stack((west, south, east, north)).astype(np.int64)
+    seen = are_beyond(reach, (tile.column, tile.row, tile.column, tile.row))
     # 0: the strip to the west or east, 1: to the south or north; where four tiles may see, there is no strip
     sure = np.full(len(keys), -1, np.int64)
     for axis, (values, low, high, across_low, across_high, origin) in enumerate(
@@ -99,7 +100,14 @@ def shared_facets(
     named[strip] = False
     _, first = np.unique(piece[order], return_index=True)
     named[strip[order[first]]] = True
-    return seen, named
+    return reach, named
+
+
+def are_beyond(reach: IntArray, area: tuple[int, int, int, int]) -> BoolArray:
+    """Which of some reaches (j, 4) leave an area of tiles; both are first column, first row, last column, last row."""
+    first_column, first_row, last_column, last_row = area
+    beyond: BoolArray = (reach[:, 0] < first_column) | (reach[:, 1] < first_row)
+    return beyond | (reach[:, 2] > last_column) | (reach[:, 3] > last_row)
 
 
 def _connected(keys: IntArray, layer: IntArray) -> IntArray:

@@ -13,7 +13,6 @@ from pathlib import Path
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import FOLDER, DamagedError, Place, brief_of, drop_outcomes, key_of
 from pipeline.runtime.stages.ingested import Ingested
-from pipeline.runtime.stages.sites import Joined
 
 
 def clear_points(scratch: Scratch, wanted: Iterable[Place]) -> None:
@@ -47,8 +46,15 @@ def clear_tiles(scratch: Scratch, folder: str, wanted: Iterable[Place], keys: Co
             shutil.rmtree(tile, ignore_errors=True)
 
 
-def tidy(scratch: Scratch, joined: Joined, models: Collection[str], run_dirs: Sequence[str]) -> None:
-    """Remove what a finished run no longer needs: models by other settings, and points of units that are gone.
+def clear_units(scratch: Scratch, wanted: Collection[str]) -> None:
+    """Remove the points of units except those in some folders of scratch."""
+    for folder in Path(scratch.root, "units").glob("*/*"):
+        if f"units/{folder.parent.name}/{folder.name}" not in wanted:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def tidy(scratch: Scratch, models: Collection[str], run_dirs: Sequence[str]) -> None:
+    """Remove what a finished run no longer needs: models by other settings, and what it published elsewhere.
 
     `models` are the stages under which its models are stored, `run_dirs` where it published.
     """
@@ -57,10 +63,6 @@ def tidy(scratch: Scratch, joined: Joined, models: Collection[str], run_dirs: Se
         by_others = stage.name.startswith("models-") and stage.name not in models
         if by_others or (stage.name.startswith(("publish-", "points-")) and stage.name not in published):
             shutil.rmtree(stage, ignore_errors=True)
-    blocks = {site.block for site in joined.candidates}
-    for folder in Path(scratch.root, "units").glob("*"):
-        if folder.name not in blocks:
-            shutil.rmtree(folder, ignore_errors=True)
 
 
 def publishing(run_dir: str) -> str:

@@ -37,6 +37,11 @@ class Finished:
     small: int
     """Surfaces below the size of an object: counted, not listed."""
 
+    @property
+    def candidate_points(self) -> int:
+        """Number of points of the candidates."""
+        return int((self.candidate_ranges[:, 3] - self.candidate_ranges[:, 2]).sum())
+
 
 def finished(surfaces: Surfaces, ranges: IntArray, settings: CandidateSettings) -> Finished:
     """Judge whole surfaces, and unite levels to candidates; no step connects the surfaces with any other.

@@ -1,241 +1,370 @@
 """Join: fragments become whole surfaces by union-find over the facets that cross tile borders; then they are judged.
 
-The tiles have finished all surfaces that no other tile sees, and pass on the rest by columns. The join reads one tile
-at a time, makes its sites, and collects its columns with those of the others. It makes no object per fragment.
+The tiles have finished all surfaces that no other tile sees, and pass on the rest by columns. A task joins those of a
+block of tiles, finishes what no tile outside of the block sees, and passes on the rest; one more task joins that. The
+sites are then made tile by tile (`units.py`), so neither the driver nor any task holds an object per building.
 """
 
 from __future__ import annotations
 
 import collections
 import dataclasses
-import functools
-import itertools
-import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import shapely
 
-from pipeline.model import IntArray
+from pipeline.kernels.union_find import united
+from pipeline.model import BoolArray, IntArray
+from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.stages.border_facets import united_by_name
+from pipeline.runtime.scratch.kept_files import Files
+from pipeline.runtime.scratch.outcomes import InParts, Place, drop_outcomes, key_of, part_of, result_of
+from pipeline.runtime.stages.border_facets import are_beyond, united_by_name
 from pipeline.runtime.stages.finished_surfaces import Finished, finished
 from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
-from pipeline.runtime.stages.open_fragments import TileSurfaces
-from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, RejectedSite, largest_first, object_id
+from pipeline.runtime.stages.open_fragments import BorderFacets, OpenSurfaces
+from pipeline.runtime.stages.sites import CandidateSite, FoundSites, Joined, PointRange, largest_first, object_id
 from pipeline.runtime.stages.split import Splits
 from pipeline.runtime.stages.split_window import Split
-from pipeline.runtime.stages.units import divide_units
-from pipeline.terrain.candidates import NOWHERE, Surfaces, verdicts
-from pipeline.terrain.fragment_sums import N_SUMS, Sum
+from pipeline.runtime.stages.stored_sites import joined_of, store_sites
+from pipeline.runtime.stages.tile_sites import TileSites, by_owner, figures_of, sites_of
+from pipeline.runtime.stages.units import STAGE as UNITS
+from pipeline.runtime.stages.units import BorderSites, find_units
+from pipeline.terrain.candidates import NOWHERE, Surfaces
+from pipeline.terrain.fragment_sums import N_SUMS
 from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.terrain.settings import CandidateSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
+_STAGE = "join"
+_TILES_ACROSS = 8
+"""Tiles along the side of a block. Few surfaces of a block of 64 tiles reach beyond it."""
 
-class _Waiting:
-    """The fragments and steps of all tiles that wait for other tiles, by columns, numbered through."""
+Area = tuple[int, int, int, int]
+"""First column, first row, last column, last row."""
 
-    def __init__(self) -> None:
+
+class _Columns:
+    """The open surfaces and steps of several tiles or blocks, by columns, numbered through."""
+
+    def __init__(self, parts: Iterable[OpenSurfaces]) -> None:
         self._columns: dict[str, list[npt.NDArray[Any]]] = collections.defaultdict(list)
-        self.fragments = 0
+        self.surfaces = 0
         self.steps = 0
+        tiles: dict[Tile, int] = {}
+        for part in parts:
+            self._add(part, np.array([tiles.setdefault(tile, len(tiles)) for tile in part.tiles], np.int64))
+        self.tiles = tuple(tiles)
 
-    def add(self, tile: int, found: TileSurfaces) -> None:
-        """Add the open fragments of one more tile, by its number."""
-        held = np.flatnonzero(found.ranges[:, 1] > found.ranges[:, 0])
+    def _add(self, part: OpenSurfaces, tile: IntArray) -> None:
+        """Add those of one more tile or block; `tile` are the numbers of its tiles here."""
+        ranges = part.ranges
         new: dict[str, npt.NDArray[Any]] = {
-            "kind": found.kind,
-            "sums": found.sums,
-            "boxes": found.boxes_mm,
-            "points": found.lowest_point_mm,
-            "ranges": np.column_stack((held + self.fragments, np.full(len(held), tile), found.ranges[held])),
-            "names": found.facets.names,
-            "holders": found.facets.holders + np.int64(self.fragments),
-            "step_names": found.step_facets.names,
-            "step_holders": found.step_facets.holders + np.int64(self.steps),
-            "along": found.along_steps + np.array([self.fragments, self.steps], np.int64),
+            "kind": part.kind,
+            "sums": part.sums,
+            "boxes": part.boxes_mm,
+            "points": part.lowest_point_mm,
+            "ranges": np.column_stack((ranges[:, 0] + self.surfaces, tile[ranges[:, 1]], ranges[:, 2:])),
+            "reach": part.reach,
+            "names": part.facets.names,
+            "holders": part.facets.holders + np.int64(self.surfaces),
+            "step_reach": part.step_reach,
+            "step_names": part.step_facets.names,
+            "step_holders": part.step_facets.holders + np.int64(self.steps),
+            "along": part.along_steps + np.array([self.surfaces, self.steps], np.int64),
         }
         for name, column in new.items():
             if len(column):
                 self._columns[name].append(column)
-        self.fragments += len(found.kind)
-        self.steps += found.steps
+        self.surfaces += len(part.kind)
+        self.steps += len(part.step_reach)
 
     def take(self, name: str, *shape: int, dtype: npt.DTypeLike = np.int64) -> npt.NDArray[Any]:
-        """A column of all tiles, with rows of that shape; its memory is released."""
+        """A column of all parts, with rows of that shape; its memory is released."""
         parts = self._columns.pop(name, [])
         return np.concatenate(parts) if parts else np.empty((0, *shape), dtype)
 
 
-def _whole_surfaces(waiting: _Waiting) -> tuple[Surfaces, IntArray]:
-    """Whole surfaces, united from the fragments of several tiles, and the ranges of their points for `finished`."""
-    count, steps = waiting.fragments, waiting.steps
-    roots = united_by_name(count, waiting.take("names", 2, dtype=np.uint64), waiting.take("holders"))
-    step = united_by_name(steps, waiting.take("step_names", 2, dtype=np.uint64), waiting.take("step_holders"))
-    members, surface = np.unique(roots, return_inverse=True)
-    surface = surface.reshape(-1)
-    k = len(members)
+def united_surfaces(parts: Iterable[OpenSurfaces]) -> OpenSurfaces:
+    """The surfaces of several tiles or blocks, as far as facets connect them; one row of facets per name."""
+    columns = _Columns(parts)
+    names, holders = columns.take("names", 2, dtype=np.uint64), columns.take("holders")
+    step_names, step_holders = columns.take("step_names", 2, dtype=np.uint64), columns.take("step_holders")
+    members, surface = _numbered(united_by_name(columns.surfaces, names, holders))
+    step_members, step = _numbered(united_by_name(columns.steps, step_names, step_holders))
+    k, s = len(members), len(step_members)
     sums = np.zeros((k, N_SUMS), np.int64)
-    np.add.at(sums, surface, waiting.take("sums", N_SUMS))
-    boxes = np.empty((k, 4), np.int64)
-    boxes[:, :2], boxes[:, 2:] = NOWHERE, -NOWHERE
-    of_fragments = waiting.take("boxes", 4)
-    np.minimum.at(boxes[:, :2], surface, of_fragments[:, :2])
-    np.maximum.at(boxes[:, 2:], surface, of_fragments[:, 2:])
-    del of_fragments
-    points = waiting.take("points", 3)
+    np.add.at(sums, surface, columns.take("sums", N_SUMS))
+    points = columns.take("points", 3)
     order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], surface))
-    first = order[np.searchsorted(surface[order], np.arange(k))]
-    along = waiting.take("along", 2)
-    pairs = np.unique(surface[along[:, 0]] * max(1, steps) + step[along[:, 1]])
-    whole = Surfaces(
-        kind=waiting.take("kind", dtype=np.int8)[members],
-        sums=sums,
-        boxes_mm=boxes,
-        lowest_point_mm=points[first],
-        along_steps=np.column_stack((pairs // max(1, steps), pairs % max(1, steps))),
-    )
-    ranges = waiting.take("ranges", 4)
+    along = columns.take("along", 2)
+    pairs = np.unique(surface[along[:, 0]] * max(1, s) + step[along[:, 1]])
+    ranges = columns.take("ranges", 4)
     ranges[:, 0] = surface[ranges[:, 0]]
-    return whole, ranges
+    return OpenSurfaces(
+        tiles=columns.tiles,
+        kind=columns.take("kind", dtype=np.int8)[members],
+        sums=sums,
+        boxes_mm=_around(surface, k, columns.take("boxes", 4)),
+        lowest_point_mm=points[order[np.searchsorted(surface[order], np.arange(k))]],
+        ranges=ranges,
+        reach=_around(surface, k, columns.take("reach", 4)),
+        facets=_once(names, surface[holders]),
+        step_reach=_around(step, s, columns.take("step_reach", 4)),
+        step_facets=_once(step_names, step[step_holders]),
+        along_steps=np.column_stack((pairs // max(1, s), pairs % max(1, s))),
+    )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Sites:
-    """Makes sites from finished surfaces."""
-
-    grid: TileGrid
-    settings: CandidateSettings
-    crs_name: str
-    candidates: list[CandidateSite] = dataclasses.field(default_factory=list)
-    rejected: list[RejectedSite] = dataclasses.field(default_factory=list)
-    tiles: dict[Tile, Tile] = dataclasses.field(default_factory=dict)
-
-    def add(self, found: Finished, tiles: Sequence[Tile]) -> None:
-        """Add the sites of some finished surfaces; `tiles` by their numbers there."""
-        of_candidates = _site_ranges(found.candidate_ranges, len(found.candidate_points_mm), tiles)
-        for point, ranges in zip(found.candidate_points_mm.tolist(), of_candidates, strict=True):
-            self.candidates.append(
-                CandidateSite(
-                    building_id=object_id(self.crs_name, point),
-                    owner=self._owner(point),
-                    ranges=ranges,
-                    points=sum(part.stop - part.start for part in ranges),
-                )
-            )
-        judged = verdicts(found.kind, found.sums, self.settings)
-        of_rejected = _site_ranges(found.rejected_ranges, len(found.kind), tiles)
-        lowest, boxes = found.lowest_point_mm.tolist(), found.boxes_mm.tolist()
-        for verdict, point, box, sums, ranges in zip(judged, lowest, boxes, found.sums, of_rejected, strict=True):
-            assert verdict is not None
-            self.rejected.append(
-                RejectedSite(
-                    object_id=object_id(self.crs_name, point),
-                    owner=self._owner(point),
-                    verdict=verdict,
-                    box_mm=tuple(box),
-                    area_m2=float(sums[Sum.AREA2]) / 2e6,
-                    height_m=float(sums[Sum.HEIGHT]) / max(1, int(sums[Sum.VERTICES])) / 1000.0,
-                    points=int(sums[Sum.POINTS]),
-                    ranges=ranges,
-                )
-            )
-
-    def _owner(self, point_mm: Sequence[int]) -> Tile:
-        """The tile of a point; one object for all sites of a tile, since these are many."""
-        tile = self.grid.tile_of(point_mm[0], point_mm[1])
-        return self.tiles.setdefault(tile, tile)
+def _numbered(roots: IntArray) -> tuple[IntArray, IntArray]:
+    """The smallest member of each set, and the set of each element, numbered from 0."""
+    members, number = np.unique(roots, return_inverse=True)
+    return members, number.reshape(-1)
 
 
-def _site_ranges(ranges: IntArray, count: int, tiles: Sequence[Tile]) -> Iterator[tuple[PointRange, ...]]:
-    """Point ranges of each of `count` sites, by tile, then start; `ranges` as in `Finished`."""
-    place = np.empty(len(tiles), np.int64)
-    place[sorted(range(len(tiles)), key=tiles.__getitem__)] = np.arange(len(tiles))
-    ordered = ranges[np.lexsort((ranges[:, 2], place[ranges[:, 1]], ranges[:, 0]))]
-    first = np.searchsorted(ordered[:, 0], np.arange(count + 1)).tolist()
-    for begin, end in itertools.pairwise(first):
-        yield tuple(
-            PointRange(tile=tiles[tile], start=start, stop=stop) for _, tile, start, stop in ordered[begin:end].tolist()
-        )
+def _around(number: IntArray, count: int, boxes: IntArray) -> IntArray:
+    """The smallest box (count, 4) around the boxes of each number: two lower bounds, then two upper ones."""
+    around = np.empty((count, 4), np.int64)
+    around[:, :2], around[:, 2:] = NOWHERE, -NOWHERE
+    np.minimum.at(around[:, :2], number, boxes[:, :2])
+    np.maximum.at(around[:, 2:], number, boxes[:, 2:])
+    return around
+
+
+def _once(names: npt.NDArray[np.uint64], holders: IntArray) -> BorderFacets:
+    """Facets of united holders, each name once: all that share it are one now."""
+    _, first = np.unique(names, axis=0, return_index=True)
+    return BorderFacets(names=names[first], holders=holders[first].astype(np.int32))
+
+
+def finished_within(
+    found: OpenSurfaces, area: Area | None, settings: CandidateSettings
+) -> tuple[Finished, OpenSurfaces]:
+    """The sites of united surfaces that no tile outside of an area sees, and the rest; all sites without an area.
+
+    Surfaces that steps connect are finished together.
+    """
+    k = len(found.kind)
+    waits = np.zeros(k + len(found.step_reach), np.bool_)
+    if area is not None:
+        pairs = found.along_steps
+        piece = united(len(waits), pairs[:, 0], pairs[:, 1] + k)
+        waits[piece[are_beyond(np.concatenate((found.reach, found.step_reach)), area)]] = True
+        waits = waits[piece]
+    done = _chosen(found, ~waits[:k], ~waits[k:])
+    whole = Surfaces(
+        kind=done.kind,
+        sums=done.sums,
+        boxes_mm=done.boxes_mm,
+        lowest_point_mm=done.lowest_point_mm,
+        along_steps=done.along_steps,
+    )
+    return finished(whole, done.ranges, settings), _chosen(found, waits[:k], waits[k:])
+
+
+def _chosen(found: OpenSurfaces, surfaces: BoolArray, steps: BoolArray) -> OpenSurfaces:
+    """Some of the surfaces and all that belongs to them; none of the steps along them is left out."""
+    number, step_number = np.cumsum(surfaces) - 1, np.cumsum(steps) - 1
+    ranges = found.ranges[surfaces[found.ranges[:, 0]]]
+    along = found.along_steps[surfaces[found.along_steps[:, 0]]]
+    return OpenSurfaces(
+        tiles=found.tiles,
+        kind=found.kind[surfaces],
+        sums=found.sums[surfaces],
+        boxes_mm=found.boxes_mm[surfaces],
+        lowest_point_mm=found.lowest_point_mm[surfaces],
+        ranges=np.column_stack((number[ranges[:, 0]], ranges[:, 1:])),
+        reach=found.reach[surfaces],
+        facets=_facets_of(found.facets, surfaces, number),
+        step_reach=found.step_reach[steps],
+        step_facets=_facets_of(found.step_facets, steps, step_number),
+        along_steps=np.column_stack((number[along[:, 0]], step_number[along[:, 1]])),
+    )
+
+
+def _facets_of(facets: BorderFacets, chosen: BoolArray, number: IntArray) -> BorderFacets:
+    own = chosen[facets.holders]
+    return BorderFacets(names=facets.names[own], holders=number[facets.holders[own]].astype(np.int32))
+
+
+# --- tasks -----------------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JoinTask:
-    """All tiles, to be joined."""
+    """Tiles, or blocks of tiles, to be joined."""
 
-    splits: Splits
-    """Where their descriptors are."""
-    scratch: Scratch
-    """The run's scratch."""
+    splits: tuple[Place, ...]
+    """Outcomes of the splits of the tiles; empty for blocks."""
+    blocks: tuple[tuple[Place, int], ...]
+    """Outcomes of the blocks, and the parts with what they passed on."""
+    area: Area | None
+    """The block; None finishes everything."""
+    settings: CandidateSettings
+    """What is a candidate."""
     grid: TileGrid
     """The lattice."""
-    crs_name: str
-    """Goes into the ids."""
+    scratch: Scratch
+    """Holds all of them."""
+    folder: str
+    """Folder of scratch for the outcome."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class JoinBrief:
+    """What the driver learns of a join."""
+
+    owned: tuple[BorderSites, ...]
+    """The finished sites by owner; site k is part k of the outcome, its place is not known yet."""
+    passed_on: str
+    """Digest of the last part, what waits for other blocks; empty where nothing does."""
+    small_fragments: int
+    """Surfaces below the size of an object."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class JoinedSurfaces(InParts):
+    """A join on its way to scratch: the finished sites by owner, then what is passed on."""
+
+    brief: JoinBrief
+    """What the driver learns of it."""
+
+
+def join_surfaces(task: JoinTask) -> JoinedSurfaces:
+    """Join the surfaces of some tiles, or of some blocks."""
+    scratch = task.scratch
+
+    def parts() -> Iterable[OpenSurfaces]:
+        for place in task.splits:
+            scratch.check_cancelled()
+            split: Split = result_of(scratch, place)
+            if split.surfaces is not None:
+                yield split.surfaces.open
+        for place, part in task.blocks:
+            yield part_of(scratch, place, part)
+
+    found = united_surfaces(parts())
+    done, rest = finished_within(found, task.area, task.settings)
+    owned = by_owner(done, found.tiles, task.grid)
+    waits = len(rest.kind) + len(rest.step_reach) > 0
+    return JoinedSurfaces(
+        parts=(*owned.values(), *((rest,) if waits else ())),
+        brief=JoinBrief(
+            owned=tuple(
+                BorderSites(owner=owner, part=part, figures=figures_of(sites))
+                for part, (owner, sites) in enumerate(owned.items())
+            ),
+            passed_on=key_of(rest) if waits else "",
+            small_fragments=done.small,
+        ),
+    )
+
+
+def _brief(found: JoinedSurfaces) -> JoinBrief:
+    return found.brief
 
 
 def join(
     context: RunContext,
     settings: SceneSettings,
-    min_strip_offset_m: float,
+    roof: RoofSettings,
     splits: Splits,
     footprints: GivenFootprints | None,
+    *,
+    outlines: bool = True,
 ) -> Joined:
     """The candidates of all tiles, divided into units, and the rejected objects; one per footprint where given.
 
-    Strips that disagree by more than `min_strip_offset_m` are aligned before units are separated.
+    The outlines of touching units are drawn, unless nothing needs them.
     """
-    plan, progress = context.plan, context.progress
-    started = time.perf_counter()
-    progress.tell("stage", "join", total=1)
+    plan = context.plan
     crs_name = f"EPSG:{plan.reference.epsg}" if plan.reference.epsg is not None else plan.reference.name
-    if footprints is None:
-        task = JoinTask(splits=splits, scratch=context.scratch, grid=plan.grid, crs_name=crs_name)
-        function = functools.partial(_joined, settings=settings.candidates)
-        joined = context.executor.run_step("join", function, task, progress.watch)
-        joined = dataclasses.replace(joined, keys=splits.keys)
-        joined = divide_units(context, settings.units, min_strip_offset_m, joined, crs_name)
-    else:
-        joined = join_footprints(
-            splits.stored(context.scratch),
-            plan.grid,
-            splits.numbers,
-            footprints.polygons,
-            footprints.ids,
-            crs_name,
-            footprints.attributes,
+    if footprints is not None:
+        with context.progress.stage(_STAGE, 1) as counter:
+            found = join_footprints(
+                splits.stored(context),
+                plan.grid,
+                splits.numbers,
+                footprints.polygons,
+                footprints.ids,
+                crs_name,
+                footprints.attributes,
+            )
+            counter.add(1)
+        return joined_of(store_sites(context, UNITS, found, quiet=False), 0, splits.keys)
+    borders = _joined_borders(context, settings.candidates, splits)
+    small = sum(figures.small for figures in splits.figures) + sum(brief.small_fragments for brief in borders.values())
+    owned = [dataclasses.replace(sites, place=place) for place, brief in borders.items() for sites in brief.owned]
+    units = find_units(context, settings, roof, splits, owned, crs_name, outlines=outlines)
+    return joined_of(units, small, splits.keys)
+
+
+def _joined_borders(context: RunContext, settings: CandidateSettings, splits: Splits) -> dict[Place, JoinBrief]:
+    """What reaches beyond its tile, joined within blocks of tiles, then between them."""
+    scratch, grid = context.scratch, context.plan.grid
+    tasks: dict[Place, JoinTask] = {}
+    for (column, row), (area, tiles) in blocks_of(splits.places, _TILES_ACROSS).items():
+        places = tuple(splits.places[tile] for tile in tiles)
+        key = key_of(settings, grid, area, places)
+        place = Place(_STAGE, f"block_x{column}_y{row}", key)
+        tasks[place] = JoinTask(
+            splits=places, blocks=(), area=area, settings=settings, grid=grid, scratch=scratch, folder=place.folder
         )
-        joined = dataclasses.replace(joined, keys=splits.keys)
-    progress.timings["join"] = time.perf_counter() - started
-    progress.tell("progress", "join", f"{len(joined.candidates)} candidates", done=1, total=1)
-    return joined
+    found = _run(context, tasks)
+    passing = tuple((place, len(brief.owned)) for place, brief in found.items() if brief.passed_on)
+    if passing:
+        place = Place(_STAGE, "blocks", key_of(settings, grid, [found[place].passed_on for place, _ in passing]))
+        final = JoinTask(
+            splits=(), blocks=passing, area=None, settings=settings, grid=grid, scratch=scratch, folder=place.folder
+        )
+        found |= _run(context, {place: final}, quiet=True)
+    drop_outcomes(scratch, _STAGE, found)
+    return found
 
 
-def _joined(task: JoinTask, settings: CandidateSettings) -> Joined:
-    """The tiles of a task, joined; a process that has the kernels does this."""
-    return join_tiles(task.splits.stored(task.scratch), task.grid, settings, task.crs_name)
+def _run(context: RunContext, tasks: Mapping[Place, JoinTask], *, quiet: bool = False) -> dict[Place, JoinBrief]:
+    files: Files[JoinTask, JoinBrief] = Files(reads=_read, leaves=lambda task, _: [task.folder])
+    return context.map_stored(_STAGE, join_surfaces, tasks, _brief, files=files, quiet=quiet)
 
 
-def join_tiles(splits: Iterable[Split], grid: TileGrid, settings: CandidateSettings, crs_name: str) -> Joined:
-    """Finish the surfaces that several tiles see, and find where each candidate's points lie."""
-    waiting, tiles, small = _Waiting(), list[Tile](), 0
-    sites = _Sites(grid=grid, settings=settings, crs_name=crs_name)
-    for split in splits:
-        if split.surfaces is not None:
-            sites.add(split.surfaces.done, [split.tile])
-            small += split.surfaces.done.small
-            waiting.add(len(tiles), split.surfaces)
-        tiles.append(split.tile)
-    rest = finished(*_whole_surfaces(waiting), settings)
-    sites.add(rest, tiles)
-    return Joined(
-        candidates=largest_first(sites.candidates),
-        rejected=tuple(sorted(sites.rejected, key=lambda r: r.object_id)),
-        small_fragments=small + rest.small,
-    )
+def _read(task: JoinTask) -> set[str]:
+    """The folders of scratch with the surfaces of a task."""
+    return {place.folder for place in task.splits} | {place.folder for place, _ in task.blocks}
+
+
+def blocks_of(tiles: Iterable[Tile], across: int) -> dict[tuple[int, int], tuple[Area | None, list[Tile]]]:
+    """Tiles by square blocks of so many across, and the area of each; without an area where one block suffices."""
+    ordered = sorted(tiles)
+    if len(ordered) <= across**2:
+        return {(0, 0): (None, ordered)}
+    blocks: dict[tuple[int, int], tuple[Area | None, list[Tile]]] = {}
+    for tile in ordered:
+        column, row = tile.column // across, tile.row // across
+        area = column * across, row * across, (column + 1) * across - 1, (row + 1) * across - 1
+        blocks.setdefault((column, row), (area, []))[1].append(tile)
+    return blocks
+
+
+def join_tiles(
+    splits: Iterable[Split], grid: TileGrid, settings: CandidateSettings, crs_name: str, across: int = _TILES_ACROSS
+) -> tuple[FoundSites, int]:
+    """The sites of some tiles, all in memory, and the number of smaller surfaces; blocks are so many tiles `across`."""
+    surfaces = {split.tile: split.surfaces for split in splits if split.surfaces is not None}
+    sites = [TileSites(found=one.done, tiles=(tile,)) for tile, one in surfaces.items()]
+    rest: list[OpenSurfaces] = []
+    for area, tiles in blocks_of(surfaces, across).values():
+        whole = united_surfaces(surfaces[tile].open for tile in tiles)
+        done, passed_on = finished_within(whole, area, settings)
+        sites.append(TileSites(found=done, tiles=whole.tiles))
+        rest.append(passed_on)
+    last = united_surfaces(rest)
+    done, _ = finished_within(last, None, settings)
+    sites.append(TileSites(found=done, tiles=last.tiles))
+    return sites_of(sites, grid, settings, crs_name), sum(one.found.small for one in sites)
 
 
 def join_footprints(
@@ -246,7 +375,7 @@ def join_footprints(
     source_ids: Sequence[str],
     crs_name: str,
     attributes: Sequence[str | None] | None = None,
-) -> Joined:
+) -> FoundSites:
     """The candidates where footprints were given: one per footprint, also where it holds no point; splits in any order.
 
     Parameters
@@ -289,4 +418,4 @@ def join_footprints(
                 source_attributes=None if attributes is None else attributes[number],
             )
         )
-    return Joined(candidates=largest_first(candidates), rejected=(), small_fragments=0)
+    return FoundSites(candidates=largest_first(candidates), rejected=())

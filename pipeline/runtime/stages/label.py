@@ -9,16 +9,16 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from uuid import uuid4
 
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.model import BoolArray, ByteArray, IntArray
+from pipeline.model import BoolArray, ByteArray, IntArray, Reason
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages.sites import CandidateSite, PointRange, RejectedSite
+from pipeline.runtime.stages.sites import Joined, PointRange, StoredGroup, StoredRejected
 from pipeline.runtime.stages.surroundings import surroundings_of, terrain_around
 from pipeline.runtime.stages.window_points import LoadedWindow, bucket_paths, load_window
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, VEGETATION_CLASSES, WindowPoints
@@ -47,10 +47,10 @@ class LabelTask:
     """Buildings are known by footprints or classes: no point leaves or joins them for its own evidence alone."""
     scratch: Scratch
     """Points and terrain in, classes out."""
-    buildings: tuple[PointRange, ...]
-    """Points of the candidates in all tiles that the tile's neighbourhood meets."""
-    decks: tuple[PointRange, ...] = ()
-    """Points of the bridges there."""
+    buildings: tuple[StoredGroup, ...]
+    """The candidates that lie in a tile that the tile's neighbourhood meets, among others."""
+    rejected: tuple[StoredRejected, ...] = ()
+    """The bridges there, among other rejected objects."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -122,20 +122,56 @@ def classes_of_tile(task: LabelTask) -> TileClasses:
     task.scratch.check_cancelled()
     wanted = np.zeros(len(points), np.bool_)
     wanted[:core] = True
-    evidence = evidence_of(task, loaded, window)
+    buildings, decks = ranges_near(task)
+    evidence = evidence_of(task, loaded, window, buildings)
     found = classes_of(evidence, wanted, task.settings.vegetation, given=task.given)[:core]
-    found[_held_by(task, task.decks, points, window)[:core] & (found != PointClass.GROUND)] = PointClass.BRIDGE_DECK
+    found[_held_by(task, decks, points, window)[:core] & (found != PointClass.GROUND)] = PointClass.BRIDGE_DECK
     first = np.argsort(points.return_count[:core], kind="stable")
     return TileClasses(core=loaded.core, first=first, found=found, believed=task.classes)
 
 
-def by_tile(sites: Iterable[CandidateSite | RejectedSite]) -> dict[Tile, list[PointRange]]:
-    """The ranges of the points of sites, by their tiles."""
-    ranges: dict[Tile, list[PointRange]] = {}
-    for site in sites:
-        for part in site.ranges:
-            ranges.setdefault(part.tile, []).append(part)
-    return ranges
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SitesNear:
+    """All stored sites by the tiles in which they lie."""
+
+    groups: Mapping[Tile, Sequence[StoredGroup]]
+    """The groups of which a candidate lies in the tile."""
+    rejected: Mapping[Tile, Sequence[StoredRejected]]
+    """Those of which a bridge lies in the tile."""
+
+    @classmethod
+    def of(cls, joined: Joined) -> SitesNear:
+        """The sites of a run."""
+        groups: dict[Tile, list[StoredGroup]] = {}
+        rejected: dict[Tile, list[StoredRejected]] = {}
+        for group in joined.groups:
+            for tile in group.figures.tiles:
+                groups.setdefault(tile, []).append(group)
+        for listed in joined.rejected:
+            for tile in listed.figures.bridges_in:
+                rejected.setdefault(tile, []).append(listed)
+        return cls(groups=groups, rejected=rejected)
+
+    def groups_in(self, tiles: Iterable[Tile]) -> tuple[StoredGroup, ...]:
+        """The groups of which a candidate lies in one of some tiles."""
+        return tuple({(one.place, one.part): one for tile in tiles for one in self.groups.get(tile, ())}.values())
+
+    def rejected_in(self, tiles: Iterable[Tile]) -> tuple[StoredRejected, ...]:
+        """Those of which a bridge lies in one of some tiles."""
+        return tuple({one.place: one for tile in tiles for one in self.rejected.get(tile, ())}.values())
+
+
+def ranges_near(task: LabelTask) -> tuple[list[PointRange], list[PointRange]]:
+    """The points of the candidates and of the bridges in all tiles that the tile's neighbourhood meets."""
+    near = set(task.grid.tiles_over(neighbourhood(task.tile, task.grid, task.settings)))
+    buildings = (site for group in task.buildings for site in group.sites(task.scratch))
+    decks = (
+        site for listed in task.rejected for site in listed.sites(task.scratch) if site.verdict.reason is Reason.BRIDGE
+    )
+    return (
+        [part for site in buildings for part in site.ranges if part.tile in near],
+        [part for site in decks for part in site.ranges if part.tile in near],
+    )
 
 
 def class_path(scratch: Scratch, tile: Tile, bucket: str) -> Path:
@@ -143,8 +179,10 @@ def class_path(scratch: Scratch, tile: Tile, bucket: str) -> Path:
     return scratch.path(FOLDER, tile.key, bucket)
 
 
-def evidence_of(task: LabelTask, loaded: LoadedWindow, window: Window) -> PointEvidence:
-    """What is known of the points of a tile's neighbourhood."""
+def evidence_of(
+    task: LabelTask, loaded: LoadedWindow, window: Window, buildings: Sequence[PointRange]
+) -> PointEvidence:
+    """What is known of the points of a tile's neighbourhood, of which some are those of `buildings`."""
     points = loaded.points
     around = surroundings_of(task.scratch, task.grid, window.grown(2 * MM))
     terrain = terrain_around(around)
@@ -160,7 +198,7 @@ def evidence_of(task: LabelTask, loaded: LoadedWindow, window: Window) -> PointE
         height_mm=height_above(x, y, z, around.elevation_mm, around.column0, around.row0),
         rise_mm=-height_above(x, y, np.zeros_like(z), terrain.slope_mm, around.column0, around.row0),
         ground=ground,
-        building=_held_by(task, task.buildings, points, window),
+        building=_held_by(task, buildings, points, window),
         outlier=~loaded.kept,
         echoes=points.return_count > 1,
     )

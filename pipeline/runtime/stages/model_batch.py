@@ -7,7 +7,7 @@ import functools
 import math
 import pickle
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,15 +27,12 @@ from pipeline.runtime.monitoring.tallies import TALLIES
 from pipeline.runtime.overrides.overrides_file import OwnModelling
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import DamagedError, Place, key_of, result_of
+from pipeline.runtime.stages.batch_figures import LOST, REJECTED, BatchFigures, Modelled
 from pipeline.runtime.stages.gather import gather
-from pipeline.runtime.stages.sites import CandidateSite
-from pipeline.tiling import Tile, TileGrid
+from pipeline.runtime.stages.sites import CandidateSite, StoredGroup
+from pipeline.tiling import TileGrid
 
 _BUNDLE_TIMEOUT_S = 60.0
-LOST = frozenset({Reason.CRASHED, Reason.TIMED_OUT, Reason.OUT_OF_MEMORY, Reason.INTERNAL_ERROR})
-"""Reasons caused by processes or by gablework, not by the building's points: each deserves a log line."""
-REJECTED = "rejected"
-"""The status, in the figures of a run, of a candidate that becomes a rejected object."""
 _NO_BUNDLE = "there is no bundle, since its points cannot be put together"
 
 
@@ -43,8 +40,8 @@ _NO_BUNDLE = "there is no bundle, since its points cannot be put together"
 class BatchTask:
     """Some candidates for one task."""
 
-    sites: tuple[CandidateSite, ...]
-    """The candidates."""
+    group: StoredGroup
+    """The candidates, in scratch."""
     method: str
     """Name of the method."""
     settings: ReconstructSettings
@@ -65,12 +62,14 @@ class BatchTask:
     """Outcomes of earlier batches of these candidates' tile: models of the same input are taken from them."""
     compared: bool = False
     """Whether seconds are compared with those of other methods: a method is then loaded before the clock starts."""
+    slow_s: float = math.inf
+    """Seconds of a building from which the run hears of it."""
 
     @property
     def memory_bytes(self) -> int:
         """Estimated peak memory of the process that models them, one after the other."""
         limit_bytes = None if self.isolation is None else self.isolation.memory_bytes
-        return building_bytes(max((site.points for site in self.sites), default=0), limit_bytes)
+        return building_bytes(self.group.figures.largest, limit_bytes)
 
     @property
     def supervises(self) -> bool:
@@ -81,31 +80,6 @@ class BatchTask:
         """The task with the method and the settings of one site."""
         own = self.own.get(site.building_id)
         return self if own is None else dataclasses.replace(self, method=own.method, settings=own.settings)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Modelled:
-    """The figures of one building, which travel to the driver; the model itself stays in scratch."""
-
-    building_id: str
-    owner: Tile
-    status: str
-    """As in the records, or `REJECTED`."""
-    reason: str | None
-    roof_type: str
-    faces: int
-    points: int
-    seconds: float
-    reused: bool = False
-    """Whether the model was taken from an earlier batch, of the same input."""
-    ended_s: float = 0.0
-    """When it was done, in seconds since 1970 by the clock of its machine."""
-    detail: str = ""
-    """Of a building that failed: the measured figure and the limit, or what happened."""
-    retried: str = ""
-    """What happened to the process that modelled it first, if it was modelled again in another one."""
-    content: str = ""
-    """Digest of all that is published of it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -123,10 +97,14 @@ class Batch:
     """The models of a batch."""
 
     modelled: tuple[Modelled, ...]
-    """The figures, in the order of the task's candidates."""
+    """The figures, in the order of the candidates."""
     stored: Mapping[str, tuple[str, bytes]]
     """By building_id: the digest of all that the model was made from, empty where it must not be used again; and a
     pickled `StoredResult`."""
+    compared: bool
+    """As in the task."""
+    slow_s: float
+    """As in the task."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,13 +121,13 @@ class Packed:
 
 def model_batch(task: BatchTask) -> Batch:
     """Model a batch; raises OSError if scratch cannot be read or written, RunError if children cannot be started."""
-    models = _here(task) if task.isolation is None else _in_child(task, task.isolation)
     try:
-        packed = dict(models)
+        sites = task.group.sites(task.scratch)
+        packed = dict(_here(task, sites) if task.isolation is None else _in_child(task, sites, task.isolation))
     except OSError:
         task.scratch.check_cancelled()  # the scratch of a run that is over is gone
         raise
-    each = [packed[index] for index in range(len(task.sites))]
+    each = [packed[index] for index in range(len(sites))]
     for model in each:
         building = model.modelled
         TALLIES.building(building.status, building.reason)
@@ -159,12 +137,20 @@ def model_batch(task: BatchTask) -> Batch:
     return Batch(
         modelled=tuple(model.modelled for model in each),
         stored={model.modelled.building_id: (model.made_from, model.stored) for model in each},
+        compared=task.compared,
+        slow_s=task.slow_s,
     )
 
 
-def bundles_are_whole(task: BatchTask, modelled: Iterable[Modelled], _: str) -> bool:
+def figures_of(batch: Batch) -> BatchFigures:
+    """The figures of a batch, which travel to the driver."""
+    return BatchFigures.of(batch.modelled, batch.slow_s, each=batch.compared)
+
+
+def bundles_are_whole(task: BatchTask, figures: BatchFigures, _: str) -> bool:
     """Whether the bundles that a batch left in the quarantine are whole; not each loss has one."""
-    bundles = [Path(task.quarantine, f"{one.building_id}{SUFFIX}") for one in modelled if one.reason in LOST]
+    lost = (model.building_id for model in figures.notable if model.reason in LOST)
+    bundles = [Path(task.quarantine, f"{building_id}{SUFFIX}") for building_id in lost]
     return all(is_whole(bundle) for bundle in bundles if bundle.is_file())
 
 
@@ -223,10 +209,10 @@ def _is_rejected(task: BatchTask, site: CandidateSite, result: BuildingResult) -
     return result.reason is Reason.TOO_FEW_POINTS and not known and not task.compared
 
 
-def _here(task: BatchTask) -> Iterator[tuple[int, Packed]]:
+def _here(task: BatchTask, sites: Sequence[CandidateSite]) -> Iterator[tuple[int, Packed]]:
     """Models made in this process: one that runs out of memory becomes a record, one that crashes ends all."""
     task = opened(task)
-    for index, site in enumerate(task.sites):
+    for index, site in enumerate(sites):
         task.scratch.check_cancelled()
         try:
             packed = model_site(task, site)
@@ -237,16 +223,16 @@ def _here(task: BatchTask) -> Iterator[tuple[int, Packed]]:
         yield index, packed
 
 
-def _in_child(task: BatchTask, limits: IsolationLimits) -> Iterator[tuple[int, Packed]]:
+def _in_child(task: BatchTask, sites: Sequence[CandidateSite], limits: IsolationLimits) -> Iterator[tuple[int, Packed]]:
     """Models made in a supervised child process, so that a building can only harm itself."""
-    common = opened(dataclasses.replace(task, sites=()))
+    common = opened(task)
     cancelled = functools.partial(_cancelled, task)
     work = functools.partial(model_site, common)
     retried: dict[int, str] = {}
     for index, model in supervise(
-        work, task.sites, limits, cancelled, on_second_chance=retried.__setitem__, loads=_loads(task)
+        work, sites, limits, cancelled, on_second_chance=retried.__setitem__, loads=_loads(task)
     ):
-        found = _lost(common, task.sites[index], model, limits, cancelled) if isinstance(model, Loss) else model
+        found = _lost(common, sites[index], model, limits, cancelled) if isinstance(model, Loss) else model
         if index in retried:
             found = dataclasses.replace(found, modelled=dataclasses.replace(found.modelled, retried=retried[index]))
         yield index, found

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from pipeline.kernels.union_find import united
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
-from pipeline.runtime.stages.border_facets import facet_names, shared_facets
+from pipeline.runtime.stages.border_facets import are_beyond, facet_names, shared_facets
 from pipeline.runtime.stages.finished_surfaces import Finished, finished
 from pipeline.terrain.candidates import SOLID, Fault, Surfaces, judge_surfaces, may_join
 from pipeline.terrain.facets import FacetKind
@@ -39,11 +39,11 @@ class BorderFacets:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TileSurfaces:
-    """The surfaces of one tile, by columns: finished ones, and k fragments that wait for other tiles."""
+class OpenSurfaces:
+    """k surfaces, or fragments of them, that wait for other tiles: those of a tile, or of a block of tiles."""
 
-    done: Finished
-    """Sites that no other tile can change; their tile has number 0."""
+    tiles: tuple[Tile, ...]
+    """The tiles in which their points lie, by number."""
     kind: KindArray
     """(k,) int8, FacetKind: OBJECT, BUILDING or CROWN."""
     sums: IntArray
@@ -53,15 +53,27 @@ class TileSurfaces:
     lowest_point_mm: IntArray
     """(k, 3) int64, smallest assigned point in mm; NOWHERE where there is none."""
     ranges: IntArray
-    """(k, 2) int64, start and stop of each one's points in the tile's sorted points; equal where there are none."""
+    """(p, 4) int64, surface, number of the tile, start, stop: points in the sorted points of the tile."""
+    reach: IntArray
+    """(k, 4) int64, first column, first row, last column, last row of the tiles that may see some of it."""
     facets: BorderFacets
-    """Facets of the fragments."""
-    steps: int
-    """Number of steps that lie along the fragments or cross the tile's border."""
+    """Facets of the surfaces."""
+    step_reach: IntArray
+    """(s, 4) int64, the same of the steps that lie along the surfaces or cross a border."""
     step_facets: BorderFacets
     """Facets of the steps."""
-    along_steps: LabelArray
-    """(s, 2) int32, fragment and step; one row per pair."""
+    along_steps: IntArray
+    """(q, 2) int64, surface and step; one row per pair."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TileSurfaces:
+    """The surfaces of one tile."""
+
+    done: Finished
+    """Sites that no other tile can change; their tile has number 0."""
+    open: OpenSurfaces
+    """What waits for other tiles."""
 
 
 def open_fragments(
@@ -79,9 +91,8 @@ def open_fragments(
     the tile's sorted points.
     """
     kind, count = fragments.kind, len(fragments.kind)
-    opened, holders, names = _shared_facets(fragments, tile, grid, cut)
-    is_open = np.zeros(count, np.bool_)
-    is_open[opened] = True
+    reach, holders, names = _shared_facets(fragments, tile, grid, cut)
+    is_open = are_beyond(reach, (tile.column, tile.row, tile.column, tile.row))
     solid, step = np.isin(kind, SOLID), kind == FacetKind.STEP
     pairs = _linking_pairs(fragments, is_open, settings)
     piece = united(count, pairs[:, 0], pairs[:, 1])
@@ -98,19 +109,24 @@ def open_fragments(
     ranges[keys, 0], ranges[keys, 1] = starts[:-1], starts[1:]
     pair_waits = waits[pairs[:, 0]]
     chosen = np.flatnonzero(waiting)
+    held = np.flatnonzero(ranges[chosen, 1] > ranges[chosen, 0])
     return TileSurfaces(
         done=_finished(fragments, solid & ~waits, pairs[~pair_waits], ranges, settings),
-        kind=kind[chosen],
-        sums=fragments.sums[chosen],
-        boxes_mm=fragments.boxes_mm[chosen],
-        lowest_point_mm=fragments.lowest_point_mm[chosen],
-        ranges=ranges[chosen],
-        facets=_facets_of(waiting, holders, names),
-        steps=int(waiting_steps.sum()),
-        step_facets=_facets_of(waiting_steps, holders, names),
-        along_steps=np.column_stack(
-            (_numbers(waiting)[pairs[pair_waits, 0]], _numbers(waiting_steps)[pairs[pair_waits, 1]])
-        ).astype(np.int32),
+        open=OpenSurfaces(
+            tiles=(tile,),
+            kind=kind[chosen],
+            sums=fragments.sums[chosen],
+            boxes_mm=fragments.boxes_mm[chosen],
+            lowest_point_mm=fragments.lowest_point_mm[chosen],
+            ranges=np.column_stack((held, np.zeros(len(held), np.int64), ranges[chosen[held]])),
+            reach=reach[chosen],
+            facets=_facets_of(waiting, holders, names),
+            step_reach=reach[waiting_steps],
+            step_facets=_facets_of(waiting_steps, holders, names),
+            along_steps=np.column_stack(
+                (_numbers(waiting)[pairs[pair_waits, 0]], _numbers(waiting_steps)[pairs[pair_waits, 1]])
+            ),
+        ),
     )
 
 
@@ -128,14 +144,17 @@ def _facets_of(chosen: BoolArray, holders: IntArray, names: npt.NDArray[np.uint6
 def _shared_facets(
     fragments: Fragments, tile: Tile, grid: TileGrid, cut: SurfaceSettings
 ) -> tuple[IntArray, IntArray, npt.NDArray[np.uint64]]:
-    """Fragments that another tile may see; and the fragments and names of the facets that are named to other tiles."""
+    """The tiles that may see each fragment (k, 4), and the fragments and names of the facets named to other tiles."""
     kinds = fragments.kind[fragments.crossing_fragment]
     above = np.flatnonzero(kinds != FacetKind.GROUND)
     keys = fragments.crossing_keys[above]
     holders = fragments.crossing_fragment[above].astype(np.int64)
     names = facet_names(keys)
-    seen, named = shared_facets(keys, names, kinds[above], tile, grid, cut)
-    return np.unique(holders[seen]), holders[named], names[named]
+    seen_by, named = shared_facets(keys, names, kinds[above], tile, grid, cut)
+    reach = np.tile(np.array([tile.column, tile.row, tile.column, tile.row], np.int64), (len(fragments.kind), 1))
+    np.minimum.at(reach[:, :2], holders, seen_by[:, :2])
+    np.maximum.at(reach[:, 2:], holders, seen_by[:, 2:])
+    return reach, holders[named], names[named]
 
 
 def _linking_pairs(fragments: Fragments, is_open: BoolArray, settings: CandidateSettings) -> IntArray:

@@ -8,30 +8,27 @@ from collections.abc import Sequence
 
 from pipeline.export.point_files import FOLDER, INDEX
 from pipeline.io import storage_at
-from pipeline.model import Reason
 from pipeline.runtime.plan import window_bytes
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import FOLDER as KEPT
 from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of
 from pipeline.runtime.stages.cleanup import writing_points
 from pipeline.runtime.stages.coarse_points import coarse_levels, write_coarse_points
 from pipeline.runtime.stages.coarse_terrain import terrain_spacing
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
-from pipeline.runtime.stages.label import LabelTask, by_tile, label_halo_m, neighbourhood
+from pipeline.runtime.stages.label import LabelTask, SitesNear, label_halo_m, neighbourhood
 from pipeline.runtime.stages.reconstruct import Models
-from pipeline.runtime.stages.sites import CandidateSite, Joined, folders_with_points
+from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import Splits
 from pipeline.runtime.stages.tile_points import (
     PointsTask,
     StoredTilePoints,
-    TileBuilding,
     TilePoints,
     write_tile_points,
 )
 from pipeline.runtime.stages.window_points import folders_of
 from pipeline.settings import RunSettings
-from pipeline.tiling import MM, Tile
+from pipeline.tiling import MM
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -87,10 +84,9 @@ def _read(task: PointsTask) -> set[str]:
     """The folders of scratch with the points, the terrain and the models that a tile's points need."""
     label = task.label
     near = label.grid.tiles_over(neighbourhood(label.tile, label.grid, label.settings).grown(label.grid.size_mm))
-    parts = (*label.buildings, *label.decks, *(part for one in task.buildings for part in one.ranges))
-    return (
-        folders_of(near) | folders_with_points(parts) | {f"{KEPT}/{place.stage}/{place.unit}" for place in task.batches}
-    )
+    listed = (*label.buildings, *label.rejected)
+    folders = {folder for one in listed for folder in (one.place.folder, *one.figures.folders)}
+    return folders_of(near) | folders | {place.folder for place in task.batches}
 
 
 def _brief(stored: StoredTilePoints) -> TilePoints:
@@ -103,20 +99,14 @@ def _tasks(
     """One task per tile; their places lack the stage."""
     scratch, grid, splits = context.scratch, context.plan.grid, output.splits
     classes, _ = classes_in_use(output.ingested, trust=settings.general.classes == "trust")
-    candidates = by_tile(joined.candidates)
-    decks = by_tile([site for site in joined.rejected if site.verdict.reason is Reason.BRIDGE])
-    sites: dict[Tile, list[CandidateSite]] = {}
-    for site in sorted(joined.candidates, key=lambda one: one.building_id):
-        for tile in {part.tile for part in site.ranges}:
-            sites.setdefault(tile, []).append(site)
+    sites = SitesNear.of(joined)
     counts = points_by_tile(output.ingested)
     seen = dataclasses.replace(grid, halo_mm=math.ceil(label_halo_m(settings.scene) * MM))
     above, spacing = coarse_levels(list(splits.places)), terrain_spacing(splits.places, grid)
     tasks = {}
     for tile in sorted(splits.places):
         near = tuple(grid.tiles_over(neighbourhood(tile, grid, settings.scene)))
-        own = sites.get(tile, [])
-        owners = sorted({site.owner for site in own})
+        owners = sorted({group.figures.owner for group in sites.groups.get(tile, ())})
         task = PointsTask(
             label=LabelTask(
                 tile=tile,
@@ -125,29 +115,20 @@ def _tasks(
                 classes=classes,
                 given=output.given or classes.building,
                 scratch=scratch,
-                buildings=tuple(part for other in near for part in candidates.get(other, ())),
-                decks=tuple(part for other in near for part in decks.get(other, ())),
+                buildings=sites.groups_in(near),
+                rejected=sites.rejected_in(near),
             ),
             run_dir=output.run_dir,
-            buildings=tuple(_part_in(tile, site) for site in own),
             batches=tuple(place for owner in owners for place in models.places[owner]),
             above=above,
             terrain_spacing=spacing,
             memory_bytes=window_bytes(seen, tile, counts),
         )
         label = task.label
-        what = (label.settings, label.classes, label.given, label.buildings, label.decks)
+        listed = sorted(one.figures.digest for one in (*label.buildings, *label.rejected))
+        what = (label.settings, label.classes, label.given, listed)
         around = [splits.keys.get(other, "") for other in near]
         modelled = [models.contents[owner] for owner in owners]
-        key = key_of(output.run_dir, tile, grid, what, task.buildings, modelled, above, spacing, around)
+        key = key_of(output.run_dir, tile, grid, what, modelled, above, spacing, around)
         tasks[Place("", tile.key, key)] = task
     return tasks
-
-
-def _part_in(tile: Tile, site: CandidateSite) -> TileBuilding:
-    """The part of a building in a tile."""
-    return TileBuilding(
-        building_id=site.building_id,
-        ranges=tuple(part for part in site.ranges if part.tile == tile),
-        tiles=tuple(sorted({part.tile.key for part in site.ranges})),
-    )

@@ -23,11 +23,12 @@ from pipeline.runtime.plan import Plan
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import FOLDER, Place, brief_of, drop_outcomes, key_of, whole
+from pipeline.runtime.scratch.outcomes import Place, brief_of, drop_outcomes, key_of, whole
+from pipeline.runtime.stages.batch_figures import BatchFigures
 from pipeline.runtime.stages.cleanup import publishing
 from pipeline.runtime.stages.model_batch import StoredResult, stored_results
 from pipeline.runtime.stages.reconstruct import QUARANTINE, Models
-from pipeline.runtime.stages.sites import Joined, RejectedSite
+from pipeline.runtime.stages.sites import Joined, RejectedSite, StoredRejected
 from pipeline.runtime.stages.split import Splits
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile
@@ -42,8 +43,8 @@ class PublishTask:
     scratch: Scratch
     batches: tuple[Place, ...]
     """Outcomes of the batches that modelled the buildings of this tile."""
-    rejected: tuple[RejectedSite, ...]
-    """Objects of this tile that are not buildings."""
+    rejected: tuple[StoredRejected, ...]
+    """Objects of this tile that are not buildings, in scratch."""
     context: RecordContext
     meshes: str
     again: bool = False
@@ -134,9 +135,9 @@ def publish(
 ) -> list[Published]:
     """Write every tile; the outcome of each, in their order."""
     scratch, run_dir = context.scratch, output.run_dir
-    rejected: dict[Tile, list[RejectedSite]] = {}
-    for site in joined.rejected:
-        rejected.setdefault(site.owner, []).append(site)
+    rejected: dict[Tile, list[StoredRejected]] = {}
+    for listed in joined.rejected:
+        rejected.setdefault(listed.figures.owner, []).append(listed)
     owners = sorted({*models.places, *rejected, *splits.places})
     records = record_context(context.plan, settings)
     stage, storage = publishing(run_dir), storage_at(run_dir)
@@ -156,14 +157,14 @@ def publish(
             empty_tables=not models.places and not rejected and tile == owners[0],
         )
         models_of_tile = models.contents.get(tile, "")
-        rejected_there = [dataclasses.replace(site, ranges=()) for site in task.rejected]
+        rejected_there = sorted(listed.figures.digest for listed in task.rejected)
         key = key_of(run_dir, models_of_tile, rejected_there, records, task.meshes, task.empty_tables)
         tasks[Place(stage, tile.key, key)] = task
     # tiles that a user removed from the run directory are published again
     drop_outcomes(scratch, stage, [place for place in tasks if place.unit in there])
     units = ProgressUnits[Published](failed=lambda found: int(bool(found.error)))
     files: Files[PublishTask, Published] = Files(
-        reads=lambda task: {f"{FOLDER}/{place.stage}/{place.unit}" for place in task.batches},
+        reads=_read,
         intact=is_published,
         at_once=True,
     )
@@ -177,6 +178,11 @@ def publish(
             context.progress.warn("publish", f"tile {outcome.tile.key} failed: {outcome.error}")
             Path(scratch.root, place.name).unlink(missing_ok=True)  # so that a resumed run tries it again
     return list(published.values())
+
+
+def _read(task: PublishTask) -> set[str]:
+    """The folders of scratch with the models and the rejected objects of a tile."""
+    return {place.folder for place in (*task.batches, *(listed.place for listed in task.rejected))}
 
 
 def is_published(task: PublishTask, _: Published, __: str) -> bool:
@@ -262,11 +268,14 @@ def _write(task: PublishTask, put: Put) -> dict[str, str]:
         stored.extend(stored_results(task.scratch, place))
     context = dataclasses.replace(task.context, facts={entry.result.building_id: entry.facts for entry in stored})
     buildings, unmodelled = buildings_and_rejected(stored)
+    rejected = sorted(
+        (site for listed in task.rejected for site in listed.sites(task.scratch)), key=lambda site: site.object_id
+    )
     files = write_tile(
         task.run_dir,
         task.tile.key,
         buildings,
-        [*(rejected_object(site) for site in task.rejected), *unmodelled],
+        [*(rejected_object(site) for site in rejected), *unmodelled],
         context,
         meshes=task.meshes,
         put=put,
@@ -282,7 +291,8 @@ def _put_bundles(task: PublishTask, storage: Storage) -> tuple[dict[str, str], s
     bundles: dict[str, str] = {}
     lost = ""
     for place in task.batches:
-        for model in brief_of(task.scratch, place):
+        figures: BatchFigures = brief_of(task.scratch, place)
+        for model in figures.notable:
             bundle = Path(task.scratch.root, QUARANTINE, f"{model.building_id}{SUFFIX}")
             if model.status != Status.FAILED.value or not bundle.is_file():
                 continue

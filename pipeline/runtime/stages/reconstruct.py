@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.model import Status
@@ -13,25 +13,24 @@ from pipeline.runtime.overrides.overrides_file import own_modelling
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import FOLDER, Place, brief_of, drop_outcomes, key_of, keys_of
+from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, keys_of, result_of
+from pipeline.runtime.stages.batch_figures import LOST, BatchFigures, Counted, Modelled
 from pipeline.runtime.stages.model_batch import (
-    LOST,
     Batch,
     BatchTask,
-    Modelled,
     StoredResult,
     bundles_are_whole,
+    figures_of,
     model_batch,
     stored_results,
 )
-from pipeline.runtime.stages.sites import CandidateSite, Joined, by_owner, folders_around
+from pipeline.runtime.stages.sites import Joined, folders_around
 from pipeline.settings import RunSettings
 from pipeline.tiling import Tile
 
 QUARANTINE = "quarantine"
 """Folder of a run directory, and of scratch, for the bundles of buildings that ended their process."""
-_POINTS_PER_BATCH = 20_000
-_MAX_PER_BATCH = 64
+_DIGEST_BITS = 160
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,14 +43,15 @@ class Models:
     """The run's scratch."""
     contents: Mapping[Tile, str]
     """Digest of all that is published of each tile's models, whichever batches they came in."""
-    made: int
-    """Number of models made now; the others were taken from earlier runs, since none of their input changed."""
+    counted: Counted
+    """The counts of all models."""
 
     def each(self) -> Iterator[Modelled]:
         """The figures of each building, tile after tile, read one batch at a time."""
         for places in self.places.values():
             for place in places:
-                yield from brief_of(self.scratch, place)
+                batch: Batch = result_of(self.scratch, place)
+                yield from batch.modelled
 
     def stored(self) -> Iterator[tuple[Tile, list[StoredResult]]]:
         """The models themselves, one owner tile at a time."""
@@ -77,56 +77,56 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
     alike = key_of(method, settings.building, plan.gps_kind, limits, plan.grid)
     tasks: dict[Place, BatchTask] = {}
     places: dict[Tile, list[Place]] = {}
-    for tile, candidates in sorted(by_owner(joined.candidates).items()):
-        earlier = tuple(Place(stage, tile.key, key) for key in keys_of(scratch, stage, tile.key))
-        for sites in batches(candidates):
-            own = {
-                site.building_id: own_modelling(site.override, settings)
-                for site in sites
-                if site.override is not None and site.override.remodels
-            }
-            place = Place(stage, tile.key, key_of(alike, sites, joined.around(sites, plan.grid), own))
-            places.setdefault(tile, []).append(place)
-            tasks[place] = BatchTask(
-                sites=sites,
-                method=method,
-                settings=settings.building,
-                grid=plan.grid,
-                scratch=scratch,
-                gps_kind=plan.gps_kind,
-                isolation=limits,
-                quarantine=str(Path(scratch.root, QUARANTINE)),
-                reference=plan.reference,
-                own=own,
-                earlier=earlier,
-                compared=compared,
-            )
-    largest_first = sorted(tasks.items(), key=lambda item: -sum(site.points for site in item[1].sites))
-    made = 0
+    earlier: dict[Tile, tuple[Place, ...]] = {}
+    for group in joined.groups:
+        owner, figures = group.figures.owner, group.figures
+        if owner not in earlier:
+            earlier[owner] = tuple(Place(stage, owner.key, key) for key in keys_of(scratch, stage, owner.key))
+        own = {building_id: own_modelling(override, settings) for building_id, override in figures.overridden}
+        place = Place(stage, owner.key, key_of(alike, figures.digest, joined.around(figures.tiles), own))
+        places.setdefault(owner, []).append(place)
+        tasks[place] = BatchTask(
+            group=group,
+            method=method,
+            settings=settings.building,
+            grid=plan.grid,
+            scratch=scratch,
+            gps_kind=plan.gps_kind,
+            isolation=limits,
+            quarantine=str(Path(scratch.root, QUARANTINE)),
+            reference=plan.reference,
+            own=own,
+            earlier=earlier[owner],
+            compared=compared,
+            slow_s=slow_building_s(),
+        )
+    largest_first = sorted(tasks.items(), key=lambda item: -item[1].group.figures.points)
 
-    def count(models: Sequence[Modelled]) -> None:
-        nonlocal made
-        made += sum(not model.reused for model in models)
-        for model in models:
+    def tell(batch: BatchFigures) -> None:
+        for model in batch.notable:
             _tell(context, model)
 
-    brief: Callable[[Batch], tuple[Modelled, ...]] = operator.attrgetter("modelled")
-    units = ProgressUnits[tuple[Modelled, ...]](
-        total=len(joined.candidates), done=len, failed=_failed_of, parts=_traced
+    units = ProgressUnits[BatchFigures](
+        total=joined.candidates,
+        done=operator.attrgetter("count"),
+        failed=operator.attrgetter("failed"),
+        parts=lambda batch: _traced(batch.notable),
     )
-    files: Files[BatchTask, tuple[Modelled, ...]] = Files(
-        reads=lambda task: folders_around(task.sites, task.grid),
-        leaves=lambda task, _: [f"{FOLDER}/{stage}/{task.sites[0].owner.key}"],
+    files: Files[BatchTask, BatchFigures] = Files(
+        reads=lambda task: folders_around(task.group, task.grid),
+        leaves=lambda task, _: [Place(stage, task.group.figures.owner.key, "").folder],
         intact=bundles_are_whole,
     )
-    briefs = context.map_stored("reconstruct", model_batch, dict(largest_first), brief, units, count, files)
-    contents = {
-        tile: key_of(sorted(model.content for place in made_in for model in briefs[place]))
-        for tile, made_in in places.items()
-    }
+    found = context.map_stored("reconstruct", model_batch, dict(largest_first), figures_of, units, tell, files)
+    contents: dict[Tile, str] = {}
+    for tile, made_in in sorted(places.items()):
+        # a sum, so that it does not matter which batches they came in
+        content = sum(found[place].content for place in made_in) % 2**_DIGEST_BITS
+        contents[tile] = key_of(content, sum(found[place].count for place in made_in))
     # only now: models whose input did not change are taken from the earlier batches
     drop_outcomes(scratch, stage, tasks)
-    return Models(places=places, scratch=scratch, contents=contents, made=made)
+    counted = Counted.of(found.values())
+    return Models(places=dict(sorted(places.items())), scratch=scratch, contents=contents, counted=counted)
 
 
 def _tell(context: RunContext, model: Modelled) -> None:
@@ -138,11 +138,6 @@ def _tell(context: RunContext, model: Modelled) -> None:
         reason = model.reason or ""
         message = f"failed: {reason}" + (f": {model.detail}" if model.detail else "")
         context.progress.detail("reconstruct", message, reason=reason, seconds=round(model.seconds, 3), **facts)
-
-
-def _failed_of(models: Sequence[Modelled]) -> int:
-    """Number of failed buildings of a batch."""
-    return sum(model.status == Status.FAILED.value for model in models)
 
 
 def _traced(models: Sequence[Modelled]) -> Iterator[Part]:
@@ -161,25 +156,3 @@ def _traced(models: Sequence[Modelled]) -> Iterator[Part]:
                 error=model.reason if is_lost else None,
                 facts=facts | {"points": model.points, "faces": model.faces},
             )
-
-
-def batches(sites: Sequence[CandidateSite]) -> list[tuple[CandidateSite, ...]]:
-    """Group the candidates of a tile, which come largest first, to batches of some seconds each.
-
-    >>> from pipeline.runtime.stages.sites import CandidateSite
-    >>> site = lambda n: CandidateSite(building_id=str(n), owner=Tile(0, 0), ranges=(), points=n)
-    >>> [len(b) for b in batches([site(30_000), site(14_000), site(5_000), site(4_000), site(10)])]
-    [1, 2, 2]
-    """
-    groups: list[tuple[CandidateSite, ...]] = []
-    current: list[CandidateSite] = []
-    points = 0
-    for site in sites:
-        if current and (points + site.points > _POINTS_PER_BATCH or len(current) == _MAX_PER_BATCH):
-            groups.append(tuple(current))
-            current, points = [], 0
-        current.append(site)
-        points += site.points
-    if current:
-        groups.append(tuple(current))
-    return groups

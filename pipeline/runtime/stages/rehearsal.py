@@ -17,7 +17,7 @@ from pipeline.runtime.stages.ground import GroundTask, draw_ground
 from pipeline.runtime.stages.join import join_tiles
 from pipeline.runtime.stages.split_window import SplitTask, split_window
 from pipeline.runtime.stages.tile_content import zone_sums
-from pipeline.runtime.stages.units import divide, unit_tasks
+from pipeline.runtime.stages.units import UnitTask, divide
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
 from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
@@ -58,8 +58,20 @@ def rehearse_scene(outlines: str = "") -> None:
         found = split_window(task, settings)
         if footprints is not None:
             return
-        joined = join_tiles([found], grid, settings.candidates, "")
-        for units in unit_tasks(
-            joined.candidates, settings.units, RoofSettings().min_strip_offset_m, grid, scratch, ""
-        ):
-            divide(units)
+        joined, _ = join_tiles([found], grid, settings.candidates, "")
+        units = UnitTask(
+            tile=tile,
+            share=0,
+            shares=1,
+            split=None,
+            borders=(),
+            scene=settings,
+            roof=RoofSettings(),
+            outlines=False,
+            grid=grid,
+            scratch=scratch,
+            crs_name="",
+            scale=1,
+            folder="units/made-up",
+        )
+        divide(joined.candidates, units)

@@ -6,10 +6,13 @@ import base64
 import dataclasses
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Generic, TypeVar
 
 from shapely import MultiPolygon, Polygon
 
 from pipeline.runtime.overrides.overrides_file import Override
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.outcomes import Place, part_of
 from pipeline.runtime.stages.window_points import folders_of
 from pipeline.terrain.candidates import Verdict
 from pipeline.tiling import MM, Tile, TileGrid, Window
@@ -24,8 +27,6 @@ class PointRange:
     stop: int
     folder: str = "tiles"
     """Folder of the scratch that holds the tile's points."""
-    checksum: int = 0
-    """CRC-32 of the points, where they were stored again; 0 where the tile's outcome has a digest of all."""
 
     @property
     def left_in(self) -> str:
@@ -82,21 +83,115 @@ class RejectedSite:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Joined:
-    """The candidates of a run."""
+class FoundSites:
+    """Candidates and rejected objects in memory: those of a tile, or of a whole run that is small enough."""
 
     candidates: tuple[CandidateSite, ...]
     """Largest first, then by id."""
     rejected: tuple[RejectedSite, ...]
     """By id."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Figures:
+    """What the driver knows of some stored sites."""
+
+    owner: Tile
+    """The tile that publishes all of them."""
+    folders: tuple[str, ...]
+    """The folders of scratch with points of candidates or bridges, sorted."""
+    digest: str
+    """Of all that later stages see of them."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GroupFigures(Figures):
+    """What the driver knows of some stored candidates, which one task models."""
+
+    count: int
+    """Number of candidates."""
+    points: int
+    """Number of their points."""
+    largest: int
+    """Points of the largest."""
+    tiles: tuple[Tile, ...]
+    """The tiles in which they lie, sorted."""
+    overridden: tuple[tuple[str, Override], ...] = ()
+    """Ids and overrides of those that are modelled in their own way."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RejectedFigures(Figures):
+    """What the driver knows of the rejected objects of a tile."""
+
+    reasons: Mapping[str, int]
+    """Number of objects by reason."""
+    bridges_in: tuple[Tile, ...]
+    """The tiles in which bridges lie, sorted."""
+
+    @property
+    def count(self) -> int:
+        """Number of objects."""
+        return sum(self.reasons.values())
+
+
+Site_co = TypeVar("Site_co", covariant=True)
+Known_co = TypeVar("Known_co", bound=Figures, covariant=True)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Stored(Generic[Site_co, Known_co]):
+    """Some sites that lie in scratch: the driver holds no object per building."""
+
+    place: Place
+    """The outcome of which they are a part."""
+    part: int
+    """Its number."""
+    figures: Known_co
+    """What the driver knows of them."""
+
+    def sites(self, scratch: Scratch) -> tuple[Site_co, ...]:
+        """The sites, candidates largest first, rejected objects by id; raises the errors of `part_of`."""
+        found: tuple[Site_co, ...] = part_of(scratch, self.place, self.part)
+        return found
+
+
+StoredGroup = Stored[CandidateSite, GroupFigures]
+"""Candidates that one task models."""
+StoredRejected = Stored[RejectedSite, RejectedFigures]
+"""The rejected objects of a tile."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Joined:
+    """The candidates of a run, in scratch."""
+
+    groups: tuple[StoredGroup, ...]
+    """Candidates, group by group; those of one tile follow each other."""
+    rejected: tuple[StoredRejected, ...]
+    """Rejected objects, tile by tile."""
     small_fragments: int
     """Surfaces below the size of an object: counted, not listed."""
     keys: Mapping[Tile, str] = dataclasses.field(default_factory=dict)
     """Digest of what lies in and around each tile: equal where later stages see no difference."""
 
-    def around(self, sites: Sequence[CandidateSite], grid: TileGrid) -> list[str]:
-        """Digests of what lies in and around the tiles of some candidates."""
-        return [self.keys.get(tile, "") for tile in sorted(tiles_of(sites, grid))]
+    @property
+    def candidates(self) -> int:
+        """Number of candidates."""
+        return sum(group.figures.count for group in self.groups)
+
+    def around(self, tiles: Iterable[Tile]) -> list[str]:
+        """Digests of what lies in and around some tiles."""
+        return [self.keys.get(tile, "") for tile in tiles]
+
+    def found(self, scratch: Scratch) -> FoundSites:
+        """All of them in memory, for what looks at single buildings of a run."""
+        return FoundSites(
+            candidates=largest_first(site for group in self.groups for site in group.sites(scratch)),
+            rejected=tuple(
+                sorted((site for one in self.rejected for site in one.sites(scratch)), key=lambda r: r.object_id)
+            ),
+        )
 
 
 def tiles_of(sites: Iterable[CandidateSite], grid: TileGrid) -> set[Tile]:
@@ -116,10 +211,14 @@ def folders_with_points(ranges: Iterable[PointRange]) -> set[str]:
     return {part.left_in for part in ranges}
 
 
-def folders_around(sites: Sequence[CandidateSite], grid: TileGrid) -> set[str]:
-    """The folders of scratch from which some candidates are gathered: their points, and what lies around them."""
-    tiles = {near for tile in tiles_of(sites, grid) for near in grid.tiles_over(grid.core(tile).grown(grid.size_mm))}
-    return folders_of(tiles) | folders_with_points(part for site in sites for part in site.ranges)
+def near_tiles(tiles: Iterable[Tile], grid: TileGrid) -> set[Tile]:
+    """Some tiles and those that touch them: what lies there is seen where their candidates are gathered."""
+    return {near for tile in tiles for near in grid.tiles_over(grid.core(tile).grown(grid.size_mm))}
+
+
+def folders_around(group: StoredGroup, grid: TileGrid) -> set[str]:
+    """The folders of scratch from which the candidates of a group are gathered, and in which they are listed."""
+    return {*folders_of(near_tiles(group.figures.tiles, grid)), *group.figures.folders, group.place.folder}
 
 
 def object_id(crs_name: str, lowest_point_mm: Sequence[int]) -> str:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 from pipeline.runtime.plan import split_grid, window_bytes
 from pipeline.runtime.run_context import RunContext
-from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, key_of, result_of
 from pipeline.runtime.stages.cleanup import clear_tiles
@@ -38,9 +37,12 @@ class Splits:
     numbers: Mapping[Tile, Sequence[int]]
     """By tile, the numbers of the given footprints that meet it; empty where none were given."""
 
-    def stored(self, scratch: Scratch) -> Iterator[Split]:
+    def stored(self, context: RunContext) -> Iterator[Split]:
         """The descriptors of all tiles in their order, read one after the other."""
-        return (result_of(scratch, place) for _, place in sorted(self.places.items(), key=operator.itemgetter(0)))
+        context.check(place.folder for place in self.places.values())
+        return (
+            result_of(context.scratch, place) for _, place in sorted(self.places.items(), key=operator.itemgetter(0))
+        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -91,8 +93,8 @@ def _read(task: SplitTask) -> set[str]:
 
 
 def _stored(task: SplitTask, _: SplitFigures) -> tuple[str, ...]:
-    """The folder of scratch with the sorted points of a tile."""
-    return (f"{task.folder}/{task.tile.key}",)
+    """The folders of scratch with the sorted points and with the surfaces of a tile."""
+    return f"{task.folder}/{task.tile.key}", Place(task.folder, task.tile.key, "").folder
 
 
 def split_windows(
@@ -130,7 +132,7 @@ def split_windows(
     clear_tiles(context.scratch, folder, tasks)
     function = functools.partial(split_window, settings=settings.scene)
     brief: Callable[[Split], SplitFigures] = operator.attrgetter("figures")
-    stored = Files(reads=_read, leaves=_stored, intact=is_intact, results=True)
+    stored = Files(reads=_read, leaves=_stored, intact=is_intact)
     found = context.map_stored(stage, function, tasks, brief, files=stored)
     return Splits(
         figures=tuple(found.values()),

@@ -81,6 +81,12 @@ class SplitFigures:
     """Points of the core: assigned and class 6, assigned and not, class 6 and not assigned."""
     outcome: str
     """Digest of the stored points: equal where later stages see no difference."""
+    sites: int = 0
+    """Candidates and rejected objects that no other tile sees."""
+    candidate_points: int = 0
+    """Points of these candidates."""
+    small: int = 0
+    """Surfaces below the size of an object that no other tile sees."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -134,17 +140,23 @@ def split_window(task: SplitTask, settings: SceneSettings) -> Split:
     else:
         cut, judging = settings.surfaces, settings.candidates
         surfaces = open_fragments(result.fragments, keys, starts, task.tile, task.grid, cut, judging)
+    done = None if surfaces is None else surfaces.done
     figures = SplitFigures(
         tile=task.tile,
         points=len(loaded.core),
         audit=audit,
         outcome=outcome,
+        sites=0 if done is None else len(done.candidate_points_mm) + len(done.kind),
+        candidate_points=0 if done is None else done.candidate_points,
+        small=0 if done is None else done.small,
     )
     return Split(tile=task.tile, surfaces=surfaces, footprints=footprints, figures=figures)
 
 
 def is_intact(task: SplitTask, figures: SplitFigures, folder: str) -> bool:
     """Whether a tile's points in a folder of scratch are as they were stored."""
+    if folder != f"{task.folder}/{task.tile.key}":
+        return True  # the outcome itself
     stored = task.scratch.array(folder, "points", mapped=True)
     return hashlib.sha256(np.ascontiguousarray(stored).data).hexdigest() == figures.outcome
 

@@ -56,8 +56,6 @@ class PointsTask:
     """How its points are classified."""
     run_dir: str
     """Where the files go."""
-    buildings: tuple[TileBuilding, ...]
-    """The buildings with points in it, by id."""
     batches: tuple[Place, ...]
     """Outcomes of the batches that modelled them."""
     above: int
@@ -125,7 +123,8 @@ def write_tile_points(task: PointsTask) -> StoredTilePoints:
 
 def _written(task: PointsTask, storage: Storage) -> StoredTilePoints:
     tile, scratch = task.label.tile, task.label.scratch
-    points, origin_mm = modelled_points(task)
+    buildings = buildings_in(task.label)
+    points, origin_mm = modelled_points(task, buildings)
     scratch.check_cancelled()
     core, side_mm = task.label.grid.core(tile), task.label.grid.size_mm
     while side_mm <= int(points.xyz_mm[:, 2].max()):
@@ -148,7 +147,7 @@ def _written(task: PointsTask, storage: Storage) -> StoredTilePoints:
             written.add(f"{folder}/{TILESET}")
             puts.wait()
         # last: a tile with this file is complete
-        puts.put(f"{folder}/{INDEX}", _index(task.buildings, points, tree))
+        puts.put(f"{folder}/{INDEX}", _index(buildings, points, tree))
         written.add(f"{folder}/{INDEX}")
     if task.again:
         for name in sorted(set(storage.keys(folder)) - written):
@@ -168,21 +167,38 @@ def _written(task: PointsTask, storage: Storage) -> StoredTilePoints:
     return StoredTilePoints(brief=brief, parts=tuple(points.take(index) for index in tree.above))
 
 
-def modelled_points(task: PointsTask) -> tuple[ModelledPoints, tuple[int, int, int]]:
+def buildings_in(task: LabelTask) -> list[TileBuilding]:
+    """The buildings with points in a tile, by id."""
+    sites = (site for group in task.buildings if task.tile in group.figures.tiles for site in group.sites(task.scratch))
+    return sorted(
+        (
+            TileBuilding(
+                building_id=site.building_id,
+                ranges=tuple(part for part in site.ranges if part.tile == task.tile),
+                tiles=tuple(sorted({part.tile.key for part in site.ranges})),
+            )
+            for site in sites
+            if any(part.tile == task.tile for part in site.ranges)
+        ),
+        key=lambda one: one.building_id,
+    )
+
+
+def modelled_points(task: PointsTask, buildings: Sequence[TileBuilding]) -> tuple[ModelledPoints, tuple[int, int, int]]:
     """The points of a tile, at least one, about an origin; and that origin, in whole metres."""
     classes = classes_of_tile(task.label)
     records = classes.core
     core = task.label.grid.core(task.label.tile)
     origin_mm = (core.x0_mm // MM * MM, core.y0_mm // MM * MM, int(records["z"].min()) // MM * MM)
     xyz_mm = np.column_stack([records[name].astype(np.int64) for name in "xyz"])
-    building, models = _buildings_of(task, records)
-    names = tuple(one.building_id for one in task.buildings if one.building_id in models)
+    building, models = _buildings_of(task, buildings, records)
+    names = tuple(one.building_id for one in buildings if one.building_id in models)
     plane = np.full(len(records), NO_PLANE, np.uint16)
     residual = np.full(len(records), NO_RESIDUAL, np.int16)
     number = np.full(NO_BUILDING + 1, NO_BUILDING, np.uint16)
     order = np.argsort(building, kind="stable")
-    starts = np.searchsorted(building[order], np.arange(len(task.buildings) + 1))
-    for k, one in enumerate(task.buildings):
+    starts = np.searchsorted(building[order], np.arange(len(buildings) + 1))
+    for k, one in enumerate(buildings):
         model = models.get(one.building_id)
         if model is None:
             continue
@@ -200,14 +216,16 @@ def modelled_points(task: PointsTask) -> tuple[ModelledPoints, tuple[int, int, i
     return points, origin_mm
 
 
-def _buildings_of(task: PointsTask, records: npt.NDArray[np.void]) -> tuple[UShortArray, dict[str, BuildingResult]]:
-    """The building of each record, (n,) by its place in the task, and the models of those that are buildings."""
+def _buildings_of(
+    task: PointsTask, buildings: Sequence[TileBuilding], records: npt.NDArray[np.void]
+) -> tuple[UShortArray, dict[str, BuildingResult]]:
+    """The building of each record, (n,) by its number, and the models of those that are buildings."""
     held = np.full(len(records), NO_BUILDING, np.uint16)
-    wanted = {one.building_id for one in task.buildings}
+    wanted = {one.building_id for one in buildings}
     stored = [entry for place in task.batches for entry in stored_results(task.label.scratch, place, wanted)]
     models = {entry.result.building_id: entry.result for entry in stored if not entry.is_rejected}
     core = task.label.grid.core(task.label.tile)
-    parts = [(k, part) for k, one in enumerate(task.buildings) for part in one.ranges]
+    parts = [(k, part) for k, one in enumerate(buildings) for part in one.ranges]
     if parts:
         pieces = [records_within(task.label.scratch, part, core) for _, part in parts]
         of_piece = np.repeat(np.array([k for k, _ in parts], np.uint16), [len(piece) for piece in pieces])

@@ -1,129 +1,245 @@
-"""Units: a candidate in which several buildings touch becomes one candidate per unit, at the end of the join.
+"""Units: the candidates of a tile, divided where several buildings touch, and the outlines of touching units.
 
 A task sees all points of its candidates, in whichever tiles they lie, so the outcome does not depend on the tiles. The
-points of a divided candidate are stored again, sorted by unit, tile by tile: a range still lies in the tile it names.
+points of divided candidates are stored again, sorted by unit, tile by tile: a range still lies in the tile it names.
 """
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import itertools
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.model import IntArray
+from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.run_context import RunContext
-from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.scratch.folder import POINT, OpenScratch, Scratch
 from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, whole
-from pipeline.runtime.stages.gather import canonical_order, stored_bytes
-from pipeline.runtime.stages.grouping import in_groups
-from pipeline.runtime.stages.sites import (
-    CandidateSite,
-    Joined,
-    PointRange,
-    by_owner,
-    folders_with_points,
-    largest_first,
-    object_id,
-)
+from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, part_of, result_of
+from pipeline.runtime.stages.cleanup import clear_units
+from pipeline.runtime.stages.gather import canonical_order
+from pipeline.runtime.stages.outline import outlined
+from pipeline.runtime.stages.sites import CandidateSite, FoundSites, PointRange, largest_first, near_tiles, object_id
+from pipeline.runtime.stages.split import Splits
+from pipeline.runtime.stages.split_window import Split
+from pipeline.runtime.stages.stored_sites import SitesBrief, StoredSites, brief_of_sites, scale_of, stored_sites
+from pipeline.runtime.stages.tile_sites import TileSites, TileSitesFigures, sites_of
+from pipeline.runtime.stages.window_points import folders_of
 from pipeline.strip_alignment import strip_offsets_m
-from pipeline.terrain.settings import UnitSettings
+from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.terrain.units import smallest_points, units_of
 from pipeline.tiling import MM, Tile, TileGrid
 
+STAGE = "units"
+"""The stage under which the sites of tiles are stored."""
 _POINTS_PER_TASK = 50_000
+_KEY_DIGITS = 16
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BorderSites:
+    """Sites of a tile that reach other tiles, as the join found them."""
+
+    owner: Tile
+    """The tile."""
+    place: Place | None = None
+    """The outcome of the join that holds them; None within that outcome."""
+    part: int
+    """Their part of it."""
+    figures: TileSitesFigures
+    """What the driver knows of them."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class UnitTask:
-    """Some candidates for one task."""
+    """A share of the candidates of one tile."""
 
-    sites: tuple[CandidateSite, ...]
-    """The candidates."""
-    settings: UnitSettings
-    """What separates units."""
-    min_strip_offset_m: float
-    """Strips of a candidate that disagree by more are aligned first."""
+    tile: Tile
+    """The tile."""
+    share: int
+    """Number of the share, from 0; the first one lists the rejected objects, too."""
+    shares: int
+    """Number of shares."""
+    split: Place | None
+    """The outcome of the tile's split, with the sites that no other tile sees; None where it has no split."""
+    borders: tuple[BorderSites, ...]
+    """The tile's other sites."""
+    scene: SceneSettings
+    """What is a candidate, and what separates units."""
+    roof: RoofSettings
+    """How outlines are drawn; strips of a candidate that disagree by more than its limit are aligned first."""
+    outlines: bool
+    """Whether the outlines of touching units are drawn."""
     grid: TileGrid
-    """The lattice, for the owners."""
+    """The lattice."""
     scratch: Scratch
     """Holds the points, and gets those of the units."""
     crs_name: str
     """Goes into the ids."""
+    scale: int
+    """How many times larger groups are than those of a small run."""
+    folder: str = ""
+    """Folder of scratch for the points of units."""
 
 
-def divide_units(
-    context: RunContext, settings: UnitSettings, min_strip_offset_m: float, joined: Joined, crs_name: str
-) -> Joined:
-    """The candidates, divided into units; part of the join and not a stage of its own."""
-    if settings.split == "nothing":
-        return joined
-    scratch, grid, alike = context.scratch, context.plan.grid, key_of(settings, min_strip_offset_m, crs_name)
-    tasks = {}
-    for tile, candidates in by_owner(joined.candidates).items():
-        for task in unit_tasks(candidates, settings, min_strip_offset_m, grid, scratch, crs_name):
-            key = key_of(alike, task.sites, joined.around(task.sites, grid))
-            tasks[Place("units", tile.key, key)] = task
-    drop_outcomes(scratch, "units", tasks)
-    files: Files[UnitTask, tuple[CandidateSite, ...]] = Files(reads=_read, leaves=_left, intact=is_intact)
-    divided = context.map_stored("join", divide, tasks, whole, files=files, quiet=True)
-    return dataclasses.replace(joined, candidates=largest_first(itertools.chain(*divided.values())))
+def find_units(
+    context: RunContext,
+    settings: SceneSettings,
+    roof: RoofSettings,
+    splits: Splits,
+    borders: Iterable[BorderSites],
+    crs_name: str,
+    *,
+    outlines: bool,
+) -> dict[Place, SitesBrief]:
+    """The candidates of all tiles, divided into units with their outlines, and the rejected objects."""
+    scratch, grid = context.scratch, context.plan.grid
+    reaching: dict[Tile, list[BorderSites]] = {}
+    for sites in borders:
+        reaching.setdefault(sites.owner, []).append(sites)
+    points = {figures.tile: figures.candidate_points for figures in splits.figures if figures.sites}
+    for tile, own in reaching.items():
+        points[tile] = points.get(tile, 0) + sum(sites.figures.points for sites in own)
+    scale = scale_of(sum(points.values()))
+    alike = key_of(settings, roof if outlines else roof.min_strip_offset_m, outlines, grid, crs_name, scale)
+    tasks: dict[Place, UnitTask] = {}
+    for tile, of_tile in sorted(points.items()):
+        own = reaching.get(tile, [])
+        around = {tile, *(other for sites in own for other in sites.figures.tiles)}
+        shares = max(1, round(of_tile / (_POINTS_PER_TASK * scale)))
+        content = [splits.keys.get(other, "") for other in sorted(around)], [sites.figures.digest for sites in own]
+        for share in range(shares):
+            place = Place(STAGE, tile.key, key_of(alike, tile, share, shares, content))
+            tasks[place] = UnitTask(
+                tile=tile,
+                share=share,
+                shares=shares,
+                split=splits.places.get(tile),
+                borders=tuple(own),
+                scene=settings,
+                roof=roof,
+                outlines=outlines,
+                grid=grid,
+                scratch=scratch,
+                crs_name=crs_name,
+                scale=scale,
+                folder=f"{STAGE}/{tile.key}/{place.key[:_KEY_DIGITS]}",
+            )
+    drop_outcomes(scratch, STAGE, tasks)
+    clear_units(scratch, {task.folder for task in tasks.values()})
+    files: Files[UnitTask, SitesBrief] = Files(reads=_read, leaves=_left, intact=is_intact)
+    found = context.map_stored("outline", sites_of_tile, tasks, brief_of_sites, files=files)
+    for warning in sorted(warning for brief in found.values() for warning in brief.warnings):
+        context.progress.warn("outline", warning)
+    return found
 
 
 def _read(task: UnitTask) -> set[str]:
-    """The folders of scratch with the points of a task's candidates."""
-    return folders_with_points(part for site in task.sites for part in site.ranges)
+    """The folders of scratch with the sites of a task, their points, and what lies around them."""
+    tiles = {task.tile, *(tile for sites in task.borders for tile in sites.figures.tiles)}
+    listed = {sites.place.folder for sites in task.borders if sites.place is not None}
+    if task.split is not None:
+        listed.add(task.split.folder)
+    return listed | folders_of(near_tiles(tiles, task.grid))
 
 
-def _left(_: UnitTask, units: Sequence[CandidateSite]) -> set[str]:
-    """The folders of scratch with the points of the units."""
-    return folders_with_points(part for site in units if site.block is not None for part in site.ranges)
+def _left(task: UnitTask, brief: SitesBrief) -> set[str]:
+    """The folders of scratch with the sites and with the points of the units."""
+    return {Place(STAGE, task.tile.key, "").folder} | ({task.folder} if brief.checksums else set())
 
 
-def is_intact(task: UnitTask, units: Sequence[CandidateSite], folder: str) -> bool:
+def is_intact(task: UnitTask, brief: SitesBrief, folder: str) -> bool:
     """Whether the points of the units below a folder of scratch are as they were stored."""
+    if folder != task.folder:
+        return True  # the outcome itself
     return all(
-        zlib.crc32(stored_bytes(task.scratch, part).data) == part.checksum
-        for site in units
-        for part in site.ranges
-        if part.left_in == folder
+        zlib.crc32(np.ascontiguousarray(task.scratch.array(f"{folder}/{tile}", "points", mapped=True)).data) == checksum
+        for tile, checksum in brief.checksums.items()
     )
 
 
-def unit_tasks(
-    sites: Sequence[CandidateSite],
-    settings: UnitSettings,
-    min_strip_offset_m: float,
-    grid: TileGrid,
-    scratch: Scratch,
-    crs_name: str,
-) -> list[UnitTask]:
-    """Group candidates to tasks of some tenths of a second each."""
-    groups = in_groups(((site, site.points) for site in sites), _POINTS_PER_TASK)
-    return [
-        UnitTask(
-            sites=tuple(group),
-            settings=settings,
-            min_strip_offset_m=min_strip_offset_m,
-            grid=grid,
-            scratch=scratch,
-            crs_name=crs_name,
-        )
-        for group in groups
-    ]
+def sites_of_tile(task: UnitTask) -> StoredSites:
+    """The share's candidates, divided into units; those that are one unit stay as they are.
+
+    Raises MemoryError or OSError if scratch cannot be read, or does not fit into memory.
+    """
+    task = dataclasses.replace(task, scratch=OpenScratch(task.scratch.root, task.scratch.attempt))
+    found = _found(task)
+    divided, checksums = divide(shares_of(found.candidates, task.shares)[task.share], task)
+    warnings: list[str] = []
+    if task.outlines:
+        divided, warnings = outlined(largest_first(divided), task.roof, task.grid, task.scratch)
+    rejected = found.rejected if task.share == 0 else ()
+    return stored_sites(divided, rejected, task.grid, task.scale, checksums, warnings)
 
 
-def divide(task: UnitTask) -> tuple[CandidateSite, ...]:
-    """The units of some candidates; those that are one unit stay as they are."""
+def _found(task: UnitTask) -> FoundSites:
+    """The tile's sites before they are divided."""
+    parts: list[TileSites] = []
+    if task.split is not None:
+        split: Split = result_of(task.scratch, task.split)
+        if split.surfaces is not None:
+            parts.append(TileSites(found=split.surfaces.done, tiles=(split.tile,)))
+    parts += [part_of(task.scratch, sites.place, sites.part) for sites in task.borders if sites.place is not None]
+    return sites_of(parts, task.grid, task.scene.candidates, task.crs_name)
+
+
+def shares_of(sites: Sequence[CandidateSite], shares: int) -> list[list[CandidateSite]]:
+    """Candidates, which come largest first, in shares of about as many points: each goes to the share with least.
+
+    >>> site = lambda n: CandidateSite(building_id=str(n), owner=Tile(0, 0), ranges=(), points=n)
+    >>> [[one.points for one in share] for share in shares_of([site(n) for n in (90, 40, 30, 20, 0)], 2)]
+    [[90, 0], [40, 30, 20]]
+    """
+    found: list[list[CandidateSite]] = [[] for _ in range(shares)]
+    points = [0] * shares
+    for site in sites:
+        least = points.index(min(points))
+        found[least].append(site)
+        points[least] += site.points
+    return found
+
+
+class _Restored:
+    """The points of divided candidates, by tile, on their way to scratch."""
+
+    def __init__(self, folder: str) -> None:
+        self._folder = folder
+        self._pieces: dict[Tile, list[npt.NDArray[np.void]]] = collections.defaultdict(list)
+        self._counts: dict[Tile, int] = collections.Counter()
+
+    def add(self, tile: Tile, points: npt.NDArray[np.void]) -> PointRange:
+        """Add points of a tile; where they will lie."""
+        start = self._counts[tile]
+        self._pieces[tile].append(points)
+        self._counts[tile] += len(points)
+        return PointRange(tile=tile, start=start, stop=self._counts[tile], folder=self._folder)
+
+    def store(self, scratch: Scratch) -> dict[str, int]:
+        """Store them; the CRC-32 of each tile's by its key."""
+        checksums = {}
+        for tile, pieces in self._pieces.items():
+            points = np.concatenate(pieces).view(np.uint8)
+            scratch.put_arrays(f"{self._folder}/{tile.key}", {"points": points})
+            checksums[tile.key] = zlib.crc32(points.data)
+        return checksums
+
+
+def divide(sites: Sequence[CandidateSite], task: UnitTask) -> tuple[list[CandidateSite], dict[str, int]]:
+    """The units of some candidates, whose points are stored again, and the CRC-32 of these points by tile."""
+    if task.scene.units.split == "nothing":
+        return list(sites), {}
     found: list[CandidateSite] = []
-    for site in task.sites:
+    restored = _Restored(task.folder)
+    for site in sites:
         task.scratch.check_cancelled()
-        found.extend(_units_of_site(site, task))
-    return tuple(found)
+        found.extend(_units_of_site(site, task, restored))
+    return found, restored.store(task.scratch)
 
 
 def _aligned_mm(
@@ -142,7 +258,7 @@ def _aligned_mm(
     return x, y, z
 
 
-def _units_of_site(site: CandidateSite, task: UnitTask) -> list[CandidateSite]:
+def _units_of_site(site: CandidateSite, task: UnitTask, restored: _Restored) -> list[CandidateSite]:
     by_tile: dict[Tile, list[npt.NDArray[np.void]]] = {}
     for part in site.ranges:
         stored = task.scratch.array(f"{part.folder}/{part.tile.key}", "points", mapped=True).view(POINT)
@@ -153,26 +269,23 @@ def _units_of_site(site: CandidateSite, task: UnitTask) -> list[CandidateSite]:
         return [site]
     points = np.concatenate(pieces)
     x, y, z = points["x"].astype(np.int64), points["y"].astype(np.int64), points["z"].astype(np.int64)
-    aligned = _aligned_mm(points, (x, y, z), task.min_strip_offset_m)
-    unit = units_of(*aligned, task.settings, points["source"].astype(np.int64))
+    aligned = _aligned_mm(points, (x, y, z), task.roof.min_strip_offset_m)
+    unit = units_of(*aligned, task.scene.units, points["source"].astype(np.int64))
     count = int(unit.max(initial=0)) + 1
     if count == 1:
         return [site]
     firsts = smallest_points(x, y, z, unit)
     ranges: list[list[PointRange]] = [[] for _ in range(count)]
-    folder = f"units/{site.building_id}"
     done = 0
     for tile, piece in zip(tiles, pieces, strict=True):
         own = unit[done : done + len(piece)]
         done += len(piece)
         by_unit = np.argsort(own, kind="stable")
         ordered = piece[by_unit]
-        task.scratch.put_arrays(f"{folder}/{tile.key}", {"points": ordered.view(np.uint8)})
         borders = np.searchsorted(own[by_unit], np.arange(count + 1)).tolist()
         for k, (start, stop) in enumerate(itertools.pairwise(borders)):
             if start < stop:
-                checksum = zlib.crc32(ordered[start:stop].view(np.uint8).data)
-                ranges[k].append(PointRange(tile=tile, start=start, stop=stop, folder=folder, checksum=checksum))
+                ranges[k].append(restored.add(tile, ordered[start:stop]))
     return [
         CandidateSite(
             building_id=object_id(task.crs_name, (int(x[first]), int(y[first]), int(z[first]))),

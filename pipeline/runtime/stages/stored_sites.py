@@ -1,0 +1,208 @@
+"""Candidates and rejected objects on their way to scratch: in groups, each of which one task models.
+
+Tasks make the sites of a tile and store them; the driver gets figures of each group. It holds no object per building.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+
+from pipeline.model import Reason
+from pipeline.runtime.run_context import RunContext
+from pipeline.runtime.scratch.kept_files import Files
+from pipeline.runtime.scratch.outcomes import InParts, Place, drop_outcomes, key_of
+from pipeline.runtime.stages.sites import (
+    CandidateSite,
+    FoundSites,
+    GroupFigures,
+    Joined,
+    RejectedFigures,
+    RejectedSite,
+    Stored,
+    by_owner,
+    folders_with_points,
+    largest_first,
+    tiles_of,
+)
+from pipeline.tiling import Tile, TileGrid
+
+_POINTS_PER_GROUP = 20_000
+_MOST_PER_GROUP = 64
+_GROUPS = 8192
+"""A run has about as many groups at most: larger runs have larger ones."""
+_LARGEST_SCALE = 16
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SitesBrief:
+    """What the driver learns of the sites that a task stored."""
+
+    groups: tuple[GroupFigures, ...]
+    """The groups; group k is part k of the outcome."""
+    rejected: tuple[RejectedFigures, ...]
+    """Rejected objects by tile; the parts behind those of the groups."""
+    checksums: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """CRC-32 of the points that the task stored again, by the keys of their tiles."""
+    warnings: tuple[str, ...] = ()
+    """What was odd but usable."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StoredSites(InParts):
+    """Sites on their way to scratch; each part is a group of candidates, or the rejected objects of a tile."""
+
+    brief: SitesBrief
+    """What the driver learns of them."""
+
+
+def stored_sites(
+    candidates: Iterable[CandidateSite],
+    rejected: Iterable[RejectedSite],
+    grid: TileGrid,
+    scale: int = 1,
+    checksums: Mapping[str, int] | None = None,
+    warnings: Sequence[str] = (),
+) -> StoredSites:
+    """Some sites in groups of one owner each, `scale` times as large as those of a small run."""
+    owned = sorted(by_owner(largest_first(candidates)).items())
+    groups = [group for _, sites in owned for group in groups_of(sites, scale)]
+    listed = [(owner, tuple(sorted(sites, key=lambda r: r.object_id))) for owner, sites in _by_owner(rejected)]
+    return StoredSites(
+        parts=(*groups, *(sites for _, sites in listed)),
+        brief=SitesBrief(
+            groups=tuple(_group_figures(group, grid) for group in groups),
+            rejected=tuple(_rejected_figures(owner, sites) for owner, sites in listed),
+            checksums=checksums or {},
+            warnings=tuple(warnings),
+        ),
+    )
+
+
+def _by_owner(sites: Iterable[RejectedSite]) -> list[tuple[Tile, list[RejectedSite]]]:
+    found: dict[Tile, list[RejectedSite]] = {}
+    for site in sites:
+        found.setdefault(site.owner, []).append(site)
+    return sorted(found.items())
+
+
+def _group_figures(sites: tuple[CandidateSite, ...], grid: TileGrid) -> GroupFigures:
+    return GroupFigures(
+        owner=sites[0].owner,
+        count=len(sites),
+        points=sum(site.points for site in sites),
+        largest=max(site.points for site in sites),
+        tiles=tuple(sorted(tiles_of(sites, grid))),
+        folders=tuple(sorted(folders_with_points(part for site in sites for part in site.ranges))),
+        digest=key_of(sites),
+        overridden=tuple(
+            (site.building_id, site.override) for site in sites if site.override is not None and site.override.remodels
+        ),
+    )
+
+
+def _rejected_figures(owner: Tile, sites: Sequence[RejectedSite]) -> RejectedFigures:
+    bridges = [part for site in sites if site.verdict.reason is Reason.BRIDGE for part in site.ranges]
+    return RejectedFigures(
+        owner=owner,
+        reasons=Counter(site.verdict.reason.value for site in sites),
+        bridges_in=tuple(sorted({part.tile for part in bridges})),
+        folders=tuple(sorted(folders_with_points(bridges))),
+        digest=key_of([dataclasses.replace(site, ranges=()) for site in sites]),
+    )
+
+
+def groups_of(sites: Sequence[CandidateSite], scale: int = 1) -> list[tuple[CandidateSite, ...]]:
+    """Group the candidates of a tile, which come largest first, so that a task models each group in some seconds.
+
+    >>> site = lambda n: CandidateSite(building_id=str(n), owner=Tile(0, 0), ranges=(), points=n)
+    >>> [len(group) for group in groups_of([site(30_000), site(14_000), site(5_000), site(4_000), site(10)])]
+    [1, 2, 2]
+    """
+    groups: list[tuple[CandidateSite, ...]] = []
+    current: list[CandidateSite] = []
+    points = 0
+    for site in sites:
+        full = points + site.points > _POINTS_PER_GROUP * scale or len(current) == _MOST_PER_GROUP * scale
+        if current and full:
+            groups.append(tuple(current))
+            current, points = [], 0
+        current.append(site)
+        points += site.points
+    if current:
+        groups.append(tuple(current))
+    return groups
+
+
+def scale_of(points: int) -> int:
+    """How many times larger the tasks of a run are, by the points of its candidates: 1, 2, 4, 8 or 16.
+
+    A task costs driver and scheduler milliseconds, however small it is. Powers of two, so that runs of about the same
+    size have the same tasks.
+
+    >>> [scale_of(points) for points in (0, 160_000_000, 200_000_000, 10**9, 10**10)]
+    [1, 1, 2, 8, 16]
+    """
+    scale = 1
+    while scale < _LARGEST_SCALE and points > _GROUPS * _POINTS_PER_GROUP * scale:
+        scale *= 2
+    return scale
+
+
+def joined_of(briefs: Mapping[Place, SitesBrief], small_fragments: int, keys: Mapping[Tile, str]) -> Joined:
+    """All stored sites of a run."""
+    return Joined(
+        groups=tuple(
+            Stored(place=place, part=part, figures=figures)
+            for place, brief in briefs.items()
+            for part, figures in enumerate(brief.groups)
+        ),
+        rejected=tuple(
+            Stored(place=place, part=len(brief.groups) + part, figures=figures)
+            for place, brief in briefs.items()
+            for part, figures in enumerate(brief.rejected)
+        ),
+        small_fragments=small_fragments,
+        keys=keys,
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StoreTask:
+    """Sites that the driver found, of one owner."""
+
+    tile: Tile
+    """The owner."""
+    sites: FoundSites
+    """The sites."""
+    grid: TileGrid
+    """The lattice."""
+    scale: int
+    """How many times larger groups are than those of a small run."""
+
+
+def store_sites(context: RunContext, folder: str, found: FoundSites, *, quiet: bool = True) -> dict[Place, SitesBrief]:
+    """Store sites that the driver found: in given footprints, or changed by overrides; each stage in a `folder`."""
+    grid = context.plan.grid
+    candidates, rejected = by_owner(found.candidates), dict(_by_owner(found.rejected))
+    scale = scale_of(sum(site.points for site in found.candidates))
+    tasks = {}
+    for tile in sorted({*candidates, *rejected}):
+        own = FoundSites(candidates=tuple(candidates.get(tile, ())), rejected=tuple(rejected.get(tile, ())))
+        tasks[Place(folder, tile.key, key_of(own, grid, scale))] = StoreTask(
+            tile=tile, sites=own, grid=grid, scale=scale
+        )
+    drop_outcomes(context.scratch, folder, tasks)
+    files: Files[StoreTask, SitesBrief] = Files(leaves=lambda task, _: [Place(folder, task.tile.key, "").folder])
+    return context.map_stored("outline", store, tasks, brief_of_sites, files=files, quiet=quiet)
+
+
+def store(task: StoreTask) -> StoredSites:
+    """The sites of a task, in groups."""
+    return stored_sites(task.sites.candidates, task.sites.rejected, task.grid, task.scale)
+
+
+def brief_of_sites(stored: StoredSites) -> SitesBrief:
+    """What the driver learns of stored sites."""
+    return stored.brief
