@@ -59,10 +59,6 @@ class TracingExecutor:
         """As the inner one."""
         self._inner.prepare(stage, watch)
 
-    def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:
-        """As the inner one."""
-        return self._inner.run_step(stage, function, task, watch)
-
     @property
     def memory_limit_bytes(self) -> int | None:
         """As the inner one."""

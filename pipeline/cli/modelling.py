@@ -360,9 +360,9 @@ def _statistics_of(run_dir: str) -> dict[str, Any]:
 
     if has_idle_child():
         from pipeline.runtime.cluster.local_executor import LocalExecutor
-        from pipeline.runtime.monitoring.events import Watch
+        from pipeline.runtime.cluster.serial_executor import run_alone
 
-        return LocalExecutor(1).run_step("report", _read_statistics, run_dir, Watch())
+        return run_alone(LocalExecutor(1), "report", _read_statistics, run_dir)
     return _read_statistics(run_dir)
 
 

@@ -8,6 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.decisions import decision_rows, decisions_path, decisions_table
@@ -28,6 +30,8 @@ class TileFiles:
 
     digests: Mapping[str, str]
     """sha256 of every file in hexadecimal, by its path relative to the run directory, in path order."""
+    tables: Mapping[str, pa.Table]
+    """Its tables by their names, without that of decisions."""
     n_buildings: int
     """Rows of the buildings table."""
     n_planes: int
@@ -121,12 +125,14 @@ def write_tile(
     _check_unique([result.building_id for result in results], tile_key)
     _check_unique([entry.object_id for entry in rejected], tile_key)
     store = put or put_local(run_dir)
-    digests = {}
-    for path, data in _tile_files(tile_key, results, rejected, context, meshes):
+    digests: dict[str, str] = {}
+    tables: dict[str, pa.Table] = {}
+    for path, data in _tile_files(tile_key, results, rejected, context, meshes, tables):
         store(path, data)
         digests[path] = hashlib.sha256(data).hexdigest()
     return TileFiles(
         digests=dict(sorted(digests.items())),
+        tables=tables,
         n_buildings=len(results),
         n_planes=sum(len(result.planes) for result in results),
         n_rejected=len(rejected),
@@ -146,8 +152,12 @@ def _tile_files(
     rejected: Sequence[RejectedObject],
     context: RecordContext,
     meshes: str,
+    written: dict[str, pa.Table],
 ) -> Iterator[tuple[str, bytes]]:
-    """The tile's files as path and content: meshes first, so that no row names a mesh that is not there yet."""
+    """The tile's files as path and content, and in `written` its tables.
+
+    Meshes come first, so that no row names a mesh that is not there yet.
+    """
     reference = context.reference
     rows = building_rows(results, context, tile_key, meshes)
     lines = list(cityjson_lines(list(zip(results, rows, strict=True)), reference, f"buildings of tile {tile_key}"))
@@ -162,5 +172,5 @@ def _tile_files(
     }
     projjson = reference.projjson
     for name, table_rows in tables.items():
-        table = geo_table(name, table_rows, projjson)
+        written[name] = table = geo_table(name, table_rows, projjson)
         yield f"{name}/tile={tile_key}/part-0.parquet", parquet_bytes(table)

@@ -8,10 +8,11 @@ row hashes are then hashed in the order of the keys, so only the keys and 32 byt
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,53 @@ _HASH_BYTES = hashlib.sha256().digest_size
 Fixed = npt.NDArray[np.uint8]
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Rows:
+    """n rows of a table, in the order of their keys."""
+
+    keys: tuple[npt.NDArray[Any], ...]
+    """The key columns, (n,) each: bytes or integers."""
+    hashes: Fixed
+    """(n, 32) sha256 of each row."""
+
+    def between(self, low: bytes, high: bytes | None) -> Rows:
+        """Those whose first key is at least `low` and smaller than `high`; None is the end."""
+        first = np.searchsorted(self.keys[0], low)
+        last = len(self.hashes) if high is None else np.searchsorted(self.keys[0], high)
+        return Rows(keys=tuple(column[first:last] for column in self.keys), hashes=self.hashes[first:last])
+
+
+def rows_of(table: pa.Table, name: str) -> Rows:
+    """The rows of a table as the digest counts them; raises RunError if it lacks a key."""
+    columns = [column for column in stored_schema(name).names if column not in NOT_CONTENT]
+    batches = table.select(columns).to_batches(ROWS_A_BATCH)
+    return merged(name, [_rows_of_batch(batch, name, name) for batch in batches])
+
+
+def merged(name: str, parts: Sequence[Rows]) -> Rows:
+    """Parts of a table together, in the order of the keys; raises RunError if a key comes twice."""
+    key = KEYS[name]
+    parts = [part for part in parts if len(part.hashes)]
+    if not parts:
+        return Rows(keys=tuple(np.empty(0, "S1") for _ in key), hashes=np.empty((0, _HASH_BYTES), np.uint8))
+    keys = [np.concatenate([part.keys[k] for part in parts]) for k in range(len(key))]
+    order = np.lexsort(tuple(reversed(keys)))
+    _check_unique(name, key, keys, order)
+    hashes = np.concatenate([part.hashes for part in parts])
+    return Rows(keys=tuple(column[order] for column in keys), hashes=hashes[order])
+
+
+def digest_of(tables: Mapping[str, tuple[int, Iterable[Fixed]]]) -> str:
+    """The sha256 of a run, from the number of rows of each table and their hashes in the order of the keys."""
+    content = hashlib.sha256(b"gablework content 2\n")
+    for name in KEYS:
+        count, parts = tables[name]
+        content.update(f"{name} {count}\n".encode())
+        for hashes in parts:
+            content.update(np.ascontiguousarray(hashes).data)
+    return content.hexdigest()
+
+
 def run_digest(run_dir: str, filesystem: pafs.FileSystem | None = None, tiles: Sequence[str] | None = None) -> str:
     """The sha256 of a run's content in hexadecimal.
 
@@ -55,33 +103,22 @@ def run_digest(run_dir: str, filesystem: pafs.FileSystem | None = None, tiles: S
     """
     if filesystem is None:
         filesystem, run_dir = arrow_at(run_dir)
-    whole = hashlib.sha256(b"gablework content 2\n")
-    for name, key in KEYS.items():
-        keys, hashes = _row_hashes(run_dir, name, key, filesystem, tiles)
-        order = np.lexsort(tuple(reversed(keys)))
-        _check_unique(name, key, keys, order)
-        whole.update(f"{name} {len(order)}\n".encode())
-        for start in range(0, len(order), ROWS_A_BATCH):
-            whole.update(hashes[order[start : start + ROWS_A_BATCH]].tobytes())
-    return whole.hexdigest()
+    tables = {}
+    for name in KEYS:
+        columns = [column for column in stored_schema(name).names if column not in NOT_CONTENT]
+        batches = table_batches(run_dir, name, columns, filesystem, tiles, ROWS_A_BATCH)
+        rows = merged(name, [_rows_of_batch(batch, name, f"{run_dir}/{name}") for batch in batches if batch.num_rows])
+        tables[name] = (len(rows.hashes), [rows.hashes])
+    return digest_of(tables)
 
 
-def _row_hashes(
-    run_dir: str, name: str, key: tuple[str, ...], filesystem: pafs.FileSystem, tiles: Sequence[str] | None
-) -> tuple[list[npt.NDArray[Any]], Fixed]:
-    """The key columns of a table, and the hash of every row, shape (n, 32)."""
-    key_parts: list[list[npt.NDArray[Any]]] = [[] for _ in key]
-    hash_parts = [np.empty((0, _HASH_BYTES), np.uint8)]
-    columns = [column for column in stored_schema(name).names if column not in NOT_CONTENT]
-    for batch in table_batches(run_dir, name, columns, filesystem, tiles, ROWS_A_BATCH):
-        if batch.num_rows == 0:
-            continue
-        digests = b"".join(hashlib.sha256(row).digest() for row in canonical_rows(batch))
-        hash_parts.append(np.frombuffer(digests, np.uint8).reshape(-1, _HASH_BYTES))
-        for part, column in zip(key_parts, key, strict=True):
-            part.append(_key_values(batch.column(column), f"{run_dir}/{name}", column))
-    keys = [np.concatenate(part) if part else np.empty(0, "S1") for part in key_parts]
-    return keys, np.concatenate(hash_parts)
+def _rows_of_batch(batch: pa.RecordBatch, name: str, where: str) -> Rows:
+    """The rows of a batch in their order there."""
+    digests = b"".join(hashlib.sha256(row).digest() for row in canonical_rows(batch))
+    return Rows(
+        keys=tuple(_key_values(batch.column(column), where, column) for column in KEYS[name]),
+        hashes=np.frombuffer(digests, np.uint8).reshape(-1, _HASH_BYTES),
+    )
 
 
 def _key_values(column: pa.Array, folder: str, name: str) -> npt.NDArray[Any]:

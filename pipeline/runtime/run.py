@@ -8,7 +8,7 @@ import datetime as dt
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from pipeline import __version__
@@ -16,7 +16,7 @@ from pipeline.errors import RunCancelledError, RunError
 from pipeline.export.point_files import FOLDER as POINTS_FOLDER
 from pipeline.io import SpatialReference, Storage, is_url, shown, storage_at
 from pipeline.methods import ReconstructSettings
-from pipeline.runtime.cluster.serial_executor import Executor
+from pipeline.runtime.cluster.serial_executor import Executor, run_alone
 from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.manifest import (
@@ -28,7 +28,7 @@ from pipeline.runtime.manifest import (
     read_manifest,
     write_manifest,
 )
-from pipeline.runtime.monitoring.events import Listener, Watch, ignore, never
+from pipeline.runtime.monitoring.events import Listener, ignore, never
 from pipeline.runtime.monitoring.measurement import peak_of_process
 from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.overrides.overrides_file import Override, read_overrides
@@ -37,10 +37,13 @@ from pipeline.runtime.request import RunRequest, input_file, plan_inputs, reques
 from pipeline.runtime.run_context import RunContext, run_context
 from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import check_scratch, run_scratch
+from pipeline.runtime.scratch.outcomes import Place
 from pipeline.runtime.scratch.work_folder import is_known, locked_work
 from pipeline.runtime.stages.apply_overrides import apply_overrides
 from pipeline.runtime.stages.batch_figures import Counted
 from pipeline.runtime.stages.cleanup import publishing, tidy
+from pipeline.runtime.stages.content_digest import STAGE as DIGEST
+from pipeline.runtime.stages.content_digest import content_digest
 from pipeline.runtime.stages.counts import run_counts
 from pipeline.runtime.stages.given_footprints import GivenFootprints, given_footprints
 from pipeline.runtime.stages.ground import Ground, find_ground
@@ -230,6 +233,8 @@ def run_variants(
             if request.overrides is not None:
                 found = _override(context, settings, found, overrides, runs)
             _model(context, request, found, runs)
+            for one in runs:
+                one.find_digest(context, found.joined)
         except BaseException as error:
             context.scratch.cancel()
             for one in runs:
@@ -326,9 +331,11 @@ class _VariantRun:
     manifest: RunManifest
     progress: Progress
     models: Models = dataclasses.field(init=False)
-    published: list[Published] = dataclasses.field(init=False)
+    published: Mapping[Place, Published] = dataclasses.field(init=False)
     without_points: tuple[str, ...] = ()
     """Keys of tiles whose points could not be written."""
+    digest: str = ""
+    """sha256 of the content."""
 
     @classmethod
     def of(
@@ -388,26 +395,39 @@ class _VariantRun:
         )
         write_manifest(self.run_dir, ended, self.storage.put)
 
+    @property
+    def failed_tiles(self) -> tuple[str, ...]:
+        """Keys of the tiles that could not be published."""
+        return tuple(outcome.tile.key for outcome in self.published.values() if outcome.error)
+
+    def find_digest(self, context: RunContext, joined: Joined) -> None:
+        """The digest of all that was published."""
+        began, watch = time.perf_counter(), self.progress.watch
+        if self.failed_tiles:
+            content = (self.run_dir, _with_tables(self.run_dir, joined, self.models, list(self.published.values())))
+            self.digest = run_alone(context.executor, DIGEST, _digest_of, content, watch)
+        else:
+            places = [place for place, outcome in self.published.items() if outcome.has_tables]
+            self.digest = content_digest(context.executor, context.scratch, places, watch)
+        self.progress.timings[DIGEST] = time.perf_counter() - began
+
     def finish(
         self, context: RunContext, found: _Candidates, inputs: tuple[InputFile, ...], began: float | None
     ) -> VariantOutcome:
-        """Compute the digest and write the manifest; the run can no longer be cancelled."""
-        finishing = time.perf_counter()
-        content = (self.run_dir, _with_tables(self.run_dir, found.joined, self.models, self.published))
-        digest = context.executor.run_step("digest", _digest_of, content, Watch())
+        """Write the manifest; the run can no longer be cancelled."""
+        outcomes = list(self.published.values())
         timings = self.progress.timings
-        timings["digest"] = time.perf_counter() - finishing
         timings["total"] = sum(timings.values()) if began is None else time.perf_counter() - began
         driver, peak_bytes = peak_of_process()
         self.progress.peaks[driver] = peak_bytes
-        failed_tiles = tuple(outcome.tile.key for outcome in self.published if outcome.error)
+        failed_tiles = self.failed_tiles
         counts = run_counts(context.plan, found.ingested, found.ground, found.splits, found.joined, self.counted)
         manifest = dataclasses.replace(
             self.manifest,
             status=RunStatus.INCOMPLETE if failed_tiles else RunStatus.FINISHED,
             finished_at=dt.datetime.now(tz=dt.UTC),
             inputs=inputs,
-            tiles=tuple(outcome.tile.key for outcome in self.published),
+            tiles=tuple(outcome.tile.key for outcome in outcomes),
             failed_tiles=failed_tiles,
             tiles_without_points=self.without_points,
             counts=counts,
@@ -415,7 +435,7 @@ class _VariantRun:
             peak_memory_bytes=self.progress.peaks,
             slowest=self.counted.slowest,
             warnings=tuple(self.progress.warnings),
-            content_sha256=digest,
+            content_sha256=self.digest,
         )
         write_manifest(self.run_dir, manifest, self.storage.put)
         rejected = Counter(self.counted.rejected)
@@ -423,7 +443,7 @@ class _VariantRun:
             rejected.update(listed.figures.reasons)
         summary = RunSummary(
             run_dir=self.run_dir,
-            digest=digest,
+            digest=self.digest,
             statuses=dict(self.counted.statuses),
             reasons=dict(self.counted.reasons),
             rejected=dict(rejected),

@@ -14,6 +14,7 @@ from processes import wait_for
 
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.cluster.local_executor import LocalExecutor
+from pipeline.runtime.cluster.serial_executor import run_alone
 from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.manifest import read_manifest
 from pipeline.runtime.monitoring.events import Event, Watch
@@ -39,7 +40,7 @@ def test_every_task_gives_its_result_however_many_children_there_are(count: int)
     executor = LocalExecutor(count)
     assert sorted(results(executor, chores.double, list(range(7)))) == [0, 2, 4, 6, 8, 10, 12]
     assert results(executor, chores.double, []) == []
-    assert executor.run_step("test", chores.double, 21, Watch()) == 42
+    assert run_alone(executor, "test", chores.double, 21) == 42
 
 
 def test_tasks_see_the_environment_of_now_also_where_older_children_wait(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -334,7 +334,7 @@ def test_a_torn_outcome_or_published_file_costs_its_task(
     used: Place, finished: Finished, tear: Callable[[Path], object]
 ) -> None:
     kept, run_dir = used.folder / "work" / "scratch" / "kept", used.folder / "run"
-    for stage in ("ingest", "cells", "ground", "tiles", "units", "outline"):
+    for stage in ("ingest", "cells", "ground", "tiles", "units", "join"):
         torn(kept, f"{stage}/*/*", tear)
     tiles = {torn(kept, "publish-*/*/*", tear, 1).parent.name}
     tiles.add(torn(run_dir, "state/*.json", tear, 2).stem)
@@ -360,12 +360,11 @@ def test_a_torn_file_of_points_or_terrain_costs_its_task_where_it_is_read(
     scratch = used.folder / "work" / "scratch"
     arrays = ("cells/*/states", "cells/*/lowest", "ground/*/terrain", "ground/*/corner")
     files = [torn(scratch, f"{name}.npy", tear, 2 * k) for k, name in enumerate(arrays)]
-    files += [torn(scratch, "points/*/*.bin", tear, 5), torn(scratch, "units/*/*/points.npy", tear)]
+    files += [torn(scratch, "points/*/*.bin", tear, 5), torn(scratch, "units/*/*/*/points.npy", tear)]
     used.run()
     assert not used.tasks  # nothing reads them
-    for stage in ("outline", "models-*"):
-        for path in scratch.glob(f"kept/{stage}/*/*"):
-            path.unlink()
+    for path in scratch.glob("kept/models-*/*/*"):
+        path.unlink()
     used.tasks.clear()
     again = used.run()
     whole = finished.tasks
@@ -373,8 +372,8 @@ def test_a_torn_file_of_points_or_terrain_costs_its_task_where_it_is_read(
     side = tiles_per_block(round(TILE_M * MM))
     torn_ground = [Tile.from_key(path.parent.name) for path in files[2:4]]
     blocks = {(tile.column // side, tile.row // side) for tile in torn_ground}
-    repaired = {"ingest": 1, "cells": 2, "ground": len(blocks), "join": 1}
-    assert used.tasks == {"outline": whole["outline"], "reconstruct": whole["reconstruct"], **repaired}
+    repaired = {"ingest": 1, "cells": 2, "ground": len(blocks), "outline": 1}
+    assert used.tasks == {"reconstruct": whole["reconstruct"], **repaired}
     assert has_warned(again, "")
     # the sorted points of a tile are read where units are divided
     files.append(max(scratch.glob("tiles/*/points.npy"), key=lambda path: path.stat().st_size))
@@ -383,7 +382,7 @@ def test_a_torn_file_of_points_or_terrain_costs_its_task_where_it_is_read(
         path.unlink()
     used.tasks.clear()
     assert used.run().digest == finished.summary.digest
-    assert used.tasks == {"split": 1, "join": whole["join"]}
+    assert used.tasks == {"split": 1, "outline": whole["outline"]}
     for path in files:
         assert path.read_bytes() == (finished.aside / path.relative_to(used.folder)).read_bytes()
 

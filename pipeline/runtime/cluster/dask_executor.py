@@ -324,10 +324,6 @@ class DaskExecutor:
             self._report.add(stage, measured)
             yield measured
 
-    def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:  # noqa: ARG002
-        """Run the step here: a driver's data of a whole city should not travel."""
-        return function(task)
-
     def _started(self) -> ClusterMonitor:
         if self._monitor is None:
             raise ClusterError("the executor is not connected: use it as a context manager")

@@ -1,8 +1,7 @@
 """Small jobs without a cluster: tasks in supervised child processes of this one, as many at once as there are cores.
 
-This process plans, merges results and writes the manifest. Its children do everything else and stay from stage to
-stage. The join of surfaces and the digest each run in one child (`run_step`), as they need kernels and libraries that
-this process does not load. Deaths of children are handled as deaths of workers are (`runtime.cluster.dispatch`):
+This process plans, merges results and writes the manifest; it loads no kernels. Its children do everything else and
+stay from stage to stage. Deaths of children are handled as deaths of workers are (`runtime.cluster.dispatch`):
 
 | event | outcome |
 | --- | --- |
@@ -15,7 +14,6 @@ this process does not load. Deaths of children are handled as deaths of workers 
 
 from __future__ import annotations
 
-import contextlib
 import contextvars
 import math
 import queue
@@ -70,11 +68,6 @@ class LocalExecutor:
         alone.
         """
         return _Stage(stage, function, tasks, watch, self._memory_bytes).results(self._children)
-
-    def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:
-        """Run the step in a child: this process has no kernels."""
-        with contextlib.closing(self.map(stage, function, [task], watch)) as found:
-            return next(found).result
 
     @property
     def memory_limit_bytes(self) -> int | None:

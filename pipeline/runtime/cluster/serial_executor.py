@@ -6,6 +6,7 @@ as they come, in any order. It shows nothing else of the engine.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Generator, Sequence
 from types import TracebackType
 from typing import Protocol, Self
@@ -24,9 +25,6 @@ class Executor(Protocol):
         self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
     ) -> Generator[Measured[Result], None, None]:
         """Results of all tasks, in the order in which they finish."""
-
-    def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:
-        """Run one step of the driver, here or in a process with the libraries that it needs."""
 
     @property
     def memory_limit_bytes(self) -> int | None:
@@ -55,10 +53,6 @@ class SerialExecutor:
             watch.check_cancelled()
             yield measure(function, task, stage)
 
-    def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:  # noqa: ARG002
-        """Run the step here."""
-        return function(task)
-
     @property
     def memory_limit_bytes(self) -> int | None:
         """No limit of its own."""
@@ -72,3 +66,11 @@ class SerialExecutor:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Nothing to stop."""
+
+
+def run_alone(
+    executor: Executor, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch | None = None
+) -> Result:
+    """Run one task in a process with the libraries that it needs; without a watch it cannot be cancelled."""
+    with contextlib.closing(executor.map(stage, function, [task], watch or Watch())) as found:
+        return next(found).result

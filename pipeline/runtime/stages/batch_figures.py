@@ -120,19 +120,18 @@ class Counted:
     """Wall-clock seconds of each building by its id; empty unless they are compared."""
 
     @classmethod
-    def of(cls, batches: Iterable[BatchFigures]) -> Counted:
-        """The counts of some batches."""
+    def of(cls, batches: Iterable[BatchFigures], made: int) -> Counted:
+        """The counts of some batches, of whose candidates this run modelled `made`."""
         statuses, reasons, rejected, roof_types = Counter[str](), Counter[str](), Counter[str](), Counter[str]()
         seconds: dict[str, float] = {}
         slowest: list[tuple[float, str]] = []
-        faces = made = 0
+        faces = 0
         for batch in batches:
             statuses.update(batch.statuses)
             reasons.update(batch.reasons)
             rejected.update(batch.rejected)
             roof_types.update(batch.roof_types)
             faces += batch.faces
-            made += batch.count - batch.reused
             seconds.update(batch.seconds)
             slowest = heapq.nlargest(SLOWEST, (*slowest, *batch.slowest))
         del statuses[REJECTED]

@@ -6,8 +6,9 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
 
 import shapely
 
@@ -23,15 +24,20 @@ from pipeline.runtime.plan import Plan
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, brief_of, drop_outcomes, key_of, whole
+from pipeline.runtime.scratch.outcomes import InParts, Place, brief_of, drop_outcomes, key_of
 from pipeline.runtime.stages.batch_figures import BatchFigures
 from pipeline.runtime.stages.cleanup import publishing
+from pipeline.runtime.stages.content_digest import TABLES
 from pipeline.runtime.stages.model_batch import StoredResult, stored_results
 from pipeline.runtime.stages.reconstruct import QUARANTINE, Models
 from pipeline.runtime.stages.sites import Joined, RejectedSite, StoredRejected
 from pipeline.runtime.stages.split import Splits
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile
+
+if TYPE_CHECKING:  # these load Arrow, which the driver does not need
+    from pipeline.export.tile import TileFiles
+    from pipeline.runtime.digest import Rows
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,10 +66,20 @@ class Published:
     tile: Tile
     n_files: int
     """Number of its files; their digests are in its state."""
+    has_tables: bool = False
+    """Whether tables are among them."""
     error: str = ""
     """Why the tile failed; empty where it did not."""
     warning: str = ""
     """A fault that did not fail the tile."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PublishedTile(InParts):
+    """The outcome of one tile; its parts are the rows of its tables, in the order of `TABLES`, for the run's digest."""
+
+    brief: Published
+    """What the driver learns."""
 
 
 def rejected_object(site: RejectedSite) -> RejectedObject:
@@ -132,8 +148,8 @@ class RunOutput:
 
 def publish(
     context: RunContext, settings: RunSettings, splits: Splits, joined: Joined, models: Models, output: RunOutput
-) -> list[Published]:
-    """Write every tile; the outcome of each, in their order."""
+) -> dict[Place, Published]:
+    """Write every tile; the outcomes in their order."""
     scratch, run_dir = context.scratch, output.run_dir
     rejected: dict[Tile, list[StoredRejected]] = {}
     for listed in joined.rejected:
@@ -168,7 +184,7 @@ def publish(
         intact=is_published,
         at_once=True,
     )
-    published = context.map_stored("publish", publish_tile, tasks, whole, units, files=files)
+    published = context.map_stored("publish", publish_tile, tasks, _brief, units, files=files)
     for tile_key in sorted(there - {tile.key for tile in owners}):
         retire(storage, Tile.from_key(tile_key))
     for place, outcome in published.items():
@@ -177,7 +193,11 @@ def publish(
         if outcome.error:
             context.progress.warn("publish", f"tile {outcome.tile.key} failed: {outcome.error}")
             Path(scratch.root, place.name).unlink(missing_ok=True)  # so that a resumed run tries it again
-    return list(published.values())
+    return published
+
+
+def _brief(outcome: PublishedTile) -> Published:
+    return outcome.brief
 
 
 def _read(task: PublishTask) -> set[str]:
@@ -194,7 +214,7 @@ def is_published(task: PublishTask, _: Published, __: str) -> bool:
     return all(sha256_of(storage.path(name)) == digest for name, digest in files.items())
 
 
-def publish_tile(task: PublishTask) -> Published:
+def publish_tile(task: PublishTask) -> PublishedTile:
     """Write one tile's tables, meshes and city objects, then its state; may run twice.
 
     A tile that fails harms only itself: its state says so, and why. A tile that owns nothing has a state and no files.
@@ -202,11 +222,13 @@ def publish_tile(task: PublishTask) -> Published:
     storage = storage_at(task.run_dir)
     task.scratch.check_cancelled()
     files: dict[str, str] = {}
+    tables: Mapping[str, Any] = {}
     error = ""
     try:
         if task.batches or task.rejected or task.empty_tables:
             with storage.several(task.scratch.check_cancelled) as puts:
-                files = _write(task, _tables_last(puts))
+                written = _write(task, _tables_last(puts))
+            files, tables = dict(written.digests), written.tables
     except RunCancelledError:
         raise
     except Exception as fault:  # noqa: BLE001 - goes into the tile's state, the manifest and the exit code
@@ -226,10 +248,20 @@ def publish_tile(task: PublishTask) -> Published:
         storage.put(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
     except (RunError, OSError) as fault:
         # a tile without its state is not finished, and the manifest will say so
-        return Published(tile=task.tile, n_files=0, error=error or f"its state: {fault}")
+        return PublishedTile(parts=(), brief=Published(tile=task.tile, n_files=0, error=error or f"its state: {fault}"))
     for name in sorted(before - files.keys()):
         storage.delete(name)
-    return Published(tile=task.tile, n_files=len(files), error=error, warning=lost)
+    brief = Published(tile=task.tile, n_files=len(files), has_tables=bool(tables), error=error, warning=lost)
+    return PublishedTile(parts=_rows(tables), brief=brief)
+
+
+def _rows(tables: Mapping[str, Any]) -> tuple[Rows, ...]:
+    """The rows of a tile's tables as the run's digest counts them; nothing without tables."""
+    if not tables:
+        return ()
+    from pipeline.runtime.digest import rows_of  # loads Arrow, which the driver does not need
+
+    return tuple(rows_of(tables[name], name) for name in TABLES)
 
 
 def _tables_last(puts: Puts) -> Put:
@@ -259,8 +291,8 @@ def retire(storage: Storage, tile: Tile) -> None:
     storage.delete(f"state/{tile.key}.json")
 
 
-def _write(task: PublishTask, put: Put) -> dict[str, str]:
-    """Write the files of a tile that owns something; the sha256 of each by its path."""
+def _write(task: PublishTask, put: Put) -> TileFiles:
+    """Write the files of a tile that owns something."""
     from pipeline.export.tile import write_tile  # loads Arrow, which the driver does not need
 
     stored: list[StoredResult] = []
@@ -271,7 +303,7 @@ def _write(task: PublishTask, put: Put) -> dict[str, str]:
     rejected = sorted(
         (site for listed in task.rejected for site in listed.sites(task.scratch)), key=lambda site: site.object_id
     )
-    files = write_tile(
+    return write_tile(
         task.run_dir,
         task.tile.key,
         buildings,
@@ -280,7 +312,6 @@ def _write(task: PublishTask, put: Put) -> dict[str, str]:
         meshes=task.meshes,
         put=put,
     )
-    return dict(files.digests)
 
 
 def _put_bundles(task: PublishTask, storage: Storage) -> tuple[dict[str, str], str]:

@@ -102,7 +102,11 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
         )
     largest_first = sorted(tasks.items(), key=lambda item: -item[1].group.figures.points)
 
+    made = 0
+
     def tell(batch: BatchFigures) -> None:
+        nonlocal made
+        made += batch.count - batch.reused
         for model in batch.notable:
             _tell(context, model)
 
@@ -125,7 +129,7 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
         contents[tile] = key_of(content, sum(found[place].count for place in made_in))
     # only now: models whose input did not change are taken from the earlier batches
     drop_outcomes(scratch, stage, tasks)
-    counted = Counted.of(found.values())
+    counted = Counted.of(found.values(), made)
     return Models(places=dict(sorted(places.items())), scratch=scratch, contents=contents, counted=counted)
 
 

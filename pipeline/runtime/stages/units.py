@@ -24,7 +24,15 @@ from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, part
 from pipeline.runtime.stages.cleanup import clear_units
 from pipeline.runtime.stages.gather import canonical_order
 from pipeline.runtime.stages.outline import outlined
-from pipeline.runtime.stages.sites import CandidateSite, FoundSites, PointRange, largest_first, near_tiles, object_id
+from pipeline.runtime.stages.sites import (
+    CandidateSite,
+    FoundSites,
+    PointRange,
+    folders_with_points,
+    largest_first,
+    near_tiles,
+    object_id,
+)
 from pipeline.runtime.stages.split import Splits
 from pipeline.runtime.stages.split_window import Split
 from pipeline.runtime.stages.stored_sites import SitesBrief, StoredSites, brief_of_sites, scale_of, stored_sites
@@ -145,7 +153,8 @@ def _read(task: UnitTask) -> set[str]:
     listed = {sites.place.folder for sites in task.borders if sites.place is not None}
     if task.split is not None:
         listed.add(task.split.folder)
-    return listed | folders_of(near_tiles(tiles, task.grid))
+    points = folders_with_points(PointRange(tile=tile, start=0, stop=0) for tile in tiles)
+    return listed | points | folders_of(near_tiles(tiles, task.grid))
 
 
 def _left(task: UnitTask, brief: SitesBrief) -> set[str]:
