@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from distributed import Client, Status
 from processes import LONG_S, wait_for
 
 from pipeline.errors import ClusterError, RunCancelledError, RunError, VersionMismatchError
-from pipeline.runtime.cluster import worker_setup
+from pipeline.runtime.cluster import dispatch, worker_setup
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.dispatch import ClusterMonitor
 from pipeline.runtime.cluster.local_executor import LocalExecutor
@@ -23,7 +23,7 @@ from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.isolation.forked_child import can_fork
 from pipeline.runtime.monitoring.events import Event, Watch
-from pipeline.runtime.monitoring.measurement import Measured, measure_packed, pack_task
+from pipeline.runtime.monitoring.measurement import Measured, measure_packed, pack_tasks
 from pipeline.runtime.monitoring.versions import ENGINE, differences, fingerprint, versions_here, versions_of
 from pipeline.runtime.resources import Resources
 
@@ -55,6 +55,40 @@ def test_every_task_gives_its_result(cluster: Cluster) -> None:
         executor.prepare("double", Watch())
         results = [measured.result for measured in executor.map("double", chores.double, range(50), Watch())]
     assert sorted(results) == [2 * n for n in range(50)]
+
+
+@pytest.fixture
+def sent(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many tasks each message to the cluster had."""
+    sizes: list[int] = []
+
+    def noted(function: Callable[[Any], Any], tasks: Sequence[Any]) -> bytes:
+        sizes.append(len(tasks))
+        return pack_tasks(function, tasks)
+
+    monkeypatch.setattr(dispatch, "pack_tasks", noted)
+    return sizes
+
+
+def test_short_tasks_travel_together_and_fewer_towards_the_end(cluster: Cluster, sent: list[int]) -> None:
+    assert sorted(worked_off(cluster, "double", chores.double, range(600))) == [2 * n for n in range(600)]
+    assert sum(sent) == 600
+    assert sent[0] == sent[-1] == 1
+    assert 8 < max(sent) <= 600 // (2 * dispatch._SHARES)
+    assert len(sent) < 300
+
+
+def test_tasks_that_take_long_travel_alone(cluster: Cluster, sent: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatch, "_TOGETHER_S", 0.0)
+    assert len(worked_off(cluster, "double", chores.double, range(100))) == 100
+    assert sent == [1] * 100
+
+
+@pytest.mark.slow
+def test_tasks_that_travel_with_a_killer_are_not_lost(cluster: Cluster, sent: list[int], tmp_path: Path) -> None:
+    tasks = [(str(tmp_path), number, 3 if number == 90 else 0) for number in range(200)]
+    assert sorted(worked_off(cluster, "die", chores.die_at_first, tasks)) == list(range(200))
+    assert max(sent) > 1
 
 
 def test_workers_do_not_spend_their_time_on_looking_at_themselves(cluster: Cluster) -> None:
@@ -320,7 +354,8 @@ def test_a_task_of_another_version_is_refused_before_it_is_unpacked() -> None:
     other = fingerprint().replace(f"{ENGINE}=", f"{ENGINE}=9.")
     with pytest.raises(VersionMismatchError, match=rf"worker \S+: {ENGINE} \S+ where the client has 9\."):
         measure_packed(other, b"no pickle at all")
-    assert measure_packed(fingerprint(), pack_task(chores.double, 4)).result == 8
+    found = measure_packed(fingerprint(), pack_tasks(chores.double, [4, 5]))
+    assert [measured.result for measured in found] == [8, 10]
 
 
 def test_a_fingerprint_has_every_version() -> None:

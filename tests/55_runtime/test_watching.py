@@ -84,8 +84,8 @@ def test_what_a_process_sent_and_worked_off_become_figures() -> None:
     tallies, registry = Tallies(), CollectorRegistry()
     registry.register(TallyMetrics(tallies))
     for _ in range(3):
-        tallies.send("split", 100)
-    tallies.land("split", "done")
+        tallies.send("split", 1, 100)
+    tallies.land("split", "done", 1)
     tallies.begin()
     tallies.end("ingest", "failed", 2.5)
     tallies.begin()

@@ -182,6 +182,8 @@ class Cluster:
                     preload=[worker_setup.__name__],
                     security=self.security,
                     resources={RESOURCE: each_bytes},
+                    # those that come later, in the place of one whose nanny gave up, too
+                    config=worker_setup.LEAN_LOOP,
                     # their fork server may have started with another environment
                     env=environment_with_this_package(),
                 )

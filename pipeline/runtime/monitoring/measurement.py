@@ -10,7 +10,7 @@ import socket
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar
 
 from pipeline.errors import GableworkError, RunCancelledError, VersionMismatchError
@@ -109,27 +109,27 @@ def measure_in_child(work: tuple[Callable[[Task], Result], Task, str]) -> Measur
         raise
 
 
-def pack_task(function: Callable[[Task], Result], task: Task) -> bytes:
-    """A function and its task as bytes for another process.
+def pack_tasks(function: Callable[[Task], Result], tasks: Sequence[Task]) -> bytes:
+    """A function and some of its tasks as bytes for another process.
 
     A Dask scheduler unpickles what it passes on; with bytes it need not import what only workers need.
     """
-    return pickle.dumps((function, task), protocol=pickle.HIGHEST_PROTOCOL)
+    return pickle.dumps((function, tasks), protocol=pickle.HIGHEST_PROTOCOL)
 
 
-def measure_packed(client_fingerprint: str, task: bytes, stage: str = "") -> Measured[Any]:
-    """Run and measure a client's packed task, if this process has the client's versions.
+def measure_packed(client_fingerprint: str, packed: bytes, stage: str = "") -> list[Measured[Any]]:
+    """Run and measure a client's packed tasks one after the other, if this process has the client's versions.
 
     If it has others VersionMismatchError is raised, since a late worker must not mix other versions into a result. This
-    happens before the task is unpickled, which could then fail in strange ways.
+    happens before the tasks are unpickled, which could then fail in strange ways.
     """
     configure_once()
     if client_fingerprint != fingerprint():
         process, _ = peak_of_process()
         differing = differences(versions_of(client_fingerprint), versions_here())
         raise VersionMismatchError(mismatch_message([f"worker {process}: {', '.join(differing)}"]))
-    function, unpacked = pickle.loads(task)  # noqa: S301 - from the client, whose code the worker runs anyway
-    return measure(function, unpacked, stage)
+    function, tasks = pickle.loads(packed)  # noqa: S301 - from the client, whose code the worker runs anyway
+    return [measure(function, task, stage) for task in tasks]
 
 
 def mismatch_message(faults: list[str]) -> str:

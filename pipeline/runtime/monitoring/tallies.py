@@ -31,18 +31,18 @@ class Tallies:
         self.buildings: Counter[tuple[str, str]] = Counter()
         """Buildings modelled by tasks of this process, by status and reason."""
 
-    def send(self, stage: str, size_bytes: int) -> None:
-        """Count a task sent to the cluster."""
+    def send(self, stage: str, tasks: int, size_bytes: int) -> None:
+        """Count tasks sent to the cluster together."""
         with self._lock:
-            self.sent[stage] += 1
+            self.sent[stage] += tasks
             self.sent_bytes[stage] += size_bytes
-            self.in_flight[stage] += 1
+            self.in_flight[stage] += tasks
 
-    def land(self, stage: str, outcome: str) -> None:
-        """Count a task that came back from the cluster."""
+    def land(self, stage: str, outcome: str, tasks: int) -> None:
+        """Count tasks that came back from the cluster together."""
         with self._lock:
-            self.in_flight[stage] -= 1
-            self.landed[stage, outcome] += 1
+            self.in_flight[stage] -= tasks
+            self.landed[stage, outcome] += tasks
 
     def begin(self) -> None:
         """Count the start of a task in this process."""
