@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import shapely
@@ -89,12 +89,17 @@ def tile_size_m(density_per_m2: float, halo_m: float, area_m2: float) -> float:
     return _TILE_SIZES_M[-1]
 
 
-def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings) -> Plan:
-    """Read every input's header and lay out the lattice.
+def make_plan(
+    paths: Sequence[str],
+    options: ReadOptions,
+    settings: RunSettings,
+    look: Callable[[Sequence[str], ReadOptions], tuple[SourceInfo, ...]] | None = None,
+) -> Plan:
+    """Read every input's header, by `look` if given, and lay out the lattice.
 
     Raises InputError if an input cannot be used, or two inputs disagree about their CRS.
     """
-    sources = _looked_at(sorted(paths), options)
+    sources = (look or looked_at)(sorted(paths), options)
     first = sources[0].reference
     odd: dict[str, list[str]] = {}
     for info in sources:
@@ -196,24 +201,29 @@ def _block_bytes(grid: TileGrid, sources: Sequence[SourceInfo], settings: RunSet
     return int(cells * _BYTES_PER_CELL[settings.scene.ground.filter])
 
 
-def _looked_at(paths: Sequence[str], options: ReadOptions) -> tuple[SourceInfo, ...]:
-    """The headers of all inputs; remote ones are read concurrently, since that is mostly waiting."""
+def looked_at(paths: Sequence[str], options: ReadOptions) -> tuple[SourceInfo, ...]:
+    """The headers of all inputs; remote ones are read concurrently, since that is mostly waiting.
 
-    def look(path: str) -> SourceInfo:
-        return open_source(path, options).info
+    Raises InputError with the faults of all that cannot be used.
+    """
+    if any(is_url(path) for path in paths):
+        with ThreadPoolExecutor(_ASKED_AT_ONCE, thread_name_prefix="gablework-plan") as threads:
+            return tuple(threads.map(lambda path: open_source(path, options).info, paths))
+    found, faults = usable(paths, options)
+    if faults:
+        raise all_at_fault(faults)
+    return tuple(found)
 
-    if not any(is_url(path) for path in paths):
-        found, faults = [], []
-        for path in paths:
-            try:
-                found.append(look(path))
-            except InputError as fault:
-                faults.append(fault)
-        if faults:
-            raise all_at_fault(faults)
-        return tuple(found)
-    with ThreadPoolExecutor(_ASKED_AT_ONCE, thread_name_prefix="gablework-plan") as threads:
-        return tuple(threads.map(look, paths))
+
+def usable(paths: Sequence[str], options: ReadOptions) -> tuple[list[SourceInfo], list[InputError]]:
+    """The headers of the inputs that can be used, and what is wrong with the others."""
+    found, faults = [], []
+    for path in paths:
+        try:
+            found.append(open_source(path, options).info)
+        except InputError as fault:
+            faults.append(fault)
+    return found, faults
 
 
 def check_places(plan: Plan) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from pipeline.io import ReadOptions, find_inputs, is_url, open_source, sha256_of
 from pipeline.io.footprints import read_area
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.tile_index import TileIndex
+from pipeline.runtime.looking import look_at_all
 from pipeline.runtime.manifest import InputFile
 from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.plan import Plan, check_places, make_plan, without_far_files
@@ -82,7 +84,8 @@ def plan_inputs(request: RunRequest, progress: Progress) -> tuple[Plan, list[str
     if request.aoi is not None:
         reference = open_source(paths[0], options).info.reference
         options = dataclasses.replace(options, aoi=read_area(request.aoi, reference))
-    plan = make_plan(paths, options, request.settings)
+    look = functools.partial(look_at_all, resources=request.resources, listener=progress.listener)
+    plan = make_plan(paths, options, request.settings, look)
     if not request.allow_outside_area_of_use:
         check_places(plan)
     plan, paths = without_far_files(plan, paths)

@@ -46,6 +46,7 @@ def of_one_block(quarter: Path, tmp_path_factory: pytest.TempPathFactory) -> Run
 def test_a_run_joined_by_blocks_has_the_same_content(
     across: int, of_one_block: RunSummary, quarter: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(join, "_AT_ONCE", 4)
     monkeypatch.setattr(join, "_TILES_ACROSS", across)
     found = reconstruct(quarter, settings=TILED)
     assert found.digest == of_one_block.digest
@@ -65,6 +66,7 @@ def test_blocks_pass_on_little_and_the_last_join_finishes_it(quarter: Path, reco
         return packed(brief, result)
 
     monkeypatch.setattr(outcomes, "_packed", noted)
+    monkeypatch.setattr(join, "_AT_ONCE", 4)
     monkeypatch.setattr(join, "_TILES_ACROSS", 2)
     reconstruct(quarter, settings=TILED)
     *blocks, last = joined

@@ -11,9 +11,13 @@ import pytest
 
 from pipeline.errors import CrsError, InconsistentInputError, InputError, UnreadableInputError
 from pipeline.io import ReadOptions
+from pipeline.runtime import looking
+from pipeline.runtime.cluster.serial_executor import Executor
+from pipeline.runtime.looking import look_at_all
 from pipeline.runtime.monitoring.progress import Progress
-from pipeline.runtime.plan import check_memory, make_plan
+from pipeline.runtime.plan import check_memory, looked_at, make_plan
 from pipeline.runtime.request import RunRequest, plan_inputs
+from pipeline.runtime.resources import Resources
 from pipeline.settings import RunSettings
 
 
@@ -80,3 +84,43 @@ def test_a_plan_that_is_denser_than_any_survey_names_the_extent_and_no_absurd_me
     with pytest.raises(InconsistentInputError, match=r"its 1000 points lie within 1e-05 by 9.98e-06 m") as refused:
         check_memory(plan, 4 << 30)
     assert "GB" not in str(refused.value)
+
+
+# --- many inputs
+
+
+@pytest.fixture
+def many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """More inputs than this process looks at itself."""
+    monkeypatch.setattr(looking, "_MANY", 5)
+    monkeypatch.setattr(looking, "_FILES_PER_TASK", 3)
+    return [_file(tmp_path / f"{number}.laz", "EPSG:25832") for number in range(8)]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_tasks_that_look_at_many_inputs_see_what_this_process_sees(
+    many: list[str], workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = looked_at(many, ReadOptions())
+    executors: list[object] = []
+    executor = looking._executor
+
+    def noted(resources: Resources) -> Executor | None:
+        executors.append(executor(resources))
+        return executors[-1]
+
+    monkeypatch.setattr(looking, "_executor", noted)
+    assert look_at_all(many, ReadOptions(), Resources(workers=workers)) == here
+    assert [info.path for info in here] == many
+    assert [one is not None for one in executors] == [workers > 0]
+    assert look_at_all(many[:4], ReadOptions(), Resources(workers=workers)) == here[:4]
+    assert len(executors) == 1
+
+
+def test_tasks_that_look_at_many_inputs_name_all_that_cannot_be_used(many: list[str]) -> None:
+    for path in (many[1], many[6]):
+        Path(path).write_bytes(b"<html>not found</html>")
+    with pytest.raises(InputError) as refused:
+        look_at_all(many, ReadOptions(), Resources(workers=1))
+    assert refused.value.path == many[1]
+    assert f"1 more input cannot be used: {many[6]}: " in str(refused.value)

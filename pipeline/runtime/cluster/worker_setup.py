@@ -15,7 +15,10 @@ from pipeline.runtime.isolation.start_up import start_own_process
 from pipeline.runtime.monitoring import logs
 
 STAGES = (
-    *(f"pipeline.runtime.stages.{name}" for name in ("ingest", "ground", "split_window", "join", "model_batch", "publish")),
+    *(
+        f"pipeline.runtime.stages.{name}"
+        for name in ("ingest", "ground", "split_window", "join", "model_batch", "publish")
+    ),
     "pipeline.reconstruct",
 )
 """The modules of all tasks."""

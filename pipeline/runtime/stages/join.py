@@ -44,6 +44,8 @@ _STAGE = "join"
 _TILES_ACROSS = 8
 """Tiles along the side of a block. Few surfaces of a block of 64 tiles reach beyond it."""
 
+_AT_ONCE = 64
+"""So few tiles are joined by one task."""
 Area = tuple[int, int, int, int]
 """First column, first row, last column, last row."""
 
@@ -307,7 +309,10 @@ def _joined_borders(context: RunContext, settings: CandidateSettings, splits: Sp
     """What reaches beyond its tile, joined within blocks of tiles, then between them."""
     scratch, grid = context.scratch, context.plan.grid
     tasks: dict[Place, JoinTask] = {}
-    for (column, row), (area, tiles) in blocks_of(splits.places, _TILES_ACROSS).items():
+    blocks: Mapping[tuple[int, int], tuple[Area | None, list[Tile]]] = blocks_of(splits.places, _TILES_ACROSS)
+    if len(splits.places) <= _AT_ONCE:
+        blocks = {(0, 0): (None, sorted(splits.places))}
+    for (column, row), (area, tiles) in blocks.items():
         places = tuple(splits.places[tile] for tile in tiles)
         key = key_of(settings, grid, area, places)
         place = Place(_STAGE, f"block_x{column}_y{row}", key)
@@ -336,13 +341,10 @@ def _read(task: JoinTask) -> set[str]:
     return {place.folder for place in task.splits} | {place.folder for place, _ in task.blocks}
 
 
-def blocks_of(tiles: Iterable[Tile], across: int) -> dict[tuple[int, int], tuple[Area | None, list[Tile]]]:
-    """Tiles by square blocks of so many across, and the area of each; without an area where one block suffices."""
-    ordered = sorted(tiles)
-    if len(ordered) <= across**2:
-        return {(0, 0): (None, ordered)}
-    blocks: dict[tuple[int, int], tuple[Area | None, list[Tile]]] = {}
-    for tile in ordered:
+def blocks_of(tiles: Iterable[Tile], across: int) -> dict[tuple[int, int], tuple[Area, list[Tile]]]:
+    """Tiles by square blocks of so many across, and the area of each."""
+    blocks: dict[tuple[int, int], tuple[Area, list[Tile]]] = {}
+    for tile in sorted(tiles):
         column, row = tile.column // across, tile.row // across
         area = column * across, row * across, (column + 1) * across - 1, (row + 1) * across - 1
         blocks.setdefault((column, row), (area, []))[1].append(tile)

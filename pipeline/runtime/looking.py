@@ -1,0 +1,95 @@
+"""A look at the headers of all inputs: here for few of them, in tasks for many.
+
+A look decodes some chunks of a file, 5 to 10 ms of processor time. The driver alone would look for minutes at the
+files of a country, while all workers wait.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Sequence
+
+from pipeline.errors import InputError, all_at_fault
+from pipeline.io import ReadOptions, SourceInfo, is_url
+from pipeline.runtime.cluster.serial_executor import Executor
+from pipeline.runtime.monitoring.events import Listener, Watch, ignore
+from pipeline.runtime.plan import looked_at, usable
+from pipeline.runtime.resources import Resources
+
+_MANY = 256
+"""From so many files on tasks look at them: two seconds of work, more than the start of a process takes."""
+_FILES_PER_TASK = 32
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LookTask:
+    """Some inputs for one task."""
+
+    number: int
+    """Its place among the tasks."""
+    paths: tuple[str, ...]
+    """The inputs."""
+    options: ReadOptions
+    """How they are read."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Looked:
+    """What a task saw."""
+
+    number: int
+    """The task's place."""
+    sources: tuple[SourceInfo, ...]
+    """The inputs that can be used, in their order."""
+    faults: tuple[InputError, ...]
+    """What is wrong with the others."""
+
+
+def look_at_all(
+    paths: Sequence[str], options: ReadOptions, resources: Resources, listener: Listener = ignore
+) -> tuple[SourceInfo, ...]:
+    """The headers of all inputs in their order; `listener` hears if workers are waited for.
+
+    Raises
+    ------
+    InputError
+        Some inputs cannot be used: all that is wrong with any of them.
+    ClusterError
+        The scheduler does not answer.
+    """
+    # remote inputs are mostly waited for
+    local = len(paths) < _MANY or any(is_url(path) for path in paths)
+    executor = None if local else _executor(resources)
+    if executor is None:
+        return looked_at(paths, options)
+    groups = [tuple(paths[k : k + _FILES_PER_TASK]) for k in range(0, len(paths), _FILES_PER_TASK)]
+    tasks = [LookTask(number=k, paths=group, options=options) for k, group in enumerate(groups)]
+    watch = Watch(listener=listener)
+    with executor:
+        executor.prepare("plan", watch)
+        with contextlib.closing(executor.map("plan", look, tasks, watch)) as running:
+            found = sorted((measured.result for measured in running), key=lambda one: one.number)
+    faults = [fault for one in found for fault in one.faults]
+    if faults:
+        raise all_at_fault(faults)
+    return tuple(info for one in found for info in one.sources)
+
+
+def _executor(resources: Resources) -> Executor | None:
+    """What looks at many inputs; None for this process, where the run has no other."""
+    if resources.scheduler is not None:
+        from pipeline.runtime.cluster.dask_executor import Cluster
+
+        return Cluster(scheduler=resources.scheduler, tls=resources.tls).executor(traffic=resources.traffic)
+    if resources.workers == 0:
+        return None
+    from pipeline.runtime.cluster.local_executor import LocalExecutor
+
+    return LocalExecutor(resources.workers)
+
+
+def look(task: LookTask) -> Looked:
+    """Look at some inputs, whatever is wrong with one of them."""
+    sources, faults = usable(task.paths, task.options)
+    return Looked(number=task.number, sources=tuple(sources), faults=tuple(faults))
