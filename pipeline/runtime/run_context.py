@@ -131,7 +131,8 @@ class RunContext:
                 kept, failed = sum(map(units.done, found.values())), sum(map(units.failed, found.values()))
                 counter.add(kept, failed, kept=kept, message=f"{len(found)} of {len(tasks)} tasks were done before")
             todo = [work for place, work in works.items() if place not in found]
-            self.check(folder for work in todo for folder in files.reads(work.task))
+            if self.kept:
+                self.check(folder for work in todo for folder in files.reads(work.task))
             # closed at once where the listener raises, so that no task goes on in vain
             with contextlib.closing(self.executor.map(stage, run_and_store, todo, self.progress.watch)) as running:
                 for measured in running:

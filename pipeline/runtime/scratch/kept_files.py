@@ -90,6 +90,10 @@ class KeptFiles:
         self._promises: dict[str, dict[Place, Promise[Any, Any]]] = {}
         self._stages: dict[str, None] = {}
 
+    def __bool__(self) -> bool:
+        """Whether anything is left to check."""
+        return bool(self._promises)
+
     def add(self, work: OutcomeTask[Task, Any, Brief], brief: Brief, files: Files[Task, Brief]) -> None:
         """Add what a task left; stages come in the order of the run."""
         self._stages[work.place.stage] = None

@@ -73,8 +73,8 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
     """Model all candidates, the batches of most points first; seconds may be compared with those of other methods."""
     scratch, plan = context.scratch, context.plan
     stage, method = models_stage(settings), settings.general.method
-    limits = context.isolation
-    alike = key_of(method, settings.building, plan.gps_kind, limits, plan.grid)
+    limits, gps_kind = context.isolation, plan.gps_kind
+    alike = key_of(method, settings.building, gps_kind, limits, plan.grid)
     tasks: dict[Place, BatchTask] = {}
     places: dict[Tile, list[Place]] = {}
     earlier: dict[Tile, tuple[Place, ...]] = {}
@@ -91,7 +91,7 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
             settings=settings.building,
             grid=plan.grid,
             scratch=scratch,
-            gps_kind=plan.gps_kind,
+            gps_kind=gps_kind,
             isolation=limits,
             quarantine=str(Path(scratch.root, QUARANTINE)),
             reference=plan.reference,
