@@ -15,8 +15,10 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import hashlib
 import io
 import json
+import math
 import multiprocessing
 import pickle
 import re
@@ -150,15 +152,17 @@ class Copier(SerialExecutor):
         """The results of copies."""
         began_s = time.process_time()
         self.before_s[stage] = self.before_s.get(stage, 0.0) + began_s - self.ended_s
-        for task in tasks:
-            self.tasks[stage] += 1
-            self.task_bytes[stage] += len(pack_tasks(function, [task]))
-            result = self._copied(task, stage) if isinstance(task, OutcomeTask) else "0" * 64
-            yield Measured(
-                result=result, seconds=1.0, cpu_s=1.0, began_s=0.0, process="copier:1", peak_bytes=1, tile=None
-            )
-        self.ended_s = time.process_time()
-        self.during_s[stage] = self.during_s.get(stage, 0.0) + self.ended_s - began_s
+        try:
+            for task in tasks:
+                self.tasks[stage] += 1
+                self.task_bytes[stage] += len(pack_tasks(function, [task]))
+                result = self._copied(task, stage) if isinstance(task, OutcomeTask) else "0" * 64
+                yield Measured(
+                    result=result, seconds=1.0, cpu_s=1.0, began_s=0.0, process="copier:1", peak_bytes=1, tile=None
+                )
+        finally:
+            self.ended_s = time.process_time()
+            self.during_s[stage] = self.during_s.get(stage, 0.0) + self.ended_s - began_s
 
     def _copied(self, work: OutcomeTask[Any, Any, Any], stage: str) -> StoredOutcome[Any]:
         place = work.place
@@ -227,7 +231,8 @@ def copied(plan: Plan, copies: int, stride: int) -> Plan:
             bounds = (x0 + copy * step_m, y0, z0, x1 + copy * step_m, y1, z1)
             # a copy of its own of all that a real plan holds apiece
             own = pickle.loads(pickle.dumps(info))
-            sources.append(dataclasses.replace(own, path=f"{info.path}{_PATH}{copy}", bounds_m=bounds))
+            path = f"{info.path}{_PATH}{copy}"
+            sources.append(dataclasses.replace(own, path=path, bounds_m=bounds, reference=info.reference))
     return dataclasses.replace(plan, sources=tuple(sources), points=copies * plan.points)
 
 
@@ -238,13 +243,14 @@ def cost_of_driver(
     side_mm = plan.grid.size_mm
     columns = [tile.column for tile in map(Tile.from_key, {key[1] for key in briefs if key[0] == "cells"})]
     block = tiles_per_block(side_mm)
-    stride = -(-(max(columns) - min(columns) + 3) // _ACROSS) * _ACROSS
+    together = math.lcm(_ACROSS, block)
+    stride = -(-(max(columns) - min(columns) + 3) // together) * together
     large = copied(plan, copies, stride)
     executor = Copier(briefs, min(columns), stride, copies, block)
     before = peak_of_process()[1]
     with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
         request = request_of(str(Path(folder, "run")), tile_size_m)
-        with mock.patch.object(units, "scale_of", return_value=scale):
+        with mock.patch.object(units, "scale_of", return_value=scale), mock.patch.object(join, "_AT_ONCE", 0):
             summary = run_with(large, request, executor)
     after_s = time.process_time() - executor.ended_s
     return {
@@ -268,6 +274,14 @@ def look_s(city: Sequence[str], settings: RunSettings) -> float:
     began = time.process_time()
     make_plan(sorted(city), ReadOptions(), settings)
     return (time.process_time() - began) / len(city)
+
+
+def hash_s() -> float:
+    """Seconds of processor time that the digest takes per byte of the hashes that it puts together."""
+    content = bytes(2**26)
+    began = time.process_time()
+    hashlib.sha256(content).digest()
+    return (time.process_time() - began) / len(content)
 
 
 def in_all(row: Mapping[str, Any]) -> float:
@@ -340,7 +354,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with fresh.Pool(1) as pool:
             rows.append(pool.apply(cost_of_driver, (plan, briefs, -(-buildings // count), scale, wanted.tile_size)))
         print(rows[-1], flush=True)
-    costs = {"rows": rows, "look_s": look_s(city, request_of("", wanted.tile_size).settings)}
+    costs = {"rows": rows, "hash_s": hash_s(), "look_s": look_s(city, request_of("", wanted.tile_size).settings)}
     (wanted.out / "driver_scale.json").write_text(json.dumps(costs, indent=1) + "\n", encoding="utf-8")
     text = tables(costs)
     (wanted.out / "driver_scale.md").write_text(text, encoding="utf-8")

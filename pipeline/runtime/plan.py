@@ -124,6 +124,8 @@ def make_plan(
             faults.append(fault)
     if faults:
         raise all_at_fault(faults)
+    # one object for all: that of a file that a task looked at is a copy
+    sources = tuple(dataclasses.replace(info, reference=first) if info.reference == first else info for info in sources)
     densities = [info.density_per_m2 for info in sources if math.isfinite(info.density_per_m2)]
     density = max(densities, default=1.0)
     halo_m = settings.halo_m

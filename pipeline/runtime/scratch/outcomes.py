@@ -117,7 +117,7 @@ def _add(update: Callable[[bytes], None], value: object) -> None:
         raise TypeError(f"the content of a {type(value).__name__} is not known to key_of")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class Place:
     """Where an outcome is stored."""
 
