@@ -28,7 +28,7 @@ STAGES = [
     "Find the ground",
     "Find walls and roofs",
     "Join surfaces over borders",
-    "Outline the buildings",
+    "Separate and outline the buildings",
     "Model the buildings",
     "Write the results",
     "Assemble the downloads",

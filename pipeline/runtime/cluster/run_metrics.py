@@ -30,8 +30,8 @@ UNITS = {
     "ground": "blocks",
     "split": "tiles",
     "redraw": "tiles",
-    "join": "steps",
-    "outline": "blocks",
+    "join": "blocks",
+    "outline": "tasks",
     "reconstruct": "buildings",
     "publish": "tiles",
 }

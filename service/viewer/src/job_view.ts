@@ -37,14 +37,14 @@ const STAGES: [string, string, string][] = [
   ["ground", "Find the ground", ""],
   ["split", "Find walls and roofs", "tiles"],
   ["join", "Join surfaces over borders", ""],
-  ["outline", "Outline the buildings", ""],
+  ["outline", "Separate and outline the buildings", ""],
   ["reconstruct", "Model the buildings", "buildings"],
   ["publish", "Write the results", "tiles"],
   ["outputs", "Assemble the downloads", ""],
 ];
 
-/** Number of stages up to the joining of surfaces. */
-const JOINED = 1 + STAGES.findIndex(([name]) => name === "join");
+/** Number of stages up to the buildings that are to be modelled. */
+const FOUND = 1 + STAGES.findIndex(([name]) => name === "outline");
 
 /** Stages of a classification that differ from those of a reconstruction. */
 const CLASSIFIED: typeof STAGES = [
@@ -70,7 +70,7 @@ const WITH_POINTS: typeof STAGES = [["octree", "Write the points", "tiles"]];
 
 function stagesOf(job: StatusInfo): typeof STAGES {
   if (job.processID === "echo") return [];
-  if (job.processID === "classify") return [...STAGES.slice(0, JOINED), ...CLASSIFIED, ...STAGES.slice(-1)];
+  if (job.processID === "classify") return [...STAGES.slice(0, FOUND), ...CLASSIFIED, ...STAGES.slice(-1)];
   const more = job.processID === "compare" ? SIDE_BY_SIDE : job.request?.inputs?.["points"] === true ? WITH_POINTS : [];
   return [...STAGES.slice(0, -1), ...more, ...STAGES.slice(-1)];
 }
