@@ -49,7 +49,7 @@ from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.split import split
 from pipeline.settings import RunSettings
 
-STAGES = ("ingest", "cells", "ground", "split", "join")
+STAGES = ("ingest", "cells", "ground", "split", "join", "outline")
 REQUIRED_POINTS_A_SECOND = 300_000.0
 WANTED_POINTS_A_SECOND = 1_000_000.0
 _MB = 1e6

@@ -144,8 +144,9 @@ def classify(
         crs=request.crs,
         vertical_unit=request.vertical_unit,
         allow_outside_area_of_use=request.allow_outside_area_of_use,
+        resources=request.resources,
     )
-    plan, paths = plan_inputs(run_request, progress)
+    plan, paths = plan_inputs(run_request, progress, cancelled, executor)
     for path in paths:
         if is_url(path):
             raise InputError(shown(path), "classify reads files of this machine only", "Fetch it first")

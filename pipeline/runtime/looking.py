@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pipeline.errors import InputError, all_at_fault
 from pipeline.io import ReadOptions, SourceInfo, is_url
 from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.monitoring.events import Listener, Watch, ignore
+from pipeline.runtime.monitoring.events import Watch
 from pipeline.runtime.plan import looked_at, usable
 from pipeline.runtime.resources import Resources
 
@@ -47,28 +47,34 @@ class Looked:
 
 
 def look_at_all(
-    paths: Sequence[str], options: ReadOptions, resources: Resources, listener: Listener = ignore
+    paths: Sequence[str],
+    options: ReadOptions,
+    resources: Resources,
+    watch: Watch | None = None,
+    executor: Executor | None = None,
 ) -> tuple[SourceInfo, ...]:
-    """The headers of all inputs in their order; `listener` hears if workers are waited for.
+    """The headers of all inputs in their order; the executor of the run looks at many, if there is one already.
 
     Raises
     ------
     InputError
         Some inputs cannot be used: all that is wrong with any of them.
+    RunCancelledError
+        The watch says so.
     ClusterError
         The scheduler does not answer.
     """
     # remote inputs are mostly waited for
     local = len(paths) < _MANY or any(is_url(path) for path in paths)
-    executor = None if local else _executor(resources)
-    if executor is None:
+    looking = None if local else executor or _executor(resources)
+    if looking is None:
         return looked_at(paths, options)
     groups = [tuple(paths[k : k + _FILES_PER_TASK]) for k in range(0, len(paths), _FILES_PER_TASK)]
     tasks = [LookTask(number=k, paths=group, options=options) for k, group in enumerate(groups)]
-    watch = Watch(listener=listener)
-    with executor:
-        executor.prepare("plan", watch)
-        with contextlib.closing(executor.map("plan", look, tasks, watch)) as running:
+    watch = watch or Watch()
+    with looking:
+        looking.prepare("plan", watch)
+        with contextlib.closing(looking.map("plan", look, tasks, watch)) as running:
             found = sorted((measured.result for measured in running), key=lambda one: one.number)
     faults = [fault for one in found for fault in one.faults]
     if faults:

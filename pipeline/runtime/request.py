@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import shapely
@@ -13,8 +13,10 @@ from pipeline.io import ReadOptions, find_inputs, is_url, open_source, sha256_of
 from pipeline.io.footprints import read_area
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.tile_index import TileIndex
+from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.looking import look_at_all
 from pipeline.runtime.manifest import InputFile
+from pipeline.runtime.monitoring.events import Watch, never
 from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.plan import Plan, check_places, make_plan, without_far_files
 from pipeline.runtime.resources import Resources
@@ -60,8 +62,16 @@ class RunRequest:
     """Replace an earlier run in `out`."""
 
 
-def plan_inputs(request: RunRequest, progress: Progress) -> tuple[Plan, list[str]]:
-    """The plan of a run, and its input files in order; raises InputError if one cannot be used."""
+def plan_inputs(
+    request: RunRequest,
+    progress: Progress,
+    cancelled: Callable[[], bool] = never,
+    executor: Executor | None = None,
+) -> tuple[Plan, list[str]]:
+    """The plan of a run, and its input files in order; the run's executor looks at many files, if there is one already.
+
+    Raises InputError if an input cannot be used; RunCancelledError or ClusterError while tasks look at many of them.
+    """
     options = ReadOptions(
         crs=request.crs,
         vertical_unit=request.vertical_unit,
@@ -84,7 +94,8 @@ def plan_inputs(request: RunRequest, progress: Progress) -> tuple[Plan, list[str
     if request.aoi is not None:
         reference = open_source(paths[0], options).info.reference
         options = dataclasses.replace(options, aoi=read_area(request.aoi, reference))
-    look = functools.partial(look_at_all, resources=request.resources, listener=progress.listener)
+    watch = Watch(cancelled=cancelled, listener=progress.listener)
+    look = functools.partial(look_at_all, resources=request.resources, watch=watch, executor=executor)
     plan = make_plan(paths, options, request.settings, look)
     if not request.allow_outside_area_of_use:
         check_places(plan)

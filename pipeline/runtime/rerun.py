@@ -150,7 +150,7 @@ def _rerun(
     unknown = [name for name in request.only if name not in known or known[name].status == REJECTED]
     if unknown:
         raise RunError(f"{', '.join(unknown)}: no building of {earlier.run_dir}. Give ids of its buildings table")
-    plan, paths = plan_inputs(wanted, progress)
+    plan, paths = plan_inputs(dataclasses.replace(wanted, resources=request.resources), progress, cancelled, executor)
     footprints = None if wanted.footprints is None else given_footprints(wanted.footprints, plan)
     overrides = () if wanted.overrides is None else read_overrides(wanted.overrides, plan.reference, wanted.settings)
     check_outlines(earlier.manifest, wanted)

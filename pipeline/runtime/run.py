@@ -41,7 +41,7 @@ from pipeline.runtime.scratch.outcomes import Place
 from pipeline.runtime.scratch.work_folder import is_known, locked_work
 from pipeline.runtime.stages.apply_overrides import apply_overrides
 from pipeline.runtime.stages.batch_figures import Counted
-from pipeline.runtime.stages.cleanup import publishing, tidy
+from pipeline.runtime.stages.cleanup import OVERRIDDEN, publishing, tidy
 from pipeline.runtime.stages.content_digest import STAGE as DIGEST
 from pipeline.runtime.stages.content_digest import content_digest
 from pipeline.runtime.stages.counts import run_counts
@@ -199,7 +199,7 @@ def run_variants(
         storage_at(variant.out)  # refuses a URL of no storage before anything is read
     progress = Progress(on_event)
     progress.tell("run", "plan", f"run into {request.out}")
-    plan, paths = plan_inputs(request, progress)
+    plan, paths = plan_inputs(request, progress, cancelled, executor)
     footprints = None if request.footprints is None else given_footprints(request.footprints, plan)
     for warning in () if footprints is None else footprints.warnings:
         progress.warn("plan", warning)
@@ -242,7 +242,8 @@ def run_variants(
             raise
         if resources.work is not None:
             stages = {models_stage(variant.settings_in(request.settings)) for variant in variants}
-            tidy(context.scratch, stages, [one.run_dir for one in runs])
+            run_dirs = [one.run_dir for one in runs]
+            tidy(context.scratch, stages, run_dirs, overridden=request.overrides is not None)
     inputs = _input_files(request, paths, found.ingested, plan)
     # a single run took all the time; of several, each took that of the shared stages and its own
     outcomes = [one.finish(context, found, inputs, began if len(runs) == 1 else None) for one in runs]
@@ -289,7 +290,7 @@ def _override(
             context.progress.warn("join", entry.warning)
     for one in runs:
         put_json(one.run_dir, OVERRIDES, [entry.as_dict() for entry in entries])
-    stored = store_sites(context, "overridden", sites)
+    stored = store_sites(context, OVERRIDDEN, sites)
     joined = joined_of(stored, found.joined.small_fragments, found.joined.keys)
     return dataclasses.replace(found, joined=joined)
 

@@ -3,17 +3,20 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, ClassVar
 
 import laspy
 import numpy as np
 import pyproj
 import pytest
 
-from pipeline.errors import CrsError, InconsistentInputError, InputError, UnreadableInputError
+from pipeline.errors import CrsError, InconsistentInputError, InputError, RunCancelledError, UnreadableInputError
 from pipeline.io import ReadOptions
 from pipeline.runtime import looking
-from pipeline.runtime.cluster.serial_executor import Executor
+from pipeline.runtime.classify import ClassifyRequest, classify
+from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 from pipeline.runtime.looking import look_at_all
+from pipeline.runtime.monitoring.events import Watch, ignore
 from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.plan import check_memory, looked_at, make_plan
 from pipeline.runtime.request import RunRequest, plan_inputs
@@ -124,3 +127,31 @@ def test_tasks_that_look_at_many_inputs_name_all_that_cannot_be_used(many: list[
         look_at_all(many, ReadOptions(), Resources(workers=1))
     assert refused.value.path == many[1]
     assert f"1 more input cannot be used: {many[6]}: " in str(refused.value)
+
+
+def test_a_look_at_many_inputs_is_the_callers_and_can_be_cancelled(many: list[str]) -> None:
+    class Noted(SerialExecutor):
+        seen: ClassVar[list[str]] = []
+
+        def map(self, stage: str, function: Any, tasks: Any, watch: Watch) -> Any:
+            self.seen.append(stage)
+            return super().map(stage, function, tasks, watch)
+
+    request = RunRequest(inputs=tuple(many), out="nowhere", resources=Resources(workers=2))
+    assert plan_inputs(request, Progress(ignore), executor=Noted())[1] == many
+    assert Noted.seen == ["plan"]
+    with pytest.raises(RunCancelledError):
+        plan_inputs(request, Progress(ignore), cancelled=lambda: True)
+
+
+def test_commands_that_run_in_this_process_look_here(many: list[str], tmp_path: Path, monkeypatch: Any) -> None:
+    wanted: list[int | None] = []
+
+    def noted(resources: Resources) -> None:
+        wanted.append(resources.workers)
+
+    monkeypatch.setattr(looking, "_executor", noted)
+    request = ClassifyRequest(inputs=tuple(many), out=str(tmp_path / "out"), resources=Resources(workers=0))
+    with pytest.raises(InputError):  # four points on a line
+        classify(request)
+    assert wanted == [0]

@@ -16,12 +16,15 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RunError
+from pipeline.export.geoparquet import read_table
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
+from pipeline.runtime.digest import run_digest
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.monitoring.measurement import Measured
 from pipeline.runtime.plan import tiles_per_block
 from pipeline.runtime.request import RunRequest
+from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.scratch.work_folder import is_at_work, locked_work
@@ -42,7 +45,7 @@ class CountingExecutor(SerialExecutor):
         self, stage: str, function: Callable[[Any], Any], tasks: Sequence[Any], watch: Any
     ) -> Generator[Measured[Any], None, None]:
         for task in tasks:
-            if stage != "check":  # which makes nothing
+            if stage not in {"check", "digest"}:  # the first makes nothing, the other is always made
                 self.tasks[stage] += 1
             # as to another process
             yield from super().map(stage, function, [pickle.loads(pickle.dumps(task))], watch)
@@ -259,6 +262,33 @@ def test_a_file_that_is_gone_and_one_that_is_new(used: Place, finished: Finished
 )
 def test_other_settings_are_another_result(used: Place, settings: dict[str, Any]) -> None:
     used.run_as_fresh(settings)
+
+
+def test_classes_that_are_no_longer_believed_give_other_sites(place: Place) -> None:
+    def classified(las: laspy.LasData) -> None:
+        """Whoever classified it saw every second building only, and vans."""
+        height, number = np.array(las.z) - np.array(las.z).min(), np.array(las.x) // 20 + np.array(las.y) // 20
+        las.classification = np.where(height < 1.5, 2, np.where(number % 2, 6, 5)).astype(np.uint8)
+
+    for name in ("sw", "se", "nw", "ne"):
+        place.change(f"{name}.laz", classified)
+    trusted = place.run_as_fresh({"classes": "trust"})
+    ignored = place.run_as_fresh({"classes": "ignore"})
+    assert ignored.digest != trusted.digest
+    assert place.run_as_fresh({"classes": "trust"}).digest == trusted.digest
+
+
+def test_what_a_rerun_changed_is_published_again(used: Place, finished: Finished) -> None:
+    before, digest = files_of(used.folder / "run"), finished.summary.digest
+    name = read_table(str(used.folder / "run"), "buildings")["building_id"][0].as_py()
+    overrides = used.folder / "overrides.toml"
+    overrides.write_text(f'[[building]]\nbuilding_id = "{name}"\naction = "reject"\n')
+    request = RerunRequest(run_dir=str(used.folder / "run"), overrides=str(overrides), resources=Resources(workers=0))
+    assert rerun(request).digest != digest
+    again = used.run()
+    assert again.digest == run_digest(str(used.folder / "run")) == digest
+    assert used.tasks == {"publish": 1}
+    assert files_of(used.folder / "run") == before
 
 
 @pytest.mark.slow

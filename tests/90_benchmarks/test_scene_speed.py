@@ -17,13 +17,26 @@ def suburb(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def lap(ingest: float, split: float, join: float) -> Lap:
-    seconds = {"ingest": ingest, "cells": 0.1, "ground": 0.2, "split": split, "join": join}
+    seconds = {"ingest": ingest, "cells": 0.1, "ground": 0.2, "split": split, "join": join, "outline": 0.0}
     return Lap(seconds=seconds, cpu_s=1.0, points=3_000_000, candidates=1, peaks={}, scratch_bytes=0)
 
 
 def test_a_row_holds_the_medians_of_each_stage_and_of_the_whole() -> None:
     row = speed_row("serial", [lap(1.0, 5.0, 0.5), lap(2.0, 3.0, 0.5), lap(3.0, 1.0, 0.5)])
-    assert row == ["serial", "3000000", "2.00", "0.10", "0.20", "3.00", "0.50", "5.80", "4.80 to 6.80", "0.52", "1.00"]
+    assert row == [
+        "serial",
+        "3000000",
+        "2.00",
+        "0.10",
+        "0.20",
+        "3.00",
+        "0.50",
+        "0.00",
+        "5.80",
+        "4.80 to 6.80",
+        "0.52",
+        "1.00",
+    ]
 
 
 def test_rounds_after_the_first_are_clocked_over_all_points(suburb: Path, tmp_path: Path) -> None:

@@ -366,9 +366,9 @@ class Dispatch(Generic[Task, Result]):
             if self._alone is not None:
                 raise RunError(blame(self.stage, self.tasks[numbers[0]])) from error
             self._drop(future, "suspect")
-            for number in numbers:
-                LOG.warning("the task killed workers: it is tried alone", extra=self._facts(number))
-                self.watch.listener(tried_alone(self.stage, self.tasks[number]))
+            with_others = "" if len(numbers) == 1 else f", as are {len(numbers) - 1} tasks that travelled with it"
+            LOG.warning("the task killed workers: it is tried alone%s", with_others, extra=self._facts(numbers[0]))
+            self.watch.listener(tried_alone(self.stage, self.tasks[numbers[0]]))
             self._suspects.extend(numbers)
             return
         try:

@@ -20,6 +20,7 @@ from pipeline.runtime.overrides.overrides_file import Override
 from pipeline.runtime.plan import split_grid
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.stages.cleanup import REDRAWN
 from pipeline.runtime.stages.given_footprints import numbers_by_tile
 from pipeline.runtime.stages.ground import Ground
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
@@ -96,7 +97,7 @@ def apply_overrides(
     outcomes = outcomes_of(overrides, found, context.scratch, context.plan.grid)
     redrawn: dict[str, tuple[PointRange, ...]] = {}
     for number, layer in enumerate(_layers_of(outcomes)):
-        redrawn |= _redrawn(context, settings, layer, ingested, ground, f"redrawn-{number}")
+        redrawn |= _redrawn(context, settings, layer, ingested, ground, f"{REDRAWN}{number}")
     changed = _overridden(found, outcomes, redrawn, context.scratch)
     timings = context.progress.timings
     timings["join"] = timings.get("join", 0.0) + time.perf_counter() - started - timings.get("redraw", 0.0)

@@ -44,7 +44,7 @@ class Modelled:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BatchFigures:
-    """The figures of a batch, which travel to the driver: their size hardly depends on that of the batch."""
+    """The figures of a batch, which travel to the driver; only failed, retried and slow buildings are listed."""
 
     count: int
     """Number of candidates."""

@@ -6,6 +6,7 @@ those of interrupted tasks, and of inputs that changed or are gone. Files with a
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
@@ -13,6 +14,12 @@ from pathlib import Path
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import FOLDER, DamagedError, Place, brief_of, drop_outcomes, key_of
 from pipeline.runtime.stages.ingested import Ingested
+from pipeline.runtime.stages.sites import UNITS
+
+OVERRIDDEN = "overridden"
+"""The stage under which sites are stored after overrides."""
+REDRAWN = "redrawn-"
+"""How the folders of scratch begin with the points in other footprints of some buildings."""
 
 
 def clear_points(scratch: Scratch, wanted: Iterable[Place]) -> None:
@@ -48,13 +55,16 @@ def clear_tiles(scratch: Scratch, folder: str, wanted: Iterable[Place], keys: Co
 
 def clear_units(scratch: Scratch, wanted: Collection[str]) -> None:
     """Remove the points of units except those in some folders of scratch."""
-    for folder in Path(scratch.root, "units").glob("*/*"):
-        if f"units/{folder.parent.name}/{folder.name}" not in wanted:
-            shutil.rmtree(folder, ignore_errors=True)
+    for tile in Path(scratch.root, UNITS).glob("*"):
+        for folder in tile.glob("*"):
+            if f"{UNITS}/{tile.name}/{folder.name}" not in wanted:
+                shutil.rmtree(folder, ignore_errors=True)
+        with contextlib.suppress(OSError):  # one that is not empty
+            tile.rmdir()
 
 
-def tidy(scratch: Scratch, models: Collection[str], run_dirs: Sequence[str]) -> None:
-    """Remove what a finished run no longer needs: models by other settings, and what it published elsewhere.
+def tidy(scratch: Scratch, models: Collection[str], run_dirs: Sequence[str], *, overridden: bool) -> None:
+    """Remove what a finished run no longer needs: models by other settings, sites after overrides that are gone.
 
     `models` are the stages under which its models are stored, `run_dirs` where it published.
     """
@@ -63,6 +73,10 @@ def tidy(scratch: Scratch, models: Collection[str], run_dirs: Sequence[str]) -> 
         by_others = stage.name.startswith("models-") and stage.name not in models
         if by_others or (stage.name.startswith(("publish-", "points-")) and stage.name not in published):
             shutil.rmtree(stage, ignore_errors=True)
+    if not overridden:
+        for pattern in (OVERRIDDEN, f"{REDRAWN}*"):
+            for folder in (*Path(scratch.root).glob(pattern), *Path(scratch.root, FOLDER).glob(pattern)):
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 def publishing(run_dir: str) -> str:

@@ -2,7 +2,7 @@
 
 The tiles have finished all surfaces that no other tile sees, and pass on the rest by columns. A task joins those of a
 block of tiles, finishes what no tile outside of the block sees, and passes on the rest; one more task joins that. The
-sites are then made tile by tile (`units.py`), so neither the driver nor any task holds an object per building.
+sites are then made tile by tile (`units.py`). The driver holds no object per building, unless footprints are given.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import InParts, Place, drop_outcomes, key_of, part_of, result_of
 from pipeline.runtime.stages.border_facets import are_beyond, united_by_name
+from pipeline.runtime.stages.cleanup import clear_units
 from pipeline.runtime.stages.finished_surfaces import Finished, finished
 from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
 from pipeline.runtime.stages.open_fragments import BorderFacets, OpenSurfaces
-from pipeline.runtime.stages.sites import CandidateSite, FoundSites, Joined, PointRange, largest_first, object_id
+from pipeline.runtime.stages.sites import UNITS, CandidateSite, FoundSites, Joined, PointRange, largest_first, object_id
 from pipeline.runtime.stages.split import Splits
 from pipeline.runtime.stages.split_window import Split
 from pipeline.runtime.stages.stored_sites import joined_of, store_sites
 from pipeline.runtime.stages.tile_sites import TileSites, by_owner, figures_of, sites_of
-from pipeline.runtime.stages.units import STAGE as UNITS
 from pipeline.runtime.stages.units import BorderSites, find_units
 from pipeline.terrain.candidates import NOWHERE, Surfaces
 from pipeline.terrain.fragment_sums import N_SUMS
@@ -297,6 +297,7 @@ def join(
                 footprints.attributes,
             )
             counter.add(1)
+        clear_units(context.scratch, ())
         return joined_of(store_sites(context, UNITS, found, quiet=False), 0, splits.keys)
     borders = _joined_borders(context, settings.candidates, splits)
     small = sum(figures.small for figures in splits.figures) + sum(brief.small_fragments for brief in borders.values())

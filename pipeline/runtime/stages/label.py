@@ -158,7 +158,7 @@ class SitesNear:
 
     def rejected_in(self, tiles: Iterable[Tile]) -> tuple[StoredRejected, ...]:
         """Those of which a bridge lies in one of some tiles."""
-        return tuple({one.place: one for tile in tiles for one in self.rejected.get(tile, ())}.values())
+        return tuple({(one.place, one.part): one for tile in tiles for one in self.rejected.get(tile, ())}.values())
 
 
 def ranges_near(task: LabelTask) -> tuple[list[PointRange], list[PointRange]]:

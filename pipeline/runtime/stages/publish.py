@@ -66,6 +66,8 @@ class Published:
     tile: Tile
     n_files: int
     """Number of its files; their digests are in its state."""
+    state: str = ""
+    """sha256 of its state; empty where it could not be written."""
     has_tables: bool = False
     """Whether tables are among them."""
     error: str = ""
@@ -205,13 +207,18 @@ def _read(task: PublishTask) -> set[str]:
     return {place.folder for place in (*task.batches, *(listed.place for listed in task.rejected))}
 
 
-def is_published(task: PublishTask, _: Published, __: str) -> bool:
-    """Whether the files of a tile are those that its state names; only in a folder, since stores keep checksums."""
+def is_published(task: PublishTask, published: Published, _: str) -> bool:
+    """Whether the state of a tile is the one that was written, and its files are those that the state names.
+
+    Stores keep checksums of their objects themselves, so there the state is enough.
+    """
+    state = storage_at(task.run_dir).get(f"state/{task.tile.key}.json")
+    if hashlib.sha256(state).hexdigest() != published.state:
+        return False  # a rerun wrote other files
     if is_url(task.run_dir):
         return True
     storage = LocalStorage(root=Path(task.run_dir))
-    files = json.loads(storage.get(f"state/{task.tile.key}.json"))["files"]
-    return all(sha256_of(storage.path(name)) == digest for name, digest in files.items())
+    return all(sha256_of(storage.path(name)) == digest for name, digest in json.loads(state)["files"].items())
 
 
 def publish_tile(task: PublishTask) -> PublishedTile:
@@ -222,13 +229,13 @@ def publish_tile(task: PublishTask) -> PublishedTile:
     storage = storage_at(task.run_dir)
     task.scratch.check_cancelled()
     files: dict[str, str] = {}
-    tables: Mapping[str, Any] = {}
+    rows: tuple[Rows, ...] = ()
     error = ""
     try:
         if task.batches or task.rejected or task.empty_tables:
             with storage.several(task.scratch.check_cancelled) as puts:
                 written = _write(task, _tables_last(puts))
-            files, tables = dict(written.digests), written.tables
+            files, rows = dict(written.digests), _rows(written.tables)
     except RunCancelledError:
         raise
     except Exception as fault:  # noqa: BLE001 - goes into the tile's state, the manifest and the exit code
@@ -245,20 +252,26 @@ def publish_tile(task: PublishTask) -> PublishedTile:
     }
     task.scratch.check_cancelled()
     try:
-        storage.put(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
+        stated = json.dumps(state, indent=1).encode()
+        storage.put(f"state/{task.tile.key}.json", stated)
     except (RunError, OSError) as fault:
         # a tile without its state is not finished, and the manifest will say so
         return PublishedTile(parts=(), brief=Published(tile=task.tile, n_files=0, error=error or f"its state: {fault}"))
     for name in sorted(before - files.keys()):
         storage.delete(name)
-    brief = Published(tile=task.tile, n_files=len(files), has_tables=bool(tables), error=error, warning=lost)
-    return PublishedTile(parts=_rows(tables), brief=brief)
+    brief = Published(
+        tile=task.tile,
+        n_files=len(files),
+        state=hashlib.sha256(stated).hexdigest(),
+        has_tables=bool(rows),
+        error=error,
+        warning=lost,
+    )
+    return PublishedTile(parts=rows, brief=brief)
 
 
 def _rows(tables: Mapping[str, Any]) -> tuple[Rows, ...]:
-    """The rows of a tile's tables as the run's digest counts them; nothing without tables."""
-    if not tables:
-        return ()
+    """The rows of a tile's tables as the run's digest counts them."""
     from pipeline.runtime.digest import rows_of  # loads Arrow, which the driver does not need
 
     return tuple(rows_of(tables[name], name) for name in TABLES)

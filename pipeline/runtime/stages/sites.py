@@ -17,6 +17,9 @@ from pipeline.runtime.stages.window_points import folders_of
 from pipeline.terrain.candidates import Verdict
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
+UNITS = "units"
+"""The stage under which the sites of tiles are stored, and the folder of scratch with the points of units."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class PointRange:

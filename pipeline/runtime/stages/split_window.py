@@ -13,6 +13,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.model import BoolArray, IntArray
 from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.outcomes import key_of
 from pipeline.runtime.stages.open_fragments import TileSurfaces, open_fragments
 from pipeline.runtime.stages.surroundings import surroundings_of, terrain_around
 from pipeline.runtime.stages.window_points import load_window
@@ -81,8 +82,8 @@ class SplitFigures:
     """Points of the core: assigned and class 6, assigned and not, class 6 and not assigned."""
     outcome: str
     """Digest of the stored points: equal where later stages see no difference."""
-    sites: int = 0
-    """Candidates and rejected objects that no other tile sees."""
+    sites: str = ""
+    """Digest of the candidates and rejected objects that no other tile sees; empty where there are none."""
     candidate_points: int = 0
     """Points of these candidates."""
     small: int = 0
@@ -146,7 +147,7 @@ def split_window(task: SplitTask, settings: SceneSettings) -> Split:
         points=len(loaded.core),
         audit=audit,
         outcome=outcome,
-        sites=0 if done is None else len(done.candidate_points_mm) + len(done.kind),
+        sites=key_of(done) if done is not None and len(done.candidate_points_mm) + len(done.kind) else "",
         candidate_points=0 if done is None else done.candidate_points,
         small=0 if done is None else done.small,
     )

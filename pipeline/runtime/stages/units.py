@@ -25,6 +25,7 @@ from pipeline.runtime.stages.cleanup import clear_units
 from pipeline.runtime.stages.gather import canonical_order
 from pipeline.runtime.stages.outline import outlined
 from pipeline.runtime.stages.sites import (
+    UNITS,
     CandidateSite,
     FoundSites,
     PointRange,
@@ -43,8 +44,6 @@ from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.terrain.units import smallest_points, units_of
 from pipeline.tiling import MM, Tile, TileGrid
 
-STAGE = "units"
-"""The stage under which the sites of tiles are stored."""
 _POINTS_PER_TASK = 50_000
 _KEY_DIGITS = 16
 
@@ -110,6 +109,7 @@ def find_units(
     reaching: dict[Tile, list[BorderSites]] = {}
     for sites in borders:
         reaching.setdefault(sites.owner, []).append(sites)
+    alone = {figures.tile: figures.sites for figures in splits.figures}
     points = {figures.tile: figures.candidate_points for figures in splits.figures if figures.sites}
     for tile, own in reaching.items():
         points[tile] = points.get(tile, 0) + sum(sites.figures.points for sites in own)
@@ -120,9 +120,11 @@ def find_units(
         own = reaching.get(tile, [])
         around = {tile, *(other for sites in own for other in sites.figures.tiles)}
         shares = max(1, round(of_tile / (_POINTS_PER_TASK * scale)))
-        content = [splits.keys.get(other, "") for other in sorted(around)], [sites.figures.digest for sites in own]
+        # the same points may be other sites: by other classes of the file, say
+        listed = [alone.get(tile, ""), *(sites.figures.digest for sites in own)]
+        content = [splits.keys.get(other, "") for other in sorted(around)], listed
         for share in range(shares):
-            place = Place(STAGE, tile.key, key_of(alike, tile, share, shares, content))
+            place = Place(UNITS, tile.key, key_of(alike, tile, share, shares, content))
             tasks[place] = UnitTask(
                 tile=tile,
                 share=share,
@@ -136,9 +138,9 @@ def find_units(
                 scratch=scratch,
                 crs_name=crs_name,
                 scale=scale,
-                folder=f"{STAGE}/{tile.key}/{place.key[:_KEY_DIGITS]}",
+                folder=f"{UNITS}/{tile.key}/{place.key[:_KEY_DIGITS]}",
             )
-    drop_outcomes(scratch, STAGE, tasks)
+    drop_outcomes(scratch, UNITS, tasks)
     clear_units(scratch, {task.folder for task in tasks.values()})
     files: Files[UnitTask, SitesBrief] = Files(reads=_read, leaves=_left, intact=is_intact)
     found = context.map_stored("outline", sites_of_tile, tasks, brief_of_sites, files=files)
@@ -159,7 +161,7 @@ def _read(task: UnitTask) -> set[str]:
 
 def _left(task: UnitTask, brief: SitesBrief) -> set[str]:
     """The folders of scratch with the sites and with the points of the units."""
-    return {Place(STAGE, task.tile.key, "").folder} | ({task.folder} if brief.checksums else set())
+    return {Place(UNITS, task.tile.key, "").folder} | ({task.folder} if brief.checksums else set())
 
 
 def is_intact(task: UnitTask, brief: SitesBrief, folder: str) -> bool:
