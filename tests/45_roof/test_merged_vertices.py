@@ -9,7 +9,8 @@ from pipeline.model import FloatArray, IntArray
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.arrangement.joined_planes import joined_planes
 from pipeline.roof.arrangement.limits import limits_at
-from pipeline.roof.arrangement.merged_vertices import Borders, edges_of_rings, merge_vertices, rings_with_merged
+from pipeline.roof.arrangement.merged_vertices import merge_vertices, rings_with_merged
+from pipeline.roof.arrangement.movable_borders import Borders, edges_of_rings
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import ArrangementSettings
 
@@ -168,3 +169,17 @@ def test_planes_of_a_true_step_stay() -> None:
     planes = np.array([(0.0, 0.0, 3.0), (0.0, 0.0, 3.3), (0.0, 0.0, 3.7)])
     points, labels, borders = corner_of_three(planes)
     assert joined_planes(points, labels, planes, borders, LIMITS).tolist() == planes.tolist()
+
+
+def test_a_gap_that_costs_more_points_to_close_than_a_corner_must_save_stays() -> None:
+    """The more points show a gap of 8 cm the more they lose; a corner saves the same number everywhere."""
+    planes = np.array([(0.0, 0.5, 3.0), (-0.5, 0.0, 6.08), (0.4, 0.0, 3.3)])
+    points, labels, borders = corner_of_three(planes)
+    joined = joined_planes(points, labels, planes, borders, LIMITS)
+    assert np.ptp(heights(joined, 3.0, 3.0)) < 1e-9
+    dense, of_dense = np.repeat(points, 16, axis=0), np.repeat(labels, 16)
+    joined = joined_planes(dense, of_dense, planes, borders, LIMITS)
+    assert np.ptp(heights(joined, 3.0, 3.0)) > 0.07
+    limits = LIMITS._replace(corner_cost=16.0 * LIMITS.corner_cost)
+    joined = joined_planes(dense, of_dense, planes, borders, limits)
+    assert np.ptp(heights(joined, 3.0, 3.0)) < 1e-9

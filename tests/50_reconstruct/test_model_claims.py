@@ -112,8 +112,9 @@ def test_two_of_three_ridges_are_as_near_to_the_truth_as_the_record_says(modelle
         assert 0.004 <= sigma < 1.0
         within.append((abs(error) <= sigma, abs(error) <= 3.0 * sigma))
     one_sigma, three_sigma = np.mean(within, axis=0)
-    # of 64 models one standard deviation of such a share is 6 points: two below .68 and three above are allowed
-    assert 0.56 <= one_sigma <= 0.86
+    # .68 if errors are normal, .80 on roofs without difficulties (docs/results/ridge_uncertainty.md); of 64 models one
+    # standard deviation of such a share is 5 or 6 points: two below the one and above the other are allowed
+    assert 0.56 <= one_sigma <= 0.9
     assert three_sigma >= 0.9  # the others missed the ridge itself
 
 

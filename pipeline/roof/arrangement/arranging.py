@@ -25,8 +25,10 @@ from pipeline.roof.arrangement.far_corners import (
 )
 from pipeline.roof.arrangement.joined_planes import joined_planes
 from pipeline.roof.arrangement.limits import Limits, limits_at
-from pipeline.roof.arrangement.merged_vertices import Borders, edges_of_rings, merge_vertices, rings_with_merged
+from pipeline.roof.arrangement.merged_vertices import merge_vertices, rings_with_merged
 from pipeline.roof.arrangement.minimum_cut import costs_of_all, every_label, expand_labels, neighbour_lists
+from pipeline.roof.arrangement.movable_borders import Borders, edges_of_rings
+from pipeline.roof.arrangement.moved_vertices import move_vertices
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
 from pipeline.roof.arrangement.raster_labels import raster_labels
 from pipeline.roof.arrangement.subdivision import CELLS, EDGES, VERTICES, Subdivision, subdivide, subdivision_of
@@ -123,6 +125,28 @@ def _label_cells(
     return cells
 
 
+@kernel(inline="always")
+def clean_borders(
+    borders: Borders,
+    rings: tuple[IntArray, IntArray],
+    points: FloatArray,
+    labels: LabelArray,
+    planes: FloatArray,
+    limits: Limits,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Fewer corners, each where its planes meet, and planes that meet there; vertices of the borders move in place.
+
+    Vertices and starts of the rings are those of `trace_faces`; `points` (n, 3) and `planes` (k, 3) are in metres,
+    `labels` (n,) are the planes of the points. Returns the vertices and starts of the new rings and the new planes.
+    """
+    vertices, starts = rings_with_merged(rings[0], rings[1], merge_vertices(borders, points, planes, limits))
+    planes = refitted_planes(points, labels, planes, limits.cap_m)
+    if move_vertices(borders, points, planes, limits):
+        into = merge_vertices(borders, points, planes, limits)
+        vertices, starts = rings_with_merged(vertices, starts, into)
+    return vertices, starts, joined_planes(points, labels, planes, borders, limits)
+
+
 @kernel
 def _arranged(
     points: FloatArray, labels: LabelArray, planes: FloatArray, outline: _Outline, limits: Limits
@@ -162,17 +186,17 @@ def _arranged(
     for i in range(counts[CELLS]):
         plane_of_face[faces[i]] = cell_labels[i]
     vertices, ring_starts, owner = trace_faces(plan, faces, corners_of_borders(plan, len(outline.xy), faces))
+    # one row more, in which places are tried
+    xy = np.concatenate((plan.xy, np.zeros((1, 2), np.int64)))
     if n_faces > 1 and limits.clearance == 1.0:
-        edges = edges_of_rings(plan.xy, vertices, ring_starts, owner)
-        borders = Borders(plan.xy, edges, plane_of_face, np.arange(len(plan.xy)) < len(outline.xy))
-        into = merge_vertices(borders, points, planes, limits)
-        vertices, ring_starts = rings_with_merged(vertices, ring_starts, into)
-        planes = refitted_planes(points, label_of_point, planes, limits.cap_m)
-        planes = joined_planes(points, label_of_point, planes, borders, limits)
+        edges = edges_of_rings(xy, vertices, ring_starts, owner)
+        borders = Borders(xy, edges, plane_of_face, np.arange(len(xy)) < len(outline.xy))
+        rings = vertices, ring_starts
+        vertices, ring_starts, planes = clean_borders(borders, rings, points, label_of_point, planes, limits)
     support = support_of_planes(points, label_of_point, planes, limits.cap_m)
-    rings = rings_of_faces(plan.xy, vertices, ring_starts, owner, n_faces)
+    polygons = rings_of_faces(xy, vertices, ring_starts, owner, n_faces)
     used = Subdivision(plan.xy[: counts[VERTICES]].copy(), plan.graph[: counts[EDGES]].copy(), counts)
-    return _Arranged(used, rings, plane_of_face, faces, planes, support)
+    return _Arranged(used, polygons, plane_of_face, faces, planes, support)
 
 
 def _rings_of(outline_mm: MultiPolygon) -> tuple[IntArray, IntArray, IntArray]:

@@ -3,12 +3,11 @@
 Fitted one by one, three planes that meet in one corner of a roof miss it by centimetres, and the solid gets small walls
 and clusters of vertices there. Each condition "these two planes have one height over this vertex" is linear, so least
 squares under it is one step of a Kalman filter with an exact measurement (Kalman 1960). Conditions come in order of
-their costs, and one that moves a plane farther from its points than the settings allow is left out.
+their costs. One that costs more points than a corner must save is left out, and so is one that moves a plane farther
+from its points than the settings allow: such a gap is real, or the corner lies in the wrong place.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from pipeline.compiler import kernel
 from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.limits import Limits
-from pipeline.roof.arrangement.merged_vertices import Borders
+from pipeline.roof.arrangement.movable_borders import Borders
 from pipeline.roof.arrangement.raster_labels import vertical_distance_m
 
 _FEWEST_POINTS = 6
@@ -137,9 +136,10 @@ def _cheapest(
     change: FloatArray,
     covariance: FloatArray,
     is_open: BoolArray,
+    max_rise_m2: float,
 ) -> tuple[int, float, float]:
     """The open condition that raises the sum of squared residuals least, its gap now and its variance; -1 for none."""
-    best, best_gap, best_variance, least = -1, 0.0, 0.0, math.inf
+    best, best_gap, best_variance, least = -1, 0.0, 0.0, max_rise_m2
     for i in range(len(gaps)):
         if not is_open[i]:
             continue
@@ -170,9 +170,11 @@ def joined_planes(
     covariance = _covariance(moments)
     factors, index, gaps = _terms(borders, _conditions(borders, k), planes, middle)
     is_open = np.full(len(gaps), limits.plane_shift_m > 0.0)
+    # a residual of the cap is one unexplained point
+    max_rise_m2 = limits.corner_cost * limits.cap_m**2
     change, trial, gain = np.zeros(3 * k), np.empty(3 * k), np.empty(3 * k)
     while True:
-        i, gap, variance = _cheapest(factors, index, gaps, change, covariance, is_open)
+        i, gap, variance = _cheapest(factors, index, gaps, change, covariance, is_open, max_rise_m2)
         if i < 0:
             break
         is_open[i] = False
