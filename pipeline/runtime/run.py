@@ -380,10 +380,10 @@ class _VariantRun:
         """Remove an earlier run, except what the work folder knows; readers see that the directory changes."""
         known = work is not None and _is_of_work(self.run_dir, work)
         write_manifest(self.run_dir, self.manifest, self.storage.put)
-        outdated = (FOOTPRINTS, OVERRIDES, PAGE)
+        outdated = [FOOTPRINTS, OVERRIDES, PAGE]
         if not (known and points):
-            outdated = (*outdated, POINTS_FOLDER)
-        self.storage.clear(outdated if known else (*outdated, *_RESULTS))
+            outdated.append(POINTS_FOLDER)
+        self.storage.clear(outdated if known else [*outdated, *_RESULTS])
         if footprints is not None:
             put_json(self.run_dir, FOOTPRINTS, footprints.report)
 
