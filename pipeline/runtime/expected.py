@@ -48,6 +48,8 @@ class Rates:
     """CPU seconds per tile."""
     publish_each: float = 0.002
     """CPU seconds per building."""
+    octree_per_million: float = 2.0
+    """CPU seconds per million points that are written over the models."""
     digest_s: float = 0.015
     """CPU seconds per run, spent by one process."""
     digest_each: float = 0.0002
@@ -71,7 +73,7 @@ class Rates:
     cluster_driver_gib: float = 0.32
     """Memory of a command with an embedded cluster."""
     split_bytes: float = 130.0
-    """Memory per point of a tile's window."""
+    """Memory per point of a tile's window; twice that where points are written over the models."""
     ground_bytes: float = 130e6
     """Memory per square kilometre that a block of the ground sees."""
 
@@ -107,6 +109,8 @@ class Expected:
     """Memory of its largest task, above the process's own size."""
     models: bool = True
     """Whether buildings are modelled."""
+    octree: bool = False
+    """Whether points are written over the models."""
     pace: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """By stage, the seconds measured in a sample over those by the rates; 1 where nothing was measured."""
 
@@ -129,13 +133,14 @@ class Expected:
             "outline": self.buildings * RATES.outline_each,
             "reconstruct": self.buildings * RATES.reconstruct_each,
             "publish": self.tiles * RATES.publish_tile + self.buildings * RATES.publish_each,
+            "octree": millions * RATES.octree_per_million if self.octree else 0.0,
             "digest": RATES.digest_s + self.buildings * RATES.digest_each,
         }
         return {stage: seconds * self.pace.get(stage, 1.0) for stage, seconds in by_rates.items()}
 
     def wall_s(self, hands: int) -> dict[str, float]:
         """Wall seconds by stage with so many processes."""
-        at_once = dict.fromkeys(("cells", "split", "publish"), float(self.tiles)) | dict.fromkeys(_ALONE, 1.0)
+        at_once = dict.fromkeys(("cells", "split", "publish", "octree"), float(self.tiles)) | dict.fromkeys(_ALONE, 1.0)
         at_once["ingest"] = self.readers
         if self.ground_km2:
             at_once["ground"] = sum(self.ground_km2) / max(self.ground_km2)
@@ -149,7 +154,8 @@ class Expected:
         """Peak memory of the largest process that works, of several or `alone`."""
         tables_bytes = RATES.tables_gib * 2**30 * (2.0 if alone else 1.0)
         ground_bytes = max(self.ground_km2, default=0.0) * RATES.ground_bytes
-        largest = max(ground_bytes, self.window_points * RATES.split_bytes + tables_bytes)
+        window_bytes = self.window_points * RATES.split_bytes * (2.0 if self.octree else 1.0)
+        largest = max(ground_bytes, window_bytes + tables_bytes)
         return round(RATES.kernels_gib * 2**30 + largest)
 
 

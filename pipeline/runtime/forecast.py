@@ -72,7 +72,7 @@ def forecast(
     worth_s : float
         Wall seconds by the rates from which on a sample is run.
     """
-    work = expected(plan, buildings)
+    work = dataclasses.replace(expected(plan, buildings), octree=request.points)
     if request.settings.general.method != "arrangement":
         work = dataclasses.replace(work, pace={"reconstruct": RATES.other_methods})
     total_s, stage_s = _total_s(work, engine, hands)

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import GableworkError, RunError
-from pipeline.io import ReadOptions, SourceInfo, SpatialReference, is_url, open_source, shown
+from pipeline.io import ReadOptions, Source, SourceInfo, SpatialReference, is_url, open_source, shown
 from pipeline.io.crs import UNITS_M
 from pipeline.io.records import Share
 from pipeline.model import PointCloud
@@ -47,8 +47,12 @@ _PER_HAND = (2, 5)
 """Least and most windows per process: one window says little, many make the sample longer and not much better."""
 _SIDES_M = (60.0, 600.0)
 """Least and greatest side of a window."""
-_READ_POINTS = 2_000_000
-"""Points of a file that are read for a window."""
+_SAMPLE_S = 8.0
+"""Windows that have not begun after this wall time are left out, except one for each process."""
+_READ_POINTS = 1_000_000
+"""Points of a larger file that are read for a window."""
+_THIN = 0.7
+"""A window that is thinner than the file by this factor lacks the other flight lines: then more of the file is read."""
 _READ_S = 4.0
 """Reading ends after this time; what was read until then is the sample."""
 _RUN_S = 20.0
@@ -75,8 +79,12 @@ class SampleTask:
     """The place of the window's middle among the points that are read, from 0 to 1."""
     side_m: float
     """Side of the window."""
+    density_per_m2: float
+    """Points per square metre of the file."""
     grid: TileGrid
     """The lattice of the run."""
+    until_s: float = math.inf
+    """The window is left out if it has not begun at this time, in seconds since 1970."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -148,15 +156,18 @@ def sample_tasks(work: Expected, request: RunRequest, plan: Plan, paths: Sequenc
     # a window more than there are processes takes as long as one for each of them
     wanted = hands * min(max(each, _PER_HAND[0]), _PER_HAND[1])
     side_m = window_side_m(plan.density_per_m2)
+    late_s = time.time() + _SAMPLE_S
+    # multiples of the golden ratio are spread evenly, however many of the windows there will be time for
+    places = [(0.5 + k * _GOLDEN) % 1.0 for k in range(wanted)]
     tasks = []
-    for k in range(wanted):
-        # multiples of the golden ratio are spread evenly, however many there are
-        info, at = used[k * len(used) // wanted], (0.5 + k * _GOLDEN) % 1.0
+    for k, place in enumerate(places):
+        at = place * len(used) % 1.0
+        info = used[int(place * len(used))]
         options, share = plan.options, None
         if info.format == "copc":
             options = dataclasses.replace(options, bbox=_box_at(info, plan, at, side_m))
-        elif info.is_divisible and plan.options.window is None and info.point_count > 2 * _READ_POINTS:
-            of = info.point_count // _READ_POINTS
+        elif info.is_divisible and plan.options.window is None and info.point_count > 1.5 * _READ_POINTS:
+            of = info.point_count // _READ_POINTS + 1
             share, at = Share(number=int(at * of), of=of), 0.5
         task = SampleTask(
             request=request,
@@ -165,7 +176,9 @@ def sample_tasks(work: Expected, request: RunRequest, plan: Plan, paths: Sequenc
             share=share,
             at=at,
             side_m=side_m,
+            density_per_m2=info.density_per_m2,
             grid=plan.grid,
+            until_s=late_s if k >= hands else math.inf,
         )
         tasks.append(task)
     return tasks
@@ -205,18 +218,13 @@ def _box_at(info: SourceInfo, plan: Plan, at: float, side_m: float) -> tuple[flo
 
 def sample_window(task: SampleTask, clock: Callable[[], float] = time.perf_counter) -> Sampled:
     """Read a window and run over it; raises InputError if the file cannot be read."""
-    began = clock()
-    source = open_source(task.path, task.options)
-    clouds: list[PointCloud] = []
-    for cloud in source.chunks(_CHUNK_POINTS, task.share):
-        clouds.append(cloud)
-        if clock() - began > _READ_S:
-            break
-    read_s, read_points = clock() - began, source.findings.n_read
-    if not clouds:
+    if time.time() > task.until_s:
         return Sampled()
-    filled = _filled(clouds, task.grid) if read_points == source.info.point_count else None
-    points, side_m = _cut(clouds, task.at, task.side_m)
+    source = open_source(task.path, task.options)
+    seen = _seen(task, source, clock)
+    if seen is None:
+        return Sampled()
+    points, side_m = seen.points, seen.side_m
     with tempfile.TemporaryDirectory(prefix="gablework-sample-") as folder:
         path = Path(folder, "window.ply")
         _write(path, points, source.info.reference)
@@ -234,7 +242,6 @@ def sample_window(task: SampleTask, clock: Callable[[], float] = time.perf_count
             bbox=None,
             crs=source.info.reference.wkt,
             vertical_unit=_unit_name(source.info.reference),
-            points=False,
         )
         deadline = clock() + _RUN_S
         try:
@@ -242,16 +249,47 @@ def sample_window(task: SampleTask, clock: Callable[[], float] = time.perf_count
         except GableworkError:  # such as no usable point, or points on one line
             return Sampled()
     stage_s = dict(summary.timings_s)
-    stage_s["ingest"] += read_s * len(points) / max(1, read_points)
+    stage_s["ingest"] += seen.read_s * len(points) / seen.read_points
     candidates = summary.counts["candidates"]
+    width_m, depth_m, _ = np.ptp(points.xyz, axis=0).tolist()
     return Sampled(
         points=len(points),
-        area_km2=side_m**2 / 1e6,
+        area_km2=width_m * depth_m / 1e6,
         candidates=candidates,
         buildings=candidates / (1.0 + _CUT_M / side_m) ** 2,
-        filled=filled,
+        filled=seen.filled,
         stage_s=stage_s,
     )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """The points of a window, and what reading them took."""
+
+    points: PointCloud
+    side_m: float
+    read_points: int
+    read_s: float
+    filled: float | None
+
+
+def _seen(task: SampleTask, source: Source, clock: Callable[[], float]) -> _Seen | None:
+    """Read a window: from its share, or from the whole file if the share lacks flight lines; None without points."""
+    for share in (task.share, None):
+        began = clock()
+        clouds: list[PointCloud] = []
+        for cloud in source.chunks(_CHUNK_POINTS, share):
+            clouds.append(cloud)
+            if clock() - began > _READ_S:
+                break
+        read_s, read_points = clock() - began, source.findings.n_read
+        if not clouds:
+            return None
+        points, side_m = _cut(clouds, task.at, task.side_m)
+        if share is None or len(points) > _THIN * task.density_per_m2 * side_m**2:
+            break
+    filled = _filled(clouds, task.grid) if read_points == source.info.point_count else None
+    return _Seen(points=points, side_m=side_m, read_points=read_points, read_s=read_s, filled=filled)
 
 
 def _filled(clouds: Sequence[PointCloud], grid: TileGrid) -> float:
@@ -315,7 +353,8 @@ def scaled(work: Expected, found: Sequence[Sampled], buildings: int | None = Non
     measured: dict[str, float] = defaultdict(float)
     for window in found:
         # the pace of the buildings is that of each candidate, cut or whole
-        for stage, seconds in _work_of(window.points, window.area_km2, window.candidates).cpu_s().items():
+        part = dataclasses.replace(_work_of(window.points, window.area_km2, window.candidates), octree=work.octree)
+        for stage, seconds in part.cpu_s().items():
             by_rates[stage] += seconds
         for stage, seconds in window.stage_s.items():
             measured[stage] += seconds

@@ -2,9 +2,11 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 
@@ -60,7 +62,7 @@ def test_each_stage_has_its_own_pace() -> None:
     stage_s = {**slow.stage_s, "split": 5.0 * slow.stage_s["split"]}
     found = scaled(LARGE, [dataclasses.replace(slow, stage_s=stage_s)], buildings=LARGE.buildings)
     assert found is not None
-    ratios = {stage: s / LARGE.cpu_s()[stage] for stage, s in found.cpu_s().items()}
+    ratios = {stage: s / LARGE.cpu_s()[stage] for stage, s in found.cpu_s().items() if s}
     assert ratios.pop("split") == pytest.approx(5.0)
     assert list(ratios.values()) == pytest.approx([1.0] * len(ratios), rel=0.02)
 
@@ -108,7 +110,7 @@ def test_of_a_large_file_each_window_reads_another_share(town: Path) -> None:
     work = dataclasses.replace(LARGE, points_by_file={paths[0]: 1})
     tasks = sample_tasks(work, request, with_points(plan, 50_000_000), paths, 2)
     shares = [task.share for task in tasks]
-    assert all(share is not None and share.of == 25 and 0 <= share.number < 25 for share in shares)
+    assert all(share is not None and share.of == 51 and 0 <= share.number < 51 for share in shares)
     assert len(set(shares)) == len(shares)
 
 
@@ -140,6 +142,7 @@ def test_reading_takes_no_longer_than_it_may(town: Path, monkeypatch: pytest.Mon
 
 def test_the_clock_measures_what_reading_a_window_takes(town: Path) -> None:
     quick = sample_window(the_task(town), lambda: 0.0)
+    # it is asked when reading begins, after the only chunk, and at the end
     ticks = iter([0.0, 2.0, *[2.0] * 1000])
     slow = sample_window(the_task(town), ticks.__next__)
     assert slow.points == quick.points > 0
@@ -147,6 +150,41 @@ def test_the_clock_measures_what_reading_a_window_takes(town: Path) -> None:
     # two seconds for all points, of which the window holds some
     share = slow.points / planned([town])[1].points
     assert slow.stage_s["ingest"] >= 2.0 * share
+
+
+def test_windows_that_come_too_late_are_left_out_except_one_for_each_process(town: Path) -> None:
+    request, plan, paths = planned([town])
+    work = dataclasses.replace(LARGE, points_by_file={paths[0]: 1})
+    tasks = sample_tasks(work, request, plan, paths, 2)
+    assert [task.until_s == math.inf for task in tasks] == [True, True, *[False] * (len(tasks) - 2)]
+    late = dataclasses.replace(tasks[-1], until_s=0.0, path="nowhere")
+    assert sample_window(late) == Sampled()
+
+
+def test_a_share_that_lacks_flight_lines_is_not_taken_for_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sample, "_READ_POINTS", 5_000)
+    file, x = tmp_path / "lines.las", np.arange(10_000) % 100
+    las = laspy.create(point_format=6)
+    # two flight lines over the same square, one after the other
+    las.xyz = np.column_stack([np.tile(x, 2), np.tile(np.arange(10_000) // 100, 2), np.zeros(20_000)])
+    las.write(file)
+    request, plan, paths = planned([file])
+    task = sample_tasks(dataclasses.replace(LARGE, points_by_file={paths[0]: 1}), request, plan, paths, 1)[0]
+    assert task.share is not None
+    task = dataclasses.replace(task, side_m=20.0)
+    seen = sample._seen(task, sample.open_source(file), lambda: 0.0)
+    assert seen is not None
+    assert seen.read_points == 20_000
+    # laid out one after the other, a share is as dense as the file
+    las.xyz = np.column_stack([np.arange(20_000) // 100, np.arange(20_000) % 100, np.zeros(20_000)])
+    las.write(file)
+    seen = sample._seen(
+        dataclasses.replace(task, side_m=20.0, density_per_m2=1.0), sample.open_source(file), lambda: 0.0
+    )
+    assert seen is not None
+    assert seen.read_points <= 5_000
 
 
 def test_a_window_that_takes_too_long_counts_for_nothing(town: Path) -> None:
