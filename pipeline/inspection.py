@@ -135,8 +135,8 @@ def _forecast(path: str | Path, options: ReadOptions, plan: Plan) -> Forecast:
     """The forecast of a run with the default settings."""
     request = RunRequest(inputs=(str(path),), out="", crs=options.crs, vertical_unit=options.vertical_unit)
     at = workers_that_fit(cores(), memory_bytes(), plan.window_bytes)
-    engine, hands = engine_of(Resources(), expected_cpu_s=sum(expected(plan).cpu_s().values()), at=at)
-    return forecast(request, plan, [str(path)], engine=engine, hands=hands)
+    engine, workers = engine_of(Resources(), expected_cpu_s=sum(expected(plan).cpu_s().values()), at=at)
+    return forecast(request, plan, [str(path)], engine=engine, workers=workers)
 
 
 def _inspection(

@@ -134,8 +134,10 @@ def _estimated(batch: Batch, worth_s: float, known: tuple[int, int]) -> Estimate
     resources = request.resources
     # the run chooses its engine by the rates
     engine, workers, limit = _workers(resources, sum(work.cpu_s().values()))
-    hands = workers if resources.scheduler is not None else min(workers, cores())
-    found = forecast(request, plan, paths, engine=engine, hands=hands, buildings=buildings, worth_s=worth_s)
+    refusals = [*places_refused(batch), *_memory_refused(plan, limit)]
+    if refusals:
+        worth_s = math.inf  # nothing will run
+    found = forecast(request, plan, paths, engine=engine, workers=workers, buildings=buildings, worth_s=worth_s)
     work, buildings = found.work, found.work.buildings
     side = plan.grid.size_mm / MM
     work_bytes = int(
@@ -146,11 +148,7 @@ def _estimated(batch: Batch, worth_s: float, known: tuple[int, int]) -> Estimate
     out_bytes = buildings * _RESULT_BYTES + (round(work.points * _POINT_BYTES) if batch.output.points else 0)
     work_free, out_free = _free(batch.work_folder), _free(batch.out)
     most_bytes = int(RATES.process_gib * 2**30) + plan.window_bytes
-    refusals = [
-        *places_refused(batch),
-        *_memory_refused(plan, limit),
-        *_disk_refused(batch, work_bytes, work_free, out_bytes, out_free),
-    ]
+    refusals += _disk_refused(batch, work_bytes, work_free, out_bytes, out_free)
     warnings = list(progress.warnings)
     if resources.scheduler is not None and workers == 0:
         warnings.append(f"the scheduler {resources.scheduler} has no worker now: the run would wait for one")

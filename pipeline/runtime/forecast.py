@@ -8,10 +8,11 @@ from collections.abc import Mapping, Sequence
 from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled
 from pipeline.runtime.engine import Engine
 from pipeline.runtime.expected import RATES, Expected, expected
+from pipeline.runtime.monitoring.machine import cores
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest
 
-WORTH_S = 10.0
+WORTH_S = 5.0
 """Runs that take less wall time by the rates are not sampled: the sample would take a good part of their time."""
 _BY_SAMPLE = 1.5
 """Factor either way by which a run may differ from a forecast by a sample: docs/how_to/plan_a_run.md."""
@@ -57,11 +58,11 @@ def forecast(
     paths: Sequence[str],
     *,
     engine: Engine,
-    hands: int,
+    workers: int,
     buildings: int | None = None,
     worth_s: float = WORTH_S,
 ) -> Forecast:
-    """The forecast of a run with an engine and so many processes that work at once.
+    """The forecast of a run with an engine and so many processes; on this machine its cores bound what works at once.
 
     Without compiled kernels nothing is sampled: that would compile them. Raises InputError if an input cannot be read.
 
@@ -75,8 +76,9 @@ def forecast(
     work = dataclasses.replace(expected(plan, buildings), octree=request.points)
     if request.settings.general.method != "arrangement":
         work = dataclasses.replace(work, pace={"reconstruct": RATES.other_methods})
-    total_s, stage_s = _total_s(work, engine, hands)
     here = request.resources.scheduler is None
+    hands = min(workers, cores()) if here else workers
+    total_s, stage_s = _total_s(work, engine, hands)
     cold_s = 0.0 if not here or kernels_are_compiled() else RATES.compiling_s
     found = None
     if total_s >= worth_s and here and not cold_s:
@@ -93,7 +95,7 @@ def forecast(
         total_s=total_s,
         cold_s=cold_s,
         process_bytes=max(largest, round(driver)),
-        memory_bytes=round(hands * largest + driver),
+        memory_bytes=round(workers * largest + driver),
     )
 
 

@@ -51,6 +51,8 @@ _SAMPLE_S = 8.0
 """Windows that have not begun after this wall time are left out, except one for each process."""
 _READ_POINTS = 1_000_000
 """Points of a larger file that are read for a window."""
+_MOST_POINTS = 500_000
+"""Points of a window that is not made smaller."""
 _THIN = 0.7
 """A window that is thinner than the file by this factor lacks the other flight lines: then more of the file is read."""
 _READ_S = 4.0
@@ -309,8 +311,7 @@ def _cut(clouds: Sequence[PointCloud], at: float, side_m: float) -> tuple[PointC
     half = np.minimum(side_m, high - low) / 2.0
     middle = np.clip(xyz[int(at * len(xyz)), :2], low + half, high - half)
     far = np.abs(xyz[:, :2] - middle).max(axis=1)
-    most = _READ_POINTS // 4
-    while side_m > _SIDES_M[0] / 2.0 and np.count_nonzero(far < side_m / 2.0) > most:
+    while side_m > _SIDES_M[0] / 2.0 and np.count_nonzero(far < side_m / 2.0) > _MOST_POINTS:
         side_m /= 2.0
     inside = far < side_m / 2.0
     starts = np.cumsum([0, *map(len, clouds)])

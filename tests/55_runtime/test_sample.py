@@ -203,7 +203,7 @@ def test_the_window_lies_within_the_data_and_shrinks_where_it_holds_too_much(
         assert (points.xyz[:, :2].max(axis=0) - points.xyz[:, :2].min(axis=0)).tolist() == pytest.approx(
             [100.0, 100.0], abs=3.0
         )
-    monkeypatch.setattr(sample, "_READ_POINTS", 40_000)
+    monkeypatch.setattr(sample, "_MOST_POINTS", 10_000)
     points, side_m = sample._cut(clouds, 0.5, 200.0)
     assert side_m < 200.0
     assert len(points) <= 10_000
@@ -252,10 +252,10 @@ class _Fails:
         raise AssertionError
 
 
-def foreseen(town: Path, engine: Engine, resources: Resources, worth_s: float) -> forecasts.Forecast:
+def foreseen(town: Path, engine: Engine, resources: Resources, worth_s: float, workers: int = 2) -> forecasts.Forecast:
     request, plan, paths = planned([town])
     request = dataclasses.replace(request, resources=resources)
-    return forecast(request, plan, paths, engine=engine, hands=2, worth_s=worth_s)
+    return forecast(request, plan, paths, engine=engine, workers=workers, worth_s=worth_s)
 
 
 def test_a_sample_is_run_only_where_it_is_worth_it(town: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -293,6 +293,17 @@ def test_a_building_that_ends_its_process_leaves_the_rates(town: Path) -> None:
 
     request, plan, paths = planned([town])
     assert sampled(expected(plan), request, plan, paths, hands=1, executor=Dying()) is None
+
+
+def test_more_workers_than_cores_are_no_faster_and_need_more_memory(
+    town: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(forecasts, "cores", lambda: 2)
+    two, four = (foreseen(town, "cluster", Resources(), 1e9, workers) for workers in (2, 4))
+    assert two.total_s == four.total_s
+    assert four.memory_bytes == pytest.approx(two.memory_bytes + 2 * two.work.process_bytes(alone=False), abs=2)
+    far = Resources(scheduler="tcp://far:8786")
+    assert foreseen(town, "cluster", far, 1e9, 4).total_s < foreseen(town, "cluster", far, 1e9, 2).total_s
 
 
 def test_more_processes_and_denser_tiles_need_more_memory(town: Path) -> None:
