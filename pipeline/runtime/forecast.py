@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+from pipeline.compiler.signatures import kernel_named
+from pipeline.compiler.warm_up import listed
 from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled
 from pipeline.runtime.engine import Engine
 from pipeline.runtime.expected import RATES, Expected, expected
@@ -19,6 +21,8 @@ _BY_SAMPLE = 1.5
 _BY_RATES = 2.0
 """The same of a forecast by the rates alone; other machines may differ by more."""
 
+_METHOD = "arrangement"
+"""The default method."""
 _DRIVER_GIB: Mapping[Engine, float] = {
     "serial": 0.0,
     "local": RATES.driver_gib,
@@ -74,12 +78,12 @@ def forecast(
         Wall seconds by the rates from which on a sample is run.
     """
     work = dataclasses.replace(expected(plan, buildings), octree=request.points)
-    if request.settings.general.method != "arrangement":
+    if request.settings.general.method != _METHOD:
         work = dataclasses.replace(work, pace={"reconstruct": RATES.other_methods})
     here = request.resources.scheduler is None
     hands = min(workers, cores()) if here else workers
     total_s, stage_s = _total_s(work, engine, hands)
-    cold_s = 0.0 if not here or kernels_are_compiled() else RATES.compiling_s
+    cold_s = 0.0 if not here or _is_compiled(request) else RATES.compiling_s
     found = None
     if total_s >= worth_s and here and not cold_s:
         from pipeline.runtime.sample import sampled  # loads what runs
@@ -97,6 +101,14 @@ def forecast(
         process_bytes=max(largest, round(driver)),
         memory_bytes=round(workers * largest + driver),
     )
+
+
+def _is_compiled(request: RunRequest) -> bool:
+    """Whether this machine has compiled the kernels of a run: each method has its own, and so has `--points`."""
+    groups = ["compare"] if request.settings.general.method != _METHOD else []
+    groups += ["classify"] if request.points else []
+    others = listed(groups) if groups else []
+    return kernels_are_compiled() and all(kernel_named(one.kernel).is_compiled for one in others)
 
 
 def _total_s(work: Expected, engine: Engine, hands: int) -> tuple[float, dict[str, float]]:

@@ -273,6 +273,25 @@ def test_a_sample_is_run_only_where_it_is_worth_it(town: Path, monkeypatch: pyte
     assert cold.range_s[1] == short.range_s[1] + RATES.compiling_s
 
 
+def test_other_methods_and_points_over_models_need_kernels_of_their_own(
+    town: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(forecasts, "kernels_are_compiled", lambda: True)
+    asked: list[str] = []
+
+    class Cold:
+        is_compiled = False
+
+    monkeypatch.setattr(forecasts, "kernel_named", lambda name: asked.append(name) or Cold())
+    request, _, _ = planned([town])
+    general = dataclasses.replace(request.settings.general, method="kmeans")
+    settings = dataclasses.replace(request.settings, general=general)
+    assert forecasts._is_compiled(request)
+    assert not forecasts._is_compiled(dataclasses.replace(request, points=True))
+    assert not forecasts._is_compiled(dataclasses.replace(request, settings=settings))
+    assert len(set(asked)) == 2
+
+
 def test_what_was_measured_makes_the_range_narrower(town: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(forecasts, "kernels_are_compiled", lambda: True)
     by_rates = foreseen(town, "local", Resources(), 1e9)
