@@ -1,13 +1,16 @@
 """Estimates of `batch plan` against true runs: wall time and memory, by ratio.
 
     python -m benchmarks.estimates --out DIR [--data ../shared/data] [--suites DIR] [--cities DIR DIR] [--rounds 3]
-                                   [--only NAME ...]
+                                   [--only NAME ...] [--cpu]
 
 Each round plans each job and runs it right after, both as commands of their own, so that both meet about the same load.
 `--suites` holds what `gablework simulate SUITE --split test --out DIR/SUITE` wrote, `--cities` what `city_tiles.py`
 wrote. DIR/estimates.md holds, for each job, the medians of the estimate, of the true figure and of their ratio, with
 the least and the greatest ratio, and the load of the machine; DIR/estimates.json holds every round. Memory is that of
 the largest process, and of all processes together, by `run.json`. Runs of less than 20 s are listed, too.
+
+With `--cpu` each job is sampled and run serially in one process whose clock is its CPU time: what others do on the
+machine then counts little. The table is DIR/estimates_cpu.md.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import multiprocessing
 import os
 import shutil
 import statistics
@@ -22,11 +26,23 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from benchmarks.entries import markdown_table
+from pipeline.batch.batch_file import read_batch
 from pipeline.batch.remaining_time import duration
+from pipeline.runtime.cluster.serial_executor import SerialExecutor
+from pipeline.runtime.expected import expected
+from pipeline.runtime.monitoring.events import ignore
+from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.request import plan_inputs
+from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.run import run
+from pipeline.runtime.sample import sample_tasks, sample_window, sampled
+from pipeline.runtime.stages.given_footprints import given_footprints
+from pipeline.runtime.stages.model_batch import load
 
 COMMAND = [sys.executable, "-m", "service.cli"]
 FIGURES = ("wall_s", "largest_gib", "all_gib")
@@ -141,6 +157,40 @@ def measured(job: Job, out: Path) -> dict[str, Any]:
     }
 
 
+def measured_by_cpu(job: Job, out: Path) -> dict[str, Any]:
+    """Sample a job and run it serially, by the CPU time of this process, which must be fresh: its clock is replaced."""
+    time.perf_counter = time.process_time
+    (out / "job.toml").write_text(dataclasses.replace(job, workers=0).batch(out / "models"))
+    request = dataclasses.replace(read_batch(str(out / "job.toml")).request(), overwrite=True, resources=SERIAL)
+    plan, paths = plan_inputs(request, Progress(ignore))
+    known = None if request.footprints is None else len(given_footprints(request.footprints, plan).polygons)
+    by_rates = expected(plan, known)
+    load(request.settings.general.method)
+    # libraries and kernels are loaded before the clock starts, as children load them
+    sample_window(sample_tasks(by_rates, request, plan, paths, 1)[0])
+    found = sampled(by_rates, request, plan, paths, hands=1, buildings=known, executor=SerialExecutor())
+    assert found is not None
+    summary = run(request)
+    guess, truth = found.wall_s(1), {stage: summary.timings_s.get(stage, 0.0) for stage in found.wall_s(1)}
+    return {
+        "job": dataclasses.replace(job, workers="auto").label,
+        "cpu_s": [sum(guess.values()), sum(truth.values())],
+        "stage_s": [guess, truth],
+        "buildings": [found.buildings, summary.counts["candidates"]],
+    }
+
+
+def cpu_rows(rounds: Iterable[dict[str, Any]]) -> list[list[str]]:
+    """A row per job."""
+    table = []
+    for found in rounds:
+        guess, truth = found["cpu_s"]
+        name = f"{found['job']} *" if found["job"].split(",")[0] in CHOSEN_ON else found["job"]
+        counts = "{} / {}".format(*found["buildings"])
+        table.append([name, f"{guess:.1f} s", f"{truth:.1f} s", f"{guess / truth:.2f}", counts])
+    return table
+
+
 def rows(rounds: Iterable[dict[str, Any]]) -> list[list[str]]:
     """A row per job: medians, and the range of the ratios of estimate to truth."""
     by_job: dict[str, list[dict[str, Any]]] = {}
@@ -168,6 +218,23 @@ HEADER = (
 )
 
 
+def _by_cpu(chosen: Sequence[Job], out: Path) -> int:
+    """One round by CPU time, each job in a fresh process."""
+    found: list[dict[str, Any]] = []
+    # engines do not differ here
+    for job in {dataclasses.replace(job, workers="auto"): job for job in chosen}:
+        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+            found.append(pool.submit(measured_by_cpu, job, out).result())
+        guess, truth = found[-1]["cpu_s"]
+        print(f"{job.label}: {guess:.1f} s estimated, {truth:.1f} s true, ratio {guess / truth:.2f}", flush=True)
+        Path(out, "estimates_cpu.json").write_text(json.dumps(found, indent=1) + "\n")
+        Path(out, "estimates_cpu.md").write_text(markdown_table(CPU_HEADER, cpu_rows(found)))
+    return 0
+
+
+CPU_HEADER = ("job", "CPU time estimated", "true", "ratio", "buildings")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -177,6 +244,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cities", type=Path, nargs="*", default=())
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--only", nargs="*")
+    parser.add_argument("--cpu", action="store_true")
     wanted = parser.parse_args(arguments)
     wanted.out.mkdir(parents=True, exist_ok=True)
     chosen = [
@@ -184,6 +252,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for job in jobs(wanted.data, wanted.suites, wanted.cities)
         if not wanted.only or any(job.label.startswith(name) for name in wanted.only)
     ]
+    if wanted.cpu:
+        return _by_cpu(chosen, wanted.out)
     found = []
     for _ in range(wanted.rounds):
         for job in chosen:

@@ -14,7 +14,7 @@ from pipeline.runtime.monitoring.machine import cores
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest
 
-WORTH_S = 5.0
+WORTH_S = 3.0
 """Runs that take less wall time by the rates are not sampled: the sample would take a good part of their time."""
 _BY_SAMPLE = 1.5
 """Factor either way by which a run may differ from a forecast by a sample: docs/how_to/plan_a_run.md."""

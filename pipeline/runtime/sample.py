@@ -41,10 +41,12 @@ from pipeline.tiling import MM, TileGrid
 # Constants of the estimate, measured; they decide nothing in a run, so they are not settings.
 _WINDOW_S = 1.0
 """CPU seconds of a window, by the rates."""
-_SHARE = 0.1
-"""Share of a run's CPU time that its sample may take, by the rates, within the bounds of `_PER_HAND`."""
-_PER_HAND = (2, 5)
-"""Least and most windows per process: one window says little, many make the sample longer and not much better."""
+_SHARE = 0.15
+"""Share of a run's CPU time that its sample may take, by the rates."""
+_LEAST = 2
+"""Least windows: one alone says little."""
+_MOST_PER_HAND = 5
+"""Windows per process: more of them would make the sample longer and not much better."""
 _SIDES_M = (60.0, 600.0)
 """Least and greatest side of a window."""
 _SAMPLE_S = 8.0
@@ -156,7 +158,7 @@ def sample_tasks(work: Expected, request: RunRequest, plan: Plan, paths: Sequenc
         return []
     each = round(_SHARE * sum(work.cpu_s().values()) / _WINDOW_S / hands)
     # a window more than there are processes takes as long as one for each of them
-    wanted = hands * min(max(each, _PER_HAND[0]), _PER_HAND[1])
+    wanted = hands * min(max(each, -(-_LEAST // hands)), _MOST_PER_HAND)
     side_m = window_side_m(plan.density_per_m2)
     late_s = time.time() + _SAMPLE_S
     # multiples of the golden ratio are spread evenly, however many of the windows there will be time for
