@@ -34,8 +34,10 @@ class Rates:
     """CPU seconds per square kilometre with points that its blocks see."""
     ground_empty: float = 0.38
     """Cost of cells without points in a block's rectangle, as a share of the cost of cells with points."""
-    split_per_million: float = 0.9
-    """CPU seconds per million points of windows, halos included."""
+    split_per_million: float = 1.2
+    """CPU seconds per million points."""
+    split_halo: float = 0.5
+    """Cost of a point in the halo of a tile, as a share of the cost of its own points."""
     join_each: float = 0.00005
     """CPU seconds per building, spent by one process and not shared among workers."""
     units_per_million: float = 0.4
@@ -98,7 +100,7 @@ class Expected:
     readers: int = 1
     """Tasks that read the files."""
     seen_points: float
-    """Points of the tiles' windows, halos included."""
+    """Points of the tiles' windows by the cost of their split; those of halos count less."""
     buildings: int
     """Number of buildings."""
     ground_km2: tuple[float, ...] = ()
@@ -187,7 +189,7 @@ def expected(plan: Plan, buildings: int | None = None) -> Expected:
         read_points=read,
         readers=readers,
         tiles=len(tiles),
-        seen_points=sum(seen.values()),
+        seen_points=total + RATES.split_halo * max(0.0, sum(seen.values()) - total),
         window_points=max(seen.values(), default=0.0),
         ground_km2=_blocks_km2(grid, tiles, filled_cells(total, area_km2)),
         buildings=buildings,
