@@ -222,8 +222,9 @@ def _box_at(info: SourceInfo, plan: Plan, at: float, side_m: float) -> tuple[flo
     return (x - half) / unit, (y - half) / unit, (x + half) / unit, (y + half) / unit
 
 
-def sample_window(task: SampleTask, clock: Callable[[], float] = time.perf_counter) -> Sampled:
-    """Read a window and run over it; raises InputError if the file cannot be read."""
+def sample_window(task: SampleTask, clock: Callable[[], float] | None = None) -> Sampled:
+    """Read a window and run over it, by a clock in seconds; raises InputError if the file cannot be read."""
+    clock = clock or time.perf_counter
     if time.time() > task.until_s:
         return Sampled()
     source = open_source(task.path, task.options)
