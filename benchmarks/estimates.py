@@ -46,7 +46,7 @@ from pipeline.runtime.stages.model_batch import load
 
 COMMAND = [sys.executable, "-m", "service.cli"]
 FIGURES = ("wall_s", "largest_gib", "all_gib")
-CHOSEN_ON = ("city of 36 files", "sparse town", "Delft")
+CHOSEN_ON = ("city of 36 files", "suite city", "sparse town", "Delft")
 """Jobs whose stage times gave the rates, or on which the sample was developed."""
 
 
