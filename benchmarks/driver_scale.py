@@ -85,7 +85,7 @@ def moved(stored: bytes, columns: int) -> Any:
 
 
 def name_of(work: OutcomeTask[Any, Any, Any], unit: str) -> tuple[str, ...]:
-    """What tells the tasks of a unit from each other, whatever their keys."""
+    """A name for a task that does not depend on keys."""
     task = work.task
     stage = work.place.stage.partition("-")[0]
     if stage == "ingest":

@@ -12,8 +12,13 @@ import numpy as np
 from pipeline.io.area_of_use import Location
 from pipeline.io.source import ReadOptions, Source, SourceInfo, open_source
 from pipeline.model import FloatArray
-from pipeline.runtime.expected import RATES, expected
+from pipeline.runtime.engine import engine_of, workers_that_fit
+from pipeline.runtime.expected import expected
+from pipeline.runtime.forecast import Forecast, forecast
+from pipeline.runtime.monitoring.machine import cores, memory_bytes
 from pipeline.runtime.plan import Plan, make_plan
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import Resources
 from pipeline.settings import RunSettings
 
 RAISED_M = 2.5
@@ -24,8 +29,6 @@ MIN_AREA_M2 = 10.0
 """Smaller groups of raised cells are not counted."""
 MAX_CELLS = 4_000_000
 """Bounds the raster's memory: a larger tile gets coarser cells."""
-_CORES = 2
-"""Cores of the estimated time."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,10 +59,14 @@ class Inspection:
     """Groups of raised cells: buildings and trees; touching houses count as one."""
     cell_m: float
     """Side of the raster's cells."""
-    estimated_seconds: float
-    """Wall time of `reconstruct` on two cores, kernels compiled."""
+    estimated_buildings: int
+    """Buildings as in a sample, or as many as such an area often has."""
+    estimated_seconds: tuple[float, float]
+    """Least and most wall time of `reconstruct` on this machine."""
+    estimated_from_sample: bool
+    """Whether a sample of the run was measured; short runs are estimated by rates alone."""
     estimated_gib: float
-    """Peak memory of a worker process."""
+    """Peak memory of all its processes together."""
 
     def rows(self) -> list[tuple[str, str]]:
         """The facts as pairs of name and value, for people."""
@@ -68,6 +75,8 @@ class Inspection:
         x0, y0, _, x1, y1, _ = info.bounds_m
         kept_out = ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in self.dropped.items() if n)
         pulses = ", ".join(f"{n}: {100.0 * k / self.used_points:.0f} %" for n, k in self.returns.items())
+        basis = "as in a sample" if self.estimated_from_sample else "as many as such an area often has"
+        least, most = self.estimated_seconds
         acquired = "unknown"
         if info.acquired_from is not None and info.acquired_to is not None:
             acquired = f"{info.acquired_from:%Y-%m-%d} to {info.acquired_to:%Y-%m-%d}"
@@ -92,8 +101,9 @@ class Inspection:
                 "raised objects",
                 f"{self.raised_objects} higher than {RAISED_M:g} m (trees too; touching houses are one)",
             ),
-            ("estimated time", f"{self.estimated_seconds:.0f} s on two cores"),
-            ("estimated memory", f"{self.estimated_gib:.1f} GiB a worker"),
+            ("estimated buildings", f"{self.estimated_buildings}, {basis}"),
+            ("estimated time", f"{least:.0f} to {most:.0f} s on this machine"),
+            ("estimated memory", f"{self.estimated_gib:.1f} GiB for all processes"),
         ]
 
 
@@ -116,8 +126,17 @@ def inspect(path: str | Path, options: ReadOptions | None, on_progress: Callable
         lowest = min(lowest, float(cloud.xyz[:, 2].min()))
         highest = max(highest, float(cloud.xyz[:, 2].max()))
         on_progress(used, source.info.point_count)
-    plan = make_plan([str(path)], options or ReadOptions(), RunSettings())
-    return _inspection(source, raster, classes, returns, used, (lowest, highest), plan)
+    options = options or ReadOptions()
+    plan = make_plan([str(path)], options, RunSettings())
+    return _inspection(source, raster, classes, returns, used, (lowest, highest), _forecast(path, options, plan))
+
+
+def _forecast(path: str | Path, options: ReadOptions, plan: Plan) -> Forecast:
+    """The forecast of a run with the default settings."""
+    request = RunRequest(inputs=(str(path),), out="", crs=options.crs, vertical_unit=options.vertical_unit)
+    at = workers_that_fit(cores(), memory_bytes(), plan.window_bytes)
+    engine, workers = engine_of(Resources(), expected_cpu_s=sum(expected(plan).cpu_s().values()), at=at)
+    return forecast(request, plan, [str(path)], engine=engine, workers=workers)
 
 
 def _inspection(
@@ -127,11 +146,9 @@ def _inspection(
     returns: np.ndarray[tuple[int], np.dtype[np.int64]],
     used: int,
     elevation_m: tuple[float, float],
-    plan: Plan,
+    run: Forecast,
 ) -> Inspection:
-    objects = raster.raised_objects()
     area = raster.occupied_area_m2()
-    work = expected(plan, objects)
     return Inspection(
         info=source.info,
         warnings=source.warnings + _outside(source.info),
@@ -143,10 +160,12 @@ def _inspection(
         elevation_m=elevation_m,
         occupied_area_m2=area,
         density_per_m2=used / area if area > 0.0 else math.nan,
-        raised_objects=objects,
+        raised_objects=raster.raised_objects(),
         cell_m=raster.cell_m,
-        estimated_seconds=RATES.start_s + sum(work.wall_s(_CORES).values()),
-        estimated_gib=RATES.process_gib + plan.window_bytes / 2**30,
+        estimated_buildings=run.work.buildings,
+        estimated_seconds=run.range_s,
+        estimated_from_sample=run.sampled,
+        estimated_gib=run.memory_bytes / 2**30,
     )
 
 

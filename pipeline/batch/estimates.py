@@ -1,14 +1,14 @@
 """Estimates a batch run before anything runs: tiles, points, memory, time, disk, and reasons why it cannot work.
 
-Points and areas come from the headers of all inputs. The number of buildings comes from a few inputs that are read
-completely. Times are those of `pipeline.runtime.expected`; the true ones depend on machine and scene, so they are given
-as a range.
+Points and areas come from the headers of all inputs. Times and the number of buildings come from a sample of the run,
+or from measured rates alone where it is short (`pipeline.runtime.forecast`).
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -18,13 +18,12 @@ from pipeline.batch.batch_file import Batch
 from pipeline.batch.keys import as_keys, errors_with_keys
 from pipeline.batch.remaining_time import duration
 from pipeline.errors import EmptyInputError, InputError, RunError
-from pipeline.inspection import inspect
 from pipeline.io import shown
-from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled
 from pipeline.runtime.cluster.dask_executor import memory_of_workers
 from pipeline.runtime.cluster.performance_report import PerformanceReport
-from pipeline.runtime.engine import engine_of
+from pipeline.runtime.engine import Engine, engine_of
 from pipeline.runtime.expected import RATES, expected
+from pipeline.runtime.forecast import WORTH_S, forecast
 from pipeline.runtime.monitoring.events import ignore
 from pipeline.runtime.monitoring.machine import cores, memory_bytes
 from pipeline.runtime.monitoring.progress import Progress
@@ -38,8 +37,6 @@ from pipeline.runtime.stages.given_footprints import given_footprints
 from pipeline.tiling import MM
 
 # Constants of the estimate, measured; they decide nothing in a run, so they are not settings.
-_RANGE = 2.0
-"""Factor by which machines and scenes differ, either way."""
 _RESULT_BYTES = 12_000
 """Bytes per building in a run directory, with meshes; 7 to 12 kB measured."""
 _POINT_BYTES = 25.0
@@ -65,17 +62,23 @@ class Estimate:
     tile_size_m: float
     """Side of a tile."""
     buildings: int
-    """Expected buildings: raised objects of the inputs that were read, scaled up, or the given footprints."""
+    """Expected buildings."""
     buildings_from: str
     """Source of that number, in words."""
     workers: int
     """Processes on this machine, or the workers that the scheduler has now."""
     worker_bytes: int
-    """Peak memory of a worker."""
+    """Expected peak memory of the largest process."""
+    worker_most_bytes: int
+    """Memory that a worker may need for the largest task of the plan."""
+    memory_bytes: int
+    """Expected peak memory of all processes together."""
     worker_limit_bytes: int | None
     """Memory limit of a worker; None if there is none, or no worker to ask."""
     stage_s: Mapping[str, float]
     """Wall seconds by stage."""
+    sampled: bool
+    """Whether a sample of the run was measured for the times."""
     seconds: tuple[float, float]
     """Least and most seconds in total."""
     work_bytes: int
@@ -92,15 +95,15 @@ class Estimate:
     """Reasons why it cannot work, each with the fix; a run does not begin if there is one."""
 
 
-def estimate(batch: Batch, read: int = 3, known: tuple[int, int] = (0, 0)) -> Estimate:
+def estimate(batch: Batch, worth_s: float = WORTH_S, known: tuple[int, int] = (0, 0)) -> Estimate:
     """Estimate a batch run.
 
     Parameters
     ----------
-    read : int
-        Inputs that are read completely to find the number of buildings.
+    worth_s : float
+        Wall seconds by the rates from which on a sample is run.
     known : tuple of int
-        Buildings and points of an earlier run of the batch: if the points are as many now, nothing is read.
+        Buildings and points of an earlier run of the batch: if the points are as many now, nothing is sampled.
 
     Raises
     ------
@@ -110,10 +113,10 @@ def estimate(batch: Batch, read: int = 3, known: tuple[int, int] = (0, 0)) -> Es
         The scheduler does not answer.
     """
     with errors_with_keys():
-        return _estimated(batch, read, known)
+        return _estimated(batch, worth_s, known)
 
 
-def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
+def _estimated(batch: Batch, worth_s: float, known: tuple[int, int]) -> Estimate:
     request = batch.request()
     progress = Progress(ignore)
     plan, paths = plan_inputs(request, progress)
@@ -122,19 +125,20 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
         raise EmptyInputError(
             shown(paths[0]), f"all {len(paths)} inputs lie off --bbox and --aoi", "Check them, and their CRS"
         )
+    buildings, known_from = None, None
     if request.footprints is not None:
-        buildings, buildings_from = len(given_footprints(request.footprints, plan).polygons), "the given footprints"
+        buildings, known_from = len(given_footprints(request.footprints, plan).polygons), "the given footprints"
+        work = dataclasses.replace(work, buildings=buildings)
     elif known[0] and known[1] == work.points:
-        buildings, buildings_from = known[0], "as many as in the run before"
-    else:
-        used = [path for path in paths if shown(path) in work.points_by_file]
-        buildings, buildings_from = _objects(plan, work.points, used, read)
-    work = dataclasses.replace(work, buildings=buildings)
+        buildings, known_from, worth_s = known[0], "as many as in the run before", math.inf
     resources = request.resources
+    # the run chooses its engine by the rates
     engine, workers, limit = _workers(resources, sum(work.cpu_s().values()))
-    stages = work.wall_s(workers if resources.scheduler is not None else min(workers, cores()))
-    total = RATES.start_s + sum(stages.values()) + (RATES.cluster_start_s if engine == "cluster" else 0.0)
-    cold_s = RATES.compiling_s if resources.scheduler is None and not kernels_are_compiled() else 0.0
+    refusals = [*places_refused(batch), *_memory_refused(plan, limit)]
+    if refusals:
+        worth_s = math.inf  # nothing will run
+    found = forecast(request, plan, paths, engine=engine, workers=workers, buildings=buildings, worth_s=worth_s)
+    work, buildings = found.work, found.work.buildings
     side = plan.grid.size_mm / MM
     work_bytes = int(
         work.points * POINT.itemsize * (1.0 + _SPLIT_SHARE)
@@ -143,28 +147,27 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
     )
     out_bytes = buildings * _RESULT_BYTES + (round(work.points * _POINT_BYTES) if batch.output.points else 0)
     work_free, out_free = _free(batch.work_folder), _free(batch.out)
-    worker_bytes = int(RATES.process_gib * 2**30) + plan.window_bytes
-    refusals = [
-        *places_refused(batch),
-        *_memory_refused(plan, limit),
-        *_disk_refused(batch, work_bytes, work_free, out_bytes, out_free),
-    ]
+    most_bytes = int(RATES.process_gib * 2**30) + plan.window_bytes
+    refusals += _disk_refused(batch, work_bytes, work_free, out_bytes, out_free)
     warnings = list(progress.warnings)
     if resources.scheduler is not None and workers == 0:
         warnings.append(f"the scheduler {resources.scheduler} has no worker now: the run would wait for one")
-    warnings += _warnings_of_workers(cold_s, limit, plan.window_bytes, worker_bytes)
+    warnings += _warnings_of_workers(found.cold_s, limit, plan.window_bytes, most_bytes)
     return Estimate(
         files=len(paths),
         points=work.points,
         tiles=work.tiles,
         tile_size_m=side,
         buildings=buildings,
-        buildings_from=buildings_from,
+        buildings_from=known_from or ("as in a sample" if found.sampled else "as many as such an area often has"),
         workers=workers,
-        worker_bytes=worker_bytes,
+        worker_bytes=found.process_bytes,
+        worker_most_bytes=most_bytes,
+        memory_bytes=found.memory_bytes,
         worker_limit_bytes=limit,
-        stage_s=stages,
-        seconds=(total / _RANGE, total * _RANGE + cold_s),
+        stage_s=found.stage_s,
+        sampled=found.sampled,
+        seconds=found.range_s,
         work_bytes=work_bytes,
         work_free_bytes=work_free,
         out_bytes=out_bytes,
@@ -174,7 +177,7 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
     )
 
 
-def _workers(resources: Resources, expected_cpu_s: float) -> tuple[str, int, int | None]:
+def _workers(resources: Resources, expected_cpu_s: float) -> tuple[Engine, int, int | None]:
     """The engine, its number of workers, and their memory limit if there is one."""
     engine, processes = engine_of(resources, expected_cpu_s=expected_cpu_s, at=cores())
     if engine == "local":
@@ -183,32 +186,19 @@ def _workers(resources: Resources, expected_cpu_s: float) -> tuple[str, int, int
     return engine, *memory_of_workers(workers=embedded, scheduler=resources.scheduler, tls=resources.tls)
 
 
-def _warnings_of_workers(cold_s: float, limit: int | None, window_bytes: int, worker_bytes: int) -> list[str]:
+def _warnings_of_workers(cold_s: float, limit: int | None, window_bytes: int, most_bytes: int) -> list[str]:
     warnings = []
     if cold_s:
         warnings.append(
             "numba kernels are not compiled on this machine yet: this run compiles them, which may take "
             f"{duration(cold_s)} on top; gablework warm-up does it ahead"
         )
-    if limit is not None and window_bytes <= limit < worker_bytes:
+    if limit is not None and window_bytes <= limit < most_bytes:
         warnings.append(
-            f"a worker may need up to {worker_bytes / 2**30:.1f} GiB, its limit is {limit / 2**30:.1f}: if workers are "
+            f"a worker may need up to {most_bytes / 2**30:.1f} GiB, its limit is {limit / 2**30:.1f}: if workers are "
             "ended for it, set a smaller tile_size_m, or give them more memory"
         )
     return warnings
-
-
-def _objects(plan: Plan, wanted: int, paths: Sequence[str], read: int) -> tuple[int, str]:
-    """Expected raised objects, scaled up from some inputs spread over all, and the source of the number in words."""
-    step = max(1, len(paths) // max(1, read))
-    chosen = paths[step // 2 :: step][:read]
-    objects = points = 0
-    for path in chosen:
-        found = inspect(path, plan.options, lambda done, total: None)  # noqa: ARG005 - the command shows its own progress
-        objects += found.raised_objects
-        points += found.used_points
-    source = f"raised objects in {len(chosen)} of {len(paths)} inputs, trees among them"
-    return round(objects * wanted / points) if points else 0, source
 
 
 def _free(folder: str) -> int | None:

@@ -19,8 +19,8 @@ from pipeline.runtime.monitoring.events import Event, Listener, ignore, never
 from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, locked_file, make_work, refuse_locked
 
-_READ = 1
-"""Inputs that are read completely for the estimate of a run; few, since the run should begin soon."""
+_WORTH_S = 60.0
+"""Runs that take less wall time by the rates are not sampled: they should begin soon."""
 
 
 def run_batch(
@@ -78,7 +78,7 @@ def _run_with_status(
     try:
         # the headers of thousands of remote inputs take minutes
         status.begin()
-        planned = estimate(batch, _READ, known)
+        planned = estimate(batch, _WORTH_S, known)
         refuse(planned.refusals)
         status.plan(planned.stage_s, planned.points)
         summary = run(batch.request(), listen, executor, tick)

@@ -28,7 +28,6 @@ _NEXT = 3
 
 def plan(
     file: BatchFile,
-    read: Annotated[int, typer.Option(min=1, help="Inputs to read whole, to estimate the number of buildings.")] = 3,
     as_json: AsJson = False,
 ) -> None:
     """Estimate what a batch run takes, and refuse what cannot work, before anything runs."""
@@ -37,7 +36,7 @@ def plan(
         from pipeline.batch.estimates import estimate, refuse
 
         batch = read_batch(file)
-        found = estimate(batch, read)
+        found = estimate(batch)
         console.table(f"The plan of {file}", ("figure", "value"), [*_rows(found), *_times(batch)])
         for warning in found.warnings:
             console.warn(warning)
@@ -129,13 +128,16 @@ def _times(batch: Batch) -> list[tuple[str, str]]:
 
 
 def _rows(found: Estimate) -> list[tuple[str, str]]:
+    basis = ", by a sample" if found.sampled else ""
+    largest, most, all_gib = (n / 2**30 for n in (found.worker_bytes, found.worker_most_bytes, found.memory_bytes))
     limit = "" if found.worker_limit_bytes is None else f" of {found.worker_limit_bytes / 2**30:.1f}"
     return [
         ("inputs", f"files: {found.files}, {found.points / 1e6:,.1f} million points"),
         ("tiles", f"{found.tiles} of {found.tile_size_m:g} m"),
         ("buildings", f"about {found.buildings:,} ({found.buildings_from})"),
-        ("memory per worker", f"at most {found.worker_bytes / 2**30:.1f}{limit} GiB"),
-        ("time", f"{duration(found.seconds[0])} to {duration(found.seconds[1])} with {_hands(found.workers)}"),
+        ("memory per worker", f"about {largest:.1f} GiB, at most {most:.1f}{limit} GiB"),
+        ("memory in all", f"about {all_gib:.1f} GiB"),
+        ("time", f"{duration(found.seconds[0])} to {duration(found.seconds[1])} with {_hands(found.workers)}{basis}"),
         ("work folder", f"{found.work_bytes / 1e9:.2f} GB{_of(found.work_free_bytes)}"),
         ("results", f"{found.out_bytes / 1e9:.2f} GB{_of(found.out_free_bytes)}"),
     ]

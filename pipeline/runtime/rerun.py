@@ -160,7 +160,7 @@ def _rerun(
         request.resources,
         run_scratch(str(earlier.run_dir), None),
         # a few tiles are split, which are not known yet; all inputs are read
-        dataclasses.replace(expected(plan, 0), seen_points=0.0, area_km2=0.0),
+        dataclasses.replace(expected(plan, 0), seen_points=0.0, ground_km2=()),
         loads=loads_of("reconstruct", footprints=False, method=wanted.settings.general.method),
         executor=executor,
         cancelled=cancelled,

@@ -137,9 +137,9 @@ def test_the_report_is_that_of_the_last_run_or_none(file: Path, text: str, monke
 def test_a_batch_of_other_points_is_looked_at_again(file: Path) -> None:
     assert call("run", file)[0] == 0
     batch, (count, points) = read_batch(file), buildings_before(str(file.with_suffix(".work")))
-    found = estimate(batch, 1, (count, points))
+    found = estimate(batch, known=(count, points))
     assert (found.buildings, found.buildings_from) == (count, "as many as in the run before")
-    assert estimate(batch, 1, (count, points + 1)).buildings_from.startswith("raised objects in 1 of 1")
+    assert estimate(batch, known=(count, points + 1)).buildings_from == "as many as such an area often has"
 
 
 def test_times_are_reported_before_the_first_run(file: Path, text: str) -> None:
@@ -247,7 +247,7 @@ def test_a_tile_that_no_worker_can_hold_is_refused(folder: Path, monkeypatch: py
 
 
 def test_a_limit_that_the_largest_tile_may_exceed_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    need = json.loads(call("plan", folder / "city.toml", "--json")[1])["worker_bytes"]
+    need = json.loads(call("plan", folder / "city.toml", "--json")[1])["worker_most_bytes"]
     monkeypatch.setattr("pipeline.batch.estimates.memory_of_workers", lambda **_: (2, need - 1))
     code, _, error = call("plan", folder / "city.toml")
     assert code == 0
@@ -270,7 +270,7 @@ def test_kernels_that_are_yet_to_be_compiled_are_reported_with_their_time(
 ) -> None:
     ends = []
     for compiled in (True, False):
-        monkeypatch.setattr("pipeline.batch.estimates.kernels_are_compiled", lambda compiled=compiled: compiled)
+        monkeypatch.setattr("pipeline.runtime.forecast.kernels_are_compiled", lambda compiled=compiled: compiled)
         reported = json.loads(call("plan", folder / "city.toml", "--json")[1])
         assert any("gablework warm-up" in text for text in reported["warnings"]) is not compiled
         ends.append(reported["seconds"][1])
