@@ -84,7 +84,7 @@ class PointRecords:
         return len(self.xyz)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class FileFacts:
     """What a file says about itself before its points are read, in the units of its CRS."""
 

@@ -92,7 +92,7 @@ class ReadOptions:
         )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class SourceInfo:
     """What is known of a file before its points are read."""
 
@@ -159,7 +159,7 @@ class SourceInfo:
         return (now.st_size, now.st_mtime_ns, etag_of(now)) == (self.file_size, self.modified_ns, self.etag)
 
 
-@dataclasses.dataclass(kw_only=True)
+@dataclasses.dataclass(kw_only=True, slots=True)
 class Findings:
     """What a pass over the points of a file, or over a share of them, found."""
 

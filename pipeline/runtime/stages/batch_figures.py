@@ -42,7 +42,7 @@ class Modelled:
     """Digest of all that is published of it."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class BatchFigures:
     """The figures of a batch, which travel to the driver; only failed, retried and slow buildings are listed."""
 
@@ -60,8 +60,8 @@ class BatchFigures:
     """Roof faces of all models."""
     reused: int
     """Models taken from earlier batches."""
-    slowest: tuple[tuple[float, str], ...]
-    """Seconds and ids of those that took longest."""
+    slowest: str
+    """Milliseconds and ids of those that took longest, as words: as objects they would take most of the memory."""
     content: int
     """Sum of the digests of all that is published."""
     notable: tuple[Modelled, ...]
@@ -87,7 +87,12 @@ class BatchFigures:
             roof_types=Counter(model.roof_type for model in shown),
             faces=sum(model.faces for model in shown),
             reused=sum(model.reused for model in models),
-            slowest=tuple(heapq.nlargest(SLOWEST, ((round(model.seconds, 3), model.building_id) for model in models))),
+            slowest=" ".join(
+                f"{milliseconds} {name}"
+                for milliseconds, name in heapq.nlargest(
+                    SLOWEST, ((round(1000.0 * model.seconds), model.building_id) for model in models)
+                )
+            ),
             content=sum(int(model.content, 16) for model in models if model.content),
             notable=tuple(
                 model
@@ -124,7 +129,7 @@ class Counted:
         """The counts of some batches, of whose candidates this run modelled `made`."""
         statuses, reasons, rejected, roof_types = Counter[str](), Counter[str](), Counter[str](), Counter[str]()
         seconds: dict[str, float] = {}
-        slowest: list[tuple[float, str]] = []
+        slowest: list[tuple[int, str]] = []
         faces = 0
         for batch in batches:
             statuses.update(batch.statuses)
@@ -133,7 +138,8 @@ class Counted:
             roof_types.update(batch.roof_types)
             faces += batch.faces
             seconds.update(batch.seconds)
-            slowest = heapq.nlargest(SLOWEST, (*slowest, *batch.slowest))
+            words = batch.slowest.split()
+            slowest = heapq.nlargest(SLOWEST, (*slowest, *zip(map(int, words[::2]), words[1::2], strict=True)))
         del statuses[REJECTED]
         return cls(
             statuses=statuses,
@@ -142,6 +148,6 @@ class Counted:
             roof_types=roof_types,
             faces=faces,
             made=made,
-            slowest=tuple(SlowBuilding(building_id=name, seconds=longest) for longest, name in slowest),
+            slowest=tuple(SlowBuilding(building_id=name, seconds=longest / 1000.0) for longest, name in slowest),
             seconds=seconds,
         )

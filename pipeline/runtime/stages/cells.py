@@ -53,7 +53,7 @@ class CellsTask:
     """Estimated peak memory of the process; 0 if unknown."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class TileCells:
     """What a tile held."""
 

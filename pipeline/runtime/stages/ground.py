@@ -58,7 +58,7 @@ class GroundTask:
     """Estimated peak memory of the process."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class TileGround:
     """The terrain of a tile as the driver knows it."""
 

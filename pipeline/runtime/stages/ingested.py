@@ -27,7 +27,7 @@ and that of real ground will do, and the setting `classes` overrules it."""
 _NO_POINTS = np.zeros(3, np.uint64)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class Ingested:
     """What one input file held, or a share of it."""
 

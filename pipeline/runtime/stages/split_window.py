@@ -70,7 +70,7 @@ class FootprintPoints:
     """(k, 3) int64, lexicographically smallest point of each."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class SplitFigures:
     """The figures of one tile, which travel to the driver."""
 
