@@ -224,13 +224,17 @@ def test_a_damaged_file_is_refused_and_not_left_out(town: Path, tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_a_sample_finds_about_as_many_buildings_as_the_run(town: Path, tmp_path: Path) -> None:
+def test_a_sample_finds_about_as_many_buildings_as_the_run(
+    town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for limit in ("_SAMPLE_S", "_READ_S", "_RUN_S"):
+        monkeypatch.setattr(sample, limit, math.inf)  # other work on this machine shall not decide
     request, plan, paths = planned([town])
     truth = run(dataclasses.replace(request, out=str(tmp_path / "out"), resources=SERIAL)).counts["candidates"]
     found = sampled(expected(plan), request, plan, paths, hands=1, executor=SerialExecutor())
     assert found is not None
     assert truth / 1.5 < found.buildings < truth * 1.5
-    assert set(found.pace) == set(found.cpu_s())
+    assert set(found.pace) == {stage for stage, seconds in found.cpu_s().items() if seconds > 0.0}
     assert min(found.pace.values()) > 0.0
 
 
