@@ -194,7 +194,7 @@ def window_side_m(density_per_m2: float) -> float:
     """Side of a window that takes a second by the rates.
 
     >>> [round(window_side_m(density)) for density in (0.3, 5.0, 14.0, 1000.0)]
-    [210, 174, 138, 60]
+    [211, 175, 138, 60]
     """
     points = density_per_m2 * 1e6
     buildings = round(min(RATES.buildings_per_km2, points / RATES.points_per_building))
