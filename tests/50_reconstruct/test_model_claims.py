@@ -19,7 +19,7 @@ from pipeline.ruler.simulation.als import ScannerSettings, scan_all
 from pipeline.ruler.simulation.scene import Building, Scene
 
 SURVEY = ScannerSettings(pulse_density_per_m2=5.0, range_noise_m=0.04)
-SCENES = range(4)
+SCENES = range(8)
 FAR_M = 1.0
 """No corner of a roof face lies higher above the points around the face, or lower below them."""
 
@@ -112,9 +112,8 @@ def test_two_of_three_ridges_are_as_near_to_the_truth_as_the_record_says(modelle
         assert 0.004 <= sigma < 1.0
         within.append((abs(error) <= sigma, abs(error) <= 3.0 * sigma))
     one_sigma, three_sigma = np.mean(within, axis=0)
-    # .68 if errors are normal, .80 on roofs without difficulties (docs/results/ridge_uncertainty.md); of 64 models one
-    # standard deviation of such a share is 5 or 6 points: two below the one and above the other are allowed
-    assert 0.56 <= one_sigma <= 0.9
+    # of 128 models one standard deviation of such a share is 4 points: three below .68 and four and a half above
+    assert 0.56 <= one_sigma <= 0.86
     assert three_sigma >= 0.9  # the others missed the ridge itself
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from pipeline.export.point_glb import NO_BUILDING, ModelledPoints, points_glb, united
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.outcomes import OutcomeTask, Place, run_and_store
+from pipeline.runtime.scratch.outcomes import InParts, OutcomeTask, Place, brief_within, run_and_store
 from pipeline.runtime.stages.coarse_points import CoarseTask, write_coarse
-from pipeline.runtime.stages.tile_points import StoredTilePoints, TilePoints
+from pipeline.runtime.stages.tile_points import TilePoints
 from pipeline.tiling import MM, Tile
 
 LEVELS = 7
@@ -31,7 +31,7 @@ def share(seed: int, n: int) -> ModelledPoints:
     )
 
 
-def stored(tile: Tile) -> StoredTilePoints:
+def stored(tile: Tile) -> InParts[TilePoints]:
     """A tile with 800 points for the first level, 400 for the next one, and so on."""
     seed = TILES.index(tile)
     origin_mm = (tile.column * 50 * MM, tile.row * 50 * MM, 0)
@@ -46,7 +46,7 @@ def stored(tile: Tile) -> StoredTilePoints:
         terrain=None,
     )
     parts = tuple(share(seed * LEVELS + level, 800 >> level) for level in range(LEVELS))
-    return StoredTilePoints(brief=brief, parts=parts)
+    return InParts(brief=brief, parts=parts)
 
 
 def test_each_level_reads_its_own_shares_and_writes_what_they_hold(
@@ -57,9 +57,7 @@ def test_each_level_reads_its_own_shares_and_writes_what_they_hold(
     shares = []
     for tile in TILES:
         place = Place("points", tile.key, "k")
-        work = OutcomeTask(
-            function=stored, task=tile, place=place, scratch=scratch, brief=lambda one: one.brief, stage="octree"
-        )
+        work = OutcomeTask(function=stored, task=tile, place=place, scratch=scratch, brief=brief_within, stage="octree")
         shares.append((place, run_and_store(work).brief.origin_mm))
     read: list[int] = []
     loads = pickle.loads

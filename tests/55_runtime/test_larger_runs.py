@@ -18,7 +18,9 @@ from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.scratch import outcomes
+from pipeline.runtime.scratch.outcomes import InParts
 from pipeline.runtime.stages import content_digest, join, stored_sites
+from pipeline.runtime.stages.join import JoinBrief
 from pipeline.settings import RunSettings
 
 TILED: dict[str, Any] = {"tile_size_m": 30.0, "classes": "ignore"}
@@ -60,7 +62,7 @@ def test_blocks_pass_on_little_and_the_last_join_finishes_it(quarter: Path, reco
     packed = outcomes._packed
 
     def noted(brief: object, result: object) -> bytes:
-        if isinstance(result, join.JoinedSurfaces):
+        if isinstance(result, InParts) and isinstance(result.brief, JoinBrief):
             count = sum(len(sites.found.candidate_points_mm) for sites in result.parts[: len(result.brief.owned)])
             joined.append((count, len(result.parts[-1].kind) if result.brief.passed_on else 0))
         return packed(brief, result)
@@ -132,6 +134,7 @@ def test_ranges_of_ids_follow_each_other_and_miss_no_row(planes: pa.Table) -> No
     whole = rows_of(planes, "planes")
     letters = [letter.encode() for letter in content_digest._ALPHABET]
     assert letters == sorted(letters)
+    assert tuple(KEYS) == content_digest.TABLES
     edges = [b"", *letters[1:], None]
     parts = [whole.between(low or b"", high) for low, high in itertools.pairwise(edges)]
     assert np.array_equal(np.concatenate([part.hashes for part in parts]), whole.hashes)

@@ -24,6 +24,7 @@ from pipeline.runtime.scratch.outcomes import (
     OutcomeTask,
     Place,
     brief_of,
+    brief_within,
     check_outcome,
     drop_outcomes,
     key_of,
@@ -166,12 +167,12 @@ def test_an_outcome_is_stored_with_its_brief(tmp_path: Path) -> None:
         result_of(work.scratch, work.place)
 
 
-def in_parts(task: int) -> InParts:
-    return InParts(parts=("first" * task, "second" * task, "third" * task))
+def in_parts(task: int) -> InParts[int]:
+    return InParts(parts=("first" * task, "second" * task, "third" * task), brief=3)
 
 
 def test_the_parts_of_a_result_are_read_alone(tmp_path: Path) -> None:
-    work = dataclasses.replace(outcome_task(tmp_path), function=in_parts, brief=lambda found: len(found.parts))
+    work = dataclasses.replace(outcome_task(tmp_path), function=in_parts, brief=brief_within)
     assert run_and_store(work).brief == 3
     path = tmp_path / work.place.name
     content = path.read_bytes()

@@ -29,7 +29,7 @@ class Files(Generic[Task, Brief]):
     reads: Callable[[Task], Iterable[str]] = _nothing
     """Folders with files of earlier stages that a task reads."""
     leaves: Callable[[Task, Brief], Iterable[str]] = _nothing
-    """Folders in which later stages read what a task left; the folder of its outcome, where they read that."""
+    """Folders in which later stages read what a task left; that of its outcome need not be named."""
     intact: Callable[[Task, Brief, str], bool] = _all_there
     """Whether the files in one of these folders are as the task left them, by its brief. Runs in a worker."""
     results: bool = False
@@ -97,8 +97,11 @@ class KeptFiles:
     def add(self, work: OutcomeTask[Task, Any, Brief], brief: Brief, files: Files[Task, Brief]) -> None:
         """Add what a task left; stages come in the order of the run."""
         self._stages[work.place.stage] = None
-        for folder in files.leaves(work.task, brief):
-            promise = Promise(folder=folder, work=work, files=files)
+        left = dict.fromkeys(files.leaves(work.task, brief), files)
+        # its outcome, which has checksums of its own, lies where tasks that read it look
+        left.setdefault(work.place.folder, dataclasses.replace(files, intact=_all_there))
+        for folder, how in left.items():
+            promise = Promise(folder=folder, work=work, files=how)
             self._promises.setdefault(folder, {})[work.place] = promise
 
     def take(self, folders: Iterable[str]) -> list[Promise[Any, Any]]:

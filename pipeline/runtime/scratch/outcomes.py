@@ -140,11 +140,18 @@ class Place:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class InParts:
-    """A result of which only the parts are stored, each to be read alone by `part_of`."""
+class InParts(Generic[Brief]):
+    """A result of which only the brief and the parts are stored; each part can be read alone by `part_of`."""
 
     parts: tuple[Any, ...]
     """Its parts."""
+    brief: Brief
+    """What travels to the driver."""
+
+
+def brief_within(result: InParts[Brief]) -> Brief:
+    """The brief of a result in parts."""
+    return result.brief
 
 
 def whole(result: Result) -> Result:

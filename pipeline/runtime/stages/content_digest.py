@@ -21,6 +21,7 @@ from pipeline.runtime.scratch.outcomes import (
     OutcomeTask,
     Place,
     brief_of,
+    brief_within,
     drop_outcomes,
     key_of,
     part_of,
@@ -76,7 +77,9 @@ def _ordered(executor: Executor, unit: str, tasks: Sequence[RowsTask], watch: Wa
     """Run tasks that put rows in order; where their outcomes are, in the order of the tasks."""
     places = [Place(STAGE, unit, key_of(unit, number)) for number in range(len(tasks))]
     works = [
-        OutcomeTask(function=rows_in_order, task=task, place=place, scratch=task.scratch, brief=counts_of, stage=STAGE)
+        OutcomeTask(
+            function=rows_in_order, task=task, place=place, scratch=task.scratch, brief=brief_within, stage=STAGE
+        )
         for place, task in zip(places, tasks, strict=True)
     ]
     with contextlib.closing(executor.map(STAGE, run_and_store, works, watch)) as running:
@@ -85,19 +88,16 @@ def _ordered(executor: Executor, unit: str, tasks: Sequence[RowsTask], watch: Wa
     return places
 
 
-def counts_of(found: InParts) -> tuple[int, ...]:
-    """The number of rows in each part."""
-    return tuple(len(rows.hashes) for rows in found.parts)
+def rows_in_order(task: RowsTask) -> InParts[tuple[int, ...]]:
+    """The rows of some outcomes in order, table by table; if they are cut, one range of ids after the other.
 
-
-def rows_in_order(task: RowsTask) -> InParts:
-    """The rows of some outcomes in order, table by table; if they are cut, one range of ids after the other."""
+    The brief has the number of rows in each part.
+    """
     tables = _merged(task)
     inner = [letter.encode() for letter in _ALPHABET[1:]] if task.cut else []
     edges: list[bytes | None] = [b"", *inner, None]
-    return InParts(
-        parts=tuple(rows.between(low or b"", high) for low, high in itertools.pairwise(edges) for rows in tables)
-    )
+    parts = [rows.between(low or b"", high) for low, high in itertools.pairwise(edges) for rows in tables]
+    return InParts(parts=tuple(parts), brief=tuple(len(rows.hashes) for rows in parts))
 
 
 def digest_of_tiles(task: RowsTask) -> str:

@@ -22,7 +22,7 @@ from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import InParts, Place, drop_outcomes, key_of, part_of, result_of
+from pipeline.runtime.scratch.outcomes import InParts, Place, brief_within, drop_outcomes, key_of, part_of, result_of
 from pipeline.runtime.stages.border_facets import are_beyond, united_by_name
 from pipeline.runtime.stages.cleanup import clear_units
 from pipeline.runtime.stages.finished_surfaces import Finished, finished
@@ -32,7 +32,7 @@ from pipeline.runtime.stages.sites import UNITS, CandidateSite, FoundSites, Join
 from pipeline.runtime.stages.split import Splits
 from pipeline.runtime.stages.split_window import Split
 from pipeline.runtime.stages.stored_sites import joined_of, store_sites
-from pipeline.runtime.stages.tile_sites import TileSites, by_owner, figures_of, sites_of
+from pipeline.runtime.stages.tile_sites import TileSites, TileSitesFigures, by_owner, figures_of, sites_of
 from pipeline.runtime.stages.units import BorderSites, find_units
 from pipeline.terrain.candidates import NOWHERE, Surfaces
 from pipeline.terrain.fragment_sums import N_SUMS
@@ -212,32 +212,22 @@ class JoinTask:
     """The lattice."""
     scratch: Scratch
     """Holds all of them."""
-    folder: str
-    """Folder of scratch for the outcome."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JoinBrief:
     """What the driver learns of a join."""
 
-    owned: tuple[BorderSites, ...]
-    """The finished sites by owner; site k is part k of the outcome, its place is not known yet."""
+    owned: tuple[TileSitesFigures, ...]
+    """The finished sites by owner, in the order of the parts of the outcome."""
     passed_on: str
     """Digest of the last part, what waits for other blocks; empty where nothing does."""
     small_fragments: int
     """Surfaces below the size of an object."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class JoinedSurfaces(InParts):
-    """A join on its way to scratch: the finished sites by owner, then what is passed on."""
-
-    brief: JoinBrief
-    """What the driver learns of it."""
-
-
-def join_surfaces(task: JoinTask) -> JoinedSurfaces:
-    """Join the surfaces of some tiles, or of some blocks."""
+def join_surfaces(task: JoinTask) -> InParts[JoinBrief]:
+    """Join the surfaces of some tiles, or of some blocks: the finished sites by owner, then what is passed on."""
     scratch = task.scratch
 
     def parts() -> Iterable[OpenSurfaces]:
@@ -253,21 +243,14 @@ def join_surfaces(task: JoinTask) -> JoinedSurfaces:
     done, rest = finished_within(found, task.area, task.settings)
     owned = by_owner(done, found.tiles, task.grid)
     waits = len(rest.kind) + len(rest.step_reach) > 0
-    return JoinedSurfaces(
+    return InParts(
         parts=(*owned.values(), *((rest,) if waits else ())),
         brief=JoinBrief(
-            owned=tuple(
-                BorderSites(owner=owner, part=part, figures=figures_of(sites))
-                for part, (owner, sites) in enumerate(owned.items())
-            ),
+            owned=tuple(figures_of(owner, sites) for owner, sites in owned.items()),
             passed_on=key_of(rest) if waits else "",
             small_fragments=done.small,
         ),
     )
-
-
-def _brief(found: JoinedSurfaces) -> JoinBrief:
-    return found.brief
 
 
 def join(
@@ -301,7 +284,11 @@ def join(
         return joined_of(store_sites(context, UNITS, found, quiet=False), 0, splits.keys)
     borders = _joined_borders(context, settings.candidates, splits)
     small = sum(figures.small for figures in splits.figures) + sum(brief.small_fragments for brief in borders.values())
-    owned = [dataclasses.replace(sites, place=place) for place, brief in borders.items() for sites in brief.owned]
+    owned = [
+        BorderSites(place=place, part=part, figures=figures)
+        for place, brief in borders.items()
+        for part, figures in enumerate(brief.owned)
+    ]
     units = find_units(context, settings, roof, splits, owned, crs_name, outlines=outlines)
     return joined_of(units, small, splits.keys)
 
@@ -317,24 +304,20 @@ def _joined_borders(context: RunContext, settings: CandidateSettings, splits: Sp
         places = tuple(splits.places[tile] for tile in tiles)
         key = key_of(settings, grid, area, places)
         place = Place(_STAGE, f"block_x{column}_y{row}", key)
-        tasks[place] = JoinTask(
-            splits=places, blocks=(), area=area, settings=settings, grid=grid, scratch=scratch, folder=place.folder
-        )
+        tasks[place] = JoinTask(splits=places, blocks=(), area=area, settings=settings, grid=grid, scratch=scratch)
     found = _run(context, tasks)
     passing = tuple((place, len(brief.owned)) for place, brief in found.items() if brief.passed_on)
     if passing:
         place = Place(_STAGE, "blocks", key_of(settings, grid, [found[place].passed_on for place, _ in passing]))
-        final = JoinTask(
-            splits=(), blocks=passing, area=None, settings=settings, grid=grid, scratch=scratch, folder=place.folder
-        )
+        final = JoinTask(splits=(), blocks=passing, area=None, settings=settings, grid=grid, scratch=scratch)
         found |= _run(context, {place: final}, quiet=True)
     drop_outcomes(scratch, _STAGE, found)
     return found
 
 
 def _run(context: RunContext, tasks: Mapping[Place, JoinTask], *, quiet: bool = False) -> dict[Place, JoinBrief]:
-    files: Files[JoinTask, JoinBrief] = Files(reads=_read, leaves=lambda task, _: [task.folder])
-    return context.map_stored(_STAGE, join_surfaces, tasks, _brief, files=files, quiet=quiet)
+    files: Files[JoinTask, JoinBrief] = Files(reads=_read)
+    return context.map_stored(_STAGE, join_surfaces, tasks, brief_within, files=files, quiet=quiet)
 
 
 def _read(task: JoinTask) -> set[str]:

@@ -11,7 +11,7 @@ from pipeline.io import storage_at
 from pipeline.runtime.plan import window_bytes
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of
+from pipeline.runtime.scratch.outcomes import Place, brief_within, drop_outcomes, key_of
 from pipeline.runtime.stages.cleanup import writing_points
 from pipeline.runtime.stages.coarse_points import coarse_levels, write_coarse_points
 from pipeline.runtime.stages.coarse_terrain import terrain_spacing
@@ -22,7 +22,6 @@ from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import Splits
 from pipeline.runtime.stages.tile_points import (
     PointsTask,
-    StoredTilePoints,
     TilePoints,
     write_tile_points,
 )
@@ -64,7 +63,7 @@ def write_points(
     drop_outcomes(scratch, stage, [place for place in tasks if place.unit in there])
     units = ProgressUnits[TilePoints](failed=lambda one: int(bool(one.error)))
     files: Files[PointsTask, TilePoints] = Files(reads=_read, results=True)
-    written = context.map_stored("octree", write_tile_points, tasks, _brief, units, files=files)
+    written = context.map_stored("octree", write_tile_points, tasks, brief_within, units, files=files)
     failed = {place: tile for place, tile in written.items() if tile.error}
     for place, tile in failed.items():
         context.progress.warn("octree", f"the points of tile {tile.tile.key} could not be written: {tile.error}")
@@ -87,10 +86,6 @@ def _read(task: PointsTask) -> set[str]:
     listed = (*label.buildings, *label.rejected)
     folders = {folder for one in listed for folder in (one.place.folder, *one.figures.folders)}
     return folders_of(near) | folders | {place.folder for place in task.batches}
-
-
-def _brief(stored: StoredTilePoints) -> TilePoints:
-    return stored.brief
 
 
 def _tasks(

@@ -24,7 +24,7 @@ from pipeline.runtime.plan import Plan
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import InParts, Place, brief_of, drop_outcomes, key_of
+from pipeline.runtime.scratch.outcomes import InParts, Place, brief_of, brief_within, drop_outcomes, key_of
 from pipeline.runtime.stages.batch_figures import BatchFigures
 from pipeline.runtime.stages.cleanup import publishing
 from pipeline.runtime.stages.content_digest import TABLES
@@ -74,14 +74,6 @@ class Published:
     """Why the tile failed; empty where it did not."""
     warning: str = ""
     """A fault that did not fail the tile."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PublishedTile(InParts):
-    """The outcome of one tile; its parts are the rows of its tables, in the order of `TABLES`, for the run's digest."""
-
-    brief: Published
-    """What the driver learns."""
 
 
 def rejected_object(site: RejectedSite) -> RejectedObject:
@@ -186,7 +178,7 @@ def publish(
         intact=is_published,
         at_once=True,
     )
-    published = context.map_stored("publish", publish_tile, tasks, _brief, units, files=files)
+    published = context.map_stored("publish", publish_tile, tasks, brief_within, units, files=files)
     for tile_key in sorted(there - {tile.key for tile in owners}):
         retire(storage, Tile.from_key(tile_key))
     for place, outcome in published.items():
@@ -196,10 +188,6 @@ def publish(
             context.progress.warn("publish", f"tile {outcome.tile.key} failed: {outcome.error}")
             Path(scratch.root, place.name).unlink(missing_ok=True)  # so that a resumed run tries it again
     return published
-
-
-def _brief(outcome: PublishedTile) -> Published:
-    return outcome.brief
 
 
 def _read(task: PublishTask) -> set[str]:
@@ -221,8 +209,10 @@ def is_published(task: PublishTask, published: Published, _: str) -> bool:
     return all(sha256_of(storage.path(name)) == digest for name, digest in json.loads(state)["files"].items())
 
 
-def publish_tile(task: PublishTask) -> PublishedTile:
+def publish_tile(task: PublishTask) -> InParts[Published]:
     """Write one tile's tables, meshes and city objects, then its state; may run twice.
+
+    Its parts are the rows of the tables, in the order of `TABLES`, for the run's digest.
 
     A tile that fails harms only itself: its state says so, and why. A tile that owns nothing has a state and no files.
     """
@@ -256,7 +246,7 @@ def publish_tile(task: PublishTask) -> PublishedTile:
         storage.put(f"state/{task.tile.key}.json", stated)
     except (RunError, OSError) as fault:
         # a tile without its state is not finished, and the manifest will say so
-        return PublishedTile(parts=(), brief=Published(tile=task.tile, n_files=0, error=error or f"its state: {fault}"))
+        return InParts(parts=(), brief=Published(tile=task.tile, n_files=0, error=error or f"its state: {fault}"))
     for name in sorted(before - files.keys()):
         storage.delete(name)
     brief = Published(
@@ -267,7 +257,7 @@ def publish_tile(task: PublishTask) -> PublishedTile:
         error=error,
         warning=lost,
     )
-    return PublishedTile(parts=rows, brief=brief)
+    return InParts(parts=rows, brief=brief)
 
 
 def _rows(tables: Mapping[str, Any]) -> tuple[Rows, ...]:

@@ -93,8 +93,8 @@ def _read(task: SplitTask) -> set[str]:
 
 
 def _stored(task: SplitTask, _: SplitFigures) -> tuple[str, ...]:
-    """The folders of scratch with the sorted points and with the surfaces of a tile."""
-    return f"{task.folder}/{task.tile.key}", Place(task.folder, task.tile.key, "").folder
+    """The folder of scratch with the sorted points of a tile."""
+    return (f"{task.folder}/{task.tile.key}",)
 
 
 def split_windows(

@@ -11,8 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from pipeline.model import Reason
 from pipeline.runtime.run_context import RunContext
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import InParts, Place, drop_outcomes, key_of
+from pipeline.runtime.scratch.outcomes import InParts, Place, brief_within, drop_outcomes, key_of
 from pipeline.runtime.stages.sites import (
     CandidateSite,
     FoundSites,
@@ -49,14 +48,6 @@ class SitesBrief:
     """What was odd but usable."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class StoredSites(InParts):
-    """Sites on their way to scratch; each part is a group of candidates, or the rejected objects of a tile."""
-
-    brief: SitesBrief
-    """What the driver learns of them."""
-
-
 def stored_sites(
     candidates: Iterable[CandidateSite],
     rejected: Iterable[RejectedSite],
@@ -64,12 +55,12 @@ def stored_sites(
     scale: int = 1,
     checksums: Mapping[str, int] | None = None,
     warnings: Sequence[str] = (),
-) -> StoredSites:
-    """Some sites in groups of one owner each, `scale` times as large as those of a small run."""
+) -> InParts[SitesBrief]:
+    """Some sites for scratch, in groups of one owner each, `scale` times as large as those of a small run."""
     owned = sorted(by_owner(largest_first(candidates)).items())
     groups = [group for _, sites in owned for group in groups_of(sites, scale)]
     listed = [(owner, tuple(sorted(sites, key=lambda r: r.object_id))) for owner, sites in _by_owner(rejected)]
-    return StoredSites(
+    return InParts(
         parts=(*groups, *(sites for _, sites in listed)),
         brief=SitesBrief(
             groups=tuple(_group_figures(group, grid) for group in groups),
@@ -194,15 +185,9 @@ def store_sites(context: RunContext, folder: str, found: FoundSites, *, quiet: b
             tile=tile, sites=own, grid=grid, scale=scale
         )
     drop_outcomes(context.scratch, folder, tasks)
-    files: Files[StoreTask, SitesBrief] = Files(leaves=lambda task, _: [Place(folder, task.tile.key, "").folder])
-    return context.map_stored("outline", store, tasks, brief_of_sites, files=files, quiet=quiet)
+    return context.map_stored("outline", store, tasks, brief_within, quiet=quiet)
 
 
-def store(task: StoreTask) -> StoredSites:
+def store(task: StoreTask) -> InParts[SitesBrief]:
     """The sites of a task, in groups."""
     return stored_sites(task.sites.candidates, task.sites.rejected, task.grid, task.scale)
-
-
-def brief_of_sites(stored: StoredSites) -> SitesBrief:
-    """What the driver learns of stored sites."""
-    return stored.brief

@@ -92,18 +92,8 @@ class TilePoints:
     """Why they could not be written; empty where they were."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class StoredTilePoints(InParts):
-    """The outcome of a tile. Its parts are its shares of the coarser levels above, the next one first."""
-
-    parts: tuple[ModelledPoints, ...]
-    """By level; about the tile's origin."""
-    brief: TilePoints
-    """What the driver needs."""
-
-
-def write_tile_points(task: PointsTask) -> StoredTilePoints:
-    """Write the octree of one tile; may run twice.
+def write_tile_points(task: PointsTask) -> InParts[TilePoints]:
+    """Write the octree of one tile; may run twice. Its parts are its shares of the coarser levels, the next one first.
 
     A tile that fails harms only itself: the brief says why.
     """
@@ -118,10 +108,10 @@ def write_tile_points(task: PointsTask) -> StoredTilePoints:
             tile=tile, origin_mm=(0, 0, 0), low_mm=(0, 0, 0), high_mm=(0, 0, 0), points=0, error_m=0.0, classes={},
             terrain=None, error=f"{type(fault).__name__}: {fault}",
         )  # fmt: skip
-        return StoredTilePoints(brief=nothing, parts=())
+        return InParts(brief=nothing, parts=())
 
 
-def _written(task: PointsTask, storage: Storage) -> StoredTilePoints:
+def _written(task: PointsTask, storage: Storage) -> InParts[TilePoints]:
     tile, scratch = task.label.tile, task.label.scratch
     buildings = buildings_in(task.label)
     points, origin_mm = modelled_points(task, buildings)
@@ -164,7 +154,7 @@ def _written(task: PointsTask, storage: Storage) -> StoredTilePoints:
         classes={int(code): int(histogram[code]) for code in np.flatnonzero(histogram)},
         terrain=terrain_part(scratch, task.label.grid, tile, task.terrain_spacing),
     )
-    return StoredTilePoints(brief=brief, parts=tuple(points.take(index) for index in tree.above))
+    return InParts(brief=brief, parts=tuple(points.take(index) for index in tree.above))
 
 
 def buildings_in(task: LabelTask) -> list[TileBuilding]:

@@ -32,6 +32,8 @@ class TileSites:
 class TileSitesFigures:
     """What the driver knows of them."""
 
+    owner: Tile
+    """The tile that publishes them."""
     points: int
     """Points of the candidates."""
     tiles: tuple[Tile, ...]
@@ -40,10 +42,11 @@ class TileSitesFigures:
     """Of all that is stored of them."""
 
 
-def figures_of(sites: TileSites) -> TileSitesFigures:
+def figures_of(owner: Tile, sites: TileSites) -> TileSitesFigures:
     """What the driver needs to know."""
     ranges = sites.found.candidate_ranges
     return TileSitesFigures(
+        owner=owner,
         points=sites.found.candidate_points,
         tiles=tuple(sorted(sites.tiles[number] for number in np.unique(ranges[:, 1]).tolist())),
         digest=key_of(sites),

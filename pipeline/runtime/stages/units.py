@@ -20,7 +20,7 @@ from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, OpenScratch, Scratch
 from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, part_of, result_of
+from pipeline.runtime.scratch.outcomes import InParts, Place, brief_within, drop_outcomes, key_of, part_of, result_of
 from pipeline.runtime.stages.cleanup import clear_units
 from pipeline.runtime.stages.gather import canonical_order
 from pipeline.runtime.stages.outline import outlined
@@ -36,7 +36,7 @@ from pipeline.runtime.stages.sites import (
 )
 from pipeline.runtime.stages.split import Splits
 from pipeline.runtime.stages.split_window import Split
-from pipeline.runtime.stages.stored_sites import SitesBrief, StoredSites, brief_of_sites, scale_of, stored_sites
+from pipeline.runtime.stages.stored_sites import SitesBrief, scale_of, stored_sites
 from pipeline.runtime.stages.tile_sites import TileSites, TileSitesFigures, sites_of
 from pipeline.runtime.stages.window_points import folders_of
 from pipeline.strip_alignment import strip_offsets_m
@@ -52,10 +52,8 @@ _KEY_DIGITS = 16
 class BorderSites:
     """Sites of a tile that reach other tiles, as the join found them."""
 
-    owner: Tile
-    """The tile."""
-    place: Place | None = None
-    """The outcome of the join that holds them; None within that outcome."""
+    place: Place
+    """The outcome of the join that holds them."""
     part: int
     """Their part of it."""
     figures: TileSitesFigures
@@ -108,7 +106,7 @@ def find_units(
     scratch, grid = context.scratch, context.plan.grid
     reaching: dict[Tile, list[BorderSites]] = {}
     for sites in borders:
-        reaching.setdefault(sites.owner, []).append(sites)
+        reaching.setdefault(sites.figures.owner, []).append(sites)
     alone = {figures.tile: figures.sites for figures in splits.figures}
     points = {figures.tile: figures.candidate_points for figures in splits.figures if figures.sites}
     for tile, own in reaching.items():
@@ -143,7 +141,7 @@ def find_units(
     drop_outcomes(scratch, UNITS, tasks)
     clear_units(scratch, {task.folder for task in tasks.values()})
     files: Files[UnitTask, SitesBrief] = Files(reads=_read, leaves=_left, intact=is_intact)
-    found = context.map_stored("outline", sites_of_tile, tasks, brief_of_sites, files=files)
+    found = context.map_stored("outline", sites_of_tile, tasks, brief_within, files=files)
     for warning in sorted(warning for brief in found.values() for warning in brief.warnings):
         context.progress.warn("outline", warning)
     return found
@@ -152,7 +150,7 @@ def find_units(
 def _read(task: UnitTask) -> set[str]:
     """The folders of scratch with the sites of a task, their points, and what lies around them."""
     tiles = {task.tile, *(tile for sites in task.borders for tile in sites.figures.tiles)}
-    listed = {sites.place.folder for sites in task.borders if sites.place is not None}
+    listed = {sites.place.folder for sites in task.borders}
     if task.split is not None:
         listed.add(task.split.folder)
     points = folders_with_points(PointRange(tile=tile, start=0, stop=0) for tile in tiles)
@@ -160,21 +158,19 @@ def _read(task: UnitTask) -> set[str]:
 
 
 def _left(task: UnitTask, brief: SitesBrief) -> set[str]:
-    """The folders of scratch with the sites and with the points of the units."""
-    return {Place(UNITS, task.tile.key, "").folder} | ({task.folder} if brief.checksums else set())
+    """The folder of scratch with the points of the units."""
+    return {task.folder} if brief.checksums else set()
 
 
 def is_intact(task: UnitTask, brief: SitesBrief, folder: str) -> bool:
     """Whether the points of the units below a folder of scratch are as they were stored."""
-    if folder != task.folder:
-        return True  # the outcome itself
     return all(
         zlib.crc32(np.ascontiguousarray(task.scratch.array(f"{folder}/{tile}", "points", mapped=True)).data) == checksum
         for tile, checksum in brief.checksums.items()
     )
 
 
-def sites_of_tile(task: UnitTask) -> StoredSites:
+def sites_of_tile(task: UnitTask) -> InParts[SitesBrief]:
     """The share's candidates, divided into units; those that are one unit stay as they are.
 
     Raises MemoryError or OSError if scratch cannot be read, or does not fit into memory.
@@ -196,7 +192,7 @@ def _found(task: UnitTask) -> FoundSites:
         split: Split = result_of(task.scratch, task.split)
         if split.surfaces is not None:
             parts.append(TileSites(found=split.surfaces.done, tiles=(split.tile,)))
-    parts += [part_of(task.scratch, sites.place, sites.part) for sites in task.borders if sites.place is not None]
+    parts += [part_of(task.scratch, sites.place, sites.part) for sites in task.borders]
     return sites_of(parts, task.grid, task.scene.candidates, task.crs_name)
 
 
