@@ -15,6 +15,7 @@ from pipeline.model import BoolArray, ByteArray, IntArray, LabelArray
 from pipeline.terrain.facets import SceneVertices, VertexKind
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
+from pipeline.terrain.needed_ground import needed_vertices
 from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.point_assignment import Allowed, ScenePoints
 from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
@@ -143,6 +144,9 @@ def _vertices(
     planar[_has_floor(points, height_mm, floor, planar == 0, settings)] = 1
     kind[crowns(x, y, z, planar, several[chosen], settings.vegetation)] = VertexKind.CROWN
     near = np.flatnonzero(core.grown(round(1000 * facets_m)).contains(x, y))
+    surfaces = settings.surfaces
+    far_mm = max(surfaces.far_mm, round(1000 * surfaces.thin_m))
+    near = near[needed_vertices(x[near], y[near], kind[near], 1000.0 * surfaces.max_circumradius_m, far_mm)]
     return SceneVertices(
         x_mm=x[near],
         y_mm=y[near],

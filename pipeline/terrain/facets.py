@@ -224,14 +224,14 @@ def with_vertex(facets: LabelArray, marked: BoolArray) -> BoolArray:
 
 @kernel
 def label_fragments(kinds: KindArray, neighbours: LabelArray, considered: BoolArray) -> tuple[LabelArray, KindArray]:
-    """Fragment of every considered facet of a surface kind (-1 for others), and the kind of each fragment."""
+    """Fragment of every considered facet above the ground (-1 for others), and the kind of each fragment."""
     m = kinds.size
     label = np.full(m, -1, np.int32)
     stack = np.empty(m, np.int32)
     kind_of = np.empty(m, np.int8)
     count = 0
     for f in range(m):
-        if label[f] >= 0 or not considered[f] or kinds[f] < FacetKind.GROUND:
+        if label[f] >= 0 or not considered[f] or kinds[f] <= FacetKind.GROUND:
             continue
         label[f] = count
         kind_of[count] = kinds[f]

@@ -16,9 +16,9 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.normal_equations import add_to_sums, solve_plane_moments
+from pipeline.kernels.smallest_eigenvalue import smallest_eigenvalue
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Tin
 from pipeline.terrain.binning import points_by_cell
-from pipeline.terrain.vegetation import smallest_eigenvalue
 
 # Not settings: patches only serve to separate units, and the thresholds of units are settings.
 _MAX_RADIUS_M = 3.0

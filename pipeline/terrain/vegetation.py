@@ -6,7 +6,6 @@ integer sums: they are the same in every tile.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -22,19 +21,35 @@ _COUNT = 2**20 - 1
 
 
 @kernel
-def smallest_eigenvalue(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
-    """Smallest eigenvalue of a symmetric 3 x 3 matrix (trigonometric form, Smith 1961)."""
-    q = (xx + yy + zz) / 3.0
-    off = xy * xy + xz * xz + yz * yz
-    p2 = (xx - q) ** 2 + (yy - q) ** 2 + (zz - q) ** 2 + 2.0 * off
-    if p2 <= 1e-30:
-        return q
-    p = math.sqrt(p2 / 6.0)
-    a, b, c = (xx - q) / p, (yy - q) / p, (zz - q) / p
-    d, e, f = xy / p, xz / p, yz / p
-    half_det = (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)) / 2.0
-    half_det = min(1.0, max(-1.0, half_det))
-    return max(0.0, q + 2.0 * p * math.cos(math.acos(half_det) / 3.0 + 2.0 * math.pi / 3.0))
+def _cells(x_mm: IntArray, y_mm: IntArray, side_mm: int) -> tuple[LabelArray, int]:
+    """The square cell of each of some points, (2, n) its column and row from the lowest on; and the most of them."""
+    low_x, low_y, side = x_mm.min() // side_mm * side_mm, y_mm.min() // side_mm * side_mm, float(side_mm)
+    cells = np.empty((2, x_mm.size), np.int32)
+    for i in range(x_mm.size):
+        # quotients of whole numbers below 2^52 are exact when rounded down, and floats are divided several at a time
+        cells[0, i], cells[1, i] = np.int32((x_mm[i] - low_x) / side), np.int32((y_mm[i] - low_y) / side)
+    return cells, cells.max()
+
+
+@kernel
+def _around_wanted(cells: LabelArray, last: int, doublings: int, wanted: BoolArray, verdict: KindArray) -> IntArray:
+    """Points that lie at most two doubled cells from the cell of a wanted point without a verdict."""
+    side = (last >> doublings) + 1
+    marked = np.zeros((side, side), np.bool_)
+    for i in range(wanted.size):
+        if wanted[i] and verdict[i] < 0:
+            marked[cells[1, i] >> doublings, cells[0, i] >> doublings] = True
+    near = np.zeros((side, side), np.bool_)
+    for r in range(side):
+        for c in range(side):
+            if marked[r, c]:
+                near[max(r - 2, 0) : r + 3, max(c - 2, 0) : c + 3] = True
+    found = np.empty(wanted.size, np.int64)
+    count = 0
+    for i in range(wanted.size):
+        found[count] = i
+        count += near[cells[1, i] >> doublings, cells[0, i] >> doublings]
+    return found[:count].copy()
 
 
 @kernel
@@ -50,19 +65,17 @@ def _in_order(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, members: LabelArra
 
 @kernel
 def _block_around(
-    points: FloatArray, start: LabelArray, cell: tuple[int, int], shape: tuple[int, int], reach: int, block: FloatArray
+    points: FloatArray, start: LabelArray, cell: tuple[int, int], shape: tuple[int, int], block: FloatArray
 ) -> tuple[FloatArray, int]:
-    """The points (3, n) of the cells around one, in `block` or a larger array; and their number."""
+    """The points (3, n) of a cell and the eight around it, in `block` or a larger array; and their number."""
     (r, c), (rows, columns) = cell, shape
-    west, east = max(c - reach, 0), min(c + reach, columns - 1)
+    west, east = max(c - 1, 0), min(c + 1, columns - 1)
     count = 0
-    for rr in range(max(r - reach, 0), min(r + reach + 1, rows)):
+    for rr in range(max(r - 1, 0), min(r + 2, rows)):
         low, high = start[rr * columns + west], start[rr * columns + east + 1]
         if count + high - low > block.shape[1]:
             larger = np.empty((3, 2 * (count + high - low)))
-            for k in range(3):
-                for m in range(count):
-                    larger[k, m] = block[k, m]
+            larger[:, :count] = block[:, :count]
             block = larger
         for k in range(3):
             for m in range(high - low):
@@ -73,16 +86,34 @@ def _block_around(
 
 @kernel
 def _nearest(
-    block: FloatArray, count: int, at: tuple[float, float, float], limit: float, level: float, out: FloatArray
-) -> int:
-    """Write the points of a block in a circle and near in elevation to `out`, relative to a place; their number."""
+    points: FloatArray,
+    start: LabelArray,
+    cell: tuple[int, int],
+    shape: tuple[int, int],
+    at: tuple[float, float, float],
+    limit: float,
+    level: float,
+    out: FloatArray,
+) -> tuple[FloatArray, int]:
+    """The points (3, n) in a circle and on a level, relative to a place, in `out` or a larger array; their number.
+
+    The circle reaches two cells far at most.
+    """
+    (r, c), (rows, columns) = cell, shape
+    west, east = max(c - 2, 0), min(c + 2, columns - 1)
     found = 0
-    for k in range(count):
-        dx, dy, dz = block[0, k] - at[0], block[1, k] - at[1], block[2, k] - at[2]
-        # the next one takes the place of one that is too far: no branch to predict
-        out[0, found], out[1, found], out[2, found] = dx, dy, dz
-        found += 1 if dx * dx + dy * dy <= limit and abs(dz) <= level else 0
-    return found
+    for rr in range(max(r - 2, 0), min(r + 3, rows)):
+        low, high = start[rr * columns + west], start[rr * columns + east + 1]
+        if found + high - low > out.shape[1]:
+            larger = np.empty((3, 2 * (found + high - low)))
+            larger[:, :found] = out[:, :found]
+            out = larger
+        for k in range(low, high):
+            dx, dy, dz = points[0, k] - at[0], points[1, k] - at[1], points[2, k] - at[2]
+            # the next one takes the place of one that is too far: no branch to predict
+            out[0, found], out[1, found], out[2, found] = dx, dy, dz
+            found += 1 if dx * dx + dy * dy <= limit and abs(dz) <= level else 0
+    return out, found
 
 
 @kernel(fastmath={"reassoc"})
@@ -120,18 +151,20 @@ def _moments(
 
 
 @kernel
-def _spread_mm2(s: tuple[float, float, float, float, float, float, float, float, float, float]) -> float:
-    """Variance of the counted neighbours across the plane that fits them best."""
+def _is_planar(
+    s: tuple[float, float, float, float, float, float, float, float, float, float], limit_mm2: float
+) -> bool:
+    """Whether the variance of the counted points across the plane that fits them best is at most a limit.
+
+    That variance is the smallest eigenvalue of their covariances. It is above the limit if these, less the limit on the
+    diagonal, are positive definite: all three leading minors are positive (Sylvester's criterion).
+    """
     count = s[0]
     mx, my, mz = s[1] / count, s[2] / count, s[3] / count
-    return smallest_eigenvalue(
-        s[4] / count - mx * mx,
-        s[5] / count - mx * my,
-        s[6] / count - mx * mz,
-        s[7] / count - my * my,
-        s[8] / count - my * mz,
-        s[9] / count - mz * mz,
-    )
+    xx, xy, xz = s[4] / count - mx * mx - limit_mm2, s[5] / count - mx * my, s[6] / count - mx * mz
+    yy, yz, zz = s[7] / count - my * my - limit_mm2, s[8] / count - my * mz, s[9] / count - mz * mz - limit_mm2
+    minor = xx * yy - xy * xy
+    return not (xx > 0.0 and minor > 0.0 and minor * zz + 2.0 * xy * xz * yz - xx * yz * yz - yy * xz * xz > 0.0)
 
 
 class _Windows(NamedTuple):
@@ -165,34 +198,29 @@ def _planar(
     start, members, _, _, columns, rows = points_by_cell(x_mm, y_mm, np.ones(n, np.bool_), radius_mm)
     # copies in the order of the cells: neighbouring cells of a row are one run of memory
     points = _in_order(x_mm, y_mm, z_mm, members)
-    block, wide, near = np.empty((3, 256)), np.empty((3, 256)), np.empty((3, 256))
+    block, near = np.empty((3, 256)), np.empty((3, 256))
     planar_mm2, smooth_mm2 = roughness_mm * roughness_mm, smooth_mm * smooth_mm
     for cell in range(rows * columns):
         place = (cell // columns, cell % columns)
-        count, around = -1, -1
+        count = -1
         for m in range(start[cell], start[cell + 1]):
             i = members[m]
             if out[i] >= 0 or not wanted[i]:
                 continue
             if count < 0:
-                block, count = _block_around(points, start, place, (rows, columns), 1, block)
+                block, count = _block_around(points, start, place, (rows, columns), block)
             at = (points[0, m], points[1, m], points[2, m])
             # the window in the middle first: where it is planar the eight others cannot change the verdict
             s = _moments(block, count, at, (0.0, 0.0), limit, level_mm)
             if s[0] < min_points:
                 continue
-            spread_mm2 = _spread_mm2(s)
-            out[i] = 2 if spread_mm2 <= smooth_mm2 else 1 if spread_mm2 <= planar_mm2 else 0
+            out[i] = 2 if _is_planar(s, smooth_mm2) else 1 if _is_planar(s, planar_mm2) else 0
             if out[i] > 0:
                 continue
-            if around < 0:
-                wide, around = _block_around(points, start, place, (rows, columns), 2, wide)
-                if around > near.shape[1]:
-                    near = np.empty((3, 2 * around))
-            found = _nearest(wide, around, at, 4.0 * limit, level_mm, near)
+            near, found = _nearest(points, start, place, (rows, columns), at, 3.25 * limit, level_mm, near)
             for w in range(8):
                 s = _moments(near, found, (0.0, 0.0, 0.0), (shift_x[w], shift_y[w]), limit, level_mm)
-                if s[0] >= min_points and _spread_mm2(s) <= planar_mm2:
+                if s[0] >= min_points and _is_planar(s, planar_mm2):
                     out[i] = 1
                     break
 
@@ -213,18 +241,23 @@ def planarity(
     Vertices are thinned points in millimetres; all within `level_m` in elevation are neighbours.
     """
     verdict = np.full(len(x_mm), -1, np.int8)
+    if not wanted.any():
+        return verdict
     least_m = settings.roughness_m if roughness_m is None else roughness_m
+    radius_mm = round(settings.radius_m * 1000)
+    cells, last = _cells(x_mm, y_mm, radius_mm)
     for scale in range(PLANARITY_SCALES):
         windows = _Windows(
-            radius_mm=round(settings.radius_m * 1000) * 2**scale,
+            radius_mm=radius_mm * 2**scale,
             min_points=settings.min_neighbours,
             roughness_mm=least_m * 1000.0 * 1.5**scale,
             smooth_mm=settings.smooth_m * 1000.0 * 1.5**scale,
             level_mm=round(settings.level_m * 1000),
         )
-        _planar(x_mm, y_mm, z_mm, wanted, windows, verdict)
-        if not (wanted & (verdict < 0)).any():
-            break
+        near = _around_wanted(cells, last, scale, wanted, verdict)
+        found = verdict[near]
+        _planar(x_mm[near], y_mm[near], z_mm[near], wanted[near], windows, found)
+        verdict[near] = found
     return verdict
 
 

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.kernels.smallest_eigenvalue import smallest_eigenvalue
 from pipeline.model import KindArray
 from pipeline.terrain.settings import VegetationSettings
-from pipeline.terrain.vegetation import crowns, planarity, smallest_eigenvalue
+from pipeline.terrain.vegetation import _is_planar, crowns, planarity
 
 Points = npt.NDArray[np.int64]
 
@@ -85,6 +86,24 @@ def test_the_smallest_eigenvalue_is_that_of_numpy(values: list[float], stretch: 
 def test_the_smallest_eigenvalue_of_a_diagonal_is_its_smallest_entry(diagonal: tuple[float, float, float]) -> None:
     a, b, c = diagonal
     assert smallest_eigenvalue(a, 0.0, 0.0, b, 0.0, c) == pytest.approx(min(diagonal), abs=1e-7)
+
+
+@settings(deadline=None)
+@given(
+    values=st.lists(st.floats(-100, 100), min_size=9, max_size=9),
+    stretch=st.sampled_from([1e-3, 1.0, 1e3]),
+    rank=st.integers(1, 3),
+)
+def test_planar_is_what_varies_little_across_some_plane(values: list[float], stretch: float, rank: int) -> None:
+    factor = np.array(values).reshape(3, 3) * stretch
+    factor[:, rank:] = 0.0
+    m = factor @ factor.T
+    across, scale = float(np.linalg.eigvalsh(m)[0]), float(np.trace(m)) + 1e-9
+    # ten points whose mean is (1, -2, 3)
+    moments = m + np.outer([1, -2, 3], [1, -2, 3])
+    sums = (10.0, 10.0, -20.0, 30.0, *(10.0 * moments[np.triu_indices(3)]))
+    assert _is_planar(sums, across + 1e-6 * scale)
+    assert not _is_planar(sums, across - 1e-6 * scale)
 
 
 @pytest.mark.parametrize("per_m2", [0.3, 1.0, 4.0, 40.0])

@@ -145,12 +145,10 @@ def _shared_facets(
     fragments: Fragments, tile: Tile, grid: TileGrid, cut: SurfaceSettings
 ) -> tuple[IntArray, IntArray, npt.NDArray[np.uint64]]:
     """The tiles that may see each fragment (k, 4), and the fragments and names of the facets named to other tiles."""
-    kinds = fragments.kind[fragments.crossing_fragment]
-    above = np.flatnonzero(kinds != FacetKind.GROUND)
-    keys = fragments.crossing_keys[above]
-    holders = fragments.crossing_fragment[above].astype(np.int64)
+    keys = fragments.crossing_keys
+    holders = fragments.crossing_fragment.astype(np.int64)
     names = facet_names(keys)
-    seen_by, named = shared_facets(keys, names, kinds[above], tile, grid, cut)
+    seen_by, named = shared_facets(keys, names, fragments.kind[holders], tile, grid, cut)
     reach = np.tile(np.array([tile.column, tile.row, tile.column, tile.row], np.int64), (len(fragments.kind), 1))
     np.minimum.at(reach[:, :2], holders, seen_by[:, :2])
     np.maximum.at(reach[:, 2:], holders, seen_by[:, 2:])
