@@ -50,7 +50,9 @@ def with_shaded_points(roof: RoofPoints, cloud: PreparedCloud, planes: Sequence[
         close = close[distance_m <= _REACH_M]
         best[close], label[close] = off[close], number
     added = np.flatnonzero(label >= 0)
-    added = added[~surrounded(points[added], cloud.candidate.points[cloud.visible], SHADING_RADIUS_M, SHADING_HEIGHT_M)]
+    if len(added):
+        visible = cloud.candidate.points[cloud.visible]
+        added = added[~surrounded(points[added], visible, SHADING_RADIUS_M, SHADING_HEIGHT_M)]
     if len(added) == 0:
         return roof
     added = added[np.argsort(-points[added, 2], kind="stable")]
