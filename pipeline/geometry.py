@@ -431,3 +431,49 @@ def top_visible(points: FloatArray, radius_m: float = 0.5, height_m: float = 1.1
     return ~_covered(
         xyz_mm, np.ascontiguousarray(points, dtype=np.float64), round(radius_m * 1000), round(height_m * 1000)
     )
+
+
+@kernel
+def _surrounded(places_mm: IntArray, xyz_mm: IntArray, points: FloatArray, radius_mm: int, height_mm: int) -> BoolArray:
+    """Whether the points more than `height_mm` above each place within the radius lie on no one side of it."""
+    surrounded = np.zeros(len(places_mm), np.bool_)
+    x_min, y_min, size, columns, rows = _grid_shape(points, radius_mm / 1000.0 + 0.001)
+    start, members = _sort_into_grid(points, x_min, y_min, size, columns, rows)
+    dx, dy = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
+    for i in range(len(places_mm)):
+        column = math.floor((places_mm[i, 0] * 1e-3 - x_min) / size)
+        row = math.floor((places_mm[i, 1] * 1e-3 - y_min) / size)
+        m = 0
+        for r in range(max(row - 1, 0), min(row + 2, rows)):
+            for c in range(max(column - 1, 0), min(column + 2, columns)):
+                for q in range(start[r * columns + c], start[r * columns + c + 1]):
+                    j = members[q]
+                    dx[m], dy[m] = xyz_mm[j, 0] - places_mm[i, 0], xyz_mm[j, 1] - places_mm[i, 1]
+                    is_near = 0 < dx[m] * dx[m] + dy[m] * dy[m] <= radius_mm * radius_mm
+                    if is_near and xyz_mm[j, 2] > places_mm[i, 2] + height_mm:
+                        m += 1
+        # all are on one side if one of them has none to its left
+        surrounded[i] = m > 0
+        for s in range(m):
+            t = 0
+            while t < m and dx[s] * dy[t] - dy[s] * dx[t] <= 0:
+                t += 1
+            if t == m:
+                surrounded[i] = False
+                break
+    return surrounded
+
+
+def surrounded(places: FloatArray, points: FloatArray, radius_m: float = 0.5, height_m: float = 1.1) -> BoolArray:
+    """Which places (m, 3) lie within points (n, 3), at least one, that are more than 1.1 m higher and within 0.5 m.
+
+    These points are all around such a place: no line through it has all of them on one side. Places and limits are
+    compared on whole millimetres.
+    """
+    return _surrounded(
+        np.rint(places * 1000.0).astype(np.int64),
+        np.rint(points * 1000.0).astype(np.int64),
+        np.ascontiguousarray(points, dtype=np.float64),
+        round(radius_m * 1000),
+        round(height_m * 1000),
+    )

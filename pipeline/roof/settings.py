@@ -215,7 +215,7 @@ class ArrangementSettings(Parameters):
         maximum=10_000.0,
     )
     corner_share: float = parameter(
-        0.4,
+        0.5,
         "Misfitting points that a corner of the borders must save, as a share of those of a roof face; 0 keeps all.",
         minimum=0.0,
         maximum=10.0,
@@ -227,7 +227,7 @@ class ArrangementSettings(Parameters):
         0.7, "How far a corner of three or more borders moves to join another.", unit="m", minimum=0.0, maximum=5.0
     )
     plane_shift_m: float = parameter(
-        0.08,
+        0.15,
         "How far a plane may move to meet its neighbours in their corners, root mean square over its points.",
         unit="m",
         minimum=0.0,

@@ -2,7 +2,8 @@
 
 Points with another one well above them nearby are hidden, since most are of a facade. So a lower roof seems to end half
 a metre from the wall, and one that is hardly wider seems to be missing. A facade has points at all heights: those on
-the plane of a roof that goes on beside them are of that roof.
+the plane of a roof that goes on beside them are of that roof. At the foot of a wall all higher points are on one side.
+A point that they surround lies beneath the upper roof: under its eave, or met by a pulse through a gap.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.geometry import surrounded
 from pipeline.model import Plane, PreparedCloud
-from pipeline.prepared_cloud import SHADING_RADIUS_M
+from pipeline.prepared_cloud import SHADING_HEIGHT_M, SHADING_RADIUS_M
 from pipeline.roof.labelling import nearest_points
 from pipeline.roof.plan import RoofPoints
 
@@ -26,8 +28,9 @@ _ON_PLANE_M = 0.2
 def with_shaded_points(roof: RoofPoints, cloud: PreparedCloud, planes: Sequence[Plane]) -> RoofPoints:
     """Add the hidden points of a cloud that lie on a plane near visible points of it, with its label.
 
-    The labels of `roof` number `planes`. Positions stay distinct: of hidden points at one the highest counts, and none
-    where a roof point is. A point between several planes takes the nearest, the first of equal ones.
+    Points that visible ones well above them surround stay hidden. The labels of `roof` number `planes`. Positions stay
+    distinct: of hidden points at one the highest counts, and none where a roof point is. A point between several planes
+    takes the nearest, the first of equal ones.
     """
     is_hidden = np.ones(len(cloud.points), np.bool_)
     is_hidden[cloud.visible] = False
@@ -47,6 +50,9 @@ def with_shaded_points(roof: RoofPoints, cloud: PreparedCloud, planes: Sequence[
         close = close[distance_m <= _REACH_M]
         best[close], label[close] = off[close], number
     added = np.flatnonzero(label >= 0)
+    if len(added):
+        visible = cloud.candidate.points[cloud.visible]
+        added = added[~surrounded(points[added], visible, SHADING_RADIUS_M, SHADING_HEIGHT_M)]
     if len(added) == 0:
         return roof
     added = added[np.argsort(-points[added, 2], kind="stable")]

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -250,6 +251,29 @@ def test_order_and_place_do_not_change_what_is_visible() -> None:
     order = np.random.default_rng(3).permutation(len(points))
     np.testing.assert_array_equal(geometry.top_visible(points[order]), visible[order])
     np.testing.assert_array_equal(geometry.top_visible(points + np.array([1_000.0, -2_000.0, 30.0])), visible)
+
+
+@settings(max_examples=examples(200), deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 12), st.integers(0, 30)), min_size=2, max_size=40))
+def test_a_place_is_surrounded_if_it_lies_inside_the_hull_of_the_points_that_hide_it(
+    lattice: list[tuple[int, int, int]],
+) -> None:
+    places, points = np.array(lattice[:1]) * 0.1, np.array(lattice[1:]) * 0.1
+    mm = np.rint((points - places) * 1000.0).astype(int)
+    squares = mm[:, 0] ** 2 + mm[:, 1] ** 2
+    hiding = mm[(squares > 0) & (squares <= 500**2) & (mm[:, 2] > 1100)]
+    hull = shapely.convex_hull(shapely.multipoints(hiding[:, :2]))
+    expected = hull.geom_type == "Polygon" and bool(shapely.contains_properly(hull, shapely.Point(0, 0)))
+    assert geometry.surrounded(places, points).tolist() == [expected]
+
+
+def test_only_higher_points_within_the_radius_surround_a_place_also_beyond_the_others() -> None:
+    ring = np.array([(x, y, 2.0) for x, y in ((0.3, 0.3), (-0.3, 0.3), (0.0, -0.3))])
+    places = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 0.9), (0.0, 0.4, 0.0), (-9.0, 9.0, 0.0)])
+    assert geometry.surrounded(places, ring).tolist() == [True, False, False, False]
+    assert geometry.surrounded(places, ring * np.array([2.0, 2.0, 1.0])).tolist() == [False] * 4
+    above = np.vstack((ring, [(0.0, 0.0, 5.0)]))
+    assert geometry.surrounded(places[:1], above).tolist() == [True]
 
 
 def test_the_spacing_over_the_area_is_that_of_the_points_where_they_lie_evenly() -> None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.stats
 import shapely
 from shapely import MultiPolygon
 
@@ -111,8 +112,8 @@ def heights(planes: FloatArray, x: float, y: float) -> FloatArray:
     return planes @ np.array([x, y, 1.0])
 
 
-def corner_of_three(planes: FloatArray) -> tuple[FloatArray, IntArray, Borders]:
-    """Three sectors of a square around its middle, (n, 3) points on their planes, and the borders between them."""
+def corner_of_three(planes: FloatArray, *noise_m: float) -> tuple[FloatArray, IntArray, Borders]:
+    """Three sectors of a square around its middle, (n, 3) points near their planes, and the borders between them."""
     xy = np.array([(0, 0), (6000, 0), (6000, 6000), (0, 6000), (3000, 3000)], np.int64)
     rings = np.array([0, 1, 4, 1, 2, 4, 2, 3, 0, 4], np.int64)
     edges = edges_of_rings(xy, rings, np.array([0, 3, 6, 10]), np.arange(3, dtype=np.int32))
@@ -120,6 +121,8 @@ def corner_of_three(planes: FloatArray) -> tuple[FloatArray, IntArray, Borders]:
     x, y = east.ravel(), north.ravel()
     labels = np.where((y < x) & (y < 6.0 - x), 0, np.where((y < x) & (y >= 6.0 - x), 1, 2)).astype(np.int32)
     points = np.column_stack([x, y, (np.column_stack([x, y, np.ones(len(x))]) * planes[labels]).sum(axis=1)])
+    if noise_m:
+        points[:, 2] += np.random.default_rng(7).normal(0.0, 1.0, len(x)) * np.array(noise_m)[labels]
     return points, labels, Borders(xy, edges, np.arange(3, dtype=np.int32), np.arange(5) < 4)
 
 
@@ -133,10 +136,11 @@ def test_three_planes_that_miss_a_corner_by_centimetres_meet_in_it_and_stay_near
         assert np.sqrt((residuals[labels == label] ** 2).mean()) <= LIMITS.plane_shift_m
 
 
-def test_it_is_least_squares_under_the_conditions() -> None:
+@pytest.mark.parametrize("noise_m", [(0.03, 0.03, 0.03), (0.02, 0.03, 0.07)])
+def test_it_is_least_squares_under_the_conditions_with_the_weights_of_the_noise(noise_m: tuple[float, ...]) -> None:
     """Against the solution by Lagrange multipliers of the same problem."""
     planes = np.array([(0.0, 0.5, 3.0), (-0.5, 0.0, 6.02), (0.4, 0.0, 3.33)])
-    points, labels, borders = corner_of_three(planes)
+    points, labels, borders = corner_of_three(planes, *noise_m)
     joined = joined_planes(points, labels, planes, borders, LIMITS)
     places = [
         (0, 1, 6.0, 0.0),
@@ -156,7 +160,8 @@ def test_it_is_least_squares_under_the_conditions() -> None:
     normal = np.zeros((9, 9))
     for label in range(3):
         of_plane = np.column_stack([points[labels == label, :2], np.ones((labels == label).sum())])
-        normal[3 * label : 3 * label + 3, 3 * label : 3 * label + 3] = of_plane.T @ of_plane
+        noise = np.sqrt(np.mean((of_plane @ planes[label] - points[labels == label, 2]) ** 2))
+        normal[3 * label : 3 * label + 3, 3 * label : 3 * label + 3] = of_plane.T @ of_plane / noise
     conditions = np.array(held)
     m = len(held)
     system = np.block([[normal, conditions.T], [conditions, np.zeros((m, m))]])
@@ -172,14 +177,38 @@ def test_planes_of_a_true_step_stay() -> None:
 
 
 def test_a_gap_that_costs_more_points_to_close_than_a_corner_must_save_stays() -> None:
-    """The more points show a gap of 8 cm the more they lose; a corner saves the same number everywhere."""
+    """The more points show a gap of 8 cm, and the better, the more they lose; a corner saves the same everywhere."""
     planes = np.array([(0.0, 0.5, 3.0), (-0.5, 0.0, 6.08), (0.4, 0.0, 3.3)])
-    points, labels, borders = corner_of_three(planes)
+    points, labels, borders = corner_of_three(planes, 0.1, 0.1, 0.1)
     joined = joined_planes(points, labels, planes, borders, LIMITS)
     assert np.ptp(heights(joined, 3.0, 3.0)) < 1e-9
-    dense, of_dense = np.repeat(points, 16, axis=0), np.repeat(labels, 16)
-    joined = joined_planes(dense, of_dense, planes, borders, LIMITS)
-    assert np.ptp(heights(joined, 3.0, 3.0)) > 0.07
-    limits = LIMITS._replace(corner_cost=16.0 * LIMITS.corner_cost)
-    joined = joined_planes(dense, of_dense, planes, borders, limits)
-    assert np.ptp(heights(joined, 3.0, 3.0)) < 1e-9
+    for more, of_more in ((np.repeat(points, 16, axis=0), np.repeat(labels, 16)), (corner_of_three(planes)[0], labels)):
+        joined = joined_planes(more, of_more, planes, borders, LIMITS)
+        assert np.ptp(heights(joined, 3.0, 3.0)) > 0.07
+        limits = LIMITS._replace(corner_cost=16.0 * LIMITS.corner_cost)
+        joined = joined_planes(more, of_more, planes, borders, limits)
+        assert np.ptp(heights(joined, 3.0, 3.0)) < 1e-9
+
+
+def test_the_price_of_a_gap_is_what_its_closing_adds_to_the_residuals() -> None:
+    """It is enough to close a gap at both ends of a border, and a third of it not enough at one; noise is normal."""
+    planes = np.array([(0.0, 0.0, 3.0), (0.0, 0.0, 3.06)])
+    xy = np.array([(0, 0), (6000, 0), (6000, 6000), (0, 6000), (3000, 0), (3000, 6000)], np.int64)
+    rings = np.array([0, 4, 5, 3, 4, 1, 2, 5], np.int64)
+    edges = edges_of_rings(xy, rings, np.array([0, 4, 8]), np.arange(2, dtype=np.int32))
+    borders = Borders(xy, edges, np.arange(2, dtype=np.int32), np.arange(6) < 4)
+    x, y = (axis.ravel() for axis in np.meshgrid(0.1 + np.arange(0.0, 6.0, 0.2), 0.1 + np.arange(0.0, 6.0, 0.2)))
+    labels = (x > 3.0).astype(np.int32)
+    noise = scipy.stats.norm.ppf((np.arange(len(x)) * 0.6180339887498949 + 0.5) % 1.0) * 0.05
+    points = np.column_stack([x, y, planes[labels, 2] + noise])
+    closed = joined_planes(points, labels, planes, borders, LIMITS._replace(corner_cost=1e9, plane_shift_m=1.0))
+    assert np.ptp(heights(closed, 3.0, 0.0)) < 1e-9 > np.ptp(heights(closed, 3.0, 6.0))
+    place = np.column_stack([x, y, np.ones(len(x))])
+    before, after = (np.abs((place * p[labels]).sum(axis=1) - points[:, 2]).sum() for p in (planes, closed))
+    price = (after - before) / LIMITS.cap_m
+    both = [
+        joined_planes(points, labels, planes, borders, LIMITS._replace(corner_cost=share * price, plane_shift_m=1.0))
+        for share in (0.35, 1.0)
+    ]
+    assert np.ptp(heights(both[0], 3.0, 0.0)) > 0.05 < np.ptp(heights(both[0], 3.0, 6.0))
+    assert np.ptp(heights(both[1], 3.0, 0.0)) < 1e-9 > np.ptp(heights(both[1], 3.0, 6.0))

@@ -58,6 +58,18 @@ def test_points_of_a_facade_stay_out() -> None:
     assert np.abs(z[:, None] - [LOW_M, HIGH_M]).min(axis=1).max() < 0.21
 
 
+def test_points_beneath_the_edge_of_the_upper_roof_stay_out() -> None:
+    """The lower roof goes on beneath an eave, where pulses through gaps of the upper roof meet it."""
+    rng = np.random.default_rng(4)
+    beneath = np.column_stack((rng.uniform(1.0, 1.5, 60), rng.uniform(0, 8, 60), np.full(60, LOW_M)))
+    one = house(1.0)
+    cloud, roof = labelled(dataclasses.replace(one, points=np.vstack((one.points, beneath))))
+    more = with_shaded_points(roof, cloud, PLANES)
+    added = cloud.candidate.points[np.setdiff1d(more.index, roof.index)]
+    assert (added[:, 0] < 1.0).sum() > 20
+    assert 20 < (beneath[:, 0] > 1.25).sum() > 2 * (added[:, 0] > 1.25).sum()
+
+
 def test_hidden_points_far_from_the_roof_on_their_plane_stay_out() -> None:
     cloud, roof = labelled(house(1.0))
     beyond = dataclasses.replace(roof, labels=np.where(roof.points[:, 1] < 4.0, roof.labels, -1).astype(np.int32))

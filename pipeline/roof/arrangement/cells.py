@@ -17,7 +17,7 @@ from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.merge_sort import ascending_order
 from pipeline.kernels.union_find import numbered_sets, unite
-from pipeline.model import FloatArray, IntArray, LabelArray
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.limits import Limits
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
 from pipeline.roof.arrangement.subdivision import CELLS, EDGES, FACE, ORIGIN, Subdivision, between_vertices
@@ -33,6 +33,12 @@ _DOUBTFUL_SHARE = 0.5
 space, as a crown does, is met by about half of them."""
 _SLIVER = 5.0
 """A sliver is at least this many times as long as wide: narrow triangles of hips and dormers are not."""
+
+_ALONG = 0.75
+"""Share of its length with which a parapet is on the outline."""
+_SMEARED_SHARE = 0.1
+"""Share of a sliver's points that misfit its own plane from which on they are those of a wall, smeared by the beam: the
+points of a parapet's top fit it, those of a wall are spread over its height."""
 
 
 @kernel
@@ -223,13 +229,26 @@ def _borders_of_faces(faces: LabelArray, count: int, pairs: IntArray, weights: I
 
 
 @kernel(inline="always")
-def _narrowest_sliver(plan: Subdivision, areas: FloatArray, faces: LabelArray, count: int, min_width_m: float) -> int:
+def _fitted(misfits: IntArray, label_of: LabelArray, held: IntArray) -> BoolArray:
+    """Whether the points of each face, (f,), fit its own plane; `misfits` (f, k) and points `held` (f,) are sums."""
+    is_fitted = np.empty(len(held), np.bool_)
+    for f in range(len(held)):
+        is_fitted[f] = misfits[f, label_of[f]] < _SMEARED_SHARE * COST_SCALE * held[f]
+    return is_fitted
+
+
+@kernel(inline="always")
+def _narrowest_sliver(
+    plan: Subdivision, areas: FloatArray, faces: LabelArray, is_fitted: BoolArray, min_width_m: float
+) -> int:
     """The face that is the narrowest sliver of those with a neighbour, if narrower than the minimum; -1 for none.
 
-    Width and length are those of the rectangle with the area and the perimeter of the face.
+    Width and length are those of the rectangle with the area and the perimeter of the face. A fitted face (f,) whose
+    long side is on the outline is a parapet and stays.
     """
     xy, graph = plan.xy, plan.graph
-    area, half = np.zeros(count), np.zeros(count)
+    count = len(is_fitted)
+    area, half, outer = np.zeros(count), np.zeros(count), np.zeros(count)
     has_neighbour = np.zeros(count, np.bool_)
     for cell in range(len(areas)):
         area[faces[cell]] += areas[cell]
@@ -237,14 +256,19 @@ def _narrowest_sliver(plan: Subdivision, areas: FloatArray, faces: LabelArray, c
         f, g = graph[h, FACE], graph[h ^ 1, FACE]
         if f >= 0 and (g < 0 or faces[f] != faces[g]):
             p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
-            half[faces[f]] += 0.5e-3 * math.hypot(float(xy[q, 0] - xy[p, 0]), float(xy[q, 1] - xy[p, 1]))
+            length = 1e-3 * math.hypot(float(xy[q, 0] - xy[p, 0]), float(xy[q, 1] - xy[p, 1]))
+            half[faces[f]] += 0.5 * length
             has_neighbour[faces[f]] |= g >= 0
+            if g < 0:
+                outer[faces[f]] += length
     least, sliver = min_width_m, -1
     for f in range(count):
         square = 0.25 * half[f] * half[f] - area[f]
         if has_neighbour[f] and square > 0.0:
             width = 0.5 * half[f] - math.sqrt(square)
-            if width < least and half[f] - width >= _SLIVER * width:
+            length = half[f] - width
+            is_parapet = is_fitted[f] and outer[f] >= _ALONG * length
+            if width < least and length >= _SLIVER * width and not is_parapet:
                 least, sliver = width, f
     return sliver
 
@@ -263,7 +287,8 @@ def unite_faces(
 
     This saves their common border, and a face for every neighbour with that label; it costs the points that misfit
     then. A face costs more the more of its own points misfit it: `face_cost` if all fit, `doubtful_cost` if half of
-    them misfit. When nothing is saved any more, slivers that are too narrow for a roof go to a neighbour all the same.
+    them misfit. When nothing is saved any more, slivers that are too narrow for a roof go to a neighbour all the same;
+    parapets do not.
     Misfits are those of `cell_costs`, `held` of `points_per_cell`, pairs and weights of `cell_borders`.
     """
     k, face_cost, doubtful_cost = misfits.shape[1], limits.face_cost, limits.doubtful_cost
@@ -312,6 +337,7 @@ def unite_faces(
         if best_face >= 0:
             sliver = -1
         else:
-            sliver = _narrowest_sliver(plan, areas, faces, count, limits.min_face_width_m)
+            is_fitted = _fitted(data, label_of, inside)
+            sliver = _narrowest_sliver(plan, areas, faces, is_fitted, limits.min_face_width_m)
             if sliver < 0:
                 return

@@ -2,12 +2,15 @@
 
 Fitted one by one, three planes that meet in one corner of a roof miss it by centimetres, and the solid gets small walls
 and clusters of vertices there. Each condition "these two planes have one height over this vertex" is linear, so least
-squares under it is one step of a Kalman filter with an exact measurement (Kalman 1960). Conditions come in order of
-their costs. One that costs more points than a corner must save is left out, and so is one that moves a plane farther
-from its points than the settings allow: such a gap is real, or the corner lies in the wrong place.
+squares under it is one step of a Kalman filter with an exact measurement (Kalman 1960), in which a plane counts by the
+noise of its points: one that they show well moves less. Conditions come in order of their costs. One that costs more
+points than a corner must save is left out, and so is one that moves a plane farther from its points than the settings
+allow: such a gap is real, or the corner lies in the wrong place.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -22,8 +25,10 @@ _FEWEST_POINTS = 6
 """Planes with fewer points keep their coefficients: twice as many as there are coefficients."""
 _MAX_GAP_M = 0.25
 """Wider gaps are steps. Not a setting: hardly more than what planes that share a corner miss it by (`corner_gap_m`)."""
-_EXACT_M2 = 1e-12
-"""Variance per squared noise below which earlier conditions hold a gap as it is; numerical guard."""
+_EXACT_M = 1e-12
+"""Variance over noise below which earlier conditions hold a gap as it is; numerical guard."""
+_LEAST_NOISE_M = 0.01
+"""Noise of planes that fit their points better: no survey does; numerical guard."""
 _LEAST_MOMENT = (1e-2, 1e-2, 1e-3)
 """Added to the moments so that they can be inverted; numerical guard."""
 
@@ -60,11 +65,12 @@ def _conditions(borders: Borders, n_planes: int) -> IntArray:
 def _moments(
     points: FloatArray, labels: LabelArray, planes: FloatArray, middle: FloatArray, cap_m: float
 ) -> FloatArray:
-    """Sums of x x, x y, x, y y, y, 1 over the points that each plane explains, about the middle, (k, 6)."""
-    sums = np.zeros((len(planes), 6))
+    """Sums of x x, x y, x, y y, y, 1 and squared residuals over the points of each plane, about the middle, (k, 7)."""
+    sums = np.zeros((len(planes), 7))
     for i in range(len(points)):
         label = labels[i]
-        if label >= 0 and vertical_distance_m(points, i, planes, label) < cap_m:
+        off = vertical_distance_m(points, i, planes, label) if label >= 0 else cap_m
+        if off < cap_m:
             x, y = points[i, 0] - middle[0], points[i, 1] - middle[1]
             sums[label, 0] += x * x
             sums[label, 1] += x * y
@@ -72,12 +78,13 @@ def _moments(
             sums[label, 3] += y * y
             sums[label, 4] += y
             sums[label, 5] += 1.0
+            sums[label, 6] += off * off
     return sums
 
 
 @kernel(inline="always")
 def _covariance(moments: FloatArray) -> FloatArray:
-    """Covariance of all coefficients per squared noise, (3 k, 3 k); zero for planes that have too few points."""
+    """Covariance of all coefficients over the noise of their plane, (3 k, 3 k); zero for planes with too few points."""
     k = len(moments)
     covariance = np.zeros((3 * k, 3 * k))
     for p in range(k):
@@ -91,9 +98,10 @@ def _covariance(moments: FloatArray) -> FloatArray:
         inverse[0, 0], inverse[0, 1], inverse[0, 2] = a, b, c
         inverse[1, 1], inverse[1, 2], inverse[2, 2] = xx * n - x * x, x * xy - xx * y, xx * yy - xy * xy
         inverse[1, 0], inverse[2, 0], inverse[2, 1] = inverse[0, 1], inverse[0, 2], inverse[1, 2]
+        noise_m = max(math.sqrt(moments[p, 6] / moments[p, 5]), _LEAST_NOISE_M)
         for i in range(3):
             for j in range(3):
-                inverse[i, j] /= determinant
+                inverse[i, j] *= noise_m / determinant
     return covariance
 
 
@@ -136,10 +144,10 @@ def _cheapest(
     change: FloatArray,
     covariance: FloatArray,
     is_open: BoolArray,
-    max_rise_m2: float,
+    max_rise_m: float,
 ) -> tuple[int, float, float]:
-    """The open condition that raises the sum of squared residuals least, its gap now and its variance; -1 for none."""
-    best, best_gap, best_variance, least = -1, 0.0, 0.0, max_rise_m2
+    """The open condition that raises the residuals least, its gap now and its variance over noise; -1 for none."""
+    best, best_gap, best_variance, least = -1, 0.0, 0.0, max_rise_m
     for i in range(len(gaps)):
         if not is_open[i]:
             continue
@@ -148,7 +156,7 @@ def _cheapest(
             gap += factors[i, s] * change[index[i, s]]
             for t in range(6):
                 variance += factors[i, s] * factors[i, t] * covariance[index[i, s], index[i, t]]
-        if abs(gap) < _MAX_GAP_M and variance > _EXACT_M2 and gap * gap < least * variance:
+        if abs(gap) < _MAX_GAP_M and variance > _EXACT_M and gap * gap < least * variance:
             best, best_gap, best_variance, least = i, gap, variance, gap * gap / variance
     return best, best_gap, best_variance
 
@@ -170,11 +178,11 @@ def joined_planes(
     covariance = _covariance(moments)
     factors, index, gaps = _terms(borders, _conditions(borders, k), planes, middle)
     is_open = np.full(len(gaps), limits.plane_shift_m > 0.0)
-    # a residual of the cap is one unexplained point
-    max_rise_m2 = limits.corner_cost * limits.cap_m**2
+    # the sum of |residuals| of a point rises by d^2 / (sqrt(2 pi) noise) if its plane moves by d; the cap is one point
+    max_rise_m = limits.corner_cost * limits.cap_m * math.sqrt(2.0 * math.pi)
     change, trial, gain = np.zeros(3 * k), np.empty(3 * k), np.empty(3 * k)
     while True:
-        i, gap, variance = _cheapest(factors, index, gaps, change, covariance, is_open, max_rise_m2)
+        i, gap, variance = _cheapest(factors, index, gaps, change, covariance, is_open, max_rise_m)
         if i < 0:
             break
         is_open[i] = False
