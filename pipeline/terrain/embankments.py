@@ -2,8 +2,8 @@
 
 An opening takes a dam with a retaining wall on one side for a row of houses, and a bench that the edge of the data
 cuts off for a hall. No test of a few cells sees the difference. It lies in the whole surface and its foot: a building
-rises from the ground by walls nearly everywhere, and crowns are rough. A surface is terrain if it is large and smooth,
-if most of it is wider than a house, and if slopes of about 45 degrees at most lead up to a good part of it.
+rises from the ground by walls nearly everywhere, and crowns fall into many surfaces. A surface is terrain if it is
+large, if most of it is wider than a house, and if slopes of about 45 degrees at most lead up to a good part of it.
 """
 
 from __future__ import annotations
@@ -41,10 +41,7 @@ _LEVEL_MM = 250.0
 """The same as a height, with which ground rejoins by planes."""
 
 _SMOOTH_MM = 500.0
-"""Farthest that a cell may lie from the plane of its neighbours: crowns and bushes are rougher."""
-
-_SMOOTH_SHARE = 0.5
-"""Share of a surface's cells that must be as smooth."""
+"""Farthest that a cell may lie from the plane of its neighbours to join: crowns and bushes are rougher."""
 
 _SLOPED_SHARE = 0.4
 """Share of the links to lower ground that must be slopes. A dam with a wall on one side has about half of them."""
@@ -81,11 +78,11 @@ def _offsets(reach: int) -> npt.NDArray[np.int64]:
 _OFFSETS = _offsets(LINK_CELLS)
 _NONE = np.uint8(255)
 
-_CELLS, _SMOOTH, _SLOPES, _WALLS, _DM2, _NARROW, _WIDE = range(7)
-"""Columns of `Counts`: one; smooth; links up from the ground by slopes and by walls; area if not narrow; flags."""
+_CELLS, _SLOPES, _WALLS, _DM2, _NARROW, _WIDE = range(6)
+"""Columns of `Counts`: one; links up from the ground by slopes and by walls; area if not narrow; flags."""
 
 Counts = npt.NDArray[np.int64]
-"""(objects, 7) int64: what a cell adds to the sums of its surface."""
+"""(objects, 6) int64: what a cell adds to the sums of its surface."""
 
 Links = npt.NDArray[np.uint8]
 """(objects, `_MOST_LINKS`) uint8, rows of `_OFFSETS` from a cell to its neighbours, then `_NONE`."""
@@ -123,44 +120,41 @@ def _linked(lowest: Elevations, cells: IntArray) -> Links:
 
 
 @kernel
-def _are_smooth(lowest: Elevations, cells: IntArray) -> BoolArray:
-    """Which cells (n,) lie within `_SMOOTH_MM` of the plane through those around them that continue the surface."""
+def _is_smooth(lowest: Elevations, r: int, c: int) -> bool:
+    """Whether a cell lies within `_SMOOTH_MM` of the plane through those around it that continue the surface."""
     rows, columns = lowest.shape
-    out = np.zeros(len(cells), np.bool_)
-    for i in range(len(cells)):
-        r, c = cells[i] // columns, cells[i] % columns
-        n, x, y, z, xx, xy, yy, xz, yz = 0, 0, 0, 0, 0, 0, 0, 0, 0
-        for k in range(len(_OFFSETS)):
-            down, across = _OFFSETS[k, 0], _OFFSETS[k, 1]
-            apart = down * down + across * across
-            if n == _NEIGHBOURS or apart > _PLANE_CELLS * _PLANE_CELLS:
-                break
-            a, b = r + down, c + across
-            if a < 0 or a >= rows or b < 0 or b >= columns or lowest[a, b] == NO_DATA:
-                continue
-            h = np.int64(lowest[a, b]) - lowest[r, c]
-            if abs(h) > _NOISE_MM + _ALONG * CELL_MM * math.sqrt(apart):
-                continue
-            n += 1
-            x, y, z = x + across, y + down, z + h
-            xx, xy, yy = xx + across * across, xy + across * down, yy + down * down
-            xz, yz = xz + across * h, yz + down * h
-        if n < _FEWEST:
+    n, x, y, z, xx, xy, yy, xz, yz = 0, 0, 0, 0, 0, 0, 0, 0, 0
+    for k in range(len(_OFFSETS)):
+        down, across = _OFFSETS[k, 0], _OFFSETS[k, 1]
+        apart = down * down + across * across
+        if n == _NEIGHBOURS or apart > _PLANE_CELLS * _PLANE_CELLS:
+            break
+        a, b = r + down, c + across
+        if a < 0 or a >= rows or b < 0 or b >= columns or lowest[a, b] == NO_DATA:
             continue
-        vxx, vxy, vyy = xx - x * x / n, xy - x * y / n, yy - y * y / n
-        det = vxx * vyy - vxy * vxy
-        if det > MIN_SPREAD * (vxx + vyy) * (vxx + vyy):
-            vxz, vyz = xz - x * z / n, yz - y * z / n
-            east, north = (vxz * vyy - vyz * vxy) / det, (vyz * vxx - vxz * vxy) / det
-            out[i] = abs((z - east * x - north * y) / n) <= _SMOOTH_MM
-    return out
+        h = np.int64(lowest[a, b]) - lowest[r, c]
+        if abs(h) > _NOISE_MM + _ALONG * CELL_MM * math.sqrt(apart):
+            continue
+        n += 1
+        x, y, z = x + across, y + down, z + h
+        xx, xy, yy = xx + across * across, xy + across * down, yy + down * down
+        xz, yz = xz + across * h, yz + down * h
+    if n < _FEWEST:
+        return False
+    vxx, vxy, vyy = xx - x * x / n, xy - x * y / n, yy - y * y / n
+    det = vxx * vyy - vxy * vxy
+    if det <= MIN_SPREAD * (vxx + vyy) * (vxx + vyy):
+        return False
+    vxz, vyz = xz - x * z / n, yz - y * z / n
+    east, north = (vxz * vyy - vyz * vxy) / det, (vyz * vxx - vxz * vxy) / det
+    return abs((z - east * x - north * y) / n) <= _SMOOTH_MM
 
 
 @kernel
 def _counted(lowest: Elevations, ground: BoolArray, cells: IntArray, links: Links) -> Counts:
     """Links to the ground below and area of each cell; the other columns are zero."""
     columns = lowest.shape[1]
-    out = np.zeros((len(cells), 7), np.int64)
+    out = np.zeros((len(cells), 6), np.int64)
     for i in range(len(cells)):
         r, c = cells[i] // columns, cells[i] % columns
         number, total = 0, 0.0
@@ -233,7 +227,7 @@ def _surfaces(place: LabelArray, at: LabelArray, links: Links, gentle: BoolArray
 
 @kernel
 def _mark(out: BoolArray, number: LabelArray, links: Links, gentle: BoolArray, counts: Counts, least_dm2: int) -> None:
-    """Mark the cells of a block's surfaces that are terrain: those that are smooth, and not on narrow objects.
+    """Mark the cells of a block's surfaces that are terrain, those on narrow objects left out.
 
     `out` and `number` are the block's part of the lattice; `number` is the row of an object's cell in the other arrays,
     -1 in other cells. `gentle` (objects, links) is whether the surface continues along a link; links that leave the
@@ -242,32 +236,32 @@ def _mark(out: BoolArray, number: LabelArray, links: Links, gentle: BoolArray, c
     rows, columns = number.shape
     place = np.full((rows, columns), -1, np.int32)
     at = np.empty(rows * columns, np.int32)
-    members, area = 0, 0
+    members, area, slopes = 0, 0, 0
     for r in range(rows):
         for c in range(columns):
             if number[r, c] >= 0:
                 place[r, c] = members
                 at[members] = number[r, c]
                 area += counts[number[r, c], _DM2]
+                slopes += counts[number[r, c], _SLOPES]
                 members += 1
-    if area < least_dm2:
+    if area < least_dm2 or slopes == 0:
         return
     at = at[:members]
     surface = _surfaces(place, at, links, gentle)
-    sums = np.zeros((members, 7), np.int64)
+    sums = np.zeros((members, 6), np.int64)
     for i in range(members):
-        for k in range(7):
+        for k in range(6):
             sums[surface[i], k] += counts[at[i], k]
     for r in range(rows):
         for c in range(columns):
             i = place[r, c]
-            if i < 0 or counts[at[i], _SMOOTH] == 0 or counts[at[i], _NARROW] > 0:
+            if i < 0 or counts[at[i], _NARROW] > 0:
                 continue
             whole = sums[surface[i]]
             share = _WIDE_SHARE if counts[at[i], _WIDE] > 0 else _SLOPED_SHARE
             if (
                 whole[_DM2] >= least_dm2
-                and whole[_SMOOTH] >= _SMOOTH_SHARE * whole[_CELLS]
                 and whole[_NARROW] <= _NARROW_SHARE * whole[_CELLS]
                 and whole[_SLOPES] > 0
                 and whole[_SLOPES] >= share * (whole[_SLOPES] + whole[_WALLS])
@@ -315,11 +309,9 @@ def embankments(
     cells = cells[:n]
     links = _linked(lowest, cells)
     counts = _counted(lowest, ground, cells, links)
-    smooth = _are_smooth(lowest, cells)
     for i in range(n):
         r, c = cells[i] // columns, cells[i] % columns
-        counts[i, _CELLS], counts[i, _SMOOTH] = 1, smooth[i]
-        counts[i, _NARROW], counts[i, _WIDE] = narrow[r, c], wide[r, c]
+        counts[i, _CELLS], counts[i, _NARROW], counts[i, _WIDE] = 1, narrow[r, c], wide[r, c]
         if narrow[r, c]:
             counts[i, _DM2] = 0
     gentle = _continued(lowest, cells, links)
@@ -330,4 +322,7 @@ def embankments(
         for c in range(west, columns, _STRIDE):
             r0, c0, r1, c1 = max(r, 0), max(c, 0), min(r + BLOCK_CELLS, rows), min(c + BLOCK_CELLS, columns)
             _mark(out[r0:r1, c0:c1], number[r0:r1, c0:c1], links, gentle, counts, 100 * least_m2)
+    for i in range(n):
+        r, c = cells[i] // columns, cells[i] % columns
+        out[r, c] = out[r, c] and _is_smooth(lowest, r, c)
     return out

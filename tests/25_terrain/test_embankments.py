@@ -88,7 +88,7 @@ def test_the_filter_keeps_a_dam_with_a_wall_that_the_edge_of_the_data_cuts_only_
 
 
 @pytest.mark.parametrize("share", [0.25, 1.0])
-def test_a_wood_on_a_bank_is_too_rough(share: float) -> None:
+def test_a_wood_on_a_bank_falls_into_small_surfaces(share: float) -> None:
     random = np.random.default_rng(5)
     z = dam(0.8)
     high = without_foot(z)
@@ -218,7 +218,7 @@ def twin(lowest: Grid, ground: Mask, narrow: Mask, wide: Mask, corner: tuple[int
                             rise = int(lowest[at]) - int(lowest[at[0] + a, at[1] + b])
                             walls += rise > 300 + 1000 * (d + 0.5)
                             slopes += 250 + 200 * d < rise <= 300 + 1000 * (d + 0.5)
-                if area < 100 * least_m2 or slopes == 0 or 2 * sum(smooth[at] for at in members) < len(members):
+                if area < 100 * least_m2 or slopes == 0:
                     continue
                 if 3 * sum(bool(narrow[at]) for at in members) > len(members):
                     continue
