@@ -39,7 +39,7 @@ _CLUMP_BAND_MM = 750
 """Cells up to this far above the one in question belong to its clump."""
 
 _HOUSE_CELLS = 6
-"""What openings up to this radius cut off is at most 13 m wide, as houses are: no embankment."""
+"""What openings up to this radius cut off is at most 13 m wide, as houses are, and not an embankment."""
 
 _FEWEST_BESIDE = 2
 """Ground cells on the same level that a cell needs beside it to rejoin: one may be an outlier."""

@@ -8,6 +8,7 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from pipeline.terrain import morphological
 from pipeline.terrain.embankments import embankments
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.morphological import morphological_ground
@@ -72,19 +73,43 @@ def test_a_dam_with_a_wall_on_one_side_joins_and_one_with_two_walls_does_not(sha
         assert found[high].mean() > 0.85 if joins else not found.any()
 
 
-def test_the_filter_keeps_a_dam_with_a_wall_that_the_edge_of_the_data_cuts_only_as_an_embankment() -> None:
+def cut_dam() -> tuple[Grid, Mask]:
+    """Sparse points of a dam with a wall on one side and a face of 45 degrees, cut by the data's edge; its crest."""
     c, r = coordinates(140, 140)
     away = (c - r) / math.sqrt(2)
-    # a wall on one side, a face of 45 degrees on the other; ends beyond the data
-    z = np.where(away < -10.0, 0.0, np.clip(9.0 - away, 2.0, 7.0)) + 0.02 * r
-    lowest = sampled(z, 0.25, seed=3)
-    crest = (away > -8.0) & (away < 2.0) & (lowest != NO_DATA)
+    lowest = sampled(np.where(away < -10.0, 0.0, np.clip(9.0 - away, 2.0, 7.0)) + 0.02 * r, 0.25, seed=3)
+    return lowest, (away > -8.0) & (away < 2.0) & (lowest != NO_DATA)
+
+
+def test_the_filter_keeps_a_dam_with_a_wall_that_the_edge_of_the_data_cuts_only_as_an_embankment() -> None:
+    lowest, crest = cut_dam()
     with_them, without = (morphological_ground(lowest, (500, 300), GroundSettings(embankment_m2=m2)) for m2 in (600, 0))
     assert without[0][crest].mean() < 0.3
     assert with_them[0][crest].mean() > 0.9
     assert with_them[0][without[0]].all()
     # terrain is drawn from far away only through the ground that looks less far
     np.testing.assert_array_equal(with_them[1], without[1])
+
+
+def test_decks_on_an_embankment_are_not_ground(monkeypatch: pytest.MonkeyPatch) -> None:
+    lowest, crest = cut_dam()
+    deck = crest & (np.arange(140)[:, None] // 10 == 7)
+
+    def decks(*_: object) -> Mask:
+        return deck
+
+    monkeypatch.setattr(morphological, "between_walls", decks)
+    found, _ = morphological_ground(lowest, (500, 300), GroundSettings())
+    assert not found[deck].any()
+    assert found[crest & ~deck].mean() > 0.8
+
+
+def test_the_blocks_of_the_filter_begin_every_16_metres_at_the_origin_of_the_coordinates() -> None:
+    # so large that the dam's parts in some blocks suffice and in others do not
+    chosen = GroundSettings(embankment_m2=900)
+    masks = [morphological_ground(cut_dam()[0], (column, 300), chosen)[0] for column in (496, 504, 512)]
+    np.testing.assert_array_equal(masks[0], masks[2])
+    assert (masks[0] != masks[1]).sum() > 100
 
 
 @pytest.mark.parametrize("share", [0.25, 1.0])
