@@ -6,7 +6,14 @@ import dataclasses
 from collections.abc import Iterator
 
 from pipeline.parameters import Parameters, parameter
-from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS, PIT_CELLS, between_walls_support_m, wide_support_m
+from pipeline.terrain.support import (
+    CLUMP_CELLS,
+    GAP_CELLS,
+    PIT_CELLS,
+    between_walls_support_m,
+    embankments_support_m,
+    wide_support_m,
+)
 
 
 class MorphologicalFilterSettings(Parameters):
@@ -124,21 +131,35 @@ class MorphologicalFilterSettings(Parameters):
         minimum=0.0,
         maximum=1.0,
     )
+    embankment_m2: int = parameter(
+        600,
+        "Least area of smooth surfaces that are ground because slopes lead up to them, as to dams and piers; 0 leaves "
+        "them out.",
+        unit="m2",
+        minimum=0,
+        maximum=2000,
+    )
 
     @property
-    def morphological_support_m(self) -> float:
-        """How far the ground looks that terrain is drawn from at any distance: the longest chain, and regrowth."""
+    def _openings_support_m(self) -> float:
+        """How far the pit tests, openings, wide objects and decks look."""
         openings = 2 * self.max_window_m + 2 * self.second_window_m
         chain = 4 * GAP_CELLS + openings + 2 * self.trend_m + CLUMP_CELLS
         wide = wide_support_m(self.widest_m // 2) if self.looks_for_wide else 0.0
         walls = between_walls_support_m(self.deck_m)
-        return PIT_CELLS + max(float(chain), wide, walls) + self.regrowth_passes * self.regrowth_m
+        return PIT_CELLS + max(float(chain), wide, walls)
+
+    @property
+    def morphological_support_m(self) -> float:
+        """How far the ground looks that terrain is drawn from at any distance: the longest chain, and regrowth."""
+        return self._openings_support_m + self.regrowth_passes * self.regrowth_m
 
     @property
     def rejoined_support_m(self) -> float:
         """How far the ground looks that joined by planes or later; terrain is drawn from it up to `NEAR_CELLS` away."""
         passes = 2 * self.rejoin_passes * self.rejoin_m + self.berm_passes * self.regrowth_m
-        return self.morphological_support_m + passes
+        whole = embankments_support_m() + min(self.berm_passes, 1) * self.regrowth_m if self.embankment_m2 else 0.0
+        return max(self.morphological_support_m + passes, self._openings_support_m + whole)
 
     @property
     def second_window_m(self) -> int:

@@ -4,7 +4,8 @@ One step of a growing opening cuts off an object (Zhang et al. 2003). A step may
 and gaps in the surface are closed first (SMRF: Pingel, Clarke and McBride 2013). On a slope an opening cannot see an
 object that is lower than the slope rises between two points. Therefore openings run twice: the first give a provisional
 ground, the second work on heights above its trend, without slopes. Wide objects and decks between two walls are found
-separately. Brows, crests and terraces that were lost rejoin the ground beside them on the same level or plane.
+separately. Brows, crests and terraces that were lost rejoin the ground beside them on the same level or plane, and
+embankments as whole surfaces.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray
 from pipeline.terrain.between_walls import between_walls
+from pipeline.terrain.embankments import embankments
 from pipeline.terrain.filter_settings import MorphologicalFilterSettings
 from pipeline.terrain.lattice import NO_DATA, Elevations
 from pipeline.terrain.openings import cut_off
@@ -35,6 +37,9 @@ _CLUMP_SHARE = 0.1
 
 _CLUMP_BAND_MM = 750
 """Cells up to this far above the one in question belong to its clump."""
+
+_HOUSE_CELLS = 6
+"""What openings up to this radius cut off is at most 13 m wide, as houses are, and not an embankment."""
 
 _FEWEST_BESIDE = 2
 """Ground cells on the same level that a cell needs beside it to rejoin: one may be an outlier."""
@@ -208,6 +213,11 @@ def morphological_ground(
     beside = (settings.regrowth_m, step_mm, 0.0, share)
     steady = regrown(lowest, ground, wide | decks, settings.regrowth_passes, beside)
     limits_of_planes = (settings.rejoin_m, settings.rejoin_step_m * 1000.0)
-    ground = rejoined(lowest, steady, decks, settings.rejoin_passes, limits_of_planes)
+    joined = rejoined(lowest, steady, decks, settings.rejoin_passes, limits_of_planes)
     beside = (settings.regrowth_m, step_mm, settings.berm_slope * 1000.0, share)
-    return regrown(lowest, ground, decks, settings.berm_passes, beside), steady
+    last = min(settings.berm_passes, 1)
+    joined = regrown(lowest, joined, decks, settings.berm_passes - last, beside)
+    if settings.embankment_m2:
+        houses = (second > 0) & (second <= _HOUSE_CELLS)
+        joined |= embankments(lowest, ground, (houses, wide), corner, settings.embankment_m2) & ~decks
+    return regrown(lowest, joined, decks, last, beside), steady

@@ -29,6 +29,12 @@ NARROW = 2
 RIM_CELLS = 3
 """Corners this near to a wide object belong to it."""
 
+BLOCK_CELLS = 48
+"""Side of the blocks in which surfaces are judged as embankments: three times the width of most dams."""
+
+LINK_CELLS = 6
+"""Farthest apart that two neighbouring cells of such a surface may be."""
+
 NEAR_CELLS = 16
 """Half side of the widest square in which ground that rejoined by planes carries the terrain.
 
@@ -41,6 +47,11 @@ PLANARITY_SCALES = 3
 def wide_support_m(radius: int) -> float:
     """How far `wide_objects` looks: alignment of the coarse cells, gaps, closing, opening, neighbours, corners."""
     return float(COARSE * (FILL + 2 * NARROW + 2 * -(-radius // COARSE) + 1) + COARSE - 1 + RIM_CELLS)
+
+
+def embankments_support_m() -> float:
+    """How far `embankments` looks: a block from corner to corner, and a link beyond it."""
+    return float(BLOCK_CELLS - 1 + LINK_CELLS)
 
 
 def between_walls_support_m(widest: int) -> float:

@@ -20,12 +20,25 @@ Grid = npt.NDArray[np.int32]
 Points = npt.NDArray[np.int64]
 
 SMALL = GroundSettings(
-    max_window_m=3, trend_m=4, widest_m=12, regrowth_passes=1, regrowth_m=1, rejoin_passes=1, rejoin_m=2, bridge_m=6
+    max_window_m=3,
+    trend_m=4,
+    widest_m=12,
+    regrowth_passes=1,
+    regrowth_m=1,
+    rejoin_passes=1,
+    rejoin_m=2,
+    bridge_m=6,
+    embankment_m2=0,
 )
 """Looks 57 m far."""
 
 FAR = dataclasses.replace(SMALL, bridge_m=20, rejoin_passes=4)
 """Draws terrain from farther away than ground that rejoined by planes carries it."""
+
+BANKS = dataclasses.replace(
+    SMALL, max_window_m=9, residual_window_m=9, widest_m=0, rejoin_passes=0, berm_passes=1, embankment_m2=200
+)
+"""Looks farthest where it judges embankments."""
 
 elevations = st.integers(-3000, 3000)
 grids = arrays(np.int32, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=elevations)
@@ -289,6 +302,28 @@ def test_the_terrain_does_not_depend_on_the_window_beyond_its_support(
         assert 0.01 < part.measured[inner].mean() < 0.9
 
 
+def test_ground_with_embankments_does_not_depend_on_the_window_beyond_its_support() -> None:
+    random = np.random.default_rng(6)
+    xy = random.uniform(0, 360, (40_000, 2))
+    away = (xy[:, 0] - xy[:, 1]) / math.sqrt(2) % 50.0
+    # dams with a wall on one side
+    z = np.where(away < 10.0, 0.0, np.clip(29.0 - away, 0.0, 7.0)) + random.normal(0.0, 0.03, len(xy))
+    points = np.rint(1000 * np.column_stack((xy, z))).astype(np.int64)
+    whole = terrain_under(points, (0, 0, 360, 360), BANKS)
+    without = terrain_under(points, (0, 0, 360, 360), dataclasses.replace(BANKS, embankment_m2=0))
+    margin = math.ceil(BANKS.support_m)
+    for column0, row0 in ((13, 11), (21, 30)):
+        columns, rows = 320, 322
+        inside = (points[:, 0] // 1000 >= column0) & (points[:, 0] // 1000 < column0 + columns)
+        inside &= (points[:, 1] // 1000 >= row0) & (points[:, 1] // 1000 < row0 + rows)
+        part = terrain_under(points[inside], (column0, row0, columns, rows), BANKS)
+        inner = (slice(margin, rows - margin), slice(margin, columns - margin))
+        same = (slice(row0 + margin, row0 + rows - margin), slice(column0 + margin, column0 + columns - margin))
+        assert (whole.measured[same] & ~without.measured[same]).sum() > 100
+        np.testing.assert_array_equal(part.elevation_mm[inner], whole.elevation_mm[same])
+        np.testing.assert_array_equal(part.measured[inner], whole.measured[same])
+
+
 @pytest.mark.parametrize("trusted", [False, True])
 @pytest.mark.parametrize("per_cell", [1.2, 0.08])
 def test_terrain_drawn_where_it_is_wanted_is_that_of_the_whole_window(per_cell: float, trusted: bool) -> None:
@@ -314,10 +349,12 @@ def test_the_support_covers_both_openings_the_trend_between_them_and_the_bridge(
         assert chosen.support_m >= 2 + 4 * window_m + 2 * trend_m + bridge_m + 2
     wide = GroundSettings(widest_m=160)
     assert wide.support_m >= 2 + 160 + 80 + 2
-    many, few = (GroundSettings(rejoin_passes=passes) for passes in (6, 5))
+    many, few = (GroundSettings(rejoin_passes=passes, embankment_m2=0) for passes in (6, 5))
     assert many.support_m == few.support_m + 2 * few.rejoin_m
-    many, few = (GroundSettings(berm_passes=passes) for passes in (4, 3))
+    many, few = (GroundSettings(berm_passes=passes, embankment_m2=0) for passes in (4, 3))
     assert many.support_m == few.support_m + few.regrowth_m
+    # a block of 48 m, a link of 6 m, a pass of berms of 3 m: 1 m more than rejoining by planes and three passes
+    assert GroundSettings().support_m == few.support_m + 1 == 200
 
 
 @pytest.mark.parametrize("shift", [(-8, 4), (84_000, 447_000), (-1000, -2000)])

@@ -41,7 +41,15 @@ WHOLE = Window(x0_mm=0, y0_mm=0, x1_mm=110_000, y1_mm=110_000)
 NARROW = SceneSettings(
     outliers=OutlierSettings(cube_m=1.0),
     ground=GroundSettings(
-        max_window_m=4, trend_m=4, widest_m=10, regrowth_passes=1, regrowth_m=1, rejoin_passes=1, rejoin_m=2, bridge_m=6
+        max_window_m=4,
+        trend_m=4,
+        widest_m=10,
+        regrowth_passes=1,
+        regrowth_m=1,
+        rejoin_passes=1,
+        rejoin_m=2,
+        bridge_m=6,
+        embankment_m2=0,
     ),
     vegetation=VegetationSettings(radius_m=0.5),
     surfaces=SurfaceSettings(max_circumradius_m=4.0),

@@ -22,7 +22,15 @@ from pipeline.tiling import MM, Tile, TileGrid, Window
 
 SIDE_M = 130
 MORPHOLOGICAL = GroundSettings(
-    max_window_m=4, trend_m=4, widest_m=10, regrowth_passes=1, regrowth_m=1, rejoin_passes=1, rejoin_m=2, bridge_m=6
+    max_window_m=4,
+    trend_m=4,
+    widest_m=10,
+    regrowth_passes=1,
+    regrowth_m=1,
+    rejoin_passes=1,
+    rejoin_m=2,
+    bridge_m=6,
+    embankment_m2=0,
 )
 HIERARCHICAL = GroundSettings(
     filter="hierarchical", seed_cell_m=8, level_ratio=8, passes=1, min_reach_m=3, bridge_m=5, clump_m=1

@@ -32,6 +32,7 @@ NARROW: dict[str, Any] = {
         "rejoin_passes": 1,
         "rejoin_m": 2,
         "bridge_m": 6,
+        "embankment_m2": 0,
     },
     "surfaces": {"max_circumradius_m": 2.0},
     "vegetation": {"radius_m": 0.3, "company_m": 0.5},
