@@ -7,13 +7,14 @@ from pipeline.cli.cluster import worker
 from pipeline.cli.measuring import digest, evaluate, inspect, report
 from pipeline.cli.modelling import compare, reconstruct, replay, rerun
 from pipeline.cli.options import AsJson
+from pipeline.cli.publishing import publish
 from pipeline.cli.simulating import demo, simulate, warm_up
 
 __all__ = ["AsJson", "app"]
 
 # in the order of `gablework --help`
 _COMMANDS = (
-    *(reconstruct, rerun, compare, classify, inspect, evaluate, report, digest, replay),
+    *(reconstruct, rerun, compare, classify, inspect, evaluate, report, publish, digest, replay),
     *(simulate, demo, warm_up, worker),
 )
 for _command in _COMMANDS:

@@ -18,6 +18,8 @@ import pyarrow.parquet as pq
 import shapely
 
 from pipeline.errors import RunError
+from pipeline.export.decisions import DECISIONS
+from pipeline.export.decisions import NAME as DECISIONS_NAME
 from pipeline.export.records import KEYS, SCHEMAS
 from pipeline.export.solid_geometry import SOLIDS, WALL_OUTLINE
 
@@ -34,7 +36,9 @@ _DIMENSION_SUFFIX = {2: "", 3: " Z"}
 
 
 def stored_schema(table_name: str) -> pa.Schema:
-    """The schema of a table's files: the record's columns, then `bbox`."""
+    """The schema of a table's files: the record's columns, then `bbox`; `decisions` has no geometry and no `bbox`."""
+    if table_name == DECISIONS_NAME:
+        return DECISIONS
     return SCHEMAS[table_name].append(pa.field("bbox", _BBOX))
 
 

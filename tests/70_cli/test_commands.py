@@ -15,7 +15,7 @@ from pipeline.cli.options import worker_count
 
 COMMANDS = (
     *("reconstruct", "rerun", "compare", "classify", "inspect", "simulate", "digest"),
-    *("evaluate", "warm-up", "demo", "replay", "report", "worker", "batch"),
+    *("evaluate", "warm-up", "demo", "replay", "report", "publish", "worker", "batch"),
 )
 
 

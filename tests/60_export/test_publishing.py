@@ -1,0 +1,217 @@
+"""Publishing a run: all of it, nothing of it changed, and a file that is whole or the one of before."""
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyogrio
+import pytest
+from command_line import invoke
+from small_runs import moved, street, write_run
+
+import pipeline.runtime.publishing as publishing
+from pipeline.errors import RunError, SettingsError
+from pipeline.export.geopackage import LAYERS, Layer, stored_batch
+from pipeline.export.geoparquet import read_table
+from pipeline.export.records import KEYS
+from pipeline.export.tile import write_tile
+from pipeline.io import storage_at
+from pipeline.runtime.digest import run_digest
+from pipeline.runtime.manifest import RunStatus, read_manifest, write_manifest
+from pipeline.runtime.publishing import publish_geopackage
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+    """A finished run of four buildings on two tiles."""
+    return write_run(tmp_path / "run", street())
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """All files below a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def restated(run_dir: Path, **changes: Any) -> None:
+    """Change the manifest of a run."""
+    write_manifest(run_dir, dataclasses.replace(read_manifest(run_dir), **changes))
+
+
+def test_every_row_is_published_and_the_run_stays_as_it_is(run_dir: Path, tmp_path: Path) -> None:
+    before, digest = content(run_dir), run_digest(str(run_dir))
+    out = tmp_path / "new" / "run.gpkg"
+    published = publish_geopackage(str(run_dir), str(out))
+    assert published.file == str(out)
+    assert published.size_bytes == out.stat().st_size
+    assert list(published.layers) == [layer.name for layer in LAYERS]
+    assert content(run_dir) == before
+    assert run_digest(str(run_dir)) == digest
+    for name, key in KEYS.items():
+        _, read = pyogrio.read_arrow(out, layer=name)
+        table = read_table(str(run_dir), name)
+        assert published.layers[name] == len(read) == len(table) > 0
+        ordered = read.sort_by([(column, "ascending") for column in key])
+        same = [column for column in (*key, "tile", "n_points", "area_m2", "status") if column in table.column_names]
+        assert ordered.select(same).to_pylist() == table.select(same).to_pylist()
+    assert list(out.parent.iterdir()) == [out]
+
+
+def test_a_run_gives_the_same_bytes_each_time(run_dir: Path, tmp_path: Path) -> None:
+    first, second = tmp_path / "a.gpkg", tmp_path / "b.gpkg"
+    for path in (first, second):
+        publish_geopackage(str(run_dir), str(path))
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_a_run_without_buildings_has_empty_layers(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path / "run", [])
+    published = publish_geopackage(str(run_dir), str(tmp_path / "run.gpkg"))
+    assert set(published.layers.values()) == {0}
+    assert len(pyogrio.list_layers(tmp_path / "run.gpkg")) == len(LAYERS) + 1
+
+
+def test_a_run_without_decisions_is_published_without_them(run_dir: Path, tmp_path: Path) -> None:
+    shutil.rmtree(run_dir / "decisions")
+    assert list(publish_geopackage(str(run_dir), str(tmp_path / "a.gpkg")).layers) == [
+        "buildings",
+        "planes",
+        "rejected",
+    ]
+
+
+@pytest.mark.parametrize("status", set(RunStatus) - {RunStatus.FINISHED})
+def test_a_run_that_is_not_finished_is_refused(run_dir: Path, tmp_path: Path, status: RunStatus) -> None:
+    restated(run_dir, status=status, tiles=("t1", "t2"), failed_tiles=("t2",))
+    with pytest.raises(RunError, match=rf"{run_dir} is {status.value}") as refused:
+        publish_geopackage(str(run_dir), str(tmp_path / "run.gpkg"))
+    assert ("1 of 2 tiles failed (t2)" in str(refused.value)) == (status is RunStatus.INCOMPLETE)
+    assert not (tmp_path / "run.gpkg").exists()
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"run\.json does not exist: give the directory that a run wrote"):
+        publish_geopackage(str(tmp_path), str(tmp_path.parent / "run.gpkg"))
+
+
+def test_an_existing_file_is_replaced_only_where_asked(run_dir: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run.gpkg"
+    out.write_text("of before")
+    with pytest.raises(RunError, match=r"run\.gpkg exists already.*--overwrite"):
+        publish_geopackage(str(run_dir), str(out))
+    assert out.read_text() == "of before"
+    publish_geopackage(str(run_dir), str(out), overwrite=True)
+    assert out.read_bytes().startswith(b"SQLite")
+
+
+def test_a_place_that_cannot_be_a_geopackage_is_refused(run_dir: Path, tmp_path: Path) -> None:
+    places = {
+        "s3://bucket/run.gpkg": "Give a path of this machine",
+        str(tmp_path / "run.zip"): r"ends in \.zip: give a name that ends in \.gpkg",
+        str(run_dir / "run.gpkg"): "lies in the run directory",
+    }
+    before = content(tmp_path)
+    for place, words in places.items():
+        with pytest.raises(SettingsError, match=words):
+            publish_geopackage(str(run_dir), place, overwrite=True)
+    (tmp_path / "folder.gpkg").mkdir()
+    with pytest.raises(RunError, match=r"folder\.gpkg is a folder"):
+        publish_geopackage(str(run_dir), str(tmp_path / "folder.gpkg"), overwrite=True)
+    assert content(tmp_path) == before
+
+
+def fails_at(tile: str, fault: BaseException) -> Callable[..., pa.RecordBatch]:
+    """A `stored_batch` that raises at one tile of the second layer."""
+
+    def broken(batch: pa.RecordBatch, layer: Layer, at: str) -> pa.RecordBatch:
+        if (layer.name, at) == ("planes", tile):
+            raise fault
+        return stored_batch(batch, layer, at)
+
+    return broken
+
+
+@pytest.mark.parametrize("fault", [OSError("the disk is gone"), KeyboardInterrupt(), MemoryError()])
+def test_where_publishing_breaks_off_the_old_file_stays(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: BaseException
+) -> None:
+    out = tmp_path / "run.gpkg"
+    publish_geopackage(str(run_dir), str(out))
+    before = content(tmp_path)
+    monkeypatch.setattr(publishing, "stored_batch", fails_at("t2", fault))
+    with pytest.raises(type(fault)):
+        publish_geopackage(str(run_dir), str(out), overwrite=True)
+    assert content(tmp_path) == before
+
+
+def test_a_run_that_changes_meanwhile_is_not_published(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def changing(batch: pa.RecordBatch, layer: Layer, tile: str) -> pa.RecordBatch:
+        restated(run_dir, status=RunStatus.RUNNING)
+        return stored_batch(batch, layer, tile)
+
+    monkeypatch.setattr(publishing, "stored_batch", changing)
+    with pytest.raises(RunError, match="changed while it was published"):
+        publish_geopackage(str(run_dir), str(tmp_path / "run.gpkg"))
+    assert not (tmp_path / "run.gpkg").exists()
+
+
+def test_a_run_that_lost_a_file_is_not_published(run_dir: Path, tmp_path: Path) -> None:
+    restated(run_dir, counts={"candidates": 4, "rejected": 1})
+    publish_geopackage(str(run_dir), str(tmp_path / "whole.gpkg"))
+    (run_dir / "buildings" / "tile=t2" / "part-0.parquet").unlink()
+    with pytest.raises(RunError, match=r"has 2 rows, but run\.json counts 4"):
+        publish_geopackage(str(run_dir), str(tmp_path / "run.gpkg"))
+    assert not (tmp_path / "run.gpkg").exists()
+
+
+def test_memory_holds_a_tile_and_not_the_run(
+    tmp_path: Path, contexts: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_dir = write_run(tmp_path / "run", [])
+    for number in range(8):
+        row = [
+            dataclasses.replace(moved(one, 100.0 * number), building_id=f"{number}-{copy}")
+            for copy in range(20)
+            for one in street()[2:3]
+        ]
+        write_tile(run_dir, f"m{number}", row, [], contexts["compound"])
+    held: list[int] = []
+
+    def watched(batch: pa.RecordBatch, layer: Layer, tile: str) -> pa.RecordBatch:
+        stored = stored_batch(batch, layer, tile)
+        if layer.name == "decisions" or layer.name == "planes":
+            held.append(pa.total_allocated_bytes())
+        return stored
+
+    monkeypatch.setattr(publishing, "stored_batch", watched)
+    publish_geopackage(str(run_dir), str(tmp_path / "run.gpkg"))
+    assert len(held) >= 8
+    assert max(held) < 2 * held[0]
+
+
+@pytest.mark.slow
+def test_a_run_in_an_object_store_is_published(run_dir: Path, tmp_path: Path, bucket: str) -> None:
+    stored = storage_at(f"{bucket}/run")
+    for name, data in content(run_dir).items():
+        stored.put(name, data)
+    for place, out in ((f"{bucket}/run", "remote.gpkg"), (str(run_dir), "local.gpkg")):
+        publish_geopackage(place, str(tmp_path / out))
+    assert (tmp_path / "remote.gpkg").read_bytes() == (tmp_path / "local.gpkg").read_bytes()
+
+
+def test_the_command_prints_what_it_wrote_and_ends_with_the_code_of_the_fault(run_dir: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run.gpkg"
+    words = ("publish", str(run_dir), "--as", "geopackage", "--out", str(out), "--json")
+    code, said, _ = invoke(*words)
+    document = json.loads(said)
+    assert code == 0
+    assert (document["as"], document["file"], document["layers"]["buildings"]) == ("geopackage", str(out), 4)
+    assert invoke(*words)[0] == 4
+    assert invoke(*words, "--overwrite")[0] == 0
+    assert invoke("publish", str(run_dir), "--as", "geopackage", "--out", "run.zip")[0] == 2
+    assert invoke("publish", str(run_dir), "--as", "papyrus", "--out", str(out))[0] == 2
