@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.compiler import kernel
+from pipeline.kernels.union_find import root_of, unite
 from pipeline.model import BoolArray, IntArray, LabelArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 from pipeline.terrain.planar_fitting import MIN_SPREAD
@@ -194,19 +195,11 @@ def _continued(lowest: Elevations, cells: IntArray, links: Links) -> BoolArray:
     return out
 
 
-@kernel(inline="always")
-def _root(parent: LabelArray, i: int) -> int:
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
 @kernel
-def _surfaces(place: LabelArray, at: LabelArray, links: Links, gentle: BoolArray) -> LabelArray:
-    """The first member of each member's surface, (members,) int32; `place` and `at` as in `_mark`."""
+def _surfaces(place: LabelArray, at: LabelArray, links: Links, gentle: BoolArray) -> IntArray:
+    """The first member of each member's surface, (members,) int64; `place` and `at` as in `_mark`."""
     rows, columns = place.shape
-    parent = np.arange(len(at)).astype(np.int32)
+    parent = np.arange(len(at))
     for r in range(rows):
         for c in range(columns):
             i = place[r, c]
@@ -218,10 +211,9 @@ def _surfaces(place: LabelArray, at: LabelArray, links: Links, gentle: BoolArray
                     break
                 a, b = r + _OFFSETS[k, 0], c + _OFFSETS[k, 1]
                 if gentle[at[i], m] and 0 <= a < rows and 0 <= b < columns and place[a, b] >= 0:
-                    one, other = _root(parent, i), _root(parent, place[a, b])
-                    parent[max(one, other)] = min(one, other)
+                    unite(parent, i, place[a, b])
     for i in range(len(at)):
-        parent[i] = _root(parent, i)
+        parent[i] = root_of(parent, i)
     return parent
 
 
