@@ -14,19 +14,22 @@ from pipeline.console import Console
 def publish(
     run: Annotated[str, typer.Argument(metavar="RUN", help="A finished run directory, a folder or a URL.")],
     form: Annotated[
-        Literal["geopackage"],
-        typer.Option("--as", help="geopackage: one file with layers and styles, for QGIS and other GIS."),
+        Literal["geopackage", "cityjson"],
+        typer.Option(
+            "--as", help="geopackage: one file with layers and styles, for GIS. cityjson: a folder, one file per tile."
+        ),
     ],
-    out: Annotated[str, typer.Option(metavar="FILE", help="The file to write; of a GeoPackage it ends in .gpkg.")],
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    out: Annotated[str, typer.Option(metavar="PATH", help="The file, which ends in .gpkg, or the folder to write.")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a finished run as a file that other programs open. The run stays as it is."""
+    """Write a finished run as files that other programs open. The run stays as it is."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.runtime.publishing import publish_geopackage
+        from pipeline.runtime.publishing import publish_cityjson, publish_geopackage
 
-        published = publish_geopackage(run, out, overwrite=overwrite, on_event=console.on_event)
-        console.table("Layers", ["layer", "rows"], list(published.layers.items()))
-        console.say(f"{published.file}, {published.size_bytes / 1e6:.1f} MB")
+        write = publish_geopackage if form == "geopackage" else publish_cityjson
+        published = write(run, out, overwrite=overwrite, on_event=console.on_event)
+        console.table("Written", ["what", "rows"], list(published.rows.items()))
+        console.say(f"{published.place}, {published.size_bytes / 1e6:.1f} MB")
         console.document({"run": run, "as": form, **dataclasses.asdict(published)})

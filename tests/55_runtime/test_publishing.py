@@ -17,10 +17,10 @@ def test_a_simulated_run_is_published_whole(
 ) -> None:
     summary = reconstruct(suburb, settings={"tile_size_m": 40.0, "lattice_x_m": 7.0})
     published = publish_geopackage(summary.run_dir, str(tmp_path / "run.gpkg"))
-    assert published.layers["buildings"] == summary.counts["candidates"] > 1
-    assert published.layers["rejected"] == summary.counts["rejected"] > 0
-    assert published.layers["planes"] > published.layers["buildings"]
-    assert published.layers["decisions"] > 0
+    assert published.rows["buildings"] == summary.counts["candidates"] > 1
+    assert published.rows["rejected"] == summary.counts["rejected"] > 0
+    assert published.rows["planes"] > published.rows["buildings"]
+    assert published.rows["decisions"] > 0
     assert run_digest(summary.run_dir) == summary.digest
     info = pyogrio.read_info(tmp_path / "run.gpkg", layer="buildings")
     assert info["layer_metadata"]["content_sha256"] == summary.digest

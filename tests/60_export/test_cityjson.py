@@ -19,6 +19,7 @@ from faces_by_hand import assert_closed
 from small_buildings import Builder, Contexts
 
 from pipeline.export.cityjson import cityjson_lines
+from pipeline.export.cityjson_file import city_of
 from pipeline.export.records import RecordContext, building_row
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
 
@@ -76,13 +77,14 @@ def test_the_rules_catch_what_is_broken(contexts: Contexts) -> None:
 
 @pytest.mark.skipif(SCHEMAS not in os.environ, reason=f"{SCHEMAS} names no folder with the official schema files")
 @pytest.mark.parametrize("crs", CRSES)
-def test_every_line_fits_the_official_schema(contexts: Contexts, crs: str) -> None:
+def test_every_line_and_their_file_fit_the_official_schema(contexts: Contexts, crs: str) -> None:
     files = {path.name: json.loads(path.read_text()) for path in Path(os.environ[SCHEMAS]).glob("*.schema.json")}
     registry = referencing.Registry().with_resources(
         (schema["$id"], referencing.Resource.from_contents(schema)) for schema in files.values()
     )
-    for number, line in enumerate(sequence(contexts[crs])):
-        name = "cityjsonfeature.schema.json" if number else "cityjson.schema.json"
+    lines = sequence(contexts[crs])
+    for line in [*lines, city_of(json.dumps(line) for line in lines)]:
+        name = f"{line['type'].lower()}.schema.json"
         validator = jsonschema.Draft7Validator(files[name], registry=registry)
         assert [error.message[:300] for error in validator.iter_errors(line)] == []
 
@@ -188,3 +190,42 @@ def test_cjio_merges_two_tiles(contexts: Contexts, tmp_path: Path) -> None:
     xyz = np.array(model["vertices"])[[i for surface in court for ring in surface for i in ring]] * scale + translate
     assert xyz.min(axis=0) == pytest.approx([85_020.0, 447_000.0, 2.0])
     assert xyz.max(axis=0) == pytest.approx([85_040.0, 447_020.0, 11.0])
+
+
+def places_of(city: dict) -> dict[str, list]:
+    """The boundaries of each object of a CityJSON file, with coordinates in the place of numbers."""
+
+    def placed(part: list | int) -> list:
+        return [placed(inner) for inner in part] if isinstance(part, list) else city["vertices"][part]
+
+    return {
+        name: [placed(geometry["boundaries"]) for geometry in thing.get("geometry", ())]
+        for name, thing in city["CityObjects"].items()
+    }
+
+
+def test_one_file_holds_what_its_lines_hold(contexts: Contexts) -> None:
+    lines = sequence(contexts["compound"])
+    city = city_of(json.dumps(line) for line in lines)
+    assert {name: city[name] for name in ("type", "version", "transform", "metadata")} == {
+        name: lines[0][name] for name in ("type", "version", "transform", "metadata")
+    }
+    features = {name: thing for line in lines[1:] for name, thing in line["CityObjects"].items()}
+    assert list(city["CityObjects"]) == list(features)
+    assert places_of(city) == {name: place for line in lines[1:] for name, place in places_of(line).items()}
+    without = [{k: v for k, v in thing.items() if k != "geometry"} for thing in city["CityObjects"].values()]
+    assert without == [{k: v for k, v in thing.items() if k != "geometry"} for thing in features.values()]
+    assert len({tuple(vertex) for vertex in city["vertices"]}) == len(city["vertices"])
+    assert len(city["vertices"]) < sum(len(line["vertices"]) for line in lines)
+
+
+def test_one_file_is_read_by_cjio(contexts: Contexts, tmp_path: Path) -> None:
+    path = tmp_path / "tile.city.json"
+    path.write_text(json.dumps(city_of(json.dumps(line) for line in sequence(contexts["compound"]))))
+    assert "Building" in cjio(str(path), "info")
+
+
+@pytest.mark.parametrize("lines", [[], ['{"type": "CityJSONFeature"}']])
+def test_features_without_metadata_are_refused(lines: list[str]) -> None:
+    with pytest.raises(ValueError, match="metadata"):
+        city_of(lines)

@@ -15,6 +15,7 @@ from small_runs import moved, street, write_run
 
 import pipeline.runtime.publishing as publishing
 from pipeline.errors import RunError, SettingsError
+from pipeline.export.cityjson_file import city_of
 from pipeline.export.geopackage import LAYERS, Layer, stored_batch
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import KEYS
@@ -22,7 +23,7 @@ from pipeline.export.tile import write_tile
 from pipeline.io import storage_at
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus, read_manifest, write_manifest
-from pipeline.runtime.publishing import publish_geopackage
+from pipeline.runtime.publishing import publish_cityjson, publish_geopackage
 
 
 @pytest.fixture
@@ -45,15 +46,15 @@ def test_every_row_is_published_and_the_run_stays_as_it_is(run_dir: Path, tmp_pa
     before, digest = content(run_dir), run_digest(str(run_dir))
     out = tmp_path / "new" / "run.gpkg"
     published = publish_geopackage(str(run_dir), str(out))
-    assert published.file == str(out)
+    assert published.place == str(out)
     assert published.size_bytes == out.stat().st_size
-    assert list(published.layers) == [layer.name for layer in LAYERS]
+    assert list(published.rows) == [layer.name for layer in LAYERS]
     assert content(run_dir) == before
     assert run_digest(str(run_dir)) == digest
     for name, key in KEYS.items():
         _, read = pyogrio.read_arrow(out, layer=name)
         table = read_table(str(run_dir), name)
-        assert published.layers[name] == len(read) == len(table) > 0
+        assert published.rows[name] == len(read) == len(table) > 0
         ordered = read.sort_by([(column, "ascending") for column in key])
         same = [column for column in (*key, "tile", "n_points", "area_m2", "status") if column in table.column_names]
         assert ordered.select(same).to_pylist() == table.select(same).to_pylist()
@@ -70,20 +71,20 @@ def test_a_run_gives_the_same_bytes_each_time(run_dir: Path, tmp_path: Path) -> 
 def test_a_run_without_buildings_has_empty_layers(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", [])
     published = publish_geopackage(str(run_dir), str(tmp_path / "run.gpkg"))
-    assert set(published.layers.values()) == {0}
+    assert set(published.rows.values()) == {0}
     assert len(pyogrio.list_layers(tmp_path / "run.gpkg")) == len(LAYERS) + 1
 
 
 def test_a_run_without_decisions_is_published_without_them(run_dir: Path, tmp_path: Path) -> None:
     shutil.rmtree(run_dir / "decisions")
-    assert list(publish_geopackage(str(run_dir), str(tmp_path / "a.gpkg")).layers) == [
+    assert list(publish_geopackage(str(run_dir), str(tmp_path / "a.gpkg")).rows) == [
         "buildings",
         "planes",
         "rejected",
     ]
 
 
-@pytest.mark.parametrize("status", set(RunStatus) - {RunStatus.FINISHED})
+@pytest.mark.parametrize("status", [status for status in RunStatus if status is not RunStatus.FINISHED])
 def test_a_run_that_is_not_finished_is_refused(run_dir: Path, tmp_path: Path, status: RunStatus) -> None:
     restated(run_dir, status=status, tiles=("t1", "t2"), failed_tiles=("t2",))
     with pytest.raises(RunError, match=rf"{run_dir} is {status.value}") as refused:
@@ -194,6 +195,72 @@ def test_memory_holds_a_tile_and_not_the_run(
     assert max(held) < 2 * held[0]
 
 
+def test_each_tile_becomes_a_cityjson_file_with_its_buildings(run_dir: Path, tmp_path: Path) -> None:
+    restated(run_dir, counts={"candidates": 4, "rejected": 1})
+    before, out = content(run_dir), tmp_path / "new" / "city"
+    published = publish_cityjson(str(run_dir), str(out))
+    assert content(run_dir) == before
+    files = content(out)
+    assert set(files) == {"t1.city.json", "t2.city.json"}
+    assert (published.place, published.rows) == (str(out), {"buildings": 4})
+    assert published.size_bytes == sum(map(len, files.values()))
+    for tile in ("t1", "t2"):
+        lines = (run_dir / "cityjson" / f"tile={tile}" / "part-0.city.jsonl").read_text().splitlines()
+        assert json.loads(files[f"{tile}.city.json"]) == city_of(lines)
+    assert list(out.parent.iterdir()) == [out]
+
+
+def test_a_folder_is_replaced_only_where_asked_and_where_it_holds_nothing_else(run_dir: Path, tmp_path: Path) -> None:
+    out = tmp_path / "city"
+    publish_cityjson(str(run_dir), str(out))
+    (out / "t9.city.json").write_text("of before")
+    with pytest.raises(RunError, match=r"holds CityJSON files already.*--overwrite"):
+        publish_cityjson(str(run_dir), str(out))
+    publish_cityjson(str(run_dir), str(out), overwrite=True)
+    assert set(content(out)) == {"t1.city.json", "t2.city.json"}
+    (out / "notes.txt").write_text("mine")
+    before = content(tmp_path)
+    with pytest.raises(RunError, match=r"holds notes\.txt"):
+        publish_cityjson(str(run_dir), str(out), overwrite=True)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(RunError, match="is a file: give the name of a folder"):
+        publish_cityjson(str(run_dir), str(tmp_path / "file"), overwrite=True)
+    for place, words in {
+        "s3://bucket/city": "path of this machine",
+        str(run_dir / "x"): "in the run directory",
+    }.items():
+        with pytest.raises(SettingsError, match=words):
+            publish_cityjson(str(run_dir), place)
+    assert content(out) == {name.removeprefix("city/"): data for name, data in before.items() if name[:5] == "city/"}
+
+
+@pytest.mark.parametrize("fault", [OSError("the disk is gone"), KeyboardInterrupt()])
+def test_where_cityjson_breaks_off_the_old_folder_stays(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: BaseException
+) -> None:
+    out = tmp_path / "city"
+    publish_cityjson(str(run_dir), str(out))
+    before = content(tmp_path)
+
+    def breaking(lines: list[str]) -> dict[str, Any]:
+        if "t2" in lines[0]:
+            raise fault
+        return city_of(lines)
+
+    monkeypatch.setattr(publishing, "city_of", breaking)
+    with pytest.raises(type(fault)):
+        publish_cityjson(str(run_dir), str(out), overwrite=True)
+    assert content(tmp_path) == before
+
+
+def test_cityjson_of_a_run_that_lost_a_file_is_refused(run_dir: Path, tmp_path: Path) -> None:
+    restated(run_dir, counts={"candidates": 4, "rejected": 1})
+    (run_dir / "cityjson" / "tile=t2" / "part-0.city.jsonl").unlink()
+    with pytest.raises(RunError, match=r"has 2 rows, but run\.json counts 4"):
+        publish_cityjson(str(run_dir), str(tmp_path / "city"))
+    assert not (tmp_path / "city").exists()
+
+
 @pytest.mark.slow
 def test_a_run_in_an_object_store_is_published(run_dir: Path, tmp_path: Path, bucket: str) -> None:
     stored = storage_at(f"{bucket}/run")
@@ -210,7 +277,7 @@ def test_the_command_prints_what_it_wrote_and_ends_with_the_code_of_the_fault(ru
     code, said, _ = invoke(*words)
     document = json.loads(said)
     assert code == 0
-    assert (document["as"], document["file"], document["layers"]["buildings"]) == ("geopackage", str(out), 4)
+    assert (document["as"], document["place"], document["rows"]["buildings"]) == ("geopackage", str(out), 4)
     assert invoke(*words)[0] == 4
     assert invoke(*words, "--overwrite")[0] == 0
     assert invoke("publish", str(run_dir), "--as", "geopackage", "--out", "run.zip")[0] == 2
