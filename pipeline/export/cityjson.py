@@ -76,6 +76,15 @@ def cityjson_lines(
         yield _json(_feature(result, row, integers))
 
 
+def lines_of(text: str) -> list[str]:
+    r"""The lines of a CityJSONSeq file. Texts within may hold other separators of lines, such as U+2028.
+
+    >>> lines_of('{"a": "one\u2028two"}\n{}\n') == ['{"a": "one\u2028two"}', "{}"]
+    True
+    """
+    return [line for line in text.split("\n") if line]
+
+
 def _json(value: Mapping[str, Any]) -> str:
     """One line of JSON without spaces."""
     return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False)

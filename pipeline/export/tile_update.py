@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.errors import RunError
-from pipeline.export.cityjson import cityjson_lines
+from pipeline.export.cityjson import cityjson_lines, lines_of
 from pipeline.export.decisions import DECISIONS, decision_rows, decisions_path, decisions_table
 from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.geoparquet import geo_table, parquet_bytes
@@ -63,7 +63,7 @@ def updated_tile(
     path = f"cityjson/tile={tile_key}/part-0.city.jsonl"
     fresh = cityjson_lines(list(zip(results, rows, strict=True)), context.reference, "")
     text = _merged_cityjson(_text(root / path), names, fresh)
-    files = {path: text.encode(), **dict(mesh_files(tile_key, results, text.splitlines(), context, meshes))}
+    files = {path: text.encode(), **dict(mesh_files(tile_key, results, lines_of(text), context, meshes))}
     gone: list[str] = []
     for lod in (None, *context.coarser_lods):
         there = {name: mesh_path(tile_key, name, meshes, lod) for name in sorted(names)}
@@ -143,7 +143,7 @@ def _merged_cityjson(old: str, replaced: Collection[str], fresh: Iterable[str]) 
     """Two CityJSONSeq texts as one, in the order of the buildings' ids, about one origin."""
     headings: list[dict[str, Any]] = []
     features: list[tuple[dict[str, Any], dict[str, Any]]] = []
-    for lines, skipped in ((old.splitlines(), replaced), (fresh, frozenset[str]())):
+    for lines, skipped in ((lines_of(old), replaced), (fresh, frozenset[str]())):
         heading, *found = (json.loads(line) for line in lines)
         headings.append(heading)
         features.extend((heading["transform"], feature) for feature in found if feature["id"] not in skipped)

@@ -235,7 +235,7 @@ class ArrangementSettings(Parameters):
     )
     min_face_width_m: float = parameter(
         0.5,
-        "A narrower sliver is not a roof face: parapets, gutters, the edge of a wall.",
+        "A narrower sliver is not a roof face: gutters, the smeared edge of a wall. A parapet along the outline stays.",
         unit="m",
         minimum=0.0,
         maximum=2.0,

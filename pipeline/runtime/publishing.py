@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import tempfile
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.fs as pafs
 
 from pipeline.errors import RunError, SettingsError
+from pipeline.export.cityjson import lines_of
 from pipeline.export.cityjson_file import city_of
 from pipeline.export.decisions import NAME as DECISIONS_NAME
 from pipeline.export.geopackage import LAYERS, SUFFIX, TILE, GeoPackage, Layer, stored_batch
@@ -27,6 +30,8 @@ _COUNTED = {"buildings": "candidates", "rejected": "rejected"}
 """Tables whose rows the manifest counts, with the names of the counts."""
 CITYJSON = ".city.json"
 """Ending of CityJSON files."""
+_SEQUENCES = "cityjson"
+"""Folder of a run with its CityJSONSeq files."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,8 +66,10 @@ def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_ev
     target = _target(run_dir, out)
     _refuse_existing(target, overwrite)
     manifest = finished_run(run_dir)
+    stated = _stated_files(run_dir, {layer.name for layer in LAYERS})
     filesystem, place = arrow_at(run_dir)
     with (
+        _disk_at(target),
         LocalStorage(root=target.parent).putting(target.name) as temporary,
         # a folder, since SQLite has a journal beside the file
         tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder,
@@ -75,21 +82,24 @@ def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_ev
         )
         rows = {}
         for layer in LAYERS:
-            batches = _batches(place, layer, filesystem, on_event)
-            if batches is not None:
-                rows[layer.name] = made.write(layer, batches)
+            if layer.name == DECISIONS_NAME and not _has_table(place, layer.name, filesystem):
+                continue
+            rows[layer.name] = made.write(layer, _batches(place, layer, filesystem, on_event))
         made.write_styles(STYLES)
-        _check_complete(run_dir, manifest, rows)
+        _check_complete(run_dir, manifest, rows, stated)
         _refuse_existing(target, overwrite)
         made.path.replace(temporary)
     return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)
 
 
 def publish_cityjson(run_dir: str, out: str, *, overwrite: bool = False, on_event: Listener = ignore) -> Published:
-    """Write a finished run as one CityJSON file per tile, `<tile>.city.json`; the folder appears whole.
+    """Write a finished run as one CityJSON file per tile, `<tile>.city.json`, in a folder.
 
-    Raises SettingsError if `out` cannot be such a folder, and RunError if it holds something, if the run is not
-    finished, changes meanwhile or lacks buildings, or if something cannot be read or written.
+    A new folder appears whole; in one that exists, each file does, after all are made. Nothing else in it changes.
+
+    Raises SettingsError if `out` cannot be such a folder, and RunError if it holds CityJSON files of other tiles, or of
+    these and they are not to be replaced, if the run is not finished, changes meanwhile or lacks buildings, or if
+    something cannot be read or written.
 
     Parameters
     ----------
@@ -98,32 +108,60 @@ def publish_cityjson(run_dir: str, out: str, *, overwrite: bool = False, on_even
     out : str
         The folder to write, a path of this machine.
     overwrite : bool
-        Replace a folder of CityJSON files.
+        Replace the files of the same tiles.
     on_event : callable
         Gets progress: tiles.
     """
     target = _path_outside(run_dir, out, "CityJSON files are")
-    _refuse_occupied(target, overwrite)
     manifest, storage = finished_run(run_dir), storage_at(run_dir)
-    keys = storage.keys("cityjson")
+    stated = _stated_files(run_dir, {_SEQUENCES})
+    keys = {
+        f"{key.split('/')[1].removeprefix(f'{TILE}=')}{CITYJSON}": key
+        for key in storage.keys(_SEQUENCES)
+        if PurePosixPath(key).match(f"{_SEQUENCES}/{TILE}=*/part-0.city.jsonl")
+    }
     buildings = size = 0
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
-        made = LocalStorage(root=Path(folder, "new"))
-        made.make()
-        for done, key in enumerate(keys, start=1):
-            city = city_of(storage.get(key).decode().splitlines())
-            buildings += sum(thing["type"] == "Building" for thing in city["CityObjects"].values())
-            content = json.dumps(city, separators=(",", ":"), ensure_ascii=False).encode()
-            made.put(key.split("/")[-2].removeprefix(f"{TILE}=") + CITYJSON, content)
-            size += len(content)
-            on_event(Event(kind="progress", stage="cityjson", done=done, total=len(keys)))
-        _check_complete(run_dir, manifest, {"buildings": buildings})
-        _refuse_occupied(target, overwrite)
-        if target.exists():
-            target.replace(Path(folder, "old"))
-        made.root.replace(target)
+    with _disk_at(target):
+        _refuse_occupied(target, overwrite, keys)
+        beside = target if target.is_dir() else target.parent
+        beside.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=beside) as folder:
+            made = LocalStorage(root=Path(folder, "new"))
+            made.make()
+            for done, (name, key) in enumerate(keys.items(), start=1):
+                city = _city(run_dir, key)
+                buildings += sum(thing["type"] == "Building" for thing in city["CityObjects"].values())
+                content = json.dumps(city, separators=(",", ":"), ensure_ascii=False).encode()
+                made.put(name, content)
+                size += len(content)
+                on_event(Event(kind="progress", stage=_SEQUENCES, done=done, total=len(keys)))
+            _check_complete(run_dir, manifest, {"buildings": buildings}, stated)
+            _refuse_occupied(target, overwrite, keys)
+            if target.is_dir():
+                for name in keys:
+                    made.path(name).replace(target / name)
+            else:
+                made.root.replace(target)
     return Published(place=str(target), size_bytes=size, rows={"buildings": buildings})
+
+
+def _city(run_dir: str, key: str) -> dict[str, Any]:
+    """The CityJSON object of one tile; raises RunError if its file is damaged."""
+    try:
+        return city_of(lines_of(storage_at(run_dir).get(key).decode()))
+    except (ValueError, KeyError, TypeError) as fault:
+        raise RunError(f"{key} of the run in {run_dir} is damaged ({str(fault)[:160]}): run it again") from fault
+
+
+@contextlib.contextmanager
+def _disk_at(target: Path) -> Iterator[None]:
+    """Say what cannot be read or written, as a RunError."""
+    try:
+        yield
+    except OSError as fault:
+        raise RunError(
+            f"{fault.filename or target}: {fault.strerror or fault}. Free space, or give another --out"
+        ) from fault
 
 
 def finished_run(run_dir: str) -> RunManifest:
@@ -168,38 +206,37 @@ def _refuse_existing(target: Path, overwrite: bool) -> None:
         raise RunError(f"{target} exists already: give another --out, or --overwrite to replace it")
 
 
-def _refuse_occupied(target: Path, overwrite: bool) -> None:
-    """Refuse a folder with other things than CityJSON files, and these unless they are to be replaced; raises RunError.
-
-    What a user keeps beside them is never removed.
-    """
+def _refuse_occupied(target: Path, overwrite: bool, names: Collection[str]) -> None:
+    """Refuse a folder with CityJSON files of other tiles, or with these unless they are to be replaced; RunError."""
     if target.exists() and not target.is_dir():
         raise RunError(f"{target} is a file: give the name of a folder")
-    held = sorted(path.name for path in target.iterdir()) if target.exists() else []
-    others = [name for name in held if not name.endswith(CITYJSON)]
+    held = sorted(path.name for path in target.glob(f"*{CITYJSON}"))
+    others = [name for name in held if name not in names or not (target / name).is_file()]
     if others:
-        raise RunError(f"{target} holds {others[0]}, which is no CityJSON file of a run: give another --out")
+        raise RunError(f"{target} holds {others[0]}, which is of no tile of this run: give another --out")
     if held and not overwrite:
-        raise RunError(f"{target} holds CityJSON files already: give another --out, or --overwrite to replace them")
+        raise RunError(f"{target} holds {held[0]} already: give another --out, or --overwrite to replace it")
 
 
-def _batches(
-    run_dir: str, layer: Layer, filesystem: pafs.FileSystem, on_event: Listener
-) -> Iterator[pa.RecordBatch] | None:
-    """The rows of a layer tile by tile; None where runs of older versions lack the table."""
-    if layer.name == DECISIONS_NAME:
-        folder = filesystem.get_file_info(f"{run_dir.rstrip('/')}/{layer.name}")
-        if folder.type is not pafs.FileType.Directory:
-            return None
+def _has_table(run_dir: str, name: str, filesystem: pafs.FileSystem) -> bool:
+    """Whether a run has a table: those of older versions lack some."""
+    return bool(filesystem.get_file_info(f"{run_dir.rstrip('/')}/{name}").type is pafs.FileType.Directory)
+
+
+def _batches(run_dir: str, layer: Layer, filesystem: pafs.FileSystem, on_event: Listener) -> Iterator[pa.RecordBatch]:
+    """The rows of a layer tile by tile."""
     tiles = [path.split("/")[-2].removeprefix(f"{TILE}=") for path in table_files(run_dir, layer.name, filesystem)]
+    for done, tile in enumerate(tiles, start=1):
+        for batch in table_batches(run_dir, layer.name, layer.columns, filesystem, [tile], ROWS):
+            yield stored_batch(batch, layer, tile)
+        on_event(Event(kind="progress", stage=layer.name, done=done, total=len(tiles)))
 
-    def batches() -> Iterator[pa.RecordBatch]:
-        for done, tile in enumerate(tiles, start=1):
-            for batch in table_batches(run_dir, layer.name, layer.columns, filesystem, [tile], ROWS):
-                yield stored_batch(batch, layer, tile)
-            on_event(Event(kind="progress", stage=layer.name, done=done, total=len(tiles)))
 
-    return batches()
+def _stated_files(run_dir: str, folders: Collection[str]) -> list[str]:
+    """The files in some folders of a run that the states of its tiles list."""
+    storage = storage_at(run_dir)
+    states = (json.loads(storage.get(key)) for key in storage.keys("state"))
+    return [name for state in states for name in state["files"] if name.split("/")[0] in folders]
 
 
 def _facts(manifest: RunManifest) -> dict[str, str]:
@@ -215,10 +252,14 @@ def _facts(manifest: RunManifest) -> dict[str, str]:
     return {name: value for name, value in facts.items() if value}
 
 
-def _check_complete(run_dir: str, manifest: RunManifest, rows: Mapping[str, int]) -> None:
-    """Refuse a run that changed while it was read, or that lacks rows; raises RunError."""
+def _check_complete(run_dir: str, manifest: RunManifest, rows: Mapping[str, int], stated: Collection[str]) -> None:
+    """Refuse a run that changed while it was read, or that lacks files or rows; raises RunError."""
     if read_manifest(run_dir) != manifest:
         raise RunError(f"the run in {run_dir} changed while it was published: publish it again when it is finished")
+    storage = storage_at(run_dir)
+    lost = [name for name in stated if not storage.has(name)]
+    if lost:
+        raise RunError(f"{lost[0]} of the run in {run_dir} is gone, and {len(lost) - 1} files more: run it again")
     for layer, count in _COUNTED.items():
         expected = manifest.counts.get(count) if layer in rows else None
         if expected is not None and rows[layer] != expected:

@@ -134,7 +134,7 @@ class MorphologicalFilterSettings(Parameters):
     embankment_m2: int = parameter(
         600,
         "Least area of smooth surfaces that are ground because slopes lead up to them, as to dams and piers; 0 leaves "
-        "them out.",
+        "them out. It is counted by the distances of neighbours: 1.2 of the area of dense points, half at 0.05 per m2.",
         unit="m2",
         minimum=0,
         maximum=2000,

@@ -107,7 +107,7 @@ def needed_vertices(
     max_circumradius_mm : float
         Facets with a wider circumcircle are gaps.
     far_mm : int
-        How far from an object points refer to it.
+        How far from an object points refer to it, or ground beside a thin one is looked for.
     """
     if len(x_mm) == 0:
         return np.zeros(0, np.bool_)

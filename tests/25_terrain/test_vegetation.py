@@ -244,3 +244,19 @@ def test_points_across_a_wall_do_not_make_a_narrow_roof_rough() -> None:
     roof = np.abs(xy[:, 0] - 7.0) < 1.0
     points = in_mm(xy[:, 0], xy[:, 1], np.where(roof, 3.0, 0.0) + random.normal(0, 0.02, len(xy)))
     assert (verdicts(points)[roof] >= 1).mean() > 0.95
+
+
+@pytest.mark.parametrize("scale", [0, 1, 2])
+@pytest.mark.parametrize("corner_mm", [-987_654_000, 0, 123_456_000])
+def test_a_lone_wanted_vertex_sees_all_that_its_windows_reach(scale: int, corner_mm: int) -> None:
+    # rough to the west; to the east even, but so far off that only a shifted window reaches it
+    radius_mm = 1000 * 2**scale
+    turn = np.linspace(0.0, 6.0, 8)
+    west = np.column_stack((-0.75 - 0.1 * np.cos(turn), 0.3 * np.sin(turn), np.where(turn % 2 < 1, 0.4, -0.4)))
+    east = np.column_stack((1.45 + 0.2 * np.cos(turn), 0.3 * np.sin(turn), np.zeros(8)))
+    shape = np.vstack((np.zeros(3), west, east)) * [radius_mm, radius_mm, 1000]
+    for shift in np.arange(0.0, 4.0, 0.25) * radius_mm:
+        points = np.rint(shape + np.array([corner_mm + shift, shift - corner_mm, 0])).astype(np.int64)
+        alone = np.zeros(len(points), np.bool_)
+        alone[0] = True
+        assert verdicts(points, alone)[0] == slow_twin(points, 0, VegetationSettings()) == 1

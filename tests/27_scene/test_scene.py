@@ -469,6 +469,6 @@ def test_tiles_give_the_surfaces_of_the_whole(
     expected, expected_owner = in_tiles(points, everything, NARROW, classes)
     grid = TileGrid(size_mm=size_mm, halo_mm=support_mm, origin_x_mm=origin_mm[0], origin_y_mm=origin_mm[1])
     found, owner = in_tiles(points, grid, NARROW, classes)
-    assert len(expected) > 15
+    assert len(expected) >= 5  # those of ground are none
     assert found == expected
     np.testing.assert_array_equal(owner, expected_owner)

@@ -28,8 +28,13 @@ from pipeline.runtime.publishing import publish_cityjson, publish_geopackage
 
 @pytest.fixture
 def run_dir(tmp_path: Path) -> Path:
-    """A finished run of four buildings on two tiles."""
-    return write_run(tmp_path / "run", street())
+    """A finished run of four buildings on two tiles, whose states list their files."""
+    folder = write_run(tmp_path / "run", street())
+    for tile in ("t1", "t2"):
+        files = {str(path.relative_to(folder)): "0" for path in folder.rglob(f"tile={tile}/*")}
+        state = {"tile": tile, "state": "done", "error": "", "files": files}
+        storage_at(folder).put(f"state/{tile}.json", json.dumps(state).encode())
+    return folder
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -75,8 +80,9 @@ def test_a_run_without_buildings_has_empty_layers(tmp_path: Path) -> None:
     assert len(pyogrio.list_layers(tmp_path / "run.gpkg")) == len(LAYERS) + 1
 
 
-def test_a_run_without_decisions_is_published_without_them(run_dir: Path, tmp_path: Path) -> None:
+def test_a_run_of_before_decisions_is_published_without_them(run_dir: Path, tmp_path: Path) -> None:
     shutil.rmtree(run_dir / "decisions")
+    shutil.rmtree(run_dir / "state")
     assert list(publish_geopackage(str(run_dir), str(tmp_path / "a.gpkg")).rows) == [
         "buildings",
         "planes",
@@ -135,7 +141,7 @@ def fails_at(tile: str, fault: BaseException) -> Callable[..., pa.RecordBatch]:
     return broken
 
 
-@pytest.mark.parametrize("fault", [OSError("the disk is gone"), KeyboardInterrupt(), MemoryError()])
+@pytest.mark.parametrize("fault", [RunError("the disk is gone"), KeyboardInterrupt(), MemoryError()])
 def test_where_publishing_breaks_off_the_old_file_stays(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: BaseException
 ) -> None:
@@ -161,11 +167,20 @@ def test_a_run_that_changes_meanwhile_is_not_published(
     assert not (tmp_path / "run.gpkg").exists()
 
 
-def test_a_run_that_lost_a_file_is_not_published(run_dir: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: layer.name)
+def test_a_run_that_lost_a_file_is_not_published(run_dir: Path, tmp_path: Path, layer: Layer) -> None:
+    publish_geopackage(str(run_dir), str(tmp_path / "whole.gpkg"))
+    shutil.rmtree(run_dir / layer.name / "tile=t2")
+    with pytest.raises(RunError, match=rf"{layer.name}/tile=t2/part-0\.parquet of the run .* is gone"):
+        publish_geopackage(str(run_dir), str(tmp_path / "run.gpkg"))
+    assert not (tmp_path / "run.gpkg").exists()
+
+
+def test_a_run_with_other_rows_than_it_counts_is_not_published(run_dir: Path, tmp_path: Path) -> None:
     restated(run_dir, counts={"candidates": 4, "rejected": 1})
     publish_geopackage(str(run_dir), str(tmp_path / "whole.gpkg"))
-    (run_dir / "buildings" / "tile=t2" / "part-0.parquet").unlink()
-    with pytest.raises(RunError, match=r"has 2 rows, but run\.json counts 4"):
+    restated(run_dir, counts={"candidates": 5, "rejected": 1})
+    with pytest.raises(RunError, match=r"has 4 rows, but run\.json counts 5"):
         publish_geopackage(str(run_dir), str(tmp_path / "run.gpkg"))
     assert not (tmp_path / "run.gpkg").exists()
 
@@ -210,31 +225,39 @@ def test_each_tile_becomes_a_cityjson_file_with_its_buildings(run_dir: Path, tmp
     assert list(out.parent.iterdir()) == [out]
 
 
-def test_a_folder_is_replaced_only_where_asked_and_where_it_holds_nothing_else(run_dir: Path, tmp_path: Path) -> None:
+def test_files_are_replaced_only_where_asked_and_all_else_in_the_folder_stays(run_dir: Path, tmp_path: Path) -> None:
     out = tmp_path / "city"
-    publish_cityjson(str(run_dir), str(out))
-    (out / "t9.city.json").write_text("of before")
-    with pytest.raises(RunError, match=r"holds CityJSON files already.*--overwrite"):
-        publish_cityjson(str(run_dir), str(out))
-    publish_cityjson(str(run_dir), str(out), overwrite=True)
-    assert set(content(out)) == {"t1.city.json", "t2.city.json"}
+    out.mkdir()
     (out / "notes.txt").write_text("mine")
-    before = content(tmp_path)
-    with pytest.raises(RunError, match=r"holds notes\.txt"):
-        publish_cityjson(str(run_dir), str(out), overwrite=True)
+    publish_cityjson(str(run_dir), str(out))
+    fresh = content(out)
+    (out / "t1.city.json").write_text("of before")
+    with pytest.raises(RunError, match=r"holds t1\.city\.json already.*--overwrite"):
+        publish_cityjson(str(run_dir), str(out))
+    assert (out / "t1.city.json").read_text() == "of before"
+    publish_cityjson(str(run_dir), str(out), overwrite=True)
+    assert content(out) == fresh
+    assert set(fresh) == {"t1.city.json", "t2.city.json", "notes.txt"}
+
+
+def test_a_folder_with_cityjson_of_others_is_refused(run_dir: Path, tmp_path: Path) -> None:
+    out = tmp_path / "city"
+    out.mkdir()
+    (out / "mine.city.json").write_text("mine")
     (tmp_path / "file").write_text("mine")
+    before = content(tmp_path)
+    with pytest.raises(RunError, match=r"holds mine\.city\.json, which is of no tile of this run"):
+        publish_cityjson(str(run_dir), str(out), overwrite=True)
     with pytest.raises(RunError, match="is a file: give the name of a folder"):
         publish_cityjson(str(run_dir), str(tmp_path / "file"), overwrite=True)
-    for place, words in {
-        "s3://bucket/city": "path of this machine",
-        str(run_dir / "x"): "in the run directory",
-    }.items():
+    places = {"s3://bucket/city": "path of this machine", str(run_dir / "x"): "in the run directory"}
+    for place, words in places.items():
         with pytest.raises(SettingsError, match=words):
             publish_cityjson(str(run_dir), place)
-    assert content(out) == {name.removeprefix("city/"): data for name, data in before.items() if name[:5] == "city/"}
+    assert content(tmp_path) == before
 
 
-@pytest.mark.parametrize("fault", [OSError("the disk is gone"), KeyboardInterrupt()])
+@pytest.mark.parametrize("fault", [RunError("the disk is gone"), KeyboardInterrupt()])
 def test_where_cityjson_breaks_off_the_old_folder_stays(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: BaseException
 ) -> None:
@@ -253,12 +276,32 @@ def test_where_cityjson_breaks_off_the_old_folder_stays(
     assert content(tmp_path) == before
 
 
-def test_cityjson_of_a_run_that_lost_a_file_is_refused(run_dir: Path, tmp_path: Path) -> None:
-    restated(run_dir, counts={"candidates": 4, "rejected": 1})
-    (run_dir / "cityjson" / "tile=t2" / "part-0.city.jsonl").unlink()
-    with pytest.raises(RunError, match=r"has 2 rows, but run\.json counts 4"):
+def test_cityjson_of_a_run_that_lost_a_file_or_has_a_torn_one_is_refused(run_dir: Path, tmp_path: Path) -> None:
+    path = run_dir / "cityjson" / "tile=t2" / "part-0.city.jsonl"
+    text = path.read_text()
+    path.write_text(text[: len(text) // 2])
+    with pytest.raises(RunError, match=r"tile=t2/part-0\.city\.jsonl of the run .* is damaged"):
+        publish_cityjson(str(run_dir), str(tmp_path / "city"))
+    path.unlink()
+    with pytest.raises(RunError, match=r"tile=t2/part-0\.city\.jsonl of the run .* is gone"):
         publish_cityjson(str(run_dir), str(tmp_path / "city"))
     assert not (tmp_path / "city").exists()
+
+
+def test_cityjson_takes_the_tables_files_alone_and_any_text(run_dir: Path, tmp_path: Path) -> None:
+    (run_dir / "cityjson" / "_SUCCESS").write_bytes(b"")
+    path = run_dir / "cityjson" / "tile=t1" / "part-0.city.jsonl"
+    text = "one\u2028two\u0085three"
+    path.write_text(path.read_text().replace('"status":"ok"', f'"status":"{text}"'))
+    publish_cityjson(str(run_dir), str(tmp_path / "city"))
+    city = json.loads((tmp_path / "city" / "t1.city.json").read_text())
+    assert text in {thing["attributes"]["status"] for thing in city["CityObjects"].values() if "attributes" in thing}
+
+
+@pytest.mark.parametrize("write", [publish_geopackage, publish_cityjson])
+def test_a_place_that_cannot_be_written_is_named(run_dir: Path, write: Callable[..., Any]) -> None:
+    with pytest.raises(RunError, match="/proc/nothing"):
+        write(str(run_dir), "/proc/nothing/out.gpkg")
 
 
 @pytest.mark.slow
