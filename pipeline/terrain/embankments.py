@@ -33,7 +33,7 @@ _ALONG = 0.7
 _STEEPEST = 1.0
 """Rise over run between points of ground, as in `between_walls`: what is steeper is a wall."""
 
-_OFF_CELLS = 0.5
+_OFF_CELLS = 0.6
 """Points may lie this much farther apart than the middles of their cells."""
 
 _LEVEL = 0.2
@@ -45,7 +45,7 @@ _LEVEL_MM = 250.0
 _SMOOTH_MM = 500.0
 """Farthest that a cell may lie from the plane of its neighbours to join: crowns and bushes are rougher."""
 
-_SLOPED_SHARE = 0.4
+_SLOPED_SHARE = 0.45
 """Share of the links to lower ground that must be slopes. A dam with a wall on one side has about half of them."""
 
 _WIDE_SHARE = 2 / 3

@@ -61,7 +61,7 @@ def without_foot(z: npt.NDArray[np.float64]) -> Mask:
 # -- what joins --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("share", [0.25, 1.0])
+@pytest.mark.parametrize("share", [0.4, 0.6, 1.0])
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
 def test_a_dam_with_a_wall_on_one_side_joins_and_one_with_two_walls_does_not(share: float, turns: int) -> None:
     for side, joins in ((0.8, True), (7.0, False)):
@@ -241,14 +241,14 @@ def twin(lowest: Grid, ground: Mask, narrow: Mask, wide: Mask, corner: tuple[int
                     for (a, b), d in zip(near[at], far, strict=True):
                         if ground[at[0] + a, at[1] + b]:
                             rise = int(lowest[at]) - int(lowest[at[0] + a, at[1] + b])
-                            walls += rise > 300 + 1000 * (d + 0.5)
-                            slopes += 250 + 200 * d < rise <= 300 + 1000 * (d + 0.5)
+                            walls += rise > 300 + 1000 * (d + 0.6)
+                            slopes += 250 + 200 * d < rise <= 300 + 1000 * (d + 0.6)
                 if area < 100 * least_m2 or slopes == 0:
                     continue
                 if 3 * sum(bool(narrow[at]) for at in members) > len(members):
                     continue
                 for at in members:
-                    enough = slopes >= (2 / 3 if wide[at] else 0.4) * (slopes + walls)
+                    enough = slopes >= (2 / 3 if wide[at] else 0.45) * (slopes + walls)
                     out[at] |= bool(enough and smooth[at] and not narrow[at])
     return out
 
