@@ -10,7 +10,7 @@ from typing import Any
 def city_of(lines: Iterable[str]) -> dict[str, Any]:
     """The object of a CityJSON file with all features of a sequence, in their order; each vertex is listed once.
 
-    Raises ValueError if there is no line of metadata.
+    Raises ValueError if the first line is not the metadata.
 
     >>> feature = {"type": "CityJSONFeature", "CityObjects": {"b": {"type": "Building"}}, "vertices": [[1, 2, 3]]}
     >>> city_of(['{"type": "CityJSON", "CityObjects": {}, "vertices": []}', json.dumps(feature)])["vertices"]

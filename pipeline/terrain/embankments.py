@@ -55,7 +55,7 @@ _NARROW_SHARE = 1 / 3
 """Largest share of a surface's cells that may lie on narrow objects: more is a row of houses and hedges."""
 
 _NEIGHBOURS = 8
-"""Cells that a plane is laid through: those around a cell where there are no gaps."""
+"""A plane goes through so many cells at most: the eight around a cell if all hold a point."""
 
 _FEWEST = 4
 """Fewest of them: one more than determine a plane."""
@@ -68,7 +68,7 @@ _VORONOI = 0.87
 without gaps have neighbours across their corners, too, and count 1.27 of their area; where points are few, less."""
 
 _MOST_LINKS = 12
-"""More neighbours than a cell has without another one between: 8 where there are no gaps."""
+"""Room for the links of one cell. A cell has 8 if all cells around it hold a point."""
 
 
 def _offsets(reach: int) -> npt.NDArray[np.int64]:
