@@ -228,6 +228,8 @@ def _is_in_the_way(xy: IntArray, u: int, v: int, w: int, p: int) -> bool:
 def _is_free(borders: Borders, u: int, v: int, w: int) -> bool:
     """Whether the edge from u to w can go from v to w instead: it sweeps over no vertex and touches nothing."""
     xy, edges = borders.xy, borders.edges
+    if xy[v, 0] == xy[w, 0] and xy[v, 1] == xy[w, 1]:
+        return False  # a place that is tried may be that of another vertex
     low_x, high_x = min(xy[u, 0], xy[v, 0], xy[w, 0]), max(xy[u, 0], xy[v, 0], xy[w, 0])
     low_y, high_y = min(xy[u, 1], xy[v, 1], xy[w, 1]), max(xy[u, 1], xy[v, 1], xy[w, 1])
     for e in range(len(edges)):
