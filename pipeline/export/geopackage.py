@@ -23,6 +23,7 @@ import pyarrow.compute as pc
 import shapely
 
 from pipeline.errors import RunError
+from pipeline.export.columns import COLUMNS, TILE_COLUMN, kind_of
 from pipeline.export.decisions import DECISIONS
 from pipeline.export.decisions import NAME as DECISIONS_NAME
 from pipeline.export.records import SCHEMAS
@@ -35,7 +36,7 @@ SUFFIX = ".gpkg"
 """Ending of the files: GDAL and QGIS warn of any other."""
 GEOMETRY = "geometry"
 """The column of geometry, in the tables and in the layers."""
-TILE = "tile"
+TILE = TILE_COLUMN.name
 """The column that the folders' names carry."""
 STYLES = "layer_styles"
 """The table in which QGIS looks for styles."""
@@ -44,6 +45,8 @@ VERSION = "1.3"
 """Version of GeoPackage: GDAL 3.6, which QGIS 3.22 of Debian 12 has, warns of a later one."""
 
 _JSON = {"ARROW:extension:name": "arrow.json", "ARROW:extension:metadata": ""}
+_COMMENT = "GDAL:OGR:comment"
+"""Key of a field's metadata; GDAL stores its value in `gpkg_data_columns`, where QGIS finds it."""
 _MILLISECONDS = pa.timestamp("ms", tz="UTC")
 _STYLES_SCHEMA = pa.schema(
     [
@@ -77,9 +80,12 @@ class Layer:
 
     @property
     def schema(self) -> pa.Schema:
-        """The schema of what is written: the columns in their stored types, then `tile`."""
-        fields = [stored_field(self.table.field(name)) for name in self.columns]
-        return pa.schema([*fields, pa.field(TILE, pa.string(), nullable=False)])
+        """The schema of what is written: the columns in their stored types, then `tile`; each with its meaning."""
+        fields = [*map(stored_field, map(self.table.field, self.columns)), pa.field(TILE, pa.string(), nullable=False)]
+        comments = {one.name: one.comment for one in (*COLUMNS[self.name], TILE_COLUMN)}
+        return pa.schema(
+            [field.with_metadata({**(field.metadata or {}), _COMMENT: comments[field.name]}) for field in fields]
+        )
 
 
 LAYERS = (
@@ -123,22 +129,10 @@ STORED_TYPES: Mapping[str, str] = {
 """The type in the GeoPackage of each type of the tables; lists become the text of a JSON array."""
 
 
-def kind_of(kind: pa.DataType) -> str:
-    """The entry of `STORED_TYPES` for a type of Arrow; an empty text where there is none.
-
-    >>> kind_of(pa.list_(pa.int32())), kind_of(pa.timestamp("us", tz="UTC")), kind_of(pa.uint64())
-    ('list', 'timestamp', '')
-    """
-    if pa.types.is_timestamp(kind):
-        return "timestamp"
-    name = "list" if pa.types.is_list(kind) else str(kind)
-    return name if name in STORED_TYPES else ""
-
-
 def stored_field(field: pa.Field) -> pa.Field:
     """A column of a table as it is written; raises RunError if GeoPackage has no type for it."""
     kind = kind_of(field.type)
-    if not kind:
+    if kind not in STORED_TYPES:
         raise RunError(
             f"column {field.name} has type {field.type}, for which GeoPackage has none: add it to the mapping"
         )
