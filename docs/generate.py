@@ -15,7 +15,7 @@ import typer
 
 from pipeline.batch.batch_file import TABLES
 from pipeline.console import EXIT_CODES
-from pipeline.export import cityjson, geopackage
+from pipeline.export import cityjson, geopackage, pmtiles
 from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, Column
 from pipeline.methods import METHODS
 from pipeline.parameters import Parameters
@@ -31,7 +31,11 @@ REFERENCE = Path(__file__).resolve().parent / "reference"
 NOTE = "<!-- Written by `make docs` from the code; do not edit. -->"
 
 TITLES_OF_TABLES = {layer.name: f"{layer.description}." for layer in geopackage.LAYERS}
-FORMATS = {"GeoPackage": geopackage.STORED_TYPES, "CityJSON": cityjson.ATTRIBUTE_TYPES}
+FORMATS = {
+    "GeoPackage": geopackage.STORED_TYPES,
+    "CityJSON": cityjson.ATTRIBUTE_TYPES,
+    "PMTiles": pmtiles.PROPERTY_TYPES,
+}
 NOTES_OF_FORMATS = [
     "- GeoPackage has no `bbox`, which the spatial index replaces, and no columns of solids, since a layer has one",
     "  geometry. `geometry` is a MultiPolygon in each layer, a single Polygon too; a MultiPolygon Z in `planes`.",
@@ -40,6 +44,11 @@ NOTES_OF_FORMATS = [
     "- CityJSON has the columns of `buildings` as attributes of each building, without `building_id` (the name of the",
     "  object), without columns of geometry and solids (its own geometry), and without those that are null.",
     "  `source_attributes` is an object. A plane has `plane_id`, `slope_deg` and `aspect_deg` at its semantic surface.",
+    "- PMTiles have the columns of `buildings` without those of solids and without "
+    + ", ".join(f"`{name}`" for name in pmtiles.LEFT_OUT)
+    + ".",
+    "  `int` and `double` are equal numbers; a double may be stored as an integer or a float that equals it. A null is",
+    "  a property that is not there. JavaScript reads integers beyond 2^53 inexactly.",
 ]
 
 

@@ -8,12 +8,10 @@ not grow with the run.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import datetime as dt
 import json
-import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +24,7 @@ from pipeline.errors import RunError
 from pipeline.export.columns import COLUMNS, TILE_COLUMN, kind_of
 from pipeline.export.decisions import DECISIONS
 from pipeline.export.decisions import NAME as DECISIONS_NAME
+from pipeline.export.gdal_layers import gdal_options, write_layer
 from pipeline.export.records import SCHEMAS
 from pipeline.export.solid_geometry import SOLID_COLUMNS
 
@@ -228,61 +227,12 @@ class GeoPackage:
 
     def _write(self, name: str, schema: pa.Schema, batches: Iterable[pa.RecordBatch], **options: Any) -> int:
         """Write a stream of batches as a layer; returns the number of rows."""
-        import pyogrio.raw
-
-        stream = _Stream(batches)
-        with warnings.catch_warnings(), self._gdal():
-            # an unknown CRS is stored as unknown
-            warnings.filterwarnings("ignore", message="'crs' was not provided")
-            try:
-                pyogrio.raw.write_arrow(
-                    pa.RecordBatchReader.from_batches(schema, iter(stream)),
-                    self.path,
-                    layer=name,
-                    driver="GPKG",
-                    dataset_options={"VERSION": VERSION},
-                    **options,
-                )
-            except (RuntimeError, OSError) as fault:  # those of pyogrio are RuntimeErrors
-                if stream.fault is not None:
-                    raise stream.fault from None
-                raise RunError(
-                    f"layer {name} cannot be written to {self.path.name}: {str(fault)[:160]}. "
-                    "Free space, or give another --out"
-                ) from fault
-        return stream.rows
-
-    @contextlib.contextmanager
-    def _gdal(self) -> Iterator[None]:
-        """Have GDAL write the time of the content in place of the time of day, and not wait for the disk at each step.
-
-        The options are those of the whole process.
-        """
-        import pyogrio
-
-        at = self.at.astimezone(dt.UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        options = {"OGR_CURRENT_DATE": at, "OGR_SQLITE_SYNCHRONOUS": "OFF"}
-        before = {name: pyogrio.get_gdal_config_option(name) for name in options}
-        pyogrio.set_gdal_config_options(options)
-        try:
-            yield
-        finally:
-            pyogrio.set_gdal_config_options(before)
+        with gdal_options({"OGR_CURRENT_DATE": _zulu(self.at), "OGR_SQLITE_SYNCHRONOUS": "OFF"}):
+            return write_layer(
+                self.path, name, schema, batches, "GPKG", dataset_options={"VERSION": VERSION}, **options
+            )
 
 
-class _Stream:
-    """Batches on their way through C, which loses their errors: counted, and the error kept."""
-
-    def __init__(self, batches: Iterable[pa.RecordBatch]) -> None:
-        self._batches = batches
-        self.rows = 0
-        self.fault: BaseException | None = None
-
-    def __iter__(self) -> Iterator[pa.RecordBatch]:
-        try:
-            for batch in self._batches:
-                self.rows += batch.num_rows
-                yield batch
-        except BaseException as fault:
-            self.fault = fault
-            raise
+def _zulu(at: dt.datetime) -> str:
+    """A time as GDAL takes it in place of the time of day."""
+    return at.astimezone(dt.UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import json
 import tempfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -14,11 +14,13 @@ import pyarrow as pa
 import pyarrow.fs as pafs
 
 from pipeline.errors import RunError, SettingsError
+from pipeline.export import pmtiles
 from pipeline.export.cityjson import lines_of
 from pipeline.export.cityjson_file import city_of
 from pipeline.export.decisions import NAME as DECISIONS_NAME
-from pipeline.export.geopackage import LAYERS, SUFFIX, TILE, GeoPackage, Layer, stored_batch
+from pipeline.export.geopackage import LAYERS, SUFFIX, TILE, GeoPackage, stored_batch
 from pipeline.export.geoparquet import table_batches, table_files
+from pipeline.export.projection import projection_to
 from pipeline.export.qml import STYLES
 from pipeline.io import LocalStorage, arrow_at, is_url, storage_at
 from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
@@ -63,7 +65,7 @@ def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_ev
     on_event : callable
         Gets progress: tiles of each layer.
     """
-    target = _target(run_dir, out)
+    target = _target(run_dir, out, "a GeoPackage is", SUFFIX)
     _refuse_existing(target, overwrite)
     manifest = finished_run(run_dir)
     stated = _stated_files(run_dir, {layer.name for layer in LAYERS})
@@ -84,11 +86,56 @@ def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_ev
         for layer in LAYERS:
             if layer.name == DECISIONS_NAME and not _has_table(place, layer.name, filesystem):
                 continue
-            rows[layer.name] = made.write(layer, _batches(place, layer, filesystem, on_event))
+            read = _batches(place, layer.name, layer.columns, filesystem, on_event)
+            rows[layer.name] = made.write(layer, (stored_batch(batch, layer, tile) for tile, batch in read))
         made.write_styles(STYLES)
         _check_complete(run_dir, manifest, rows, stated)
         _refuse_existing(target, overwrite)
         made.path.replace(temporary)
+    return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)
+
+
+def publish_pmtiles(run_dir: str, out: str, *, overwrite: bool = False, on_event: Listener = ignore) -> Published:
+    """Write the footprints of a finished run as vector tiles in one PMTiles file; it appears whole, or stays as it was.
+
+    Raises SettingsError if `out` cannot be such a file, and RunError if it exists, if the run's CRS is unknown, if the
+    run is not finished, changes meanwhile or lacks rows, or if something cannot be read or written.
+
+    Parameters
+    ----------
+    run_dir : str
+        The run directory, a folder or a URL.
+    out : str
+        The file to write, a path of this machine that ends in .pmtiles.
+    overwrite : bool
+        Replace an existing file.
+    on_event : callable
+        Gets progress: tiles.
+    """
+    target = _target(run_dir, out, "PMTiles are", pmtiles.SUFFIX)
+    _refuse_existing(target, overwrite)
+    manifest = finished_run(run_dir)
+    project = projection_to(manifest.crs, pmtiles.CRS)
+    stated = _stated_files(run_dir, {pmtiles.LAYER})
+    filesystem, place = arrow_at(run_dir)
+    read = 0
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        nonlocal read
+        for tile, batch in _batches(place, pmtiles.LAYER, pmtiles.READ, filesystem, on_event):
+            read += batch.num_rows
+            yield pmtiles.map_batch(batch, tile, project)
+
+    with (
+        _disk_at(target),
+        LocalStorage(root=target.parent).putting(target.name) as temporary,
+        tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder,
+    ):
+        made = Path(folder, target.name)
+        rows = {pmtiles.LAYER: pmtiles.write_pmtiles(made, batches(), _facts(manifest))}
+        _check_complete(run_dir, manifest, {pmtiles.LAYER: read}, stated)
+        _refuse_existing(target, overwrite)
+        made.replace(temporary)
     return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)
 
 
@@ -180,11 +227,11 @@ def finished_run(run_dir: str) -> RunManifest:
     return manifest
 
 
-def _target(run_dir: str, out: str) -> Path:
-    """The file to write; raises SettingsError if it cannot be a GeoPackage of this run."""
-    target = _path_outside(run_dir, out, "a GeoPackage is")
-    if target.suffix.lower() != SUFFIX:
-        raise SettingsError([f"--out {out} ends in {target.suffix or 'nothing'}: give a name that ends in {SUFFIX}"])
+def _target(run_dir: str, out: str, what: str, suffix: str) -> Path:
+    """The file to write; raises SettingsError if it cannot be a file of that format of this run."""
+    target = _path_outside(run_dir, out, what)
+    if target.suffix.lower() != suffix:
+        raise SettingsError([f"--out {out} ends in {target.suffix or 'nothing'}: give a name that ends in {suffix}"])
     return target
 
 
@@ -223,13 +270,15 @@ def _has_table(run_dir: str, name: str, filesystem: pafs.FileSystem) -> bool:
     return bool(filesystem.get_file_info(f"{run_dir.rstrip('/')}/{name}").type is pafs.FileType.Directory)
 
 
-def _batches(run_dir: str, layer: Layer, filesystem: pafs.FileSystem, on_event: Listener) -> Iterator[pa.RecordBatch]:
-    """The rows of a layer tile by tile."""
-    tiles = [path.split("/")[-2].removeprefix(f"{TILE}=") for path in table_files(run_dir, layer.name, filesystem)]
+def _batches(
+    run_dir: str, table: str, columns: Sequence[str], filesystem: pafs.FileSystem, on_event: Listener
+) -> Iterator[tuple[str, pa.RecordBatch]]:
+    """The rows of a table tile by tile, with the tile."""
+    tiles = [path.split("/")[-2].removeprefix(f"{TILE}=") for path in table_files(run_dir, table, filesystem)]
     for done, tile in enumerate(tiles, start=1):
-        for batch in table_batches(run_dir, layer.name, layer.columns, filesystem, [tile], ROWS):
-            yield stored_batch(batch, layer, tile)
-        on_event(Event(kind="progress", stage=layer.name, done=done, total=len(tiles)))
+        for batch in table_batches(run_dir, table, columns, filesystem, [tile], ROWS):
+            yield tile, batch
+        on_event(Event(kind="progress", stage=table, done=done, total=len(tiles)))
 
 
 def _stated_files(run_dir: str, folders: Collection[str]) -> list[str]:
