@@ -14,11 +14,11 @@ from pipeline.console import Console
 def publish(
     run: Annotated[str, typer.Argument(metavar="RUN", help="A finished run directory, a folder or a URL.")],
     form: Annotated[
-        Literal["geopackage", "cityjson", "pmtiles"],
+        Literal["geopackage", "cityjson", "pmtiles", "stac"],
         typer.Option(
             "--as",
             help="geopackage: one file with layers and styles, for GIS. cityjson: a folder, one file per tile. "
-            "pmtiles: one file with footprints, for maps on the web.",
+            "pmtiles: one file with footprints, for maps on the web. stac: a folder, a catalogue of the run.",
         ),
     ],
     out: Annotated[
@@ -30,9 +30,14 @@ def publish(
 ) -> None:
     """Write a finished run as files that other programs open. The run stays as it is."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.runtime.publishing import publish_cityjson, publish_geopackage, publish_pmtiles
+        from pipeline.runtime.publishing import publish_cityjson, publish_geopackage, publish_pmtiles, publish_stac
 
-        forms = {"geopackage": publish_geopackage, "cityjson": publish_cityjson, "pmtiles": publish_pmtiles}
+        forms = {
+            "geopackage": publish_geopackage,
+            "cityjson": publish_cityjson,
+            "pmtiles": publish_pmtiles,
+            "stac": publish_stac,
+        }
         published = forms[form](run, out, overwrite=overwrite, on_event=console.on_event)
         console.table("Written", ["what", "rows"], list(published.rows.items()))
         console.say(f"{published.place}, {published.size_bytes / 1e6:.1f} MB")

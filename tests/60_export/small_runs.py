@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime as dt
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,8 @@ def write_whole_run(folder: Path) -> Path:
     """A finished run of the street, whose states list its files."""
     write_run(folder, street())
     for tile in ("t1", "t2"):
-        files = {str(path.relative_to(folder)): "0" for path in folder.rglob(f"tile={tile}/*")}
+        paths = sorted(folder.rglob(f"tile={tile}/*"))
+        files = {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
         state = {"tile": tile, "state": "done", "error": "", "files": files}
         storage_at(folder).put(f"state/{tile}.json", json.dumps(state).encode())
     return folder
