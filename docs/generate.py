@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ import typer
 
 from pipeline.batch.batch_file import TABLES
 from pipeline.console import EXIT_CODES
+from pipeline.export import cityjson, geopackage, pmtiles
+from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, Column
 from pipeline.methods import METHODS
 from pipeline.parameters import Parameters
 from pipeline.quality import validity as checker
@@ -27,6 +29,27 @@ from service.cli import app
 
 REFERENCE = Path(__file__).resolve().parent / "reference"
 NOTE = "<!-- Written by `make docs` from the code; do not edit. -->"
+
+TITLES_OF_TABLES = {layer.name: f"{layer.description}." for layer in geopackage.LAYERS}
+FORMATS = {
+    "GeoPackage": geopackage.STORED_TYPES,
+    "CityJSON": cityjson.ATTRIBUTE_TYPES,
+    "PMTiles": pmtiles.PROPERTY_TYPES,
+}
+NOTES_OF_FORMATS = [
+    "- GeoPackage has no `bbox`, which the spatial index replaces, and no columns of solids, since a layer has one",
+    "  geometry. `geometry` is a MultiPolygon in each layer, a single Polygon too; a MultiPolygon Z in `planes`.",
+    "  `decisions` has no geometry. Each column holds its meaning as a comment (`gpkg_data_columns`). A text ends at",
+    "  its first zero byte, times are cut to milliseconds.",
+    "- CityJSON has the columns of `buildings` as attributes of each building, without `building_id` (the name of the",
+    "  object), without columns of geometry and solids (its own geometry), and without those that are null.",
+    "  `source_attributes` is an object. A plane has `plane_id`, `slope_deg` and `aspect_deg` at its semantic surface.",
+    "- PMTiles have the columns of `buildings` without those of solids and without "
+    + ", ".join(f"`{name}`" for name in pmtiles.LEFT_OUT)
+    + ".",
+    "  `int` and `double` are equal numbers; a double may be stored as an integer or a float that equals it. A null is",
+    "  a property that is not there. JavaScript reads integers beyond 2^53 inexactly.",
+]
 
 
 def cell(text: object) -> str:
@@ -406,6 +429,54 @@ def changes() -> str:
     return "\n".join(lines) + "\n"
 
 
+def column_rows(columns: Iterable[Column]) -> list[list[object]]:
+    """Rows of a table of columns."""
+    return [
+        [
+            f"`{one.name}`",
+            str(one.kind).replace("list<item: ", "list<").split("[")[0],
+            one.unit,
+            "" if one.required else "yes",
+            f"{one.meaning} ([more]({one.page}))" if one.page else one.meaning,
+        ]
+        for one in columns
+    ]
+
+
+def columns() -> str:
+    """The page of columns: those of each table, and what their types become in each format."""
+    lines = [
+        NOTE,
+        "# Columns",
+        "",
+        "The columns of every table of a run. A column has the same name, meaning and unit in every format. What the",
+        "tables are and how to read them: [records](records.md).",
+        "",
+        "**Units.** *CRS* is the horizontal unit of the run's CRS, *CRS, vertical* its vertical unit. Metres are",
+        "metres for any CRS. *Null* says whether a row may lack a value.",
+    ]
+    for name, columns_of_table in COLUMNS.items():
+        lines += ["", f"## {name}", "", TITLES_OF_TABLES[name], ""]
+        lines += table(["column", "type", "unit", "null", "meaning"], column_rows(columns_of_table))
+    lines += [
+        "",
+        "## tile",
+        "",
+        "The folders of the tables carry this column in their names. A GeoPackage and PMTiles have it as a column.",
+        "",
+        *table(["column", "type", "unit", "null", "meaning"], column_rows([TILE_COLUMN])),
+        "",
+        "## Types in other formats",
+        "",
+        "GeoParquet holds the types as they are. The other formats lack some of them.",
+        "",
+        *table(["type", *FORMATS], [[f"`{kind}`", *(types[kind] for types in FORMATS.values())] for kind in KINDS]),
+        "",
+        *NOTES_OF_FORMATS,
+    ]
+    return "\n".join(lines) + "\n"
+
+
 PAGES: Mapping[str, Callable[[], str]] = {
     "settings.md": settings,
     "batch_file.md": batch_file,
@@ -415,6 +486,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "service.md": service,
     "measures.md": measures,
     "changes.md": changes,
+    "columns.md": columns,
 }
 """The generated pages by file name."""
 

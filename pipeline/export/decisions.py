@@ -8,29 +8,13 @@ from typing import Any
 
 import pyarrow as pa
 
+from pipeline.export.columns import COLUMNS, schema_of
 from pipeline.model import BuildingResult
 
 NAME = "decisions"
 """Name of the table and of its folder in a run directory. The digest of a run does not cover it."""
 
-DECISIONS = pa.schema(
-    [
-        pa.field("building_id", pa.string(), nullable=False),
-        pa.field("step", pa.int32(), nullable=False),
-        pa.field("kind", pa.string(), nullable=False),
-        pa.field("name", pa.string(), nullable=False),
-        pa.field("outcome", pa.string(), nullable=False),
-        pa.field("detail", pa.string(), nullable=False),
-        pa.field("value", pa.float64()),
-        pa.field("limit", pa.float64()),
-        pa.field("n_faces", pa.int32()),
-        pa.field("n_planes", pa.int32()),
-        pa.field("levelled_share", pa.float64()),
-        pa.field("explained_share", pa.float64()),
-        pa.field("bic_margin", pa.float64()),
-        pa.field("validity_codes", pa.list_(pa.int32()), nullable=False),
-    ]
-)
+DECISIONS = schema_of(COLUMNS[NAME])
 """One row per check, form and level of detail, sorted by `building_id` and `step`."""
 
 _MAX_DETAIL = 300

@@ -8,12 +8,10 @@ not grow with the run.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import datetime as dt
 import json
-import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +21,10 @@ import pyarrow.compute as pc
 import shapely
 
 from pipeline.errors import RunError
+from pipeline.export.columns import COLUMNS, TILE_COLUMN, kind_of
 from pipeline.export.decisions import DECISIONS
 from pipeline.export.decisions import NAME as DECISIONS_NAME
+from pipeline.export.gdal_layers import gdal_options, write_layer
 from pipeline.export.records import SCHEMAS
 from pipeline.export.solid_geometry import SOLID_COLUMNS
 
@@ -35,7 +35,7 @@ SUFFIX = ".gpkg"
 """Ending of the files: GDAL and QGIS warn of any other."""
 GEOMETRY = "geometry"
 """The column of geometry, in the tables and in the layers."""
-TILE = "tile"
+TILE = TILE_COLUMN.name
 """The column that the folders' names carry."""
 STYLES = "layer_styles"
 """The table in which QGIS looks for styles."""
@@ -44,6 +44,8 @@ VERSION = "1.3"
 """Version of GeoPackage: GDAL 3.6, which QGIS 3.22 of Debian 12 has, warns of a later one."""
 
 _JSON = {"ARROW:extension:name": "arrow.json", "ARROW:extension:metadata": ""}
+_COMMENT = "GDAL:OGR:comment"
+"""Key of a field's metadata; GDAL stores its value in `gpkg_data_columns`, where QGIS finds it."""
 _MILLISECONDS = pa.timestamp("ms", tz="UTC")
 _STYLES_SCHEMA = pa.schema(
     [
@@ -77,9 +79,12 @@ class Layer:
 
     @property
     def schema(self) -> pa.Schema:
-        """The schema of what is written: the columns in their stored types, then `tile`."""
-        fields = [stored_field(self.table.field(name)) for name in self.columns]
-        return pa.schema([*fields, pa.field(TILE, pa.string(), nullable=False)])
+        """The schema of what is written: the columns in their stored types, then `tile`; each with its meaning."""
+        fields = [*map(stored_field, map(self.table.field, self.columns)), pa.field(TILE, pa.string(), nullable=False)]
+        comments = {one.name: one.comment for one in (*COLUMNS[self.name], TILE_COLUMN)}
+        return pa.schema(
+            [field.with_metadata({**(field.metadata or {}), _COMMENT: comments[field.name]}) for field in fields]
+        )
 
 
 LAYERS = (
@@ -123,22 +128,10 @@ STORED_TYPES: Mapping[str, str] = {
 """The type in the GeoPackage of each type of the tables; lists become the text of a JSON array."""
 
 
-def kind_of(kind: pa.DataType) -> str:
-    """The entry of `STORED_TYPES` for a type of Arrow; an empty text where there is none.
-
-    >>> kind_of(pa.list_(pa.int32())), kind_of(pa.timestamp("us", tz="UTC")), kind_of(pa.uint64())
-    ('list', 'timestamp', '')
-    """
-    if pa.types.is_timestamp(kind):
-        return "timestamp"
-    name = "list" if pa.types.is_list(kind) else str(kind)
-    return name if name in STORED_TYPES else ""
-
-
 def stored_field(field: pa.Field) -> pa.Field:
     """A column of a table as it is written; raises RunError if GeoPackage has no type for it."""
     kind = kind_of(field.type)
-    if not kind:
+    if kind not in STORED_TYPES:
         raise RunError(
             f"column {field.name} has type {field.type}, for which GeoPackage has none: add it to the mapping"
         )
@@ -234,61 +227,12 @@ class GeoPackage:
 
     def _write(self, name: str, schema: pa.Schema, batches: Iterable[pa.RecordBatch], **options: Any) -> int:
         """Write a stream of batches as a layer; returns the number of rows."""
-        import pyogrio.raw
-
-        stream = _Stream(batches)
-        with warnings.catch_warnings(), self._gdal():
-            # an unknown CRS is stored as unknown
-            warnings.filterwarnings("ignore", message="'crs' was not provided")
-            try:
-                pyogrio.raw.write_arrow(
-                    pa.RecordBatchReader.from_batches(schema, iter(stream)),
-                    self.path,
-                    layer=name,
-                    driver="GPKG",
-                    dataset_options={"VERSION": VERSION},
-                    **options,
-                )
-            except (RuntimeError, OSError) as fault:  # those of pyogrio are RuntimeErrors
-                if stream.fault is not None:
-                    raise stream.fault from None
-                raise RunError(
-                    f"layer {name} cannot be written to {self.path.name}: {str(fault)[:160]}. "
-                    "Free space, or give another --out"
-                ) from fault
-        return stream.rows
-
-    @contextlib.contextmanager
-    def _gdal(self) -> Iterator[None]:
-        """Have GDAL write the time of the content in place of the time of day, and not wait for the disk at each step.
-
-        The options are those of the whole process.
-        """
-        import pyogrio
-
-        at = self.at.astimezone(dt.UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        options = {"OGR_CURRENT_DATE": at, "OGR_SQLITE_SYNCHRONOUS": "OFF"}
-        before = {name: pyogrio.get_gdal_config_option(name) for name in options}
-        pyogrio.set_gdal_config_options(options)
-        try:
-            yield
-        finally:
-            pyogrio.set_gdal_config_options(before)
+        with gdal_options({"OGR_CURRENT_DATE": _zulu(self.at), "OGR_SQLITE_SYNCHRONOUS": "OFF"}):
+            return write_layer(
+                self.path, name, schema, batches, "GPKG", dataset_options={"VERSION": VERSION}, **options
+            )
 
 
-class _Stream:
-    """Batches on their way through C, which loses their errors: counted, and the error kept."""
-
-    def __init__(self, batches: Iterable[pa.RecordBatch]) -> None:
-        self._batches = batches
-        self.rows = 0
-        self.fault: BaseException | None = None
-
-    def __iter__(self) -> Iterator[pa.RecordBatch]:
-        try:
-            for batch in self._batches:
-                self.rows += batch.num_rows
-                yield batch
-        except BaseException as fault:
-            self.fault = fault
-            raise
+def _zulu(at: dt.datetime) -> str:
+    """A time as GDAL takes it in place of the time of day."""
+    return at.astimezone(dt.UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

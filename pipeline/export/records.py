@@ -11,6 +11,7 @@ import pyarrow as pa
 import shapely
 from shapely import MultiPolygon, Polygon
 
+from pipeline.export.columns import COLUMNS, schema_of
 from pipeline.export.coordinates import SpatialReference, crs_coordinates, crs_elevation, crs_geometry, decimals
 from pipeline.export.dimensions import Dimensions, dimensions
 from pipeline.export.facts import CandidateFacts, RecordContext, RejectedObject
@@ -18,116 +19,21 @@ from pipeline.export.solid_geometry import WALL_OUTLINE, solid_columns
 from pipeline.model import BuildingResult, ModelQuality, Plane
 from pipeline.quality.detection import detection_confidence
 
-_TIME = pa.timestamp("us", tz="UTC")
 _SAYS_BUILDING = frozenset({"accept", "footprint"})
 """Overrides by which a user says that an object is a building."""
 
-BUILDINGS = pa.schema(
-    [
-        pa.field("building_id", pa.string(), nullable=False),
-        pa.field("source_id", pa.string()),
-        pa.field("source_attributes", pa.string()),
-        pa.field("status", pa.string(), nullable=False),
-        pa.field("reason", pa.string()),
-        pa.field("reason_detail", pa.string(), nullable=False),
-        pa.field("overridden", pa.string()),
-        pa.field("method", pa.string(), nullable=False),
-        pa.field("roof_type", pa.string(), nullable=False),
-        pa.field("geometry", pa.binary()),
-        pa.field("lod", pa.string()),
-        pa.field("solid", pa.binary()),
-        pa.field("solid_parts", pa.list_(pa.int32())),
-        pa.field("solid_surfaces", pa.list_(pa.string())),
-        pa.field("solid_planes", pa.list_(pa.int32())),
-        pa.field("solid_lod12", pa.binary()),
-        pa.field("solid_lod12_parts", pa.list_(pa.int32())),
-        pa.field("solid_lod12_surfaces", pa.list_(pa.string())),
-        pa.field("solid_lod13", pa.binary()),
-        pa.field("solid_lod13_parts", pa.list_(pa.int32())),
-        pa.field("solid_lod13_surfaces", pa.list_(pa.string())),
-        pa.field("ground_z", pa.float64()),
-        pa.field("eave_z", pa.float64()),
-        pa.field("ridge_z", pa.float64()),
-        pa.field("h_min", pa.float64()),
-        pa.field("h_50p", pa.float64()),
-        pa.field("h_70p", pa.float64()),
-        pa.field("h_max", pa.float64()),
-        pa.field("height_m", pa.float64()),
-        pa.field("footprint_area_m2", pa.float64()),
-        pa.field("footprint_share", pa.float64()),
-        pa.field("roof_area_m2", pa.float64()),
-        pa.field("volume_m3", pa.float64()),
-        pa.field("n_points", pa.int64(), nullable=False),
-        pa.field("density_per_m2", pa.float64()),
-        pa.field("through_share", pa.float64()),
-        pa.field("detection_confidence", pa.float64()),
-        pa.field("n_planes", pa.int32(), nullable=False),
-        pa.field("rmse_m", pa.float64()),
-        pa.field("p95_m", pa.float64()),
-        pa.field("coverage", pa.float64()),
-        pa.field("point_spacing_m", pa.float64()),
-        pa.field("noise_m", pa.float64()),
-        pa.field("share_within_0_2m", pa.float64()),
-        pa.field("unexplained_m2", pa.float64()),
-        pa.field("largest_hole_m", pa.float64()),
-        pa.field("ridge_z_sigma_m", pa.float64()),
-        pa.field("bic_margin", pa.float64()),
-        pa.field("is_curved", pa.bool_(), nullable=False),
-        pa.field("valid", pa.bool_(), nullable=False),
-        pa.field("validity_codes", pa.list_(pa.int32()), nullable=False),
-        pa.field("touches_data_edge", pa.bool_(), nullable=False),
-        pa.field("strip_offset_m", pa.float64()),
-        pa.field(WALL_OUTLINE, pa.binary()),
-        pa.field("overhang_m", pa.float64()),
-        pa.field("overhang_sigma_m", pa.float64()),
-        pa.field("acquired_from", _TIME),
-        pa.field("acquired_to", _TIME),
-        pa.field("mesh_path", pa.string()),
-        pa.field("input_hash", pa.string()),
-        pa.field("settings_hash", pa.string(), nullable=False),
-        pa.field("engine_version", pa.string(), nullable=False),
-    ]
-)
-"""One row a candidate. `*_z` and `h_*` are elevations in the CRS's vertical unit; `_m`, `_m2`, `_m3` always metres."""
+BUILDINGS = schema_of(COLUMNS["buildings"])
+"""One row per candidate."""
 
-PLANES = pa.schema(
-    [
-        pa.field("building_id", pa.string(), nullable=False),
-        pa.field("plane_id", pa.int32(), nullable=False),
-        pa.field("geometry", pa.binary()),
-        pa.field("slope_deg", pa.float64(), nullable=False),
-        pa.field("aspect_deg", pa.float64(), nullable=False),
-        pa.field("o_distance_m", pa.float64(), nullable=False),
-        pa.field("origin_x", pa.float64(), nullable=False),
-        pa.field("origin_y", pa.float64(), nullable=False),
-        pa.field("origin_z", pa.float64(), nullable=False),
-        pa.field("coefficients", pa.list_(pa.float64()), nullable=False),
-        pa.field("area_m2", pa.float64(), nullable=False),
-        pa.field("n_points", pa.int64(), nullable=False),
-        pa.field("rmse_m", pa.float64()),
-    ]
-)
-"""One row a roof plane.
+PLANES = schema_of(COLUMNS["planes"])
+"""One row per roof plane.
 
-`coefficients` are a, b, c, d of a (X - origin_x) + b (Y - origin_y) + c (Z - origin_z) + d = 0 in CRS units, with
-(a, b, c) of unit length there and c > 0. `o_distance_m` is the plane's signed distance above that origin in metres;
-slope and aspect are true angles, also where the horizontal and the vertical unit differ.
+`coefficients` are in CRS units, with (a, b, c) of unit length there. `o_distance_m` is the plane's signed distance
+above that origin in metres; slope and aspect are true angles, also where the horizontal and the vertical unit differ.
 """
 
-REJECTED = pa.schema(
-    [
-        pa.field("object_id", pa.string(), nullable=False),
-        pa.field("reason", pa.string(), nullable=False),
-        pa.field("reason_detail", pa.string(), nullable=False),
-        pa.field("geometry", pa.binary()),
-        pa.field("area_m2", pa.float64()),
-        pa.field("height_m", pa.float64()),
-        pa.field("n_points", pa.int64(), nullable=False),
-        pa.field("settings_hash", pa.string(), nullable=False),
-        pa.field("engine_version", pa.string(), nullable=False),
-    ]
-)
-"""One row an object that was judged to be no building: its id is made as a building's, `geometry` is its box."""
+REJECTED = schema_of(COLUMNS["rejected"])
+"""One row per object that was judged not to be a building: its id is made as a building's, `geometry` is its box."""
 
 KEYS: Mapping[str, tuple[str, ...]] = {
     "buildings": ("building_id",),

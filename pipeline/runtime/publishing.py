@@ -5,20 +5,25 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
 import tempfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
+from urllib.parse import quote
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.fs as pafs
 
 from pipeline.errors import RunError, SettingsError
+from pipeline.export import pmtiles, stac
 from pipeline.export.cityjson import lines_of
 from pipeline.export.cityjson_file import city_of
 from pipeline.export.decisions import NAME as DECISIONS_NAME
-from pipeline.export.geopackage import LAYERS, SUFFIX, TILE, GeoPackage, Layer, stored_batch
+from pipeline.export.geopackage import LAYERS, SUFFIX, TILE, GeoPackage, stored_batch
 from pipeline.export.geoparquet import table_batches, table_files
+from pipeline.export.projection import projection_to
 from pipeline.export.qml import STYLES
 from pipeline.io import LocalStorage, arrow_at, is_url, storage_at
 from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
@@ -63,7 +68,7 @@ def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_ev
     on_event : callable
         Gets progress: tiles of each layer.
     """
-    target = _target(run_dir, out)
+    target = _target(run_dir, out, "a GeoPackage is", SUFFIX)
     _refuse_existing(target, overwrite)
     manifest = finished_run(run_dir)
     stated = _stated_files(run_dir, {layer.name for layer in LAYERS})
@@ -84,11 +89,56 @@ def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_ev
         for layer in LAYERS:
             if layer.name == DECISIONS_NAME and not _has_table(place, layer.name, filesystem):
                 continue
-            rows[layer.name] = made.write(layer, _batches(place, layer, filesystem, on_event))
+            read = _batches(place, layer.name, layer.columns, filesystem, on_event)
+            rows[layer.name] = made.write(layer, (stored_batch(batch, layer, tile) for tile, batch in read))
         made.write_styles(STYLES)
         _check_complete(run_dir, manifest, rows, stated)
         _refuse_existing(target, overwrite)
         made.path.replace(temporary)
+    return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)
+
+
+def publish_pmtiles(run_dir: str, out: str, *, overwrite: bool = False, on_event: Listener = ignore) -> Published:
+    """Write the footprints of a finished run as vector tiles in one PMTiles file; it appears whole, or stays as it was.
+
+    Raises SettingsError if `out` cannot be such a file, and RunError if it exists, if the run's CRS is unknown, if the
+    run is not finished, changes meanwhile or lacks rows, or if something cannot be read or written.
+
+    Parameters
+    ----------
+    run_dir : str
+        The run directory, a folder or a URL.
+    out : str
+        The file to write, a path of this machine that ends in .pmtiles.
+    overwrite : bool
+        Replace an existing file.
+    on_event : callable
+        Gets progress: tiles.
+    """
+    target = _target(run_dir, out, "PMTiles are", pmtiles.SUFFIX)
+    _refuse_existing(target, overwrite)
+    manifest = finished_run(run_dir)
+    project = projection_to(manifest.crs, pmtiles.CRS)
+    stated = _stated_files(run_dir, {pmtiles.LAYER})
+    filesystem, place = arrow_at(run_dir)
+    read = 0
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        nonlocal read
+        for tile, batch in _batches(place, pmtiles.LAYER, pmtiles.READ, filesystem, on_event):
+            read += batch.num_rows
+            yield pmtiles.map_batch(batch, tile, project)
+
+    with (
+        _disk_at(target),
+        LocalStorage(root=target.parent).putting(target.name) as temporary,
+        tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder,
+    ):
+        made = Path(folder, target.name)
+        rows = {pmtiles.LAYER: pmtiles.write_pmtiles(made, batches(), _facts(manifest))}
+        _check_complete(run_dir, manifest, {pmtiles.LAYER: read}, stated)
+        _refuse_existing(target, overwrite)
+        made.replace(temporary)
     return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)
 
 
@@ -121,28 +171,128 @@ def publish_cityjson(run_dir: str, out: str, *, overwrite: bool = False, on_even
         if PurePosixPath(key).match(f"{_SEQUENCES}/{TILE}=*/part-0.city.jsonl")
     }
     buildings = size = 0
-    with _disk_at(target):
-        _refuse_occupied(target, overwrite, keys)
-        beside = target if target.is_dir() else target.parent
-        beside.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=beside) as folder:
-            made = LocalStorage(root=Path(folder, "new"))
-            made.make()
-            for done, (name, key) in enumerate(keys.items(), start=1):
-                city = _city(run_dir, key)
-                buildings += sum(thing["type"] == "Building" for thing in city["CityObjects"].values())
-                content = json.dumps(city, separators=(",", ":"), ensure_ascii=False).encode()
-                made.put(name, content)
-                size += len(content)
-                on_event(Event(kind="progress", stage=_SEQUENCES, done=done, total=len(keys)))
-            _check_complete(run_dir, manifest, {"buildings": buildings}, stated)
-            _refuse_occupied(target, overwrite, keys)
-            if target.is_dir():
-                for name in keys:
-                    made.path(name).replace(target / name)
-            else:
-                made.root.replace(target)
+    with _disk_at(target), _folder(target, overwrite, keys, [f"*{CITYJSON}"]) as made:
+        for done, (name, key) in enumerate(keys.items(), start=1):
+            city = _city(run_dir, key)
+            buildings += sum(thing["type"] == "Building" for thing in city["CityObjects"].values())
+            content = json.dumps(city, separators=(",", ":"), ensure_ascii=False).encode()
+            made.put(name, content)
+            size += len(content)
+            on_event(Event(kind="progress", stage=_SEQUENCES, done=done, total=len(keys)))
+        _check_complete(run_dir, manifest, {"buildings": buildings}, stated)
     return Published(place=str(target), size_bytes=size, rows={"buildings": buildings})
+
+
+def publish_stac(run_dir: str, out: str, *, overwrite: bool = False, on_event: Listener = ignore) -> Published:
+    """Write a STAC catalogue of a finished run: a Collection, and an Item per tile that has files.
+
+    A new folder appears whole; in one that exists, each file does, after all are made, and the Collection last.
+
+    Raises SettingsError if `out` cannot be such a folder, and RunError if it holds another catalogue, or this one and
+    it is not to be replaced, if the CRS is unknown, if the run is not finished, changes meanwhile or lacks files or
+    rows, or if something cannot be read or written.
+
+    Parameters
+    ----------
+    run_dir : str
+        The run directory, a folder or a URL.
+    out : str
+        The folder to write, a path of this machine. Its files refer to those of the run.
+    overwrite : bool
+        Replace the catalogue of the same tiles.
+    on_event : callable
+        Gets progress: tiles.
+    """
+    target = _path_outside(run_dir, out, "a catalogue is")
+    manifest, storage = finished_run(run_dir), storage_at(run_dir)
+    project = projection_to(manifest.crs, stac.CRS)
+    run = _run_of(run_dir, manifest)
+    files = {state["tile"]: state["files"] for state in _states(run_dir) if state["files"]}
+    names = [*(stac.item_name(tile) for tile in files), stac.COLLECTION]
+    href = run_dir.rstrip("/") + "/" if is_url(run_dir) else _relative(Path(run_dir).resolve(), target)
+    with _disk_at(target), _folder(target, overwrite, names, ("*/*.json", stac.COLLECTION)) as made:
+        items, rows, size = [], 0, 0
+        for done, (tile, held) in enumerate(files.items(), start=1):
+            facts = _tile_facts(run_dir, tile, held, manifest)
+            rows += facts.rows["buildings"]
+            item = stac.item(facts, run, project, href if is_url(href) else f"../{href}")
+            items.append({name: item[name] for name in ("id", "bbox", "properties")})
+            size += _put_json(made, stac.item_name(tile), item)
+            on_event(Event(kind="progress", stage="items", done=done, total=len(files)))
+        if not items:
+            raise RunError(f"the run in {run_dir} has no tile with files, so there is nothing to list")
+        documents = [name for name in stac.DOCUMENTS if storage.has(name)]
+        size += _put_json(made, stac.COLLECTION, stac.collection(run, items, documents, href))
+        _check_complete(run_dir, manifest, {"buildings": rows}, [name for held in files.values() for name in held])
+    return Published(place=str(target), size_bytes=size, rows={"items": len(items)})
+
+
+def _run_of(run_dir: str, manifest: RunManifest) -> stac.Run:
+    """What a catalogue says about a run."""
+    return stac.Run(
+        name=PurePosixPath(run_dir.rstrip("/") if is_url(run_dir) else Path(run_dir).resolve().as_posix()).name,
+        version=manifest.engine_version,
+        method=manifest.method,
+        finished_at=manifest.finished_at or manifest.started_at,
+        licence=manifest.source_licence,
+        crs=manifest.crs or {},
+    )
+
+
+def _tile_facts(run_dir: str, tile: str, files: Mapping[str, str], manifest: RunManifest) -> stac.TileFacts:
+    """Where and when the objects of a tile are; if it has none, its square on the lattice."""
+    filesystem, place = arrow_at(run_dir)
+    boxes, times, rows = [], [], {}
+    for table, columns in (("buildings", ["acquired_from", "acquired_to", "bbox"]), ("rejected", ["bbox"])):
+        rows[table] = 0
+        for batch in table_batches(place, table, columns, filesystem, [tile], ROWS):
+            rows[table] += batch.num_rows
+            boxes += [tuple(box.values()) for box in batch.column("bbox").to_pylist() if box]
+            for name in columns[:-1]:
+                times += [at for at in batch.column(name).to_pylist() if at]
+    unit_m = (manifest.crs or {}).get("horizontal_unit_m", 1.0)
+    boxes = boxes or [tuple(v / unit_m for v in square.bounds) for square in manifest.squares([tile])]
+    if not boxes:
+        raise RunError(f"the place of tile {tile} of the run in {run_dir} is unknown: run it again")
+    low, high = np.min(boxes, axis=0), np.max(boxes, axis=0)
+    return stac.TileFacts(
+        key=tile,
+        files=files,
+        bounds=(float(low[0]), float(low[1]), float(high[2]), float(high[3])),
+        acquired=(min(times), max(times)) if times else None,
+        rows=rows,
+    )
+
+
+def _relative(run: Path, target: Path) -> str:
+    """The run directory as seen from a folder, percent-encoded and ending in a slash."""
+    return quote(Path(os.path.relpath(run, target)).as_posix()) + "/"
+
+
+def _put_json(storage: LocalStorage, name: str, document: Mapping[str, Any]) -> int:
+    """Write a document; returns its size in bytes."""
+    content = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False).encode() + b"\n"
+    storage.put(name, content)
+    return len(content)
+
+
+@contextlib.contextmanager
+def _folder(target: Path, overwrite: bool, names: Collection[str], patterns: Collection[str]) -> Iterator[LocalStorage]:
+    """A folder for files of some names, which get their place at the end; the last name is placed last."""
+    _refuse_occupied(target, overwrite, names, patterns)
+    beside = target if target.is_dir() else target.parent
+    beside.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=beside) as folder:
+        made = LocalStorage(root=Path(folder, "new"))
+        made.make()
+        yield made
+        _refuse_occupied(target, overwrite, names, patterns)
+        if target.is_dir():
+            for name in names:
+                (target / name).parent.mkdir(exist_ok=True)
+                made.path(name).replace(target / name)
+        else:
+            made.root.replace(target)
 
 
 def _city(run_dir: str, key: str) -> dict[str, Any]:
@@ -180,11 +330,11 @@ def finished_run(run_dir: str) -> RunManifest:
     return manifest
 
 
-def _target(run_dir: str, out: str) -> Path:
-    """The file to write; raises SettingsError if it cannot be a GeoPackage of this run."""
-    target = _path_outside(run_dir, out, "a GeoPackage is")
-    if target.suffix.lower() != SUFFIX:
-        raise SettingsError([f"--out {out} ends in {target.suffix or 'nothing'}: give a name that ends in {SUFFIX}"])
+def _target(run_dir: str, out: str, what: str, suffix: str) -> Path:
+    """The file to write; raises SettingsError if it cannot be a file of that format of this run."""
+    target = _path_outside(run_dir, out, what)
+    if target.suffix.lower() != suffix:
+        raise SettingsError([f"--out {out} ends in {target.suffix or 'nothing'}: give a name that ends in {suffix}"])
     return target
 
 
@@ -206,11 +356,12 @@ def _refuse_existing(target: Path, overwrite: bool) -> None:
         raise RunError(f"{target} exists already: give another --out, or --overwrite to replace it")
 
 
-def _refuse_occupied(target: Path, overwrite: bool, names: Collection[str]) -> None:
-    """Refuse a folder with CityJSON files of other tiles, or with these unless they are to be replaced; RunError."""
+def _refuse_occupied(target: Path, overwrite: bool, names: Collection[str], patterns: Collection[str]) -> None:
+    """Refuse a folder with such files of other tiles, or with these unless they are to be replaced; RunError."""
     if target.exists() and not target.is_dir():
         raise RunError(f"{target} is a file: give the name of a folder")
-    held = sorted(path.name for path in target.glob(f"*{CITYJSON}"))
+    found = [path for pattern in patterns for path in target.glob(pattern)]
+    held = sorted(path.relative_to(target).as_posix() for path in found)
     others = [name for name in held if name not in names or not (target / name).is_file()]
     if others:
         raise RunError(f"{target} holds {others[0]}, which is of no tile of this run: give another --out")
@@ -223,20 +374,26 @@ def _has_table(run_dir: str, name: str, filesystem: pafs.FileSystem) -> bool:
     return bool(filesystem.get_file_info(f"{run_dir.rstrip('/')}/{name}").type is pafs.FileType.Directory)
 
 
-def _batches(run_dir: str, layer: Layer, filesystem: pafs.FileSystem, on_event: Listener) -> Iterator[pa.RecordBatch]:
-    """The rows of a layer tile by tile."""
-    tiles = [path.split("/")[-2].removeprefix(f"{TILE}=") for path in table_files(run_dir, layer.name, filesystem)]
+def _batches(
+    run_dir: str, table: str, columns: Sequence[str], filesystem: pafs.FileSystem, on_event: Listener
+) -> Iterator[tuple[str, pa.RecordBatch]]:
+    """The rows of a table tile by tile, with the tile."""
+    tiles = [path.split("/")[-2].removeprefix(f"{TILE}=") for path in table_files(run_dir, table, filesystem)]
     for done, tile in enumerate(tiles, start=1):
-        for batch in table_batches(run_dir, layer.name, layer.columns, filesystem, [tile], ROWS):
-            yield stored_batch(batch, layer, tile)
-        on_event(Event(kind="progress", stage=layer.name, done=done, total=len(tiles)))
+        for batch in table_batches(run_dir, table, columns, filesystem, [tile], ROWS):
+            yield tile, batch
+        on_event(Event(kind="progress", stage=table, done=done, total=len(tiles)))
+
+
+def _states(run_dir: str) -> Iterator[dict[str, Any]]:
+    """The states of the tiles of a run."""
+    storage = storage_at(run_dir)
+    return (json.loads(storage.get(key)) for key in storage.keys("state"))
 
 
 def _stated_files(run_dir: str, folders: Collection[str]) -> list[str]:
     """The files in some folders of a run that the states of its tiles list."""
-    storage = storage_at(run_dir)
-    states = (json.loads(storage.get(key)) for key in storage.keys("state"))
-    return [name for state in states for name in state["files"] if name.split("/")[0] in folders]
+    return [name for state in _states(run_dir) for name in state["files"] if name.split("/")[0] in folders]
 
 
 def _facts(manifest: RunManifest) -> dict[str, str]:

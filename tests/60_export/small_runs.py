@@ -2,14 +2,18 @@
 
 import dataclasses
 import datetime as dt
+import hashlib
+import json
 from pathlib import Path
+from typing import Any
 
 import small_buildings as small
 
 from pipeline.export.records import RecordContext, RejectedObject
 from pipeline.export.tile import write_tile
+from pipeline.io import storage_at
 from pipeline.model import BuildingResult, Reason, Status
-from pipeline.runtime.manifest import RunManifest, RunStatus, write_manifest
+from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest, write_manifest
 
 
 def moved(result: BuildingResult, east: float, north: float = 0.0) -> BuildingResult:
@@ -53,3 +57,24 @@ def write_run(folder: Path, results: list[BuildingResult], unit_m: float = 1.0) 
     )
     write_manifest(folder, manifest)
     return folder
+
+
+def write_whole_run(folder: Path) -> Path:
+    """A finished run of the street, whose states list its files."""
+    write_run(folder, street())
+    for tile in ("t1", "t2"):
+        paths = sorted(folder.rglob(f"tile={tile}/*"))
+        files = {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+        state = {"tile": tile, "state": "done", "error": "", "files": files}
+        storage_at(folder).put(f"state/{tile}.json", json.dumps(state).encode())
+    return folder
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """All files below a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def restated(run_dir: Path, **changes: Any) -> None:
+    """Change the manifest of a run."""
+    write_manifest(run_dir, dataclasses.replace(read_manifest(run_dir), **changes))

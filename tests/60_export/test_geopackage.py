@@ -2,7 +2,6 @@
 
 import datetime as dt
 import json
-import re
 import sqlite3
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -15,11 +14,13 @@ import pyogrio
 import pyproj
 import pytest
 import shapely
+from column_values import rows
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import RunError
+from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, kind_of
 from pipeline.export.geopackage import (
     GEOMETRY,
     LAYERS,
@@ -28,7 +29,6 @@ from pipeline.export.geopackage import (
     TILE,
     GeoPackage,
     Layer,
-    kind_of,
     stored_batch,
     stored_field,
 )
@@ -37,9 +37,7 @@ from pipeline.export.solid_geometry import SOLID_COLUMNS
 from pipeline.model import Reason, Status
 from pipeline.terrain.candidates import REASON_OF_FAULT
 
-RECORDS = Path(__file__).resolve().parents[2] / "docs" / "reference" / "records.md"
 AT = dt.datetime(2026, 1, 2, 3, 4, 5, 678_901, tzinfo=dt.UTC)
-EPOCH = dt.datetime(1980, 1, 6, tzinfo=dt.UTC)
 COMPOUND = pyproj.CRS.from_epsg(7415)
 BY_NAME = {layer.name: layer for layer in LAYERS}
 
@@ -59,49 +57,12 @@ def package(path: Path, wkt: str | None = None) -> GeoPackage:
     return GeoPackage(path=path, wkt=wkt, at=AT, facts={"method": "arrangement"})
 
 
-def polygons(has_z: bool) -> st.SearchStrategy[Any]:
-    """Polygons and MultiPolygons in millimetres, as records hold them, or none."""
-    place = st.integers(0, 10**9).map(lambda mm: mm / 1000.0)
-
-    def triangle(x: float, y: float, z: float) -> shapely.Polygon:
-        corners = [(x, y, z), (x + 1.5, y, z + 0.25), (x, y + 2.125, z)]
-        return shapely.Polygon([corner if has_z else corner[:2] for corner in corners])
-
-    single = st.builds(triangle, place, place, place)
-    return st.none() | single | st.lists(single, min_size=1, max_size=3).map(shapely.MultiPolygon)
-
-
-def values(field: pa.Field, has_z: bool) -> st.SearchStrategy[Any]:
-    """What a column may hold. C ends a text at its first zero byte, so there is none; figures are finite or null."""
-    if field.name == GEOMETRY:
-        found = polygons(has_z).map(lambda one: None if one is None else shapely.to_wkb(one, flavor="iso"))
-    else:
-        found = {
-            "string": st.text(st.characters(codec="utf-8", exclude_characters="\0")),
-            "bool": st.booleans(),
-            "int32": st.integers(-(2**31), 2**31 - 1),
-            "int64": st.integers(-(2**63), 2**63 - 1),
-            "double": st.floats(allow_nan=False, allow_infinity=False),
-            "timestamp": st.integers(0, 4 * 10**15).map(lambda us: EPOCH + dt.timedelta(microseconds=us)),
-            "binary": st.binary(),
-            "list": st.lists(_items(field.type)),
-        }[kind_of(field.type)]
-    return found if not field.nullable else st.none() | found
-
-
-def _items(kind: pa.DataType) -> st.SearchStrategy[Any]:
-    """The items of a list, none of which is missing."""
-    if not pa.types.is_list(kind):
-        return st.nothing()
-    return values(pa.field("item", kind.value_type, nullable=False), False)
-
-
 @st.composite
 def tables(draw: st.DrawFn, layer: Layer) -> pa.Table:
     """A table with every column of a layer's table."""
-    columns = [layer.table.field(name) for name in layer.columns]
-    row = st.fixed_dictionaries({one.name: values(one, (layer.geometry_type or "").endswith("Z")) for one in columns})
-    return pa.Table.from_pylist(draw(st.lists(row, max_size=4)), schema=pa.schema(columns))
+    row = rows(layer.table, layer.columns, has_z=(layer.geometry_type or "").endswith("Z"))
+    schema = pa.schema([layer.table.field(name) for name in layer.columns])
+    return pa.Table.from_pylist(draw(st.lists(row, max_size=4)), schema=schema)
 
 
 def expected(value: Any, field: pa.Field) -> Any:
@@ -151,20 +112,17 @@ def test_every_column_reads_back_as_the_documented_types_say(
             assert is_same(expected(one, field), found(other, field)), (column, one, other)
 
 
-def documented_types() -> dict[str, str]:
-    """The table of the reference: type of the records, type in a GeoPackage."""
-    section = RECORDS.read_text().split("## Types in a GeoPackage")[1].split("\n## ")[0]
-    return dict(re.findall(r"^\| `([\w<>]+)` \| `(\w+)` \|", section, re.MULTILINE))
-
-
-def test_the_reference_documents_the_types_and_the_file_has_them(tmp_path: Path) -> None:
-    assert {name.partition("<")[0]: kind for name, kind in documented_types().items()} == STORED_TYPES
+def test_the_file_has_the_documented_types_and_says_what_each_column_means(tmp_path: Path) -> None:
+    assert tuple(STORED_TYPES) == KINDS
     for layer in LAYERS:
         path = written(tmp_path / f"{layer.name}.gpkg", layer, layer.table.empty_table())
         with sqlite3.connect(path) as file:
             columns = {row[1]: row[2] for row in file.execute(f'PRAGMA table_info("{layer.name}")')}
+            comments = dict(file.execute("SELECT column_name, description FROM gpkg_data_columns"))
         for name in set(layer.columns) - {GEOMETRY}:
             assert columns[name] == STORED_TYPES[kind_of(layer.table.field(name).type)], name
+        meant = {one.name: one.comment for one in (*COLUMNS[layer.name], TILE_COLUMN)}
+        assert comments == {name: meant[name] for name in (*layer.columns, TILE) if name != GEOMETRY}
 
 
 def test_a_column_that_no_type_can_hold_is_refused_by_name() -> None:

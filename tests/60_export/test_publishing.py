@@ -9,9 +9,10 @@ from typing import Any
 
 import pyarrow as pa
 import pyogrio
+import pyproj
 import pytest
 from command_line import invoke
-from small_runs import moved, street, write_run
+from small_runs import content, moved, restated, street, write_run, write_whole_run
 
 import pipeline.runtime.publishing as publishing
 from pipeline.errors import RunError, SettingsError
@@ -22,29 +23,14 @@ from pipeline.export.records import KEYS
 from pipeline.export.tile import write_tile
 from pipeline.io import storage_at
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.manifest import RunStatus, read_manifest, write_manifest
-from pipeline.runtime.publishing import publish_cityjson, publish_geopackage
+from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.publishing import publish_cityjson, publish_geopackage, publish_pmtiles
 
 
 @pytest.fixture
 def run_dir(tmp_path: Path) -> Path:
     """A finished run of four buildings on two tiles, whose states list their files."""
-    folder = write_run(tmp_path / "run", street())
-    for tile in ("t1", "t2"):
-        files = {str(path.relative_to(folder)): "0" for path in folder.rglob(f"tile={tile}/*")}
-        state = {"tile": tile, "state": "done", "error": "", "files": files}
-        storage_at(folder).put(f"state/{tile}.json", json.dumps(state).encode())
-    return folder
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    """All files below a folder."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def restated(run_dir: Path, **changes: Any) -> None:
-    """Change the manifest of a run."""
-    write_manifest(run_dir, dataclasses.replace(read_manifest(run_dir), **changes))
+    return write_whole_run(tmp_path / "run")
 
 
 def test_every_row_is_published_and_the_run_stays_as_it_is(run_dir: Path, tmp_path: Path) -> None:
@@ -298,10 +284,13 @@ def test_cityjson_takes_the_tables_files_alone_and_any_text(run_dir: Path, tmp_p
     assert text in {thing["attributes"]["status"] for thing in city["CityObjects"].values() if "attributes" in thing}
 
 
-@pytest.mark.parametrize("write", [publish_geopackage, publish_cityjson])
-def test_a_place_that_cannot_be_written_is_named(run_dir: Path, write: Callable[..., Any]) -> None:
+@pytest.mark.parametrize(
+    ("write", "name"), [(publish_geopackage, "out.gpkg"), (publish_cityjson, "out"), (publish_pmtiles, "out.pmtiles")]
+)
+def test_a_place_that_cannot_be_written_is_named(run_dir: Path, write: Callable[..., Any], name: str) -> None:
+    restated(run_dir, crs={"wkt": pyproj.CRS.from_epsg(25832).to_wkt()})
     with pytest.raises(RunError, match="/proc/nothing"):
-        write(str(run_dir), "/proc/nothing/out.gpkg")
+        write(str(run_dir), f"/proc/nothing/{name}")
 
 
 @pytest.mark.slow

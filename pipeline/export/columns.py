@@ -1,0 +1,396 @@
+"""Every column of the tables of a run: name, type, unit and meaning, in one place.
+
+The schemas of the tables, the reference page, the comments in a GeoPackage and the fields of other formats are made
+from these lists. A column has the same name in every format; `docs/reference/columns.md` says what its type becomes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+
+import pyarrow as pa
+
+TEXT, BOOL, INT32, INT64, FLOAT64 = pa.string(), pa.bool_(), pa.int32(), pa.int64(), pa.float64()
+TIME, WKB = pa.timestamp("us", tz="UTC"), pa.binary()
+INT32S, TEXTS, FLOAT64S = pa.list_(INT32), pa.list_(TEXT), pa.list_(FLOAT64)
+
+NONE = ""
+"""Unit of what has none."""
+SHARE, COUNT = "share", "count"
+"""Units of a number from 0 to 1 (a `footprint_share` may be more), and of a number of things."""
+HORIZONTAL, VERTICAL = "CRS", "CRS, vertical"
+"""Units of coordinates: the horizontal and the vertical unit of the run's CRS."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """One column of a table."""
+
+    name: str
+    """Its name, the same in every format."""
+    kind: pa.DataType
+    """Its type in the run's own tables."""
+    unit: str
+    """Its unit; empty if it has none."""
+    meaning: str
+    """What it holds and when it is null, for people; without links."""
+    page: str = ""
+    """The page that says more, relative to docs/reference; empty if there is none."""
+    required: bool = dataclasses.field(default=False, kw_only=True)
+    """Whether every row has a value."""
+
+    @property
+    def comment(self) -> str:
+        """Meaning and unit in one sentence, for formats that hold a comment per column.
+
+        >>> Column("height_m", FLOAT64, "m", "ridge above floor").comment
+        'ridge above floor [m]'
+        """
+        return f"{self.meaning} [{self.unit}]" if self.unit else self.meaning
+
+
+BUILDINGS = (
+    Column(
+        "building_id",
+        TEXT,
+        NONE,
+        "base32 of a sha256 over the CRS and the candidate's smallest point: the same for every method, "
+        "tiling and number of workers",
+        required=True,
+    ),
+    Column("source_id", TEXT, NONE, "id of the given footprint; null without footprints"),
+    Column("source_attributes", TEXT, NONE, "the given footprint's columns as a JSON object; null without footprints"),
+    Column("status", TEXT, NONE, "`ok`, `fallback` or `failed`", page="records.md#status", required=True),
+    Column(
+        "reason", TEXT, NONE, "why the status is not `ok`, from a closed list; null if it is", page="records.md#reasons"
+    ),
+    Column("reason_detail", TEXT, NONE, "measured figure and threshold, as a sentence", required=True),
+    Column(
+        "overridden",
+        TEXT,
+        NONE,
+        "what the overrides changed: `accept`, `footprint`, `method`, several with commas; null if nothing",
+        page="../how_to/overrides.md",
+    ),
+    Column("method", TEXT, NONE, "name of the method, such as `fuzzy-sart`", required=True),
+    Column(
+        "roof_type",
+        TEXT,
+        NONE,
+        "`flat`, `pent`, `gable`, `hip`, `combination`, `unknown`, or `none` without a model",
+        required=True,
+    ),
+    Column(
+        "geometry",
+        WKB,
+        HORIZONTAL,
+        "footprint: the outline of the delivered solids, 2D; null if the points span no area",
+    ),
+    Column(
+        "lod",
+        TEXT,
+        NONE,
+        "level of detail of the model: the finest requested (`2.2` by default), `1.2` for a fallback block, "
+        "null without a model",
+    ),
+    Column(
+        "solid",
+        WKB,
+        HORIZONTAL,
+        "the solids: a MultiPolygon Z with one polygon per face, oriented outward; null without a model",
+        page="../how_to/solids_and_meshes.md#solids-in-geoparquet",
+    ),
+    Column("solid_parts", INT32S, NONE, "number of the solid that each polygon of `solid` belongs to, from 0"),
+    Column("solid_surfaces", TEXTS, NONE, "kind of each polygon: `RoofSurface`, `WallSurface` or `GroundSurface`"),
+    Column("solid_planes", INT32S, NONE, "`plane_id` of each polygon; -1 on walls and ground"),
+    Column(
+        "solid_lod12",
+        WKB,
+        HORIZONTAL,
+        "the solids in LoD1.2 beside a finer model, like `solid`; null if not requested, and if `solid` "
+        "itself has this level",
+        page="../how_to/solids_and_meshes.md#levels-of-detail",
+    ),
+    Column("solid_lod12_parts", INT32S, NONE, "like `solid_parts`"),
+    Column("solid_lod12_surfaces", TEXTS, NONE, "like `solid_surfaces`"),
+    Column("solid_lod13", WKB, HORIZONTAL, "the solids in LoD1.3, like `solid_lod12`"),
+    Column("solid_lod13_parts", INT32S, NONE, "like `solid_parts`"),
+    Column("solid_lod13_surfaces", TEXTS, NONE, "like `solid_surfaces`"),
+    Column("ground_z", FLOAT64, VERTICAL, "elevation of the floor: the lowest terrain at the outline"),
+    Column("eave_z", FLOAT64, VERTICAL, "median elevation of the eave edges, weighted by roof area"),
+    Column("ridge_z", FLOAT64, VERTICAL, "highest roof point"),
+    Column("h_min", FLOAT64, VERTICAL, "elevation of the lowest roof point"),
+    Column("h_50p", FLOAT64, VERTICAL, "median elevation of the roof over plan area"),
+    Column("h_70p", FLOAT64, VERTICAL, "70th percentile of the roof's elevation over plan area"),
+    Column("h_max", FLOAT64, VERTICAL, "elevation of the highest roof point"),
+    Column("height_m", FLOAT64, "m", "ridge above floor"),
+    Column("footprint_area_m2", FLOAT64, "m2", "plan area"),
+    Column(
+        "footprint_share",
+        FLOAT64,
+        SHARE,
+        "plan area over that of the given footprint: 1 if the model fills it, less if a part without points "
+        "was left out, more only if a block uses its convex hull; null without a given footprint or without a"
+        " model",
+        page="../methods/solids.md#parts-without-points",
+    ),
+    Column("roof_area_m2", FLOAT64, "m2", "true (slanted) area of all roof faces"),
+    Column("volume_m3", FLOAT64, "m3", "volume of the solids"),
+    Column("n_points", INT64, COUNT, "points of the candidate", required=True),
+    Column("density_per_m2", FLOAT64, "1/m2", "points per square metre of footprint"),
+    Column(
+        "through_share",
+        FLOAT64,
+        SHARE,
+        "share of the points whose pulse went on to a later return: pulses go through leaves and not through "
+        "roofs; null without points",
+    ),
+    Column(
+        "detection_confidence",
+        FLOAT64,
+        SHARE,
+        "probability, from 0 to 1, that this object is a building; null without a model, and if a given "
+        "footprint or an override (`accept`, `footprint`) says that it is one",
+        page="records.md#confidence-of-a-detection",
+    ),
+    Column("n_planes", INT32, COUNT, "delivered roof planes", required=True),
+    Column(
+        "rmse_m",
+        FLOAT64,
+        "m",
+        "root mean square vertical distance of the candidate's original points to the model's top surface",
+    ),
+    Column("p95_m", FLOAT64, "m", "95th percentile of the absolute distances"),
+    Column("coverage", FLOAT64, SHARE, "share of the points that have a roof above or below them"),
+    Column("point_spacing_m", FLOAT64, "m", "typical distance of neighbouring roof points in plan"),
+    Column(
+        "noise_m",
+        FLOAT64,
+        "m",
+        "robust standard deviation of the points about the roof (1.4826 times the median absolute residual); "
+        "null for a block",
+    ),
+    Column(
+        "share_within_0_2m", FLOAT64, SHARE, "share of all points that have a roof within 0.2 m above or below them"
+    ),
+    Column(
+        "unexplained_m2",
+        FLOAT64,
+        "m2",
+        "plan area of roof that is farther than 1.5 point spacings from every point within 0.2 m of the roof",
+    ),
+    Column(
+        "largest_hole_m",
+        FLOAT64,
+        "m",
+        "diameter of the largest circle about a place on the roof that holds no point in plan",
+    ),
+    Column(
+        "ridge_z_sigma_m",
+        FLOAT64,
+        "m",
+        "standard deviation of `ridge_z` in metres; null for a block",
+        page="records.md#uncertainty-of-the-ridge",
+    ),
+    Column(
+        "bic_margin",
+        FLOAT64,
+        NONE,
+        "information criterion of the other form (templates or arrangement) minus that of the chosen form; "
+        "negative if the better one made no valid solid; null if none competed or a third form was delivered",
+    ),
+    Column(
+        "is_curved",
+        BOOL,
+        NONE,
+        "at least half of the roof is one surface that bends steadily outwards (a dome, a barrel, a cone), "
+        "modelled as many planes: at least five directions, each next plane turned by 3 to 26 deg",
+        required=True,
+    ),
+    Column(
+        "valid", BOOL, NONE, "a model was delivered, so it passed the ISO 19107 rules after rounding", required=True
+    ),
+    Column(
+        "validity_codes",
+        INT32S,
+        NONE,
+        "codes of the faults that prevented delivery of the method's own solid; empty if there were none",
+        page="validity.md",
+        required=True,
+    ),
+    Column("touches_data_edge", BOOL, NONE, "the data end at this building, so it may be cut", required=True),
+    Column(
+        "strip_offset_m",
+        FLOAT64,
+        "m",
+        "largest offset between two flight strips that was taken out of the points before modelling; null if "
+        "the strips fit or do not show an offset",
+        page="../methods/strips.md",
+    ),
+    Column(
+        "wall_outline",
+        WKB,
+        HORIZONTAL,
+        "outline of the walls beneath a footprint at the eaves, ISO WKB (MultiPolygon); with `wall_outline = "
+        "true`, null if no wall was seen",
+        page="../methods/footprints.md",
+    ),
+    Column("overhang_m", FLOAT64, "m", "mean overhang of the eaves along the walls that were seen, weighted by length"),
+    Column(
+        "overhang_sigma_m",
+        FLOAT64,
+        "m",
+        "standard error of `overhang_m`, from the thickness of the walls' points and the differences between walls",
+    ),
+    Column("acquired_from", TIME, NONE, "earliest acquisition; null if the file has no absolute time"),
+    Column("acquired_to", TIME, NONE, "latest acquisition"),
+    Column("mesh_path", TEXT, NONE, "the OBJ or GLB file, relative to the run directory; null without one"),
+    Column("input_hash", TEXT, NONE, "sha256 of the candidate's ordered points and ground"),
+    Column(
+        "settings_hash",
+        TEXT,
+        NONE,
+        "sha256 of the settings that can change geometry; of this building's own settings if an override set some",
+        required=True,
+    ),
+    Column("engine_version", TEXT, NONE, "version of gablework", required=True),
+)
+"""One row per candidate."""
+
+PLANES = (
+    Column("building_id", TEXT, NONE, "the building", required=True),
+    Column(
+        "plane_id",
+        INT32,
+        NONE,
+        "number of the plane within its building, from 0; also its material in the OBJ",
+        required=True,
+    ),
+    Column("geometry", WKB, HORIZONTAL, "the roof face in 3D; a MultiPolygon if the plane has several"),
+    Column(
+        "slope_deg",
+        FLOAT64,
+        "deg",
+        "0 is horizontal; a true angle, even if horizontal and vertical units differ",
+        required=True,
+    ),
+    Column(
+        "aspect_deg",
+        FLOAT64,
+        "deg",
+        "direction of steepest descent, clockwise from grid north; 0 for a horizontal plane",
+        required=True,
+    ),
+    Column("o_distance_m", FLOAT64, "m", "signed distance of the plane above the point `origin_*`", required=True),
+    Column("origin_x", FLOAT64, HORIZONTAL, "easting of the local origin", required=True),
+    Column("origin_y", FLOAT64, HORIZONTAL, "northing of the local origin", required=True),
+    Column("origin_z", FLOAT64, VERTICAL, "elevation of the local origin", required=True),
+    Column(
+        "coefficients",
+        FLOAT64S,
+        NONE,
+        "a, b, c, d of a (X - origin_x) + b (Y - origin_y) + c (Z - origin_z) + d = 0, unit normal with c > 0",
+        required=True,
+    ),
+    Column("area_m2", FLOAT64, "m2", "true (slanted) area", required=True),
+    Column("n_points", INT64, COUNT, "points that support the plane", required=True),
+    Column("rmse_m", FLOAT64, "m", "root mean square of the vertical residuals of these points"),
+)
+"""One row per roof plane."""
+
+REJECTED = (
+    Column("object_id", TEXT, NONE, "made like a `building_id`", required=True),
+    Column(
+        "reason", TEXT, NONE, "why it is not a building, from a closed list", page="records.md#reasons", required=True
+    ),
+    Column("reason_detail", TEXT, NONE, "the measured figure and the threshold", required=True),
+    Column("geometry", WKB, HORIZONTAL, "the box around it"),
+    Column("area_m2", FLOAT64, "m2", "plan area; null if not measured"),
+    Column("height_m", FLOAT64, "m", "height above ground; null if not measured"),
+    Column("n_points", INT64, COUNT, "points of the object", required=True),
+    Column("settings_hash", TEXT, NONE, "sha256 of the settings that can change geometry", required=True),
+    Column("engine_version", TEXT, NONE, "version of gablework", required=True),
+)
+"""One row per object that was judged not to be a building: its id is made as a building's."""
+
+DECISIONS = (
+    Column("building_id", TEXT, NONE, "the building", required=True),
+    Column("step", INT32, NONE, "order of the attempts, from 0", required=True),
+    Column(
+        "kind",
+        TEXT,
+        NONE,
+        "`check` (a figure and its limit), `form` (of the roof) or `level` (of detail)",
+        required=True,
+    ),
+    Column(
+        "name", TEXT, NONE, "the figure, the form or the level", page="../run_directory.md#decisions", required=True
+    ),
+    Column(
+        "outcome",
+        TEXT,
+        NONE,
+        "a check is `met` or `missed`; a form is `chosen`, `outdone` (another was better), `invalid` (its "
+        "solids have faults), `undrawable`, or `withdrawn` (sound, but not delivered: too few points explain "
+        "it, or a level of detail failed); a level is `chosen` or `undrawable`",
+        required=True,
+    ),
+    Column("detail", TEXT, NONE, "how the form was drawn and cleaned up, or why it was refused", required=True),
+    Column("value", FLOAT64, NONE, "the figure of a check; it is `met` from the limit on"),
+    Column("limit", FLOAT64, NONE, "the figure of a check; it is `met` from the limit on"),
+    Column("n_faces", INT32, COUNT, "roof faces and roof planes of a form that was drawn"),
+    Column("n_planes", INT32, COUNT, "roof faces and roof planes of a form that was drawn"),
+    Column(
+        "levelled_share",
+        FLOAT64,
+        SHARE,
+        "share of the plan whose faces were made level, since their planes left the points",
+    ),
+    Column(
+        "explained_share",
+        FLOAT64,
+        SHARE,
+        "share of the roof points near the faces; only where forms were compared by it",
+    ),
+    Column(
+        "bic_margin",
+        FLOAT64,
+        NONE,
+        "by how much the information criterion is below that of the form it competed with; negative where it is above",
+    ),
+    Column("validity_codes", INT32S, NONE, "codes of the faults of an `invalid` form", required=True),
+)
+"""One row per check, form and level of detail of each building."""
+
+
+COLUMNS: Mapping[str, tuple[Column, ...]] = {
+    "buildings": BUILDINGS,
+    "planes": PLANES,
+    "rejected": REJECTED,
+    "decisions": DECISIONS,
+}
+"""The columns of each table, in the order of its files; `bbox`, which covers the geometry, is no part of the record."""
+
+TILE_COLUMN = Column("tile", TEXT, NONE, "key of the tile on the lattice, such as `x85_y447`", required=True)
+"""The column that the names of a run's folders hold; other formats have it as a column of its own."""
+
+
+KINDS = ("string", "bool", "int32", "int64", "double", "timestamp", "binary", "list")
+"""The types of all columns by their names (`kind_of`); every format says what it makes of each."""
+
+
+def schema_of(columns: Iterable[Column]) -> pa.Schema:
+    """The Arrow schema of some columns, in their order."""
+    return pa.schema([pa.field(one.name, one.kind, nullable=not one.required) for one in columns])
+
+
+def kind_of(kind: pa.DataType) -> str:
+    """The name of a column's type in the reference and in the mappings of the formats.
+
+    >>> kind_of(pa.list_(pa.int32())), kind_of(pa.timestamp("us", tz="UTC")), kind_of(pa.uint64())
+    ('list', 'timestamp', 'uint64')
+    """
+    if pa.types.is_timestamp(kind):
+        return "timestamp"
+    return "list" if pa.types.is_list(kind) else str(kind)

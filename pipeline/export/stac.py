@@ -1,0 +1,256 @@
+"""A STAC catalogue of a run: a Collection for the run and an Item per tile, since a run's files are per tile.
+
+STAC 1.1 with the extensions projection, processing, file and table. Places are in longitude and latitude.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime as dt
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+import shapely
+
+from pipeline.export.columns import COLUMNS, kind_of
+from pipeline.export.projection import Project
+
+VERSION = "1.1.0"
+"""Version of STAC."""
+CRS = "OGC:CRS84"
+"""The CRS of places in STAC."""
+COLLECTION = "collection.json"
+"""File name of the Collection."""
+_EXTENSIONS = "https://stac-extensions.github.io"
+PROJECTION = f"{_EXTENSIONS}/projection/v2.0.0/schema.json"
+PROCESSING = f"{_EXTENSIONS}/processing/v1.2.0/schema.json"
+FILE = f"{_EXTENSIONS}/file/v2.1.0/schema.json"
+TABLE = f"{_EXTENSIONS}/table/v1.2.0/schema.json"
+
+_PARQUET = "application/vnd.apache.parquet"
+ASSETS: Mapping[str, tuple[str, str, str]] = {
+    "buildings": (_PARQUET, "data", "GeoParquet: one row per candidate, footprint and solids"),
+    "planes": (_PARQUET, "data", "GeoParquet: one row per roof plane"),
+    "rejected": (_PARQUET, "metadata", "GeoParquet: objects that are not buildings, with the reason"),
+    "decisions": (_PARQUET, "metadata", "Parquet: what was checked and tried for each building"),
+    "cityjson": ("application/city+json-seq", "data", "CityJSONSeq 2.0: solids with semantic surfaces"),
+    "mesh": ("", "data", "the meshes of all buildings"),
+    "mesh-lod12": ("", "data", "the meshes of all buildings in LoD1.2"),
+    "mesh-lod13": ("", "data", "the meshes of all buildings in LoD1.3"),
+}
+"""Media type, role and title of the assets of an Item; meshes have the type of their ending."""
+_MESHES = {".glb": "model/gltf-binary", ".obj": "model/obj"}
+DOCUMENTS: Mapping[str, tuple[str, str, str, str]] = {
+    "run.json": ("run", "application/json", "metadata", "settings, version, inputs, counts and warnings of the run"),
+    "run.html": ("page", "text/html", "overview", "page about the run"),
+    "points/tileset.json": ("points", "application/json", "visual", "3D Tiles: the points over the models"),
+}
+"""Name, media type, role and title of the assets of a Collection, by their files in the run directory."""
+_SPDX = re.compile(r"[A-Za-z0-9.+-]+")
+"""What an SPDX identifier may be."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run:
+    """What Collection and Items say about a run."""
+
+    name: str
+    """Name of the run: the id of the Collection."""
+    version: str
+    """Version of the program."""
+    method: str
+    """Name of the method."""
+    finished_at: dt.datetime
+    """When the models were made."""
+    licence: str | None
+    """Licence of the source data in the user's words; None if unknown."""
+    crs: Mapping[str, Any]
+    """The CRS, as a manifest holds it."""
+
+    @property
+    def lineage(self) -> str:
+        """How the models came to be, in a sentence."""
+        return f"LoD2 building models from airborne laser scanning by gablework {self.version}, method {self.method}"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TileFacts:
+    """What an Item says about a tile."""
+
+    key: str
+    """Key of the tile: the id of the Item."""
+    files: Mapping[str, str]
+    """The sha256 of its files by their paths in the run directory."""
+    bounds: tuple[float, float, float, float]
+    """Smallest x and y, largest x and y of its buildings and rejected objects, in CRS units."""
+    acquired: tuple[dt.datetime, dt.datetime] | None
+    """First and last acquisition of its buildings; None if unknown."""
+    rows: Mapping[str, int]
+    """Rows of its tables."""
+
+
+def item_name(tile: str) -> str:
+    """The file of a tile's Item in the catalogue.
+
+    >>> item_name("x85_y447")
+    'x85_y447/x85_y447.json'
+    """
+    return f"{tile}/{tile}.json"
+
+
+def asset_name(path: str, tile: str) -> str | None:
+    """The asset that a file of a tile is; None for the meshes of single buildings, which are too many to list.
+
+    >>> asset_name("planes/tile=t1/part-0.parquet", "t1"), asset_name("meshes/t1/t1-lod12.glb", "t1")
+    ('planes', 'mesh-lod12')
+    >>> asset_name("meshes/t1/abc.obj", "t1") is None
+    True
+    """
+    folder, stem = path.partition("/")[0], PurePosixPath(path).stem
+    name = stem.replace(tile, "mesh", 1) if folder == "meshes" and stem.startswith(tile) else folder
+    return name if name in ASSETS else None
+
+
+def item(tile: TileFacts, run: Run, project: Project, href: str) -> dict[str, Any]:
+    """The Item of a tile.
+
+    Parameters
+    ----------
+    tile : TileFacts
+        The tile.
+    run : Run
+        Its run.
+    project : callable
+        From the run's horizontal CRS to `CRS`.
+    href : str
+        The run directory as seen from the Item, ending in a slash.
+    """
+    place = shapely.transform(shapely.box(*tile.bounds), project)
+    return {
+        "type": "Feature",
+        "stac_version": VERSION,
+        "stac_extensions": [PROJECTION, PROCESSING, FILE, TABLE],
+        "id": tile.key,
+        "collection": run.name,
+        "bbox": _rounded(shapely.bounds(place)),
+        "geometry": shapely.geometry.mapping(shapely.set_precision(place, 1e-7)),
+        "properties": {
+            "title": f"Buildings of tile {tile.key}",
+            **_times(tile, run),
+            "proj:code": None if run.crs.get("epsg") is None else f"EPSG:{run.crs['epsg']}",
+            "proj:wkt2": run.crs["wkt"],
+            "proj:bbox": list(tile.bounds),
+            "processing:software": {"gablework": run.version},
+            "processing:datetime": _zulu(run.finished_at),
+            "processing:lineage": run.lineage,
+            "license": _licence(run),
+        },
+        "links": [_link(rel, f"../{COLLECTION}") for rel in ("root", "parent", "collection")],
+        "assets": {
+            name: _asset(name, path, digest, href) | _row_count(tile.rows.get(name))
+            for path, digest in sorted(tile.files.items())
+            if (name := asset_name(path, tile.key)) is not None
+        },
+    }
+
+
+def collection(run: Run, items: Sequence[Mapping[str, Any]], documents: Sequence[str], href: str) -> dict[str, Any]:
+    """The Collection of a run.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    items : sequence of mapping
+        `id`, `bbox` and times of its Items, at least one.
+    documents : sequence of str
+        Files of the run as a whole that exist, by their paths in it.
+    href : str
+        The run directory as seen from the Collection, ending in a slash.
+    """
+    boxes = np.array([one["bbox"] for one in items])
+    times = sorted(one["properties"].get("start_datetime") or one["properties"]["datetime"] for one in items)
+    ends = sorted(one["properties"].get("end_datetime") or one["properties"]["datetime"] for one in items)
+    return {
+        "type": "Collection",
+        "stac_version": VERSION,
+        "stac_extensions": [TABLE],
+        "id": run.name,
+        "title": f"Building models {run.name}",
+        "description": f"{run.lineage}. Licence of the source data: {run.licence or 'unknown'}.",
+        "license": _licence(run),
+        "extent": {
+            "spatial": {"bbox": [[*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]]},
+            "temporal": {"interval": [[times[0], ends[-1]]]},
+        },
+        "item_assets": {
+            name: {**_described(ASSETS[name]), "table:columns": _columns(name)} for name in ASSETS if name in COLUMNS
+        },
+        "links": [
+            _link("root", f"./{COLLECTION}"),
+            *([_link("license", run.licence, "text/html")] if _is_url(run.licence) else []),
+            *(_link("item", f"./{item_name(one['id'])}", "application/geo+json") for one in items),
+        ],
+        "assets": {
+            name: {"href": href + path, **_described(words)}
+            for path, (name, *words) in DOCUMENTS.items()
+            if path in documents
+        },
+    }
+
+
+def _times(tile: TileFacts, run: Run) -> dict[str, str | None]:
+    """When the points were measured; if that is unknown, when the models were made."""
+    if tile.acquired is None:
+        return {"datetime": _zulu(run.finished_at)}
+    return {"datetime": None, "start_datetime": _zulu(tile.acquired[0]), "end_datetime": _zulu(tile.acquired[1])}
+
+
+def _zulu(at: dt.datetime) -> str:
+    """A time as STAC writes it: UTC, with a Z."""
+    return at.astimezone(dt.UTC).isoformat().replace("+00:00", "Z")
+
+
+def _licence(run: Run) -> str:
+    """The licence as an SPDX identifier; `other` if it is unknown or in other words."""
+    return run.licence if run.licence and _SPDX.fullmatch(run.licence) else "other"
+
+
+def _is_url(licence: str | None) -> bool:
+    """Whether the licence is the address of its text."""
+    return bool(licence and licence.startswith(("https://", "http://")))
+
+
+def _link(rel: str, href: str | None, kind: str = "application/json") -> dict[str, Any]:
+    """A link of an object."""
+    return {"rel": rel, "href": href, "type": kind}
+
+
+def _described(words: Sequence[str]) -> dict[str, Any]:
+    """Type, roles and title of an asset."""
+    return {"type": words[0], "roles": [words[1]], "title": words[2]}
+
+
+def _asset(name: str, path: str, digest: str, href: str) -> dict[str, Any]:
+    """A file as an asset, with its sha256 as a multihash."""
+    kind, role, title = ASSETS[name]
+    words = (kind or _MESHES[PurePosixPath(path).suffix], role, title)
+    return {"href": href + path, **_described(words), "file:checksum": f"1220{digest}"}
+
+
+def _row_count(rows: int | None) -> dict[str, int]:
+    """The number of rows of a table."""
+    return {} if rows is None else {"table:row_count": rows}
+
+
+def _columns(table: str) -> list[dict[str, str]]:
+    """The columns of a table with their meanings."""
+    return [{"name": one.name, "type": kind_of(one.kind), "description": one.comment} for one in COLUMNS[table]]
+
+
+def _rounded(bounds: Any) -> list[float]:
+    """Degrees, to about a centimetre."""
+    return [round(float(degrees), 7) for degrees in bounds]

@@ -1,0 +1,220 @@
+"""STAC: a valid catalogue whose files, places and times are those of the run."""
+
+import datetime as dt
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+import pystac
+import pytest
+import shapely
+from command_line import invoke
+from pystac.extensions.projection import ProjectionExtension
+from pystac.extensions.table import TableExtension
+from pystac.validation.stac_validator import JsonSchemaSTACValidator
+from small_runs import content, restated, write_run, write_whole_run
+
+from pipeline.errors import RunError, SettingsError
+from pipeline.export import stac
+from pipeline.export.columns import COLUMNS
+from pipeline.export.geoparquet import read_table
+from pipeline.io import storage_at
+from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.publishing import publish_stac
+
+RD = {"wkt": pyproj.CRS.from_epsg(7415).to_wkt(), "epsg": 7415, "horizontal_unit_m": 1.0, "vertical_unit_m": 1.0}
+MADE = dt.datetime(2026, 1, 1, 2, tzinfo=dt.UTC)
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+    """A finished run of four buildings on two tiles in the Netherlands."""
+    run = write_whole_run(tmp_path / "my models")
+    restated(run, crs=RD, finished_at=MADE, source_licence="CC-BY-4.0", tiles=("t1", "t2"))
+    return run
+
+
+def validated(path: Path) -> dict[str, Any]:
+    """A Collection or Item that meets the schema of the core, which pystac brings; nothing is fetched."""
+    document: dict[str, Any] = json.loads(path.read_text())
+    kind = pystac.STACObjectType.COLLECTION if document["type"] == "Collection" else pystac.STACObjectType.ITEM
+    assert document["stac_version"] == "1.1.0"
+    assert JsonSchemaSTACValidator().validate_core(document, kind, "1.1.0", str(path))
+    return document
+
+
+def test_the_catalogue_is_valid_and_its_links_lead_somewhere(run_dir: Path, tmp_path: Path) -> None:
+    before, out = content(run_dir), tmp_path / "new" / "catalogue"
+    published = publish_stac(str(run_dir), str(out))
+    assert content(run_dir) == before
+    assert set(content(out)) == {"collection.json", "t1/t1.json", "t2/t2.json"}
+    assert (published.place, published.rows) == (str(out), {"items": 2})
+    assert published.size_bytes == sum(map(len, content(out).values()))
+    assert list(out.parent.iterdir()) == [out]
+    for name in content(out):
+        validated(out / name)
+    collection = pystac.Collection.from_file(str(out / "collection.json"))
+    assert (collection.id, collection.license) == ("my models", "CC-BY-4.0")
+    items = list(collection.get_items())
+    assert [item.id for item in items] == ["t1", "t2"]
+    assert all(item.get_collection() is collection for item in items)
+
+
+def test_the_validator_would_find_a_fault(run_dir: Path, tmp_path: Path) -> None:
+    publish_stac(str(run_dir), str(tmp_path / "out"))
+    path = tmp_path / "out" / "t1" / "t1.json"
+    path.write_text(path.read_text().replace('"datetime"', '"when"'))
+    with pytest.raises(pystac.STACValidationError, match="datetime"):
+        validated(path)
+
+
+def test_assets_are_the_files_of_the_run_with_their_digests(run_dir: Path, tmp_path: Path) -> None:
+    publish_stac(str(run_dir), str(tmp_path / "out"))
+    for tile in ("t1", "t2"):
+        path = tmp_path / "out" / tile / f"{tile}.json"
+        item = pystac.Item.from_file(str(path))
+        assert set(item.assets) == {"buildings", "planes", "rejected", "decisions", "cityjson"}
+        for name, asset in item.assets.items():
+            assert "my%20models" in asset.href
+            data = Path(pystac.utils.make_absolute_href(asset.href, str(path)).replace("%20", " ")).read_bytes()
+            assert asset.extra_fields["file:checksum"] == f"1220{hashlib.sha256(data).hexdigest()}"
+            assert (data[:4] == b"PAR1") == (asset.media_type == "application/vnd.apache.parquet")
+            if name in {"buildings", "rejected"}:
+                rows = read_table(str(run_dir), name)["tile"].to_pylist().count(tile)
+                assert asset.extra_fields["table:row_count"] == rows
+
+
+def test_places_cover_the_buildings(run_dir: Path, tmp_path: Path) -> None:
+    publish_stac(str(run_dir), str(tmp_path / "out"))
+    collection = pystac.Collection.from_file(str(tmp_path / "out" / "collection.json"))
+    to_degrees = pyproj.Transformer.from_crs(28992, "OGC:CRS84", always_xy=True).transform
+    table = read_table(str(run_dir), "buildings").to_pylist()
+    for item in collection.get_items():
+        assert item.geometry is not None
+        assert item.bbox == pytest.approx(shapely.bounds(shapely.geometry.shape(item.geometry)), abs=2e-7)
+        inside = [shapely.from_wkb(row["geometry"]) for row in table if row["tile"] == item.id and row["geometry"]]
+        shown = shapely.transform(inside, to_degrees, interleaved=False)
+        assert shapely.covers(shapely.buffer(shapely.geometry.shape(item.geometry), 1e-6), shown).all()
+        projection = ProjectionExtension.ext(item)
+        assert (projection.code, projection.wkt2) == ("EPSG:7415", RD["wkt"])
+        assert projection.bbox is not None
+        assert shapely.covers(shapely.box(*projection.bbox), inside).all()
+    boxes = np.array([item.bbox for item in collection.get_items()])
+    assert collection.extent.spatial.bboxes == [[*boxes[:, :2].min(axis=0), *boxes[:, 2:].max(axis=0)]]
+
+
+def test_times_are_those_of_the_points_and_else_that_of_the_run(run_dir: Path, tmp_path: Path) -> None:
+    publish_stac(str(run_dir), str(tmp_path / "out"))
+    unknown = pystac.Item.from_file(str(tmp_path / "out" / "t1" / "t1.json"))
+    assert (unknown.datetime, unknown.properties["processing:datetime"]) == (MADE, "2026-01-01T02:00:00Z")
+    start, end = dt.datetime(2020, 5, 1, tzinfo=dt.UTC), dt.datetime(2020, 5, 2, 1, 2, 3, 4, tzinfo=dt.UTC)
+    run = stac.Run(name="r", version="1", method="m", finished_at=MADE, licence=None, crs=RD)
+    tile = stac.TileFacts(key="t", files={}, bounds=(0.0, 0.0, 1.0, 1.0), acquired=(start, end), rows={})
+    known = stac.item(tile, run, lambda xy: xy, "")["properties"]
+    assert (known["datetime"], known["start_datetime"]) == (None, "2020-05-01T00:00:00Z")
+    assert known["end_datetime"] == "2020-05-02T01:02:03.000004Z"
+    later = stac.item(tile, run, lambda xy: xy, "") | {"id": "u"}
+    collection = stac.collection(run, [later], [], "")
+    assert collection["extent"]["temporal"]["interval"] == [[known["start_datetime"], known["end_datetime"]]]
+
+
+@pytest.mark.parametrize(
+    ("licence", "stated", "link"),
+    [
+        (None, "other", None),
+        ("etalab-2.0", "etalab-2.0", None),
+        ("free for research", "other", None),
+        ("https://example.org/licence", "other", "https://example.org/licence"),
+    ],
+)
+def test_a_licence_in_other_words_is_other_and_stays_readable(
+    run_dir: Path, tmp_path: Path, licence: str | None, stated: str, link: str | None
+) -> None:
+    restated(run_dir, source_licence=licence)
+    publish_stac(str(run_dir), str(tmp_path / "out"))
+    document = validated(tmp_path / "out" / "collection.json")
+    assert document["license"] == stated
+    assert (licence or "unknown") in document["description"]
+    assert next((one["href"] for one in document["links"] if one["rel"] == "license"), None) == link
+
+
+def test_the_collection_describes_every_column(run_dir: Path, tmp_path: Path) -> None:
+    publish_stac(str(run_dir), str(tmp_path / "out"))
+    collection = pystac.Collection.from_file(str(tmp_path / "out" / "collection.json"))
+    assert collection.assets["run"].href.endswith("my%20models/run.json")
+    assert TableExtension.has_extension(collection)
+    for table, columns in COLUMNS.items():
+        described = collection.item_assets[table].properties["table:columns"]
+        assert [(one["name"], one["description"]) for one in described] == [(one.name, one.comment) for one in columns]
+
+
+def test_meshes_of_whole_tiles_are_assets(run_dir: Path, tmp_path: Path) -> None:
+    storage = storage_at(run_dir)
+    state = json.loads(storage.get("state/t1.json"))
+    for name in ("meshes/t1/t1.glb", "meshes/t1/t1-lod12.glb", "meshes/t1/abc.obj"):
+        storage.put(name, b"x")
+        state["files"][name] = "0" * 64
+    storage.put("state/t1.json", json.dumps(state).encode())
+    publish_stac(str(run_dir), str(tmp_path / "out"))
+    assets = validated(tmp_path / "out" / "t1" / "t1.json")["assets"]
+    assert {name: one["type"] for name, one in assets.items() if "mesh" in name} == {
+        "mesh": "model/gltf-binary",
+        "mesh-lod12": "model/gltf-binary",
+    }
+
+
+def test_a_catalogue_is_replaced_only_where_asked_and_never_another_one(run_dir: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    publish_stac(str(run_dir), str(out))
+    (out / "notes.txt").write_text("mine")
+    before = content(out)
+    with pytest.raises(RunError, match=r"holds collection\.json already.*--overwrite"):
+        publish_stac(str(run_dir), str(out))
+    (out / "t1" / "t1.json").write_text("of before")
+    publish_stac(str(run_dir), str(out), overwrite=True)
+    assert content(out) == before
+    (out / "t9").mkdir()
+    (out / "t9" / "t9.json").write_text("{}")
+    with pytest.raises(RunError, match=r"holds t9/t9\.json, which is of no tile of this run"):
+        publish_stac(str(run_dir), str(out), overwrite=True)
+
+
+def test_what_cannot_be_listed_is_refused(run_dir: Path, tmp_path: Path) -> None:
+    out = str(tmp_path / "out")
+    with pytest.raises(SettingsError, match="lies in the run directory"):
+        publish_stac(str(run_dir), str(run_dir / "out"))
+    restated(run_dir, status=RunStatus.CANCELLED)
+    with pytest.raises(RunError, match="is cancelled, not finished"):
+        publish_stac(str(run_dir), out)
+    restated(run_dir, status=RunStatus.FINISHED, crs=None)
+    with pytest.raises(RunError, match="the CRS of the run is unknown"):
+        publish_stac(str(run_dir), out)
+    restated(run_dir, crs=RD)
+    (run_dir / "cityjson" / "tile=t2" / "part-0.city.jsonl").unlink()
+    with pytest.raises(RunError, match=r"tile=t2/part-0\.city\.jsonl of the run .* is gone"):
+        publish_stac(str(run_dir), out)
+    without_states = write_run(tmp_path / "run", [])
+    restated(without_states, crs=RD)
+    with pytest.raises(RunError, match="no tile with files"):
+        publish_stac(str(without_states), out)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_tile_without_objects_is_its_square(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", [])
+    files = {"buildings/tile=x1_y2/part-0.parquet": "0" * 64, "rejected/tile=x1_y2/part-0.parquet": "0" * 64}
+    for name in files:
+        storage_at(run).put(name, (run / name.replace("x1_y2", "t2")).read_bytes())
+    storage_at(run).put("state/x1_y2.json", json.dumps({"tile": "x1_y2", "state": "done", "files": files}).encode())
+    restated(run, crs=RD, lattice={"tile_size_m": 500.0, "origin_x_m": 0.0, "origin_y_m": 0.0})
+    publish_stac(str(run), str(tmp_path / "out"))
+    item = validated(tmp_path / "out" / "x1_y2" / "x1_y2.json")
+    assert item["properties"]["proj:bbox"] == [500.0, 1000.0, 1000.0, 1500.0]
+
+
+def test_the_command_writes_a_catalogue(run_dir: Path, tmp_path: Path) -> None:
+    code, said, _ = invoke("publish", str(run_dir), "--as", "stac", "--out", str(tmp_path / "out"), "--json")
+    assert (code, json.loads(said)["rows"]) == (0, {"items": 2})
