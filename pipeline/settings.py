@@ -47,6 +47,20 @@ class GeneralSettings(Parameters):
         "Use of the classes in the file: trusted, only compared with the result, or ignored.",
         choices=("trust", "audit", "ignore"),
     )
+    terrain: str = parameter(
+        "none",
+        "Terrain that is written beside the buildings: none, or triangles with their outlines cut out.",
+        choices=("none", "tin"),
+        changes_geometry=False,
+    )
+    terrain_tolerance_m: float = parameter(
+        0.1,
+        "How far the triangles of the terrain may be above or below the middle of a cell of the ground.",
+        unit="m",
+        minimum=0.01,
+        maximum=10.0,
+        changes_geometry=False,
+    )
     tile_size_m: float = parameter(
         0.0,
         "Side of the tiles; 0 chooses it from the density. Results do not depend on it.",

@@ -32,6 +32,7 @@ from pipeline.cli.options import (
     Scheduler,
     Scratch,
     SettingsFile,
+    Terrain,
     TlsCa,
     TlsCert,
     TlsKey,
@@ -82,6 +83,7 @@ def reconstruct(
     scratch: Scratch = None,
     meshes: Meshes = "building",
     points: WithPoints = False,
+    terrain: Terrain = None,
     licence: Licence = None,
     overwrite: Overwrite = False,
     isolate: Annotated[bool | None, Isolate] = None,
@@ -105,7 +107,9 @@ def reconstruct(
         request = RunRequest(
             inputs=tuple(tiles),
             out=out,
-            settings=_run_settings(settings, method=method, preset=preset, classes=classes, lods=_in_order(lods)),
+            settings=_run_settings(
+                settings, method=method, preset=preset, classes=classes, lods=_in_order(lods), terrain=terrain
+            ),
             footprints=footprints,
             overrides=overrides,
             crs=crs,
@@ -387,5 +391,7 @@ def show_summary(console: Console, summary: RunSummary) -> None:
         console.warn(f"tile {tile} failed")
     for tile in summary.tiles_without_points:
         console.warn(f"tile {tile} has no points")
+    for tile in summary.tiles_without_terrain:
+        console.warn(f"tile {tile} has no terrain")
     console.say(f"content sha256 {summary.digest}")
     console.say(f"results are in {summary.run_dir}")

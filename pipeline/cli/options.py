@@ -121,6 +121,10 @@ Meshes = Annotated[
 WithPoints = Annotated[
     bool, typer.Option("--points", help="Also write the points as 3D Tiles, with their distances to the models.")
 ]
+Terrain = Annotated[
+    Literal["none", "tin"] | None,
+    typer.Option(help="Also write the terrain: triangles with the buildings cut out; default from the settings."),
+]
 Licence = Annotated[
     str | None, typer.Option(metavar="TEXT", help="Licence of the source data, written into the results.")
 ]

@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.export.coordinates import SpatialReference, crs_coordinates, decimals, epsg_code
 from pipeline.export.obj import part_id
 from pipeline.export.solid_geometry import SHAPE_COLUMNS, SURFACES
-from pipeline.model import BuildingResult, FaceKind, Plane, Solid
+from pipeline.model import BuildingResult, FaceKind, FloatArray, Plane, Solid
 
 VERSION = "2.0"
 """Version of CityJSON."""
@@ -49,43 +49,54 @@ def cityjson_lines(
     is given as `corner`. The record of each building (`building_row`) becomes its attributes; buildings without a solid
     are features without geometry.
     """
-    digits = (
-        decimals(reference.horizontal_unit_m),
-        decimals(reference.horizontal_unit_m),
-        decimals(reference.vertical_unit_m),
-    )
     placed = [
         [crs_coordinates(solid.vertices, result.origin, reference) for solid in _solids(result)] for result, _ in rows
     ]
     corners = [xyz for solids in placed for xyz in solids]
     low = np.min([xyz.min(axis=0) for xyz in corners], axis=0) if corners else np.zeros(3)
     high = np.max([xyz.max(axis=0) for xyz in corners], axis=0) if corners else np.zeros(3)
-    translate = [math.floor(v) for v in (low if corner is None else corner)]
-    metadata: dict[str, Any] = {"title": title}
-    code = epsg_code(reference)
-    if code is not None:
-        metadata["referenceSystem"] = f"https://www.opengis.net/def/crs/EPSG/0/{code}"
-    if corners:
-        metadata["geographicalExtent"] = [float(v) for v in (*low, *high)]
-    yield _json(
-        {
-            "type": "CityJSON",
-            "version": VERSION,
-            "transform": {
-                "scale": [float(f"1e-{d}") for d in digits],
-                "translate": [float(v) for v in translate],
-            },
-            "metadata": metadata,
-            "CityObjects": {},
-            "vertices": [],
-        }
-    )
-    factor = np.array([10**d for d in digits], dtype=np.int64)
+    translate = whole_units(low if corner is None else corner)
+    yield json_line(heading(title, reference, translate, (low, high) if corners else None))
+    factor = np.array([10**d for d in decimals_of(reference)], dtype=np.int64)
     for (result, row), solids in zip(rows, placed, strict=True):
         integers = [
             np.round(xyz * factor).astype(np.int64) - np.array(translate, dtype=np.int64) * factor for xyz in solids
         ]
-        yield _json(_feature(result, row, integers))
+        yield json_line(_feature(result, row, integers))
+
+
+def decimals_of(reference: SpatialReference) -> tuple[int, int, int]:
+    """Decimals of easting, northing and elevation."""
+    plan = decimals(reference.horizontal_unit_m)
+    return plan, plan, decimals(reference.vertical_unit_m)
+
+
+def whole_units(corner: Iterable[float]) -> list[int]:
+    """The translation of a file: whole units at or below a corner."""
+    return [math.floor(value) for value in corner]
+
+
+def heading(
+    title: str, reference: SpatialReference, translate: Sequence[int], extent: tuple[FloatArray, FloatArray] | None
+) -> dict[str, Any]:
+    """The first line of a CityJSONSeq file; `extent` are the lowest and highest coordinates, (3,) each."""
+    metadata: dict[str, Any] = {"title": title}
+    code = epsg_code(reference)
+    if code is not None:
+        metadata["referenceSystem"] = f"https://www.opengis.net/def/crs/EPSG/0/{code}"
+    if extent is not None:
+        metadata["geographicalExtent"] = [float(v) for edge in extent for v in edge]
+    return {
+        "type": "CityJSON",
+        "version": VERSION,
+        "transform": {
+            "scale": [float(f"1e-{d}") for d in decimals_of(reference)],
+            "translate": [float(v) for v in translate],
+        },
+        "metadata": metadata,
+        "CityObjects": {},
+        "vertices": [],
+    }
 
 
 def lines_of(text: str) -> list[str]:
@@ -97,7 +108,7 @@ def lines_of(text: str) -> list[str]:
     return [line for line in text.split("\n") if line]
 
 
-def _json(value: Mapping[str, Any]) -> str:
+def json_line(value: Mapping[str, Any]) -> str:
     """One line of JSON without spaces."""
     return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 

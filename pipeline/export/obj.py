@@ -29,7 +29,7 @@ def obj_text(results: Iterable[BuildingResult], reference: SpatialReference, lod
         model = model_at(result, lod)
         for part, solid in enumerate(model.solids if model is not None else ()):
             lines.append(f"o {part_id(result, part)}")
-            lines.extend(_vertex_lines(crs_coordinates(solid.vertices, result.origin, reference), reference))
+            lines.extend(vertex_lines(crs_coordinates(solid.vertices, result.origin, reference), reference))
             lines.extend(_face_lines(solid, written + 1))
             written += len(solid.vertices)
     return "\n".join(lines) + "\n"
@@ -40,7 +40,8 @@ def part_id(result: BuildingResult, part: int) -> str:
     return f"{result.building_id}-{part}"
 
 
-def _vertex_lines(xyz: FloatArray, reference: SpatialReference) -> list[str]:
+def vertex_lines(xyz: FloatArray, reference: SpatialReference) -> list[str]:
+    """The `v` lines of coordinates (n, 3) in the units of the CRS."""
     plan, up = decimals(reference.horizontal_unit_m), decimals(reference.vertical_unit_m)
     return [f"v {x:.{plan}f} {y:.{plan}f} {z:.{up}f}" for x, y, z in xyz.tolist()]
 

@@ -110,6 +110,8 @@ class RunManifest:
     """Keys of the tiles that could not be published."""
     tiles_without_points: tuple[str, ...] = ()
     """Keys of the tiles whose points were requested and could not be written; the status does not depend on them."""
+    tiles_without_terrain: tuple[str, ...] = ()
+    """Keys of the tiles whose terrain was requested and could not be written; likewise."""
     counts: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """candidates, ok, fallback, failed, rejected, planes, points and the like."""
     timings_s: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -169,7 +171,7 @@ class RunManifest:
                     values[name] = dt.datetime.fromisoformat(values[name])
             values["inputs"] = tuple(_input_file(entry) for entry in values.get("inputs", ()))
             values["slowest"] = tuple(SlowBuilding(**entry) for entry in values.get("slowest", ()))
-            for name in ("tiles", "failed_tiles", "tiles_without_points", "warnings"):
+            for name in ("tiles", "failed_tiles", "tiles_without_points", "tiles_without_terrain", "warnings"):
                 values[name] = tuple(values.get(name, ()))
             return cls(**values)
         except (KeyError, TypeError, ValueError) as error:

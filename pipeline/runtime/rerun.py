@@ -22,6 +22,7 @@ import shapely
 
 from pipeline.errors import RunError
 from pipeline.export.point_files import FOLDER as POINTS_FOLDER
+from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
 from pipeline.export.tile_update import updated_tile
 from pipeline.io import LocalStorage
 from pipeline.model import Reason
@@ -71,6 +72,7 @@ this does not suffice all tiles are split."""
 _NEW = "new"
 """Folder of scratch for the files that will replace those of the run."""
 _POINTS_GONE = "the points are removed, since they showed the models before the rerun: run again with --points"
+_TERRAIN_GONE = "the terrain is removed, since it fits the models before the rerun: run again with --terrain tin"
 _QUARANTINED = (Reason.INTERNAL_ERROR, Reason.CRASHED, Reason.TIMED_OUT, Reason.OUT_OF_MEMORY)
 
 
@@ -182,6 +184,8 @@ def _rerun(
                 progress.warn("join", outcome.warning)
         if earlier.manifest.request.get("points"):
             progress.warn("publish", _POINTS_GONE)
+        if wanted.settings.general.terrain != "none":
+            progress.warn("publish", _TERRAIN_GONE)
         again = joined_of(store_sites(context, "again", found.again), 0, found.splits.keys)
         models = reconstruct(context, wanted.settings, again)
         modelled = list(models.each())
@@ -388,7 +392,7 @@ def _written(
     # readers see that the directory changes, also after a power cut
     changing = dataclasses.replace(earlier.manifest, status=RunStatus.RUNNING, content_sha256=None)
     write_manifest(root, changing, storage.put)
-    storage.clear((PAGE, POINTS_FOLDER))
+    storage.clear((PAGE, POINTS_FOLDER, TERRAIN_FOLDER))
     try:
         for tile, update in prepared.items():
             for path in update.digests:
@@ -455,6 +459,8 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
     warnings.extend(outcome.warning for outcome in found.outcomes if outcome.warning)
     if earlier.manifest.request.get("points"):
         warnings.append(_POINTS_GONE)
+    if request.settings.general.terrain != "none":
+        warnings.append(_TERRAIN_GONE)
     return dataclasses.replace(
         earlier.manifest,
         request={
@@ -464,6 +470,7 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
         },
         inputs=tuple(inputs),
         tiles_without_points=(),
+        tiles_without_terrain=(),
         counts=dict(counts),
         slowest=_slowest(earlier, found, modelled),
         warnings=tuple(warnings),

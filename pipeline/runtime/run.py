@@ -10,10 +10,12 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline import __version__
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.export.point_files import FOLDER as POINTS_FOLDER
+from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
 from pipeline.io import SpatialReference, Storage, is_url, shown, storage_at
 from pipeline.methods import ReconstructSettings
 from pipeline.runtime.cluster.serial_executor import Executor, run_alone
@@ -58,6 +60,9 @@ from pipeline.runtime.stages.stored_sites import joined_of, store_sites
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM
 
+if TYPE_CHECKING:  # loads kernels, which few drivers need
+    from pipeline.runtime.stages.terrain import TerrainOutcome
+
 FOOTPRINTS = "footprints.json"
 """File of the run directory with the faults of the given footprints, one by one."""
 OVERRIDES = "overrides.json"
@@ -94,11 +99,13 @@ class RunSummary:
     """Tiles that could not be published."""
     tiles_without_points: tuple[str, ...] = ()
     """Tiles whose points were requested and could not be written."""
+    tiles_without_terrain: tuple[str, ...] = ()
+    """Tiles whose terrain was requested and could not be written."""
 
     @property
     def is_complete(self) -> bool:
         """Whether every tile has all that was requested."""
-        return not self.failed_tiles and not self.tiles_without_points
+        return not (self.failed_tiles or self.tiles_without_points or self.tiles_without_terrain)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -225,7 +232,7 @@ def run_variants(
         )
         # all checks passed: only now are results of an earlier run removed
         for one in runs:
-            one.begin(footprints, resources.work, points=request.points)
+            one.begin(footprints, resources.work, points=request.points, terrain=settings.general.terrain != "none")
         for path in outdated:
             path.unlink(missing_ok=True)
         try:
@@ -311,6 +318,8 @@ def _model(context: RunContext, request: RunRequest, found: _Candidates, runs: S
         one.published = publish(part, settings, found.splits, found.joined, one.models, output)
         if request.points:
             one.without_points = _write_points(part, settings, found, one, given=request.footprints is not None)
+        if settings.general.terrain != "none":
+            one.terrain = _write_terrain(part, settings, found, one, meshes=request.meshes)
 
 
 def _write_points(
@@ -321,6 +330,15 @@ def _write_points(
 
     output = PointsOutput(run_dir=one.run_dir, splits=found.splits, ingested=found.ingested, given=given)
     return write_points(context, settings, found.joined, one.models, output)
+
+
+def _write_terrain(
+    context: RunContext, settings: RunSettings, found: _Candidates, one: _VariantRun, *, meshes: str
+) -> TerrainOutcome:
+    """Write the terrain around the models of a variant."""
+    from pipeline.runtime.stages.terrain import write_terrain  # loads kernels, which few drivers need
+
+    return write_terrain(context, settings, found.ground, one.models, one.run_dir, meshes)
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -335,6 +353,8 @@ class _VariantRun:
     published: Mapping[Place, Published] = dataclasses.field(init=False)
     without_points: tuple[str, ...] = ()
     """Keys of tiles whose points could not be written."""
+    terrain: TerrainOutcome | None = None
+    """The terrain; None where none was requested."""
     digest: str = ""
     """sha256 of the content."""
 
@@ -376,13 +396,15 @@ class _VariantRun:
         """The run directory's storage."""
         return storage_at(self.run_dir)
 
-    def begin(self, footprints: GivenFootprints | None, work: str | None, *, points: bool) -> None:
+    def begin(self, footprints: GivenFootprints | None, work: str | None, *, points: bool, terrain: bool) -> None:
         """Remove an earlier run, except what the work folder knows; readers see that the directory changes."""
         known = work is not None and _is_of_work(self.run_dir, work)
         write_manifest(self.run_dir, self.manifest, self.storage.put)
         outdated = [FOOTPRINTS, OVERRIDES, PAGE]
         if not (known and points):
             outdated.append(POINTS_FOLDER)
+        if not (known and terrain):
+            outdated.append(TERRAIN_FOLDER)
         self.storage.clear(outdated if known else [*outdated, *_RESULTS])
         if footprints is not None:
             put_json(self.run_dir, FOOTPRINTS, footprints.report)
@@ -425,6 +447,10 @@ class _VariantRun:
         self.progress.peaks[driver] = peak_bytes
         failed_tiles = self.failed_tiles
         counts = run_counts(context.plan, found.ingested, found.ground, found.splits, found.joined, self.counted)
+        without_terrain: tuple[str, ...] = ()
+        if self.terrain is not None:
+            counts |= self.terrain.counts
+            without_terrain = self.terrain.failed
         manifest = dataclasses.replace(
             self.manifest,
             status=RunStatus.INCOMPLETE if failed_tiles else RunStatus.FINISHED,
@@ -433,6 +459,7 @@ class _VariantRun:
             tiles=tuple(outcome.tile.key for outcome in outcomes),
             failed_tiles=failed_tiles,
             tiles_without_points=self.without_points,
+            tiles_without_terrain=without_terrain,
             counts=counts,
             timings_s={name: round(seconds, 3) for name, seconds in timings.items()},
             peak_memory_bytes=self.progress.peaks,
@@ -457,6 +484,7 @@ class _VariantRun:
             warnings=manifest.warnings,
             failed_tiles=failed_tiles,
             tiles_without_points=self.without_points,
+            tiles_without_terrain=without_terrain,
         )
         return VariantOutcome(summary=summary, seconds=self.counted.seconds)
 

@@ -45,7 +45,7 @@ def _hilbert_keys(xy_mm: IntArray, x_min: int, y_min: int, shift: int) -> npt.ND
 
 
 @kernel
-def _insert_all(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelArray) -> tuple[int, int]:
+def insert_all(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelArray) -> tuple[int, int]:
     """Triangulate vertices that follow a Hilbert curve; return the number of facets and a duplicate vertex or -1."""
     n = len(x) - 1
     third = 2
@@ -124,7 +124,7 @@ def triangulate(xy_mm: IntArray) -> Tin:
     # the sphere over n vertices and infinity has 2 n - 2 facets
     origin = np.empty(8 * n, np.int32)
     twin = np.empty(8 * n, np.int32)
-    n_facets, duplicate = _insert_all(x, y, origin, twin)
+    n_facets, duplicate = insert_all(x, y, origin, twin)
     if n_facets == 0:
         _refuse_duplicates(xy_mm, order, duplicate)
         return Tin(facets=no_facets, neighbours=no_facets)

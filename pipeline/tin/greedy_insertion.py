@@ -67,7 +67,7 @@ class GreedyTin:
     """(n,) bool, True for a point that was absorbed by a facet; False for one beneath another at the same position."""
 
 
-class _Vertices(NamedTuple):
+class Vertices(NamedTuple):
     """The n points, the four corners counter-clockwise, and the vertex at infinity."""
 
     x: FloatArray
@@ -89,7 +89,7 @@ class _Absorption(NamedTuple):
     """Square of the rise over run of Eq. 2."""
 
 
-class _Buckets(NamedTuple):
+class Buckets(NamedTuple):
     """The unused points of every facet, as linked lists, and which of them it would insert next."""
 
     first: LabelArray
@@ -103,14 +103,14 @@ class _Buckets(NamedTuple):
 
 
 @kernel
-def _is_left(x: FloatArray, y: FloatArray, rank: LabelArray, a: int, b: int, p: int) -> bool:
+def is_left(x: FloatArray, y: FloatArray, rank: LabelArray, a: int, b: int, p: int) -> bool:
     """Whether p belongs to the left of the directed edge a, b; points on it are left of its ascending direction."""
     turn = orientation(x[a], y[a], x[b], y[b], x[p], y[p])
     return bool(turn > 0.0 or (turn == 0.0 and rank[a] < rank[b]))
 
 
 @kernel
-def _facet_plane(vertices: _Vertices, origin: LabelArray, facet: int) -> tuple[int, float, float]:
+def facet_plane(vertices: Vertices, origin: LabelArray, facet: int) -> tuple[int, float, float]:
     """The smallest vertex of a facet and its gradient from there: independent of the slots that the vertices are in."""
     x, y, z, rank = vertices
     e = 4 * facet
@@ -126,7 +126,7 @@ def _facet_plane(vertices: _Vertices, origin: LabelArray, facet: int) -> tuple[i
 
 
 @kernel(inline="always")
-def _around(
+def facets_around(
     origin: LabelArray, twin: LabelArray, facet: int, infinity: int, star: LabelArray
 ) -> tuple[LabelArray, int]:
     """The real facets around the vertex in slot 0 of a facet, in `star` or a larger array; how many they are."""
@@ -145,7 +145,7 @@ def _around(
 
 
 @kernel(inline="always")
-def _take_out(buckets: _Buckets, star: LabelArray, newest: int, unplaced: LabelArray, count: int) -> int:
+def take_out(buckets: Buckets, star: LabelArray, newest: int, unplaced: LabelArray, count: int) -> int:
     """Empty the buckets of some facets and append their points but the newest to `unplaced`, which holds `count`."""
     for t in star:
         q = buckets.first[t]
@@ -159,8 +159,8 @@ def _take_out(buckets: _Buckets, star: LabelArray, newest: int, unplaced: LabelA
 
 
 @kernel(inline="always")
-def _put_in(
-    buckets: _Buckets, vertices: _Vertices, origin: LabelArray, star: LabelArray, newest: int, unplaced: LabelArray
+def put_in(
+    buckets: Buckets, vertices: Vertices, origin: LabelArray, star: LabelArray, newest: int, unplaced: LabelArray
 ) -> None:
     """Put points into the buckets of the facets around the newest vertex.
 
@@ -170,14 +170,14 @@ def _put_in(
     s = 0
     e = 4 * star[0]
     for q in unplaced:
-        if _is_left(x, y, rank, newest, origin[e + 1], q):
-            while _is_left(x, y, rank, newest, origin[e + 2], q):
+        if is_left(x, y, rank, newest, origin[e + 1], q):
+            while is_left(x, y, rank, newest, origin[e + 2], q):
                 s = s + 1 if s + 1 < len(star) else 0
                 e = 4 * star[s]
         else:
             s = s - 1 if s > 0 else len(star) - 1
             e = 4 * star[s]
-            while not _is_left(x, y, rank, newest, origin[e + 1], q):
+            while not is_left(x, y, rank, newest, origin[e + 1], q):
                 s = s - 1 if s > 0 else len(star) - 1
                 e = 4 * star[s]
         buckets.following[q] = buckets.first[e >> 2]
@@ -185,7 +185,7 @@ def _put_in(
 
 
 @kernel(inline="always")
-def _find_worst(buckets: _Buckets, vertices: _Vertices, origin: LabelArray, t: int, absorption: _Absorption) -> None:
+def _find_worst(buckets: Buckets, vertices: Vertices, origin: LabelArray, t: int, absorption: _Absorption) -> None:
     """Set the candidate of facet t: the point of the largest vertical error, of equal ones the smallest; -1 for none.
 
     A point that the facet absorbs is no candidate, unless absorbed points are inserted.
@@ -194,7 +194,7 @@ def _find_worst(buckets: _Buckets, vertices: _Vertices, origin: LabelArray, t: i
     buckets.worst[t] = -1
     q = buckets.first[t]
     if q >= 0:
-        base, gradient_x, gradient_y = _facet_plane(vertices, origin, t)
+        base, gradient_x, gradient_y = facet_plane(vertices, origin, t)
         steepness = gradient_x * gradient_x + gradient_y * gradient_y
         # Eq. 1 by Eq. 2: perpendicular is vertical distance times the cosine of the slope
         absorbing_mm = -1.0
@@ -213,7 +213,7 @@ def _find_worst(buckets: _Buckets, vertices: _Vertices, origin: LabelArray, t: i
 
 
 @kernel(inline="always")
-def _facets_of_rest(buckets: _Buckets, n_facets: int, is_absorbed: BoolArray) -> LabelArray:
+def _facets_of_rest(buckets: Buckets, n_facets: int, is_absorbed: BoolArray) -> LabelArray:
     """Facet of every point, (n,) int32, -1 where it was inserted; marks the rest as absorbed."""
     facet_of_point = np.full(len(buckets.following), -1, np.int32)
     for t in range(n_facets):
@@ -227,7 +227,7 @@ def _facets_of_rest(buckets: _Buckets, n_facets: int, is_absorbed: BoolArray) ->
 
 @kernel
 def _insert_greedily(
-    vertices: _Vertices, absorption: _Absorption
+    vertices: Vertices, absorption: _Absorption
 ) -> tuple[LabelArray, LabelArray, int, LabelArray, BoolArray]:
     """The insertion over n points; z of the vertices changes in place.
 
@@ -246,7 +246,7 @@ def _insert_greedily(
     restore_delaunay(x, y, origin, twin, facet)
 
     room = 2 * (n + 4)
-    buckets = _Buckets(np.full(room, -1, np.int32), np.empty(n, np.int32), np.full(room, -1, np.int32), np.empty(room))
+    buckets = Buckets(np.full(room, -1, np.int32), np.empty(n, np.int32), np.full(room, -1, np.int32), np.empty(room))
     worst, worst_error = buckets.worst, buckets.worst_error
     is_absorbed = np.zeros(n, np.bool_)
     # the candidates of all facets: the largest error first, of equal ones the smallest point
@@ -259,9 +259,9 @@ def _insert_greedily(
     newest = n + 3
     while True:
         # only the facets around the newest vertex have changed, and all of them
-        star, n_star = _around(origin, twin, facet, infinity, star)
-        n_unplaced = _take_out(buckets, star[:n_star], newest, unplaced, n_unplaced)
-        _put_in(buckets, vertices, origin, star[:n_star], newest, unplaced[:n_unplaced])
+        star, n_star = facets_around(origin, twin, facet, infinity, star)
+        n_unplaced = take_out(buckets, star[:n_star], newest, unplaced, n_unplaced)
+        put_in(buckets, vertices, origin, star[:n_star], newest, unplaced[:n_unplaced])
         n_unplaced = 0
         for t in star[:n_star]:
             _find_worst(buckets, vertices, origin, t, absorption)
@@ -280,7 +280,7 @@ def _insert_greedily(
         if newest < 0:
             break
         if absorption.is_inserted:
-            base, gradient_x, gradient_y = _facet_plane(vertices, origin, facet)
+            base, gradient_x, gradient_y = facet_plane(vertices, origin, facet)
             steepness = gradient_x * gradient_x + gradient_y * gradient_y
             absorbing_mm = absorption.distance_mm * math.sqrt(1.0 + steepness)
             if steepness <= absorption.steepest and worst_error[facet] <= absorbing_mm:
@@ -363,7 +363,7 @@ def insert_greedily(points_m: FloatArray, settings: GreedyInsertionSettings, cor
         distance_mm=settings.absorption_distance_m * 1000.0,
         steepest=math.tan(math.radians(settings.absorption_slope_deg)) ** 2,
     )
-    origin, twin, n_facets, facet_of_vertex, is_absorbed = _insert_greedily(_Vertices(x, y, z, rank), absorption)
+    origin, twin, n_facets, facet_of_vertex, is_absorbed = _insert_greedily(Vertices(x, y, z, rank), absorption)
 
     inserted = np.sort(point[facet_of_vertex < 0])
     number_of_vertex = np.full(n + 4, -1, np.int32)

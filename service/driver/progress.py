@@ -17,12 +17,13 @@ WEIGHTS = MappingProxyType(
         "outline": 6,
         "reconstruct": 37,
         "publish": 4,
-        "octree": 6,
+        "octree": 5,
+        "terrain": 1,
         "outputs": 8,
     }
 )
 """The stages of a job in their order, with their share of the time in percent; measured on city blocks. A job without
-points skips the stage octree."""
+points or terrain skips their stages."""
 
 CLASSIFY_WEIGHTS = MappingProxyType(
     {
@@ -56,6 +57,7 @@ WORDS = MappingProxyType(
         "reconstruct": "buildings are modelled",
         "publish": "tiles are written",
         "octree": "points are arranged for viewing",
+        "terrain": "the terrain is written",
         "classify": "points are classified",
         "write": "files are written",
         "rasters": "rasters are drawn",

@@ -68,10 +68,11 @@ def tidy(scratch: Scratch, models: Collection[str], run_dirs: Sequence[str], *, 
 
     `models` are the stages under which its models are stored, `run_dirs` where it published.
     """
-    published = {stage for run_dir in run_dirs for stage in (publishing(run_dir), writing_points(run_dir))}
+    written = (publishing, writing_points, writing_terrain)
+    published = {stage_of(run_dir) for run_dir in run_dirs for stage_of in written}
     for stage in Path(scratch.root, FOLDER).glob("*"):
         by_others = stage.name.startswith("models-") and stage.name not in models
-        if by_others or (stage.name.startswith(("publish-", "points-")) and stage.name not in published):
+        if by_others or (stage.name.startswith(("publish-", "points-", "terrain-")) and stage.name not in published):
             shutil.rmtree(stage, ignore_errors=True)
     if not overridden:
         for pattern in (OVERRIDDEN, f"{REDRAWN}*"):
@@ -87,3 +88,8 @@ def publishing(run_dir: str) -> str:
 def writing_points(run_dir: str) -> str:
     """The stage under which the outcomes of the points of a run directory are stored."""
     return f"points-{key_of(run_dir)}"
+
+
+def writing_terrain(run_dir: str) -> str:
+    """The stage under which the outcomes of the terrain of a run directory are stored."""
+    return f"terrain-{key_of(run_dir)}"

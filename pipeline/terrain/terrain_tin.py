@@ -1,0 +1,360 @@
+"""The terrain of a tile as triangles, with the outlines of buildings cut out, seamless with its neighbours.
+
+Everything on the border of a tile depends only on terrain and outlines within a few metres of it, which both tiles see:
+outlines are noded with the border on whole millimetres, and the vertices between these nodes are chosen along the
+border alone. So both tiles have the same vertices there, whatever lies inside.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from pipeline.compiler import kernel
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, height_above
+from pipeline.tiling import Window
+from pipeline.tin.constrained import LatticePoints, RefinedTin, refine, triangulate_constrained
+
+GAP_CELLS = 16
+"""Gaps between points are closed up to twice as many cells wide. Not a setting: terrain far from any point is a guess,
+and wide waters give no points."""
+CLEARANCE_MM = 500
+"""Terrain nearer than this to an outline does not count: the TIN goes to the base of the building there."""
+REACH_M = 2 * GAP_CELLS + 3
+"""How far beyond a tile terrain is looked at."""
+
+_NEAR_MM = 1000
+"""Outlines nearer than this to a tile are noded with it; one that is a millimetre off could already matter."""
+_ON_OUTLINE_MM = 0.75
+"""Noding moves an outline by at most 0.71 mm, half the diagonal of a millimetre."""
+_BORDER_MM = 250
+"""Cells whose middle is nearer than this to the border of a tile are left to the vertices on it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Outline:
+    """The floor of a building."""
+
+    rings: tuple[IntArray, ...]
+    """Outer ring, then holes: (k, 2) int64 each, absolute millimetres, the first corner not repeated."""
+    z_mm: int
+    """Its elevation."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TerrainMesh:
+    """The terrain of a tile as triangles."""
+
+    vertices_mm: IntArray
+    """(v, 3) int64, absolute millimetres, sorted by x, y, z; each is used."""
+    triangles: LabelArray
+    """(t, 3) int32, counter-clockwise seen from above, each from its smallest vertex, sorted. Upright ones join terrain
+    and floor where buildings with floors at different levels touch."""
+    n_cells: int
+    """Cells of the terrain that count, those that became vertices among them."""
+    squares_mm2: float
+    """Sum of their squared vertical errors."""
+    max_error_mm: float
+    """The largest vertical error."""
+
+
+def terrain_mesh(
+    core: Window,
+    terrain: Elevations,
+    occupied: BoolArray,
+    corner: tuple[int, int],
+    outlines: Sequence[Outline],
+    tolerance_mm: float,
+) -> TerrainMesh:
+    """Triangulate the terrain of a tile.
+
+    Parameters
+    ----------
+    core : Window
+        The tile, at most 2 km wide.
+    terrain : (rows, columns) int32
+        Elevations of cells of 1 m in mm, NO_DATA where unknown: the tile and `REACH_M` around it.
+    occupied : (rows, columns) bool
+        The cells that hold points.
+    corner : tuple of int
+        Absolute column and row of the first cell.
+    outlines : sequence of Outline
+        All that meet the tile; others do no harm.
+    tolerance_mm : float
+        Vertical distance between the middle of a cell and the triangle there, at most.
+    """
+    drawn = _Drawn(core=core, terrain=terrain, corner=corner, known=_known(terrain, occupied), outlines=outlines)
+    nodes, edges = drawn.nodes_and_edges()
+    nodes, z_mm = drawn.with_border(nodes, tolerance_mm)
+    tin = triangulate_constrained(nodes, edges)
+    floor_of_region, is_terrain = drawn.judged(nodes[tin.inside].mean(axis=1))
+    if not is_terrain.any():
+        return _no_mesh()
+    found = refine(tin, z_mm, is_terrain, drawn.lattice_points(), tolerance_mm)
+    return _mesh(found, floor_of_region, core)
+
+
+def _no_mesh() -> TerrainMesh:
+    return TerrainMesh(
+        vertices_mm=np.empty((0, 3), np.int64),
+        triangles=np.empty((0, 3), np.int32),
+        n_cells=0,
+        squares_mm2=0.0,
+        max_error_mm=0.0,
+    )
+
+
+def _widened(mask: BoolArray, cells: int) -> BoolArray:
+    """A mask and all within some cells of it along rows and columns."""
+    out = mask
+    for axis in (0, 1):
+        sums = np.cumsum(np.moveaxis(out, axis, 0), axis=0, dtype=np.int32)
+        padded = np.pad(sums, ((cells + 1, 0), (0, 0)))
+        padded = np.pad(padded, ((0, cells), (0, 0)), mode="edge")
+        out = np.moveaxis(padded[2 * cells + 1 :] > padded[: -2 * cells - 1], 0, axis)
+    return out
+
+
+def _known(terrain: Elevations, occupied: BoolArray) -> BoolArray:
+    """The cells with terrain and with points on all sides nearby."""
+    closed = ~_widened(~_widened(occupied, GAP_CELLS), GAP_CELLS)
+    return closed & (terrain != NO_DATA)
+
+
+@kernel
+def _near_segments(ends: IntArray, shape: tuple[int, int], reach_mm: int) -> BoolArray:
+    """The cells of a lattice whose middles lie nearer than a distance to segments (s, 2, 2) in mm from its corner."""
+    rows, columns = shape
+    out = np.zeros((rows, columns), np.bool_)
+    for s in range(len(ends)):
+        ax, ay, bx, by = ends[s, 0, 0], ends[s, 0, 1], ends[s, 1, 0], ends[s, 1, 1]
+        dx, dy = float(bx - ax), float(by - ay)
+        length2 = dx * dx + dy * dy
+        for r in range(max((min(ay, by) - reach_mm) // 1000, 0), min((max(ay, by) + reach_mm) // 1000 + 1, rows)):
+            for c in range(
+                max((min(ax, bx) - reach_mm) // 1000, 0), min((max(ax, bx) + reach_mm) // 1000 + 1, columns)
+            ):
+                px, py = 1000.0 * c + 500.0 - ax, 1000.0 * r + 500.0 - ay
+                along = 0.0 if length2 == 0.0 else min(max((px * dx + py * dy) / length2, 0.0), 1.0)
+                qx, qy = px - along * dx, py - along * dy
+                if qx * qx + qy * qy < reach_mm * reach_mm:
+                    out[r, c] = True
+    return out
+
+
+@kernel
+def _thinned(place: IntArray, z_mm: IntArray, tolerance_mm: float) -> BoolArray:
+    """Which points of a profile (n,) stay so that none is off by more than a tolerance (Douglas and Peucker 1973)."""
+    stays = np.zeros(len(place), np.bool_)
+    stays[0] = stays[-1] = True
+    waiting = [(0, len(place) - 1)]
+    while len(waiting) > 0:
+        first, last = waiting.pop()
+        worst, chosen = tolerance_mm, -1
+        for i in range(first + 1, last):
+            share = (place[i] - place[first]) / (place[last] - place[first])
+            error = abs(z_mm[i] - z_mm[first] - share * (z_mm[last] - z_mm[first]))
+            if error > worst:
+                worst, chosen = error, i
+        if chosen >= 0:
+            stays[chosen] = True
+            waiting.append((first, chosen))
+            waiting.append((chosen, last))
+    return stays
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Drawn:
+    """The lines of a tile; all coordinates are millimetres from its lower left corner."""
+
+    core: Window
+    terrain: Elevations
+    corner: tuple[int, int]
+    known: BoolArray
+    outlines: Sequence[Outline]
+    _low: IntArray = dataclasses.field(init=False)
+    _side: int = dataclasses.field(init=False)
+    _lines: npt.NDArray[np.object_] = dataclasses.field(init=False)
+    """The rings of the outlines."""
+    _floor_of_line: IntArray = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        """Move the outlines near the tile to its corner."""
+        low = np.array([self.core.x0_mm, self.core.y0_mm])
+        side = self.core.x1_mm - self.core.x0_mm
+        rings, floors, near = [], [], []
+        for outline in self.outlines:
+            moved = [ring - low for ring in outline.rings]
+            outer = moved[0]
+            if (outer.max(axis=0) < -_NEAR_MM).any() or (outer.min(axis=0) > side + _NEAR_MM).any():
+                continue
+            near.append(dataclasses.replace(outline, rings=tuple(moved)))
+            rings.extend(shapely.linearrings(ring) for ring in moved)
+            floors.extend([outline.z_mm] * len(moved))
+        object.__setattr__(self, "outlines", tuple(near))
+        object.__setattr__(self, "_low", low)
+        object.__setattr__(self, "_side", side)
+        object.__setattr__(self, "_lines", np.array(rings, dtype=object))
+        object.__setattr__(self, "_floor_of_line", np.array(floors, dtype=np.int64))
+
+    def nodes_and_edges(self) -> tuple[IntArray, IntArray]:
+        """The nodes (n, 2) of outlines, of the border and of the edge of the data in the tile; edges (s, 2) in it.
+
+        They meet at nodes only, on whole millimetres (snap rounding: Hobby 1999). A node depends only on lines within a
+        millimetre of it.
+        """
+        side = self._side
+        border = shapely.linearrings([(0, 0), (side, 0), (side, side), (0, side)])
+        noded = shapely.union_all([border, *self._lines, *self._data_edges()], grid_size=1.0)
+        xy, line = shapely.get_coordinates(shapely.get_parts(noded), return_index=True)
+        xy = np.rint(xy).astype(np.int64)
+        ends = np.column_stack((xy[:-1], xy[1:]))[line[:-1] == line[1:]]
+        inside = ((ends >= 0) & (ends <= side)).all(axis=1)
+        # pieces of the border are edges without being asked for
+        on_side = [(ends[:, k] == ends[:, k + 2]) & (ends[:, k] == at) for k in (0, 1) for at in (0, side)]
+        corners = np.array([(0, 0), (side, 0), (side, side), (0, side)], np.int64)
+        nodes, number = np.unique(
+            np.concatenate((ends[inside].reshape(-1, 2), corners)), axis=0, return_inverse=True
+        )
+        edges = number.reshape(-1)[: -len(corners)].reshape(-1, 2)[~np.any(on_side, axis=0)[inside]]
+        return nodes, edges.astype(np.int64)
+
+    def _data_edges(self) -> npt.NDArray[np.object_]:
+        """The sides between cells with and without terrain, in runs as long as they are straight."""
+        lines = []
+        for mask, axis in ((self.known, 0), (self.known.T, 1)):
+            changes = np.diff(np.pad(mask, ((1, 1), (0, 0))).astype(np.int8), axis=0)
+            level = np.pad(changes != 0, ((0, 0), (1, 1))).astype(np.int8)
+            at, start = np.nonzero(np.diff(level, axis=1) == 1)
+            _, stop = np.nonzero(np.diff(level, axis=1) == -1)
+            runs = np.stack((np.column_stack((start, at)), np.column_stack((stop, at))), axis=1)
+            lines.append(runs if axis == 0 else runs[:, :, ::-1])
+        cells = np.concatenate(lines).astype(np.int64) + np.array(self.corner)
+        found: npt.NDArray[np.object_] = shapely.linestrings((cells * CELL_MM - self._low).astype(np.float64))
+        return found
+
+    def elevations(self, xy: IntArray) -> IntArray:
+        """Terrain at some points, mm; NO_DATA where there is none."""
+        absolute = xy + self._low
+        x, y = np.ascontiguousarray(absolute[:, 0]), np.ascontiguousarray(absolute[:, 1])
+        below = height_above(x, y, np.zeros(len(xy), np.int64), self._shown, *self.corner)
+        return np.where(below == NO_DATA, np.int64(NO_DATA), -below)
+
+    @property
+    def _shown(self) -> Elevations:
+        """The terrain that the mesh may show."""
+        return np.where(self.known, self.terrain, NO_DATA)
+
+    def with_border(self, nodes: IntArray, tolerance_mm: float) -> tuple[IntArray, IntArray]:
+        """The nodes and further ones along the border, and the elevation of each.
+
+        On an outline it is that of the floor, of the lowest where several touch there.
+        """
+        z_mm = self._elevations_of_nodes(nodes)
+        more = [self._between(nodes, z_mm, axis, at, tolerance_mm) for axis in (0, 1) for at in (0, self._side)]
+        added = np.concatenate(more)
+        return np.concatenate((nodes, added)), np.concatenate((z_mm, self.elevations(added)))
+
+    def _elevations_of_nodes(self, nodes: IntArray) -> IntArray:
+        z_mm = self.elevations(nodes)
+        if len(self._lines):
+            points = shapely.points(nodes.astype(np.float64))
+            node, line = shapely.STRtree(self._lines).query(points, predicate="dwithin", distance=_ON_OUTLINE_MM)
+            floor = np.full(len(nodes), np.iinfo(np.int64).max)
+            np.minimum.at(floor, node, self._floor_of_line[line])
+            z_mm[node] = floor[node]
+        return z_mm
+
+    def _between(self, nodes: IntArray, z_mm: IntArray, axis: int, at: int, tolerance_mm: float) -> IntArray:
+        """Points (k, 2) on one side of the tile, where x or y is `at`, that the terrain needs between the nodes."""
+        along = 1 - axis
+        on_side = np.flatnonzero(nodes[:, axis] == at)
+        on_side = on_side[np.argsort(nodes[on_side, along])]
+        absolute = int(self._low[along])
+        first = -(-(absolute - CELL_MM // 2) // CELL_MM) * CELL_MM + CELL_MM // 2 - absolute
+        sampled = np.setdiff1d(np.arange(first, self._side, CELL_MM), nodes[on_side, along])
+        xy = np.empty((len(sampled), 2), np.int64)
+        xy[:, axis], xy[:, along] = at, sampled
+        z = self.elevations(xy)
+        usable = z != NO_DATA
+        if len(self._lines):
+            near = shapely.STRtree(self._lines).query(
+                shapely.points(xy.astype(np.float64)), predicate="dwithin", distance=float(CLEARANCE_MM)
+            )[0]
+            usable[near] = False
+        xy, z, place = xy[usable], z[usable], sampled[usable]
+        chosen = []
+        for a, b in zip(on_side[:-1], on_side[1:], strict=True):
+            start, stop = np.searchsorted(place, nodes[[a, b], along])
+            if start == stop or NO_DATA in (z_mm[a], z_mm[b]):
+                continue
+            profile = np.concatenate(([nodes[a, along]], place[start:stop], [nodes[b, along]]))
+            stays = _thinned(profile, np.concatenate(([z_mm[a]], z[start:stop], [z_mm[b]])), tolerance_mm)
+            chosen.append(xy[start:stop][stays[1:-1]])
+        return np.concatenate(chosen) if chosen else np.empty((0, 2), np.int64)
+
+    def judged(self, places: FloatArray) -> tuple[IntArray, BoolArray]:
+        """For points inside regions (r, 2), the floor of the building there (of the lowest; NO_DATA for none), and
+        whether the region is terrain.
+        """
+        floor = np.full(len(places), NO_DATA, np.int64)
+        if self.outlines:
+            polygons = [shapely.Polygon(one.rings[0], one.rings[1:]) for one in self.outlines]
+            place, polygon = shapely.STRtree(polygons).query(shapely.points(places), predicate="intersects")
+            np.minimum.at(floor, place, np.array([one.z_mm for one in self.outlines], np.int64)[polygon])
+        cells = np.floor((places + self._low) / CELL_MM).astype(np.int64) - np.array(self.corner)
+        return floor, (floor == NO_DATA) & self.known[cells[:, 1], cells[:, 0]]
+
+    def lattice_points(self) -> LatticePoints:
+        """The middles of the cells that count."""
+        middle = np.array(self.corner) * CELL_MM + CELL_MM // 2 - self._low
+        x = middle[0] + CELL_MM * np.arange(self.known.shape[1])
+        y = middle[1] + CELL_MM * np.arange(self.known.shape[0])
+        columns = np.flatnonzero((x > _BORDER_MM) & (x < self._side - _BORDER_MM))
+        rows = np.flatnonzero((y > _BORDER_MM) & (y < self._side - _BORDER_MM))
+        part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        counts = self.known[part].copy()
+        if len(self._lines):
+            xy, line = shapely.get_coordinates(self._lines, return_index=True)
+            ends = np.stack((xy[:-1], xy[1:]), axis=1)[line[:-1] == line[1:]].astype(np.int64)
+            first_cell = np.array([x[columns[0]], y[rows[0]]]) - CELL_MM // 2
+            counts &= ~_near_segments(ends - first_cell, counts.shape, CLEARANCE_MM)
+        return LatticePoints(
+            z_mm=np.where(counts, self.terrain[part], np.nan), west_mm=int(x[columns[0]]), south_mm=int(y[rows[0]])
+        )
+
+
+def _mesh(found: RefinedTin, floor_of_region: IntArray, core: Window) -> TerrainMesh:
+    """The facets and the upright triangles between them and floors, in canonical order and absolute coordinates."""
+    vertices, facets = found.vertices_mm, found.facets
+    floor = np.append(floor_of_region, NO_DATA)[found.beyond]
+    t, k = np.nonzero(floor != NO_DATA)
+    u, v, z_floor = facets[t, k], facets[t, (k + 1) % 3], floor[t, k]
+    raised_u, raised_v = vertices[u].copy(), vertices[v].copy()
+    raised_u[:, 2] = raised_v[:, 2] = z_floor
+    low_u, low_v = vertices[u], vertices[v]
+    first, second = low_u[:, 2] != z_floor, low_v[:, 2] != z_floor
+    corners = np.concatenate(
+        (
+            vertices[facets],
+            np.stack((low_v, low_u, raised_u), axis=1)[first],
+            np.stack((low_v, raised_u, raised_v), axis=1)[second],
+        )
+    )
+    places, number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    triangles = number.reshape(-1, 3)
+    start = np.argmin(triangles, axis=1)
+    turned = triangles[np.arange(len(triangles))[:, None], (start[:, None] + np.arange(3)) % 3]
+    ordered = turned[np.lexsort((turned[:, 2], turned[:, 1], turned[:, 0]))]
+    return TerrainMesh(
+        vertices_mm=places + np.array([core.x0_mm, core.y0_mm, 0]),
+        triangles=ordered.astype(np.int32),
+        n_cells=found.n_points,
+        squares_mm2=found.squares_mm2,
+        max_error_mm=found.max_error_mm,
+    )
