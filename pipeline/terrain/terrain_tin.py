@@ -25,11 +25,12 @@ GAP_CELLS = 16
 and wide waters give no points."""
 CLEARANCE_MM = 500
 """Terrain nearer than this to an outline does not count: the TIN goes to the base of the building there."""
+BESIDE_MM = 2000
+"""Nearer than this to an outline all vertices along a border stay, so that the slope to its base ends near it. Outlines
+up to so far from a tile matter to it."""
 REACH_M = 2 * GAP_CELLS + 3
 """How far beyond a tile terrain is looked at."""
 
-_NEAR_MM = 1000
-"""Outlines nearer than this to a tile are noded with it; one that is a millimetre off could already matter."""
 _ON_OUTLINE_MM = 0.75
 """Noding moves an outline by at most 0.71 mm, half the diagonal of a millimetre."""
 _BORDER_MM = 250
@@ -90,7 +91,7 @@ def terrain_mesh(
     """
     drawn = _Drawn(core=core, terrain=terrain, corner=corner, known=_known(terrain, occupied), outlines=outlines)
     nodes, edges = drawn.nodes_and_edges()
-    nodes, z_mm = drawn.with_border(nodes, tolerance_mm)
+    nodes, z_mm = drawn.with_more(nodes, edges, tolerance_mm)
     tin = triangulate_constrained(nodes, edges)
     floor_of_region, is_terrain = drawn.judged(nodes[tin.inside].mean(axis=1))
     if not is_terrain.any():
@@ -148,11 +149,16 @@ def _near_segments(ends: IntArray, shape: tuple[int, int], reach_mm: int) -> Boo
 
 
 @kernel
-def _thinned(place: IntArray, z_mm: IntArray, tolerance_mm: float) -> BoolArray:
-    """Which points of a profile (n,) stay so that none is off by more than a tolerance (Douglas and Peucker 1973)."""
-    stays = np.zeros(len(place), np.bool_)
-    stays[0] = stays[-1] = True
-    waiting = [(0, len(place) - 1)]
+def _thinned(place: IntArray, z_mm: IntArray, must_stay: BoolArray, tolerance_mm: float) -> BoolArray:
+    """Which points of a profile (n,) stay so that none is off by more than a tolerance (Douglas and Peucker 1973).
+
+    The first and the last must stay.
+    """
+    stays = must_stay.copy()
+    waiting = [(0, 0)]
+    for i in range(1, len(place)):
+        if must_stay[i]:
+            waiting.append((waiting[-1][1], i))
     while len(waiting) > 0:
         first, last = waiting.pop()
         worst, chosen = tolerance_mm, -1
@@ -191,7 +197,7 @@ class _Drawn:
         for outline in self.outlines:
             moved = [ring - low for ring in outline.rings]
             outer = moved[0]
-            if (outer.max(axis=0) < -_NEAR_MM).any() or (outer.min(axis=0) > side + _NEAR_MM).any():
+            if (outer.max(axis=0) < -BESIDE_MM).any() or (outer.min(axis=0) > side + BESIDE_MM).any():
                 continue
             near.append(dataclasses.replace(outline, rings=tuple(moved)))
             rings.extend(shapely.linearrings(ring) for ring in moved)
@@ -215,14 +221,9 @@ class _Drawn:
         xy = np.rint(xy).astype(np.int64)
         ends = np.column_stack((xy[:-1], xy[1:]))[line[:-1] == line[1:]]
         inside = ((ends >= 0) & (ends <= side)).all(axis=1)
-        # pieces of the border are edges without being asked for
-        on_side = [(ends[:, k] == ends[:, k + 2]) & (ends[:, k] == at) for k in (0, 1) for at in (0, side)]
         corners = np.array([(0, 0), (side, 0), (side, side), (0, side)], np.int64)
-        nodes, number = np.unique(
-            np.concatenate((ends[inside].reshape(-1, 2), corners)), axis=0, return_inverse=True
-        )
-        edges = number.reshape(-1)[: -len(corners)].reshape(-1, 2)[~np.any(on_side, axis=0)[inside]]
-        return nodes, edges.astype(np.int64)
+        nodes, number = np.unique(np.concatenate((ends[inside].reshape(-1, 2), corners)), axis=0, return_inverse=True)
+        return nodes, number.reshape(-1)[: -len(corners)].reshape(-1, 2).astype(np.int64)
 
     def _data_edges(self) -> npt.NDArray[np.object_]:
         """The sides between cells with and without terrain, in runs as long as they are straight."""
@@ -250,14 +251,13 @@ class _Drawn:
         """The terrain that the mesh may show."""
         return np.where(self.known, self.terrain, NO_DATA)
 
-    def with_border(self, nodes: IntArray, tolerance_mm: float) -> tuple[IntArray, IntArray]:
-        """The nodes and further ones along the border, and the elevation of each.
+    def with_more(self, nodes: IntArray, edges: IntArray, tolerance_mm: float) -> tuple[IntArray, IntArray]:
+        """The nodes and further ones along the border and the edge of the data, and the elevation of each.
 
         On an outline it is that of the floor, of the lowest where several touch there.
         """
         z_mm = self._elevations_of_nodes(nodes)
-        more = [self._between(nodes, z_mm, axis, at, tolerance_mm) for axis in (0, 1) for at in (0, self._side)]
-        added = np.concatenate(more)
+        added = self._between(nodes, z_mm, edges, tolerance_mm)
         return np.concatenate((nodes, added)), np.concatenate((z_mm, self.elevations(added)))
 
     def _elevations_of_nodes(self, nodes: IntArray) -> IntArray:
@@ -270,33 +270,46 @@ class _Drawn:
             z_mm[node] = floor[node]
         return z_mm
 
-    def _between(self, nodes: IntArray, z_mm: IntArray, axis: int, at: int, tolerance_mm: float) -> IntArray:
-        """Points (k, 2) on one side of the tile, where x or y is `at`, that the terrain needs between the nodes."""
-        along = 1 - axis
-        on_side = np.flatnonzero(nodes[:, axis] == at)
-        on_side = on_side[np.argsort(nodes[on_side, along])]
-        absolute = int(self._low[along])
-        first = -(-(absolute - CELL_MM // 2) // CELL_MM) * CELL_MM + CELL_MM // 2 - absolute
-        sampled = np.setdiff1d(np.arange(first, self._side, CELL_MM), nodes[on_side, along])
-        xy = np.empty((len(sampled), 2), np.int64)
-        xy[:, axis], xy[:, along] = at, sampled
+    def _samples(self, nodes: IntArray, edges: IntArray) -> tuple[IntArray, IntArray]:
+        """The middles of cells along those edges that run along rows or columns, (k, 2), and the edge of each."""
+        found, of_edge = [np.empty((0, 2), np.int64)], [np.empty(0, np.int64)]
+        for axis in (0, 1):
+            along, ends = 1 - axis, nodes[edges]
+            straight = np.flatnonzero(ends[:, 0, axis] == ends[:, 1, axis])
+            low, high = (edge(ends[straight][:, :, along], axis=1) for edge in (np.min, np.max))
+            half, shift = CELL_MM // 2, int(self._low[along])
+            first = (low + shift + half) // CELL_MM  # the cell with the first middle beyond the lower end
+            counts = np.maximum((high + shift - half - 1) // CELL_MM - first + 1, 0)
+            number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+            xy = np.empty((len(number), 2), np.int64)
+            xy[:, along] = (np.repeat(first, counts) + number) * CELL_MM + half - shift
+            xy[:, axis] = np.repeat(ends[straight, 0, axis], counts)
+            found.append(xy)
+            of_edge.append(np.repeat(straight, counts))
+        return np.concatenate(found), np.concatenate(of_edge)
+
+    def _between(self, nodes: IntArray, z_mm: IntArray, edges: IntArray, tolerance_mm: float) -> IntArray:
+        """Points (k, 2) on edges along rows or columns that the terrain needs between their ends."""
+        xy, of_edge = self._samples(nodes, edges)
         z = self.elevations(xy)
-        usable = z != NO_DATA
+        usable, beside = z != NO_DATA, np.zeros(len(z), np.bool_)
         if len(self._lines):
-            near = shapely.STRtree(self._lines).query(
-                shapely.points(xy.astype(np.float64)), predicate="dwithin", distance=float(CLEARANCE_MM)
-            )[0]
-            usable[near] = False
-        xy, z, place = xy[usable], z[usable], sampled[usable]
-        chosen = []
-        for a, b in zip(on_side[:-1], on_side[1:], strict=True):
-            start, stop = np.searchsorted(place, nodes[[a, b], along])
-            if start == stop or NO_DATA in (z_mm[a], z_mm[b]):
+            tree, points = shapely.STRtree(self._lines), shapely.points(xy.astype(np.float64))
+            beside[tree.query(points, predicate="dwithin", distance=float(BESIDE_MM))[0]] = True
+            usable[tree.query(points, predicate="dwithin", distance=float(CLEARANCE_MM))[0]] = False
+        xy, z, beside, of_edge = xy[usable], z[usable], beside[usable], of_edge[usable]
+        chosen = [np.empty((0, 2), np.int64)]
+        for own in np.split(np.arange(len(xy)), np.flatnonzero(np.diff(of_edge)) + 1) if len(xy) else ():
+            a, b = edges[of_edge[own[0]]]
+            if NO_DATA in (z_mm[a], z_mm[b]):
                 continue
-            profile = np.concatenate(([nodes[a, along]], place[start:stop], [nodes[b, along]]))
-            stays = _thinned(profile, np.concatenate(([z_mm[a]], z[start:stop], [z_mm[b]])), tolerance_mm)
-            chosen.append(xy[start:stop][stays[1:-1]])
-        return np.concatenate(chosen) if chosen else np.empty((0, 2), np.int64)
+            if nodes[a].sum() > nodes[b].sum():
+                a, b = b, a
+            place = np.concatenate(([nodes[a]], xy[own], [nodes[b]])).sum(axis=1)
+            profile = np.concatenate(([z_mm[a]], z[own], [z_mm[b]]))
+            stays = _thinned(place, profile, np.concatenate(([True], beside[own], [True])), tolerance_mm)
+            chosen.append(xy[own][stays[1:-1]])
+        return np.concatenate(chosen)
 
     def judged(self, places: FloatArray) -> tuple[IntArray, BoolArray]:
         """For points inside regions (r, 2), the floor of the building there (of the lowest; NO_DATA for none), and

@@ -181,7 +181,7 @@ def _written(task: TerrainTask) -> TileTerrain:
         around.elevation_mm,
         around.occupied,
         (around.column0, around.row0),
-        _outlines(task, core),
+        _outlines(task),
         task.tolerance_m * MM,
     )
     task.scratch.check_cancelled()
@@ -215,19 +215,14 @@ def _contents(task: TerrainTask, mesh: TerrainMesh, core: Window) -> tuple[str, 
     return lines, *((terrain_obj(terrain, task.tile.key, task.reference),) if task.obj else ())
 
 
-def _outlines(task: TerrainTask, core: Window) -> list[Outline]:
-    """The floors of the buildings that may meet a tile."""
+def _outlines(task: TerrainTask) -> list[Outline]:
+    """The floors of all buildings that may meet a tile, and others."""
     found = []
     for place in task.batches:
         for entry in stored_results(task.scratch, place):
             if not entry.is_rejected:
                 found.extend(floors_of(entry.result))
-    low, high = np.array([core.x0_mm, core.y0_mm]) - MM, np.array([core.x1_mm, core.y1_mm]) + MM
-    return [
-        one
-        for one in found
-        if (one.rings[0].max(axis=0) >= low).all() and (one.rings[0].min(axis=0) <= high).all()
-    ]
+    return found
 
 
 def floors_of(result: BuildingResult) -> list[Outline]:
