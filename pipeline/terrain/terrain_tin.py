@@ -112,7 +112,7 @@ def _no_mesh() -> TerrainMesh:
 
 def _widened(mask: BoolArray, cells: int) -> BoolArray:
     """A mask and all within some cells of it along rows and columns."""
-    out = mask
+    out: BoolArray = mask
     for axis in (0, 1):
         sums = np.cumsum(np.moveaxis(out, axis, 0), axis=0, dtype=np.int32)
         padded = np.pad(sums, ((cells + 1, 0), (0, 0)))
@@ -124,7 +124,8 @@ def _widened(mask: BoolArray, cells: int) -> BoolArray:
 def _known(terrain: Elevations, occupied: BoolArray) -> BoolArray:
     """The cells with terrain and with points on all sides nearby."""
     closed = ~_widened(~_widened(occupied, GAP_CELLS), GAP_CELLS)
-    return closed & (terrain != NO_DATA)
+    known: BoolArray = closed & (terrain != NO_DATA)
+    return known
 
 
 @kernel
@@ -193,7 +194,9 @@ class _Drawn:
         """Move the outlines near the tile to its corner."""
         low = np.array([self.core.x0_mm, self.core.y0_mm])
         side = self.core.x1_mm - self.core.x0_mm
-        rings, floors, near = [], [], []
+        rings: list[shapely.LinearRing] = []
+        floors: list[int] = []
+        near: list[Outline] = []
         for outline in self.outlines:
             moved = [ring - low for ring in outline.rings]
             outer = moved[0]
@@ -312,8 +315,9 @@ class _Drawn:
         return np.concatenate(chosen)
 
     def judged(self, places: FloatArray) -> tuple[IntArray, BoolArray]:
-        """For points inside regions (r, 2), the floor of the building there (of the lowest; NO_DATA for none), and
-        whether the region is terrain.
+        """The floor of the building at a point of each region (r, 2), and whether the region is terrain.
+
+        Of several buildings the lowest floor counts; it is NO_DATA where there is none.
         """
         floor = np.full(len(places), NO_DATA, np.int64)
         if self.outlines:

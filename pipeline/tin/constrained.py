@@ -1,4 +1,4 @@
-"""Constrained Delaunay triangulation with greedy insertion: given edges stay, all else is Delaunay as far as they allow.
+"""Constrained Delaunay triangulation with greedy insertion: given edges stay, all else is Delaunay where they allow it.
 
 Edges are recovered by flipping the diagonals that cross them (Sloan: *A fast algorithm for generating constrained
 Delaunay triangulations*, Computers and Structures 47, 1993). Points are then inserted as in `greedy_insertion`, and no
@@ -362,9 +362,7 @@ def _refine(
     n_facets, tolerance_mm = limits
     infinity = len(x) - 1
     room = len(region)
-    buckets = Buckets(
-        np.empty(room, np.int32), np.empty(infinity, np.int32), np.empty(room, np.int32), np.empty(room)
-    )
+    buckets = Buckets(np.empty(room, np.int32), np.empty(infinity, np.int32), np.empty(room, np.int32), np.empty(room))
     _fill_buckets(vertices, origin, buckets, wanted, lattice)
     candidates = heap_with_room(1024)
     held = 0

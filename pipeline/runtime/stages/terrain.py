@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -16,11 +16,11 @@ from pipeline.export.coordinates import SpatialReference
 from pipeline.export.terrain import FOLDER, in_crs, terrain_lines, terrain_obj, terrain_path
 from pipeline.io import storage_at
 from pipeline.model import BuildingResult, FaceKind
-from pipeline.runtime.plan import WINDOW_BASE_BYTES
+from pipeline.runtime.cluster.memory_needs import WINDOW_BASE_BYTES
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, whole
+from pipeline.runtime.scratch.outcomes import InParts, Place, brief_within, drop_outcomes, key_of, part_of, whole
 from pipeline.runtime.stages.cleanup import writing_terrain
 from pipeline.runtime.stages.ground import Ground
 from pipeline.runtime.stages.model_batch import stored_results
@@ -34,6 +34,17 @@ from pipeline.tiling import MM, Tile, TileGrid, Window
 _OVERHANG_M = 25
 """Buildings of tiles nearer than this may reach into a tile, although all their points lie in others."""
 _BYTES_PER_CELL = 150
+_FLOORS = "floors"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FloorsTask:
+    """The floors of the buildings of one tile: small, and read by the tiles around it, too."""
+
+    scratch: Scratch
+    """Models in."""
+    batches: tuple[Place, ...]
+    """Outcomes of the batches that modelled them."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,8 +59,8 @@ class TerrainTask:
     """The run directory, a path or URL."""
     scratch: Scratch
     """Terrain and models in."""
-    batches: tuple[Place, ...]
-    """Outcomes of the batches that modelled the buildings of the tile and of those around it."""
+    floors: tuple[Place, ...]
+    """Outcomes with the floors of the buildings of the tile and of those around it."""
     reference: SpatialReference
     """CRS and units of the files."""
     tolerance_m: float
@@ -96,9 +107,10 @@ def write_terrain(
     stage, there = writing_terrain(run_dir), set[str]()
     if scratch.attempt:
         there = {key for key in storage.keys(FOLDER) if not key.rpartition("/")[2].startswith(".")}
+    floors = _floors_by_tile(context, models)
     tasks = {}
     for tile in sorted(ground.tiles):
-        task = _task(context, settings, models, tile, run_dir, meshes)
+        task = _task(context, settings, floors, tile, run_dir, meshes)
         seen = [ground.tiles[other].zones for other in _around(task.grid, tile, REACH_M) if other in ground.tiles]
         near = [models.contents.get(other, "") for other in _around(task.grid, tile, _OVERHANG_M)]
         key = key_of(run_dir, tile, task.grid, task.tolerance_m, task.obj, task.reference, seen, near)
@@ -119,12 +131,40 @@ def write_terrain(
     return TerrainOutcome(counts=_counts(good), failed=tuple(one.tile.key for one in written.values() if one.error))
 
 
+def _floors_by_tile(context: RunContext, models: Models) -> dict[Tile, Place]:
+    """Where the floors of each tile with buildings are stored."""
+    scratch = context.scratch
+    tasks = {
+        tile: (
+            Place(_FLOORS, tile.key, key_of(models.contents[tile])),
+            FloorsTask(scratch=scratch, batches=tuple(places)),
+        )
+        for tile, places in models.places.items()
+    }
+    drop_outcomes(scratch, _FLOORS, [place for place, _ in tasks.values()])
+    files: Files[FloorsTask, int] = Files(reads=lambda task: {place.folder for place in task.batches})
+    context.map_stored("terrain", store_floors, dict(tasks.values()), brief_within, files=files, quiet=True)
+    return {tile: place for tile, (place, _) in tasks.items()}
+
+
+def store_floors(task: FloorsTask) -> InParts[int]:
+    """The floors of the buildings of one tile; the brief is their number."""
+    found = [
+        floor
+        for place in task.batches
+        for entry in stored_results(task.scratch, place)
+        if not entry.is_rejected
+        for floor in floors_of(entry.result)
+    ]
+    return InParts(brief=len(found), parts=(found,))
+
+
 def _around(grid: TileGrid, tile: Tile, metres: int) -> list[Tile]:
     return list(grid.tiles_over(grid.core(tile).grown(metres * MM)))
 
 
 def _task(
-    context: RunContext, settings: RunSettings, models: Models, tile: Tile, run_dir: str, meshes: str
+    context: RunContext, settings: RunSettings, floors: Mapping[Tile, Place], tile: Tile, run_dir: str, meshes: str
 ) -> TerrainTask:
     grid = context.plan.grid
     return TerrainTask(
@@ -132,7 +172,7 @@ def _task(
         grid=grid,
         run_dir=run_dir,
         scratch=context.scratch,
-        batches=tuple(place for other in _around(grid, tile, _OVERHANG_M) for place in models.places.get(other, ())),
+        floors=tuple(floors[other] for other in _around(grid, tile, _OVERHANG_M) if other in floors),
         reference=context.plan.reference,
         tolerance_m=settings.general.terrain_tolerance_m,
         obj=meshes != "none",
@@ -143,7 +183,7 @@ def _task(
 def _read(task: TerrainTask) -> set[str]:
     """The folders of scratch with the terrain and the models that a tile's terrain needs."""
     ground = {f"{GROUND}/{tile.key}" for tile in _around(task.grid, task.tile, REACH_M)}
-    return ground | {place.folder for place in task.batches}
+    return ground | {place.folder for place in task.floors}
 
 
 def _paths(task: TerrainTask) -> list[str]:
@@ -181,7 +221,7 @@ def _written(task: TerrainTask) -> TileTerrain:
         around.elevation_mm,
         around.occupied,
         (around.column0, around.row0),
-        _outlines(task),
+        [floor for place in task.floors for floor in part_of(task.scratch, place, 0)],
         task.tolerance_m * MM,
     )
     task.scratch.check_cancelled()
@@ -215,20 +255,10 @@ def _contents(task: TerrainTask, mesh: TerrainMesh, core: Window) -> tuple[str, 
     return lines, *((terrain_obj(terrain, task.tile.key, task.reference),) if task.obj else ())
 
 
-def _outlines(task: TerrainTask) -> list[Outline]:
-    """The floors of all buildings that may meet a tile, and others."""
-    found = []
-    for place in task.batches:
-        for entry in stored_results(task.scratch, place):
-            if not entry.is_rejected:
-                found.extend(floors_of(entry.result))
-    return found
-
-
 def floors_of(result: BuildingResult) -> list[Outline]:
     """The floors of a building's solids in absolute millimetres."""
     origin_mm = np.rint(np.array(result.origin) * MM).astype(np.int64)
-    found = []
+    found: list[Outline] = []
     for solid in result.solids:
         vertices = np.rint(solid.vertices * MM).astype(np.int64) + origin_mm
         found.extend(

@@ -1,0 +1,245 @@
+"""The terrain of tiles as triangles: seamless, with floors cut out, within its tolerance."""
+
+import itertools
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import shapely
+from examples import examples
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.model import IntArray
+from pipeline.terrain.lattice import NO_DATA
+from pipeline.terrain.terrain_tin import (
+    BESIDE_MM,
+    CLEARANCE_MM,
+    GAP_CELLS,
+    REACH_M,
+    Outline,
+    TerrainMesh,
+    terrain_mesh,
+)
+from pipeline.tiling import Window
+
+Edge = tuple[tuple[int, int, int], tuple[int, int, int]]
+SIDE = 24_000
+TOLERANCE = 100.0
+
+
+def hills(x: IntArray, y: IntArray) -> IntArray:
+    """A terrain in mm, at places in mm."""
+    waves = 2000 * np.sin(x / 9000) * np.cos(y / 7000) + 150 * np.sin(x / 1700 + y / 1300)
+    return np.rint(5000 + 0.1 * x + waves).astype(np.int32)
+
+
+def tile_at(
+    corner: tuple[int, int],
+    outlines: Sequence[Outline],
+    side: int = SIDE,
+    data: shapely.Geometry | None = None,
+) -> TerrainMesh:
+    """The terrain of a tile from its lower left corner; `data` is where points are, everywhere by default."""
+    core = Window(x0_mm=corner[0], y0_mm=corner[1], x1_mm=corner[0] + side, y1_mm=corner[1] + side)
+    view = core.grown(REACH_M * 1000)
+    column0, row0 = view.x0_mm // 1000, view.y0_mm // 1000
+    columns, rows = -(-view.x1_mm // 1000) - column0, -(-view.y1_mm // 1000) - row0
+    x, y = np.meshgrid(1000 * (column0 + np.arange(columns)) + 500, 1000 * (row0 + np.arange(rows)) + 500)
+    occupied = np.ones(x.shape, np.bool_) if data is None else shapely.contains_xy(data, x, y)
+    return terrain_mesh(core, hills(x, y), occupied, (column0, row0), outlines, TOLERANCE)
+
+
+def edges_of(meshes: Sequence[TerrainMesh]) -> Counter[Edge]:
+    """How often each directed edge occurs in all meshes."""
+    found: Counter[Edge] = Counter()
+    for mesh in meshes:
+        places = [tuple(place) for place in mesh.vertices_mm.tolist()]
+        for a, b, c in mesh.triangles.tolist():
+            found.update(((places[a], places[b]), (places[b], places[c]), (places[c], places[a])))
+    return found
+
+
+def area_mm2(mesh: TerrainMesh) -> float:
+    """Area in plan; no triangle may be upside down."""
+    a, b, c = (mesh.vertices_mm[mesh.triangles[:, k], :2] for k in range(3))
+    doubled = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    assert (doubled >= 0).all()
+    return float(doubled.sum()) / 2
+
+
+def box(x: int, y: int, wide: int, deep: int, turn: float, z: int) -> Outline:
+    corners = np.array([(0, 0), (wide, 0), (wide, deep), (0, deep)])
+    cosine, sine = np.cos(turn), np.sin(turn)
+    ring = np.rint(corners @ np.array([[cosine, sine], [-sine, cosine]])).astype(np.int64) + (x, y)
+    return Outline(rings=(ring,), z_mm=z)
+
+
+def row_of_houses(x: int, y: int, turn: float, levels: Sequence[int]) -> list[Outline]:
+    """Touching houses of 6 m by 9 m that share the corners between them."""
+    along, across = np.array((np.cos(turn), np.sin(turn))), np.array((-np.sin(turn), np.cos(turn)))
+    front = [np.rint((x, y) + 6000 * k * along).astype(np.int64) for k in range(len(levels) + 1)]
+    back = [np.rint((x, y) + 6000 * k * along + 9000 * across).astype(np.int64) for k in range(len(levels) + 1)]
+    return [
+        Outline(rings=(np.array((front[k], front[k + 1], back[k + 1], back[k])),), z_mm=level)
+        for k, level in enumerate(levels)
+    ]
+
+
+def polygon(outline: Outline) -> shapely.Polygon:
+    return shapely.Polygon(outline.rings[0], outline.rings[1:])
+
+
+HOUSES = st.one_of(
+    st.builds(
+        box,
+        st.integers(-9000, 50_000),
+        st.integers(-9000, 50_000),
+        st.integers(1500, 20_000),
+        st.integers(1500, 12_000),
+        st.sampled_from([0.0, 0.3, 1.1, np.pi / 4]),
+        st.sampled_from([3000, 3200, 5000]),
+    ).map(lambda one: [one]),
+    st.builds(
+        row_of_houses,
+        st.integers(0, 48_000),
+        st.integers(0, 48_000),
+        st.sampled_from([0.0, 0.7, 2.5]),
+        st.lists(st.sampled_from([3000, 3400]), min_size=2, max_size=4),
+    ),
+)
+
+
+@settings(max_examples=examples(40), deadline=None)
+@given(st.lists(HOUSES, max_size=5), st.sampled_from([(0, 0), (217, 881), (-7_000_500, 94_999_999)]))
+def test_tiles_meet_without_gaps_overlaps_or_loose_vertices(
+    houses: list[list[Outline]], corner: tuple[int, int]
+) -> None:
+    # houses that overlap are united as the models of a run never do: keep those apart from all before
+    outlines: list[Outline] = []
+    for group in houses:
+        moved = [Outline(rings=tuple(r + corner for r in one.rings), z_mm=one.z_mm) for one in group]
+        if all(polygon(a).distance(polygon(b)) > 5 for a in moved for b in outlines):
+            outlines.extend(moved)
+    corners = [(corner[0] + SIDE * i, corner[1] + SIDE * k) for i, k in itertools.product((0, 1), repeat=2)]
+    meshes = [tile_at(place, outlines) for place in corners]
+    edges = edges_of(meshes)
+    assert max(edges.values()) == 1
+    square = shapely.box(*corner, corner[0] + 2 * SIDE, corner[1] + 2 * SIDE)
+    built = shapely.union_all([polygon(one) for one in outlines]) & square
+    # noding moves vertices by less than a millimetre
+    moved_mm2 = 1000 + built.length
+    assert sum(map(area_mm2, meshes)) == pytest.approx(square.area - built.area, abs=moved_mm2)
+    walls = shapely.union_all([polygon(one).exterior for one in outlines])
+    for a, b in edges:
+        if (b, a) in edges or (a[:2] == b[:2]):
+            continue
+        line = shapely.LineString((a[:2], b[:2]))
+        on_edge = square.exterior.distance(shapely.Point(a[:2])) == square.exterior.distance(shapely.Point(b[:2])) == 0
+        assert on_edge or shapely.hausdorff_distance(line, walls & line.buffer(2)) < 3
+
+
+@settings(max_examples=examples(20), deadline=None)
+@given(st.lists(HOUSES, min_size=1, max_size=3))
+def test_cells_away_from_outlines_are_within_the_tolerance(houses: list[list[Outline]]) -> None:
+    outlines = [one for group in houses for one in group]
+    mesh = tile_at((0, 0), outlines)
+    walls = shapely.union_all([polygon(one) for one in outlines])
+    corners = mesh.vertices_mm[mesh.triangles].astype(float)
+    flat = shapely.polygons(corners[:, :, :2])
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.arange(500, SIDE, 1000)] * 2))
+    counted = shapely.distance(walls, shapely.points(x, y)) >= CLEARANCE_MM
+    cell, triangle = shapely.STRtree(flat[shapely.area(flat) > 0]).query(shapely.points(x, y), predicate="intersects")
+    upright = corners[shapely.area(flat) > 0][triangle]
+    normal = np.cross(upright[:, 1] - upright[:, 0], upright[:, 2] - upright[:, 0])
+    away = np.column_stack((x, y))[cell] - upright[:, 0, :2]
+    z = upright[:, 0, 2] - (normal[:, :2] * away).sum(axis=1) / normal[:, 2]
+    errors = np.abs(z - hills(x, y)[cell])[counted[cell]]
+    assert len(np.unique(cell[counted[cell]])) == mesh.n_cells == np.count_nonzero(counted)
+    assert errors.max(initial=0.0) <= TOLERANCE + 1e-6
+    assert mesh.max_error_mm <= TOLERANCE
+
+
+def test_outlines_are_edges_of_the_mesh_at_the_level_of_the_floor() -> None:
+    inner = np.array([(8000, 16_000), (8000, 19_000), (11_000, 19_000), (11_000, 16_000)])
+    court = Outline(rings=(box(5000, 13_000, 9000, 9000, 0.0, 0).rings[0], inner), z_mm=4321)
+    row = row_of_houses(2500, 1000, 0.1, [3000, 3400, 3000])
+    edges = edges_of([tile_at((0, 0), [court, *row])])
+    free = {frozenset(edge) for edge in edges if edge[::-1] not in edges}
+    shared = set[frozenset[tuple[int, ...]]]()
+    for first, second in itertools.pairwise(row):
+        common = {tuple(place) for place in first.rings[0].tolist()} & {tuple(p) for p in second.rings[0].tolist()}
+        shared.add(frozenset(common))
+    for one in (court, *row):
+        for ring in one.rings:
+            for a, b in zip(ring.tolist(), np.roll(ring, -1, axis=0).tolist(), strict=True):
+                if frozenset((tuple(a), tuple(b))) not in shared:
+                    assert frozenset(((*a, one.z_mm), (*b, one.z_mm))) in free
+    # nothing is drawn beneath a house, but the court has ground
+    mesh = tile_at((0, 0), [court])
+    places = shapely.polygons(mesh.vertices_mm[mesh.triangles][:, :, :2].astype(float))
+    assert not shapely.intersects(places, shapely.Point(6000, 17_000)).any()
+    assert shapely.intersects(places, shapely.Point(9500, 17_500)).any()
+
+
+def test_upright_triangles_close_the_step_between_floors_that_touch() -> None:
+    low, high = row_of_houses(8000, 8000, 0.0, [3000, 3400])
+    mesh = tile_at((0, 0), [low, high])
+    a, b, c = (mesh.vertices_mm[mesh.triangles[:, k]] for k in range(3))
+    upright = np.flatnonzero(np.cross(b - a, c - a)[:, 2] == 0)
+    # one at each end of the common wall, beneath the higher floor
+    assert len(upright) == 2
+    for triangle in mesh.triangles[upright]:
+        assert set(mesh.vertices_mm[triangle][:, 2].tolist()) == {3000, 3400}
+    assert len(mesh.vertices_mm) == len(np.unique(mesh.vertices_mm, axis=0))
+
+
+def test_outlines_farther_away_do_not_matter() -> None:
+    near = box(5000, 6000, 8000, 7000, 0.4, 3000)
+    far = box(SIDE + BESIDE_MM + 1, 6000, 8000, 7000, 0.0, 3000)
+    alone, both = tile_at((0, 0), [near]), tile_at((0, 0), [near, far])
+    assert np.array_equal(alone.vertices_mm, both.vertices_mm)
+    assert np.array_equal(alone.triangles, both.triangles)
+
+
+def test_the_order_of_outlines_does_not_matter() -> None:
+    row = row_of_houses(-3000, 9000, 0.2, [3000, 3400, 3100, 3400])
+    one, other = tile_at((0, 0), row), tile_at((0, 0), row[::-1])
+    assert np.array_equal(one.vertices_mm, other.vertices_mm)
+    assert np.array_equal(one.triangles, other.triangles)
+
+
+def test_terrain_ends_with_the_data_and_gaps_are_closed() -> None:
+    wide = 2 * GAP_CELLS * 1000 + 3000
+    data = shapely.box(-90_000, -90_000, 130_000, 70_000)
+    pond, lake = shapely.box(10_000, 10_000, 25_000, 25_000), shapely.box(40_000, 10_000, 40_000 + wide, 10_000 + wide)
+    tiles = [(100_000 * i, 0) for i in (0, 1)]
+    meshes = [tile_at(corner, [], 100_000, data - pond - lake) for corner in tiles]
+    edges = edges_of(meshes)
+    assert max(edges.values()) == 1
+    expected = shapely.box(0, 0, 130_000, 70_000) - lake
+    assert sum(map(area_mm2, meshes)) == expected.area
+    ends = shapely.MultiLineString([e for e in ((a[:2], b[:2]) for a, b in edges if (b, a) not in edges)])
+    assert shapely.union_all(ends).symmetric_difference(expected.boundary).length == 0
+    # the edge of the data is at the level of the terrain
+    for mesh in meshes:
+        x, y, z = mesh.vertices_mm.T
+        assert np.abs(z - hills(x, y)).max() < 150
+
+
+def test_a_tile_without_terrain_has_no_triangles() -> None:
+    for outlines, data in (([], shapely.Polygon()), ([box(-9000, -9000, 60_000, 60_000, 0.0, 3000)], None)):
+        mesh = tile_at((0, 0), outlines, data=data)
+        assert (len(mesh.vertices_mm), len(mesh.triangles), mesh.n_cells) == (0, 0, 0)
+        assert mesh.max_error_mm == mesh.squares_mm2 == 0.0
+
+
+def test_cells_without_terrain_are_left_out() -> None:
+    core = Window(x0_mm=0, y0_mm=0, x1_mm=8000, y1_mm=8000)
+    cells = 8 + 2 * REACH_M
+    terrain = np.full((cells, cells), 1000, np.int32)
+    terrain[:, : REACH_M + 3] = NO_DATA
+    mesh = terrain_mesh(core, terrain, np.ones((cells, cells), np.bool_), (-REACH_M, -REACH_M), [], TOLERANCE)
+    assert mesh.vertices_mm.min(axis=0).tolist() == [3000, 0, 1000]
+    assert len(mesh.triangles) == 2
