@@ -459,10 +459,14 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
     warnings.extend(outcome.warning for outcome in found.outcomes if outcome.warning)
     if earlier.manifest.request.get("points"):
         warnings.append(_POINTS_GONE)
+    settings = earlier.manifest.settings
     if request.settings.general.terrain != "none":
         warnings.append(_TERRAIN_GONE)
+        settings = {**settings, "general": {**settings["general"], "terrain": "none"}}
+        counts = Counter({name: n for name, n in counts.items() if not name.startswith("terrain_")})
     return dataclasses.replace(
         earlier.manifest,
+        settings=settings,
         request={
             **earlier.manifest.request,
             "overrides": request_record(request)["overrides"],

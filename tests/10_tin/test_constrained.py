@@ -124,7 +124,9 @@ def test_every_point_of_a_wanted_region_is_within_the_tolerance(
     found = refine(tin, random.integers(0, 400, len(xy)), wanted, points, tolerance)
     inside = shapely.union_all([shapely.Polygon(found.vertices_mm[facet, :2]) for facet in found.facets])
     rows, columns = np.nonzero(~np.isnan(z) & shapely.contains(inside, places))
-    errors = [abs(height_at(found, 500 + 1000 * c, 500 + 1000 * r) - z[r, c]) for r, c in zip(rows, columns, strict=True)]
+    errors = [
+        abs(height_at(found, 500 + 1000 * c, 500 + 1000 * r) - z[r, c]) for r, c in zip(rows, columns, strict=True)
+    ]
     assert found.n_points == len(errors)
     assert max(errors, default=0.0) <= tolerance + 1e-6
     assert found.max_error_mm == pytest.approx(max(errors, default=0.0), abs=1e-6)

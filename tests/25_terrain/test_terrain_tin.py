@@ -72,8 +72,8 @@ def area_mm2(mesh: TerrainMesh) -> float:
 def box(x: int, y: int, wide: int, deep: int, turn: float, z: int) -> Outline:
     corners = np.array([(0, 0), (wide, 0), (wide, deep), (0, deep)])
     cosine, sine = np.cos(turn), np.sin(turn)
-    ring = np.rint(corners @ np.array([[cosine, sine], [-sine, cosine]])).astype(np.int64) + (x, y)
-    return Outline(rings=(ring,), z_mm=z)
+    turned = np.rint(corners @ np.array([[cosine, sine], [-sine, cosine]])).astype(np.int64)
+    return Outline(rings=(turned + np.array((x, y)),), z_mm=z)
 
 
 def row_of_houses(x: int, y: int, turn: float, levels: Sequence[int]) -> list[Outline]:
@@ -220,7 +220,7 @@ def test_terrain_ends_with_the_data_and_gaps_are_closed() -> None:
     assert max(edges.values()) == 1
     expected = shapely.box(0, 0, 130_000, 70_000) - lake
     assert sum(map(area_mm2, meshes)) == expected.area
-    ends = shapely.MultiLineString([e for e in ((a[:2], b[:2]) for a, b in edges if (b, a) not in edges)])
+    ends = shapely.MultiLineString([(a[:2], b[:2]) for a, b in edges if (b, a) not in edges])
     assert shapely.union_all(ends).symmetric_difference(expected.boundary).length == 0
     # the edge of the data is at the level of the terrain
     for mesh in meshes:

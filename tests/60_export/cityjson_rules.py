@@ -30,6 +30,11 @@ _SOLID = _object(
 )
 _BUILDING = _object({"attributes": {"type": "object"}, "children": _array(_TEXT, 1)}, type={"const": "Building"})
 _PART = _object(type={"const": "BuildingPart"}, parents=_array(_TEXT, 1, 1), geometry=_array(_SOLID, 1))
+_TRIANGLE = _array(_array({"type": "integer", "minimum": 0}, 3, 3), 1, 1)
+_TRIANGLES = _object(
+    type={"const": "CompositeSurface"}, lod=_TEXT | {"pattern": r"^[0-3](\.[0-3])?$"}, boundaries=_array(_TRIANGLE, 1)
+)
+_RELIEF = _object({"attributes": {"type": "object"}}, type={"const": "TINRelief"}, geometry=_array(_TRIANGLES, 1))
 _METADATA = {
     "type": "object",
     "properties": {
@@ -49,7 +54,7 @@ FIRST_LINE = _object(
 FEATURE = _object(
     type={"const": "CityJSONFeature"},
     id=_TEXT,
-    CityObjects={"type": "object", "additionalProperties": {"oneOf": [_BUILDING, _PART]}},
+    CityObjects={"type": "object", "additionalProperties": {"oneOf": [_BUILDING, _PART, _RELIEF]}},
     vertices=_array(_array(_INTEGER, 3, 3)),
 )
 
@@ -78,6 +83,10 @@ def _feature_faults(feature: dict[str, Any]) -> list[str]:
             if name not in objects.get(parent, {}).get("children", ()):
                 found.append(f"{name}: its parent {parent} does not know it")
         for solid in entry.get("geometry", ()):
+            if entry["type"] == "TINRelief":
+                used.update(index for (ring,) in solid["boundaries"] for index in ring)
+                found += [f"{name}: {face} has no area" for (face,) in solid["boundaries"] if len(set(face)) < 3]
+                continue
             shells, values = solid["boundaries"], solid["semantics"]["values"]
             if [len(shell) for shell in shells] != [len(shell) for shell in values]:
                 found.append(f"{name}: not one semantic value a surface")
