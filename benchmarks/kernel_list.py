@@ -47,6 +47,7 @@ def commands(folder: Path) -> dict[str, list[str]]:
             f"evaluate {folder}/plain --points {tile} --out {folder}/measured",
         ],
         "classify": [f"classify {tile} --out {folder}/classified --rasters --classes ignore"],
+        "terrain": [f"reconstruct {tile} --out {folder}/terrain --classes ignore --workers 0 --terrain tin"],
         "compare": [f"compare {tile} --methods {every},{faithful} --out {folder}/compared"],
         "diff": [f"batch diff {folder}/plain {folder}/trusted --out {folder}/changes"],
     }

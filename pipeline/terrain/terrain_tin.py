@@ -246,13 +246,8 @@ class _Drawn:
         """Terrain at some points, mm; NO_DATA where there is none."""
         absolute = xy + self._low
         x, y = np.ascontiguousarray(absolute[:, 0]), np.ascontiguousarray(absolute[:, 1])
-        below = height_above(x, y, np.zeros(len(xy), np.int64), self._shown, *self.corner)
+        below = height_above(x, y, np.zeros(len(xy), np.int64), self.terrain, *self.corner)
         return np.where(below == NO_DATA, np.int64(NO_DATA), -below)
-
-    @property
-    def _shown(self) -> Elevations:
-        """The terrain that the mesh may show."""
-        return np.where(self.known, self.terrain, NO_DATA)
 
     def with_more(self, nodes: IntArray, edges: IntArray, tolerance_mm: float) -> tuple[IntArray, IntArray]:
         """The nodes and further ones along the border and the edge of the data, and the elevation of each.

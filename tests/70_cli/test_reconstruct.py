@@ -44,9 +44,9 @@ def test_the_run_directory_is_laid_out_as_documented(run: Run) -> None:
     folder, _, _ = run
     page = Path(__file__).resolve().parents[2] / "docs" / "run_directory.md"
     documented = {line.split("/")[0].split(" ")[0] for line in page.read_text().split("```")[1].splitlines() if line}
-    assert {entry.name for entry in folder.iterdir()} == documented - {"run.html", "points"}
+    assert {entry.name for entry in folder.iterdir()} == documented - {"run.html", "points", "terrain"}
     assert invoke("report", str(folder))[0] == 0
-    assert {entry.name for entry in folder.iterdir()} == documented - {"points"}
+    assert {entry.name for entry in folder.iterdir()} == documented - {"points", "terrain"}
     (folder / "run.html").unlink()
     assert len(list(folder.glob("meshes/*/*.obj"))) == 1
 
