@@ -240,6 +240,7 @@ class _Sinks:
     def add(self, tile: RunTile) -> None:
         """Write one tile to all files."""
         from pipeline.export.solid_geometry import SHAPE_COLUMNS
+        from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
         from service.outputs.footprints import feature_texts
         from service.outputs.merged_table import read_tile
         from service.outputs.meshes import zip_files
@@ -248,7 +249,9 @@ class _Sinks:
         for name, table in self._tables.items():
             table.add(tile.key, tables[name])
         if self._archive is not None:
-            zip_files(self._archive, self._run_dir, tile.meshes)
+            terrain = sorted((self._run_dir / TERRAIN_FOLDER / f"tile={tile.key}").glob("part-*"))
+            names = [path.relative_to(self._run_dir).as_posix() for path in terrain]
+            zip_files(self._archive, self._run_dir, [*tile.meshes, *names])
         places = self._add_cityjson(tile)
         planes: dict[str, list[dict[str, Any]]] = {}
         for plane in tables["planes"].drop_columns(["geometry", "bbox"]).to_pylist():

@@ -80,7 +80,8 @@ _OF_A_RUN = (
         output_id="meshes",
         title="Meshes as OBJ or GLB in a zip file",
         description="The solids as Wavefront OBJ in full coordinates, one file per building (or per tile, on "
-        "request); or, on request, as GLB, one file per tile. The names in the zip file are in the column mesh_path.",
+        "request); or, on request, as GLB, one file per tile. The names in the zip file are in the column mesh_path. "
+        "With the setting terrain also the terrain of each tile, as OBJ and CityJSONSeq.",
         media_type=ZIP,
         filename="meshes.zip",
         schema=_binary(ZIP),

@@ -371,6 +371,24 @@ def test_an_unknown_crs_is_reported_and_the_coordinates_stay_the_tiles_own(tmp_p
 # --- meshes ----------------------------------------------------------------------------------------------------------
 
 
+def test_the_zip_file_holds_the_terrain_of_the_tiles(tmp_path: Path) -> None:
+    run_dir = runs.write_run(tmp_path / "run")
+    write_outputs(run_dir, tmp_path / "without", ("meshes",))
+    tiles = json.loads((run_dir / "run.json").read_text())["tiles"]
+    written = {f"terrain/tile={tiles[0]}/part-0.{end}": end.encode() for end in ("city.jsonl", "obj")}
+    for name, content in written.items():
+        (run_dir / name).parent.mkdir(parents=True, exist_ok=True)
+        (run_dir / name).write_bytes(content)
+    (run_dir / "terrain" / f"tile={tiles[0]}" / ".part-0.obj.1-ab.part").touch()
+    write_outputs(run_dir, tmp_path / "with", ("meshes",))
+    with (
+        zipfile.ZipFile(output_file(tmp_path / "with", "meshes")) as archive,
+        zipfile.ZipFile(output_file(tmp_path / "without", "meshes")) as before,
+    ):
+        assert sorted(archive.namelist()) == sorted([*before.namelist(), *written])
+        assert {name: archive.read(name) for name in written} == written
+
+
 @pytest.mark.parametrize("meshes", ["building", "tile"])
 def test_the_zip_file_holds_the_meshes_under_the_names_of_the_table(tmp_path: Path, meshes: str) -> None:
     run_dir = runs.write_run(tmp_path / "run", meshes=meshes)
