@@ -412,7 +412,7 @@ def _watched(remote: Remote, job_id: str) -> None:
     """Show the events of a job; end as it ended."""
     job = remote.client.wait(job_id, on_event=lambda event: _show_event(remote.console, event))
     _shown_job(remote.console, job)
-    if job.summary.get("failed_tiles") or job.summary.get("tiles_without_points"):
+    if any(job.summary.get(name) for name in ("failed_tiles", "tiles_without_points", "tiles_without_terrain")):
         raise typer.Exit(ExitCode.TILES_FAILED)
 
 

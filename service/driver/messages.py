@@ -66,6 +66,9 @@ def outcome(summary: RunSummary) -> str:
     if summary.tiles_without_points:
         count = len(summary.tiles_without_points)
         sentence += f"; the points of {count} {'tile' if count == 1 else 'tiles'} could not be written"
+    if summary.tiles_without_terrain:
+        count = len(summary.tiles_without_terrain)
+        sentence += f"; the terrain of {count} {'tile' if count == 1 else 'tiles'} could not be written"
     if summary.warnings:
         sentence += f"; {len(summary.warnings)} {'warning' if len(summary.warnings) == 1 else 'warnings'}"
     return sentence
@@ -131,6 +134,7 @@ def digest_of(summary: RunSummary, scrub: Scrubber, engine_version: str) -> dict
         "counts": dict(summary.counts),
         "failed_tiles": list(summary.failed_tiles),
         "tiles_without_points": list(summary.tiles_without_points),
+        "tiles_without_terrain": list(summary.tiles_without_terrain),
         **_measured(summary, scrub),
     }
 

@@ -108,6 +108,7 @@ def report(
             "planned": len(manifest["tiles"]) + len(set(failed_tiles) - set(manifest["tiles"])),
             "failed": [{"tile": tile, "reason": clean(why)} for tile, why in sorted(failed_tiles.items())],
             "without_points": list(manifest.get("tiles_without_points", ())),
+            "without_terrain": list(manifest.get("tiles_without_terrain", ())),
         },
         "counts": dict(manifest["counts"]),
         "warnings": [clean(warning) for warning in manifest["warnings"]],

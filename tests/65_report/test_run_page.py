@@ -96,6 +96,13 @@ def test_a_tile_without_points_has_its_buildings(street_run: Path) -> None:
     assert "could not be published" not in text
 
 
+def test_a_tile_without_terrain_has_its_buildings(street_run: Path) -> None:
+    change(street_run, tiles=("x850_y4471",), tiles_without_terrain=("x850_y4471",), warnings=())
+    text, read = page_of(street_run)
+    assert "The terrain of 1 of 1 tiles could not be written ; this does not affect the buildings" in words(read)
+    assert "could not be published" not in text
+
+
 def test_a_failed_tile_is_on_the_map(street_run: Path) -> None:
     lattice = {"tile_size_m": 100.0, "origin_x_m": 0.0, "origin_y_m": 0.0}
     change(

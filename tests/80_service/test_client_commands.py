@@ -93,7 +93,7 @@ def test_every_option_of_submit_arrives(site: Site) -> None:
     assert json.loads(done(*classified))["request"]["inputs"]["rasterCell"] == 2.0
 
 
-@pytest.mark.parametrize("field", ["failed_tiles", "tiles_without_points"])
+@pytest.mark.parametrize("field", ["failed_tiles", "tiles_without_points", "tiles_without_terrain"])
 def test_submit_and_wait_ends_as_the_job_does(site: Site, field: str) -> None:
     job = site.runs.running(process_id="echo", echo={"message": "a", "delay": 0.0})
     site.store.succeed(job, message="all good", summary={field: ["x1_y1"]})

@@ -185,6 +185,9 @@ def test_the_outcome_is_reported_honestly() -> None:
     without = run_summary(statuses={"ok": 1}, rejected={}, tiles_without_points=("x1_y2", "x1_y3"))
     assert outcome(without) == "1 building: 1 ok, 0 fallback, 0 failed; the points of 2 tiles could not be written"
     assert digest_of(without, Scrubber(), "1.0")["tiles_without_points"] == ["x1_y2", "x1_y3"]
+    bare = run_summary(statuses={"ok": 1}, rejected={}, tiles_without_terrain=("x1_y2",))
+    assert outcome(bare) == "1 building: 1 ok, 0 fallback, 0 failed; the terrain of 1 tile could not be written"
+    assert digest_of(bare, Scrubber(), "1.0")["tiles_without_terrain"] == ["x1_y2"]
 
 
 # --- faults

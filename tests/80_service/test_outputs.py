@@ -146,6 +146,7 @@ def test_what_an_unfinished_tile_left_is_in_no_output(tmp_path: Path) -> None:
         "planned": 4,
         "failed": [{"tile": "x851_y4470", "reason": "OSError: disk full"}],
         "without_points": [],
+        "without_terrain": [],
     }
 
 
@@ -438,7 +439,12 @@ def test_the_report_names_inputs_and_warnings_without_the_servers_folders(run_di
     assert report["inputs"][0]["sha256"] == "ab" * 32
     assert report["warnings"] == ["tile.laz: no GPS time", "something else"]
     failed = {"tile": "x852_y4470", "reason": "OSError: scratch/a is gone"}
-    assert report["tiles"] == {"planned": 5, "failed": [failed], "without_points": ["x850_y4470"]}
+    assert report["tiles"] == {
+        "planned": 5,
+        "failed": [failed],
+        "without_points": ["x850_y4470"],
+        "without_terrain": [],
+    }
     assert runs.SERVER_FOLDER not in text
     assert str(run_dir) not in text
     assert "node-7" not in text
