@@ -68,10 +68,23 @@ const HAS_MODELS = new Set(["reconstruct", "publish", "outputs"]);
 /** The further stage of a job that keeps the points. */
 const WITH_POINTS: typeof STAGES = [["octree", "Write the points", "tiles"]];
 
+/** The further stage of a job that writes the terrain. */
+const WITH_TERRAIN: typeof STAGES = [["terrain", "Write the terrain", "tiles"]];
+
+interface Asked {
+  points?: boolean;
+  settings?: { settings?: { terrain?: string } };
+}
+
 function stagesOf(job: StatusInfo): typeof STAGES {
   if (job.processID === "echo") return [];
   if (job.processID === "classify") return [...STAGES.slice(0, FOUND), ...CLASSIFIED, ...STAGES.slice(-1)];
-  const more = job.processID === "compare" ? SIDE_BY_SIDE : job.request?.inputs?.["points"] === true ? WITH_POINTS : [];
+  const asked = (job.request?.inputs ?? {}) as Asked;
+  const beside = [
+    ...(asked.points === true ? WITH_POINTS : []),
+    ...(asked.settings?.settings?.terrain === "tin" ? WITH_TERRAIN : []),
+  ];
+  const more = job.processID === "compare" ? SIDE_BY_SIDE : beside;
   return [...STAGES.slice(0, -1), ...more, ...STAGES.slice(-1)];
 }
 
