@@ -153,7 +153,8 @@ class _Tiles:
         heading, *features = map(json.loads, lines_of(storage_at(self.run_dir).get(key).decode()))
         units_m = (*[self.reference.horizontal_unit_m] * 2, self.reference.vertical_unit_m)
         frame = Frame.of(heading["transform"], units_m)
-        models, blocks = [], []
+        models: _Meshes = []
+        blocks: _Meshes = []
         for feature in features:
             mesh = solid_mesh(feature, frame, None)
             if mesh is None:
