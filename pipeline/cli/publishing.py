@@ -3,28 +3,41 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from pipeline.cli.options import AsJson, Quiet
 from pipeline.console import Console
+from pipeline.errors import SettingsError
+
+if TYPE_CHECKING:
+    from pipeline.runtime.publishing import Published
 
 
 def publish(
     run: Annotated[str, typer.Argument(metavar="RUN", help="A finished run directory, a folder or a URL.")],
     form: Annotated[
-        Literal["geopackage", "cityjson", "pmtiles", "stac"],
+        Literal["geopackage", "cityjson", "pmtiles", "stac", "3dtiles"],
         typer.Option(
             "--as",
             help="geopackage: one file with layers and styles, for GIS. cityjson: a folder, one file per tile. "
-            "pmtiles: one file with footprints, for maps on the web. stac: a folder, a catalogue of the run.",
+            "pmtiles: one file with footprints, for maps on the web. stac: a folder, a catalogue of the run. "
+            "3dtiles: a folder with a tileset, for globes such as CesiumJS.",
         ),
     ],
     out: Annotated[
         str, typer.Option(metavar="PATH", help="The file, which ends in .gpkg or .pmtiles, or the folder to write.")
     ],
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    geoid_height: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES",
+            help="3dtiles: height of the geoid above the ellipsoid, added to elevations. Default: by PROJ, if it has "
+            "the grid, else nothing.",
+        ),
+    ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -38,7 +51,25 @@ def publish(
             "pmtiles": publish_pmtiles,
             "stac": publish_stac,
         }
-        published = forms[form](run, out, overwrite=overwrite, on_event=console.on_event)
+        if form == "3dtiles":
+            published: Published = _tiles(console, run, out, overwrite, geoid_height)
+        elif geoid_height is not None:
+            raise SettingsError([f"--geoid-height {geoid_height:g} is for --as 3dtiles alone: leave it out"])
+        else:
+            published = forms[form](run, out, overwrite=overwrite, on_event=console.on_event)
         console.table("Written", ["what", "rows"], list(published.rows.items()))
         console.say(f"{published.place}, {published.size_bytes / 1e6:.1f} MB")
         console.document({"run": run, "as": form, **dataclasses.asdict(published)})
+
+
+def _tiles(console: Console, run: str, out: str, overwrite: bool, geoid_height: float | None) -> Published:
+    """Write 3D Tiles, and say how they were placed."""
+    from pipeline.runtime.publishing_3dtiles import publish_3dtiles
+
+    published = publish_3dtiles(run, out, overwrite=overwrite, geoid_height_m=geoid_height, on_event=console.on_event)
+    facts = published.georeference
+    accuracy = "unknown" if facts["accuracy_m"] is None else f"{facts['accuracy_m']:g} m"
+    console.say(f"{facts['transformation']}, accuracy {accuracy}")
+    added = "" if facts["geoid_height_m"] is None else f" ({facts['geoid_height_m']:+g} m)"
+    console.say(f"heights: {facts['heights']}{added}")
+    return published

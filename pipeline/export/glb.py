@@ -17,7 +17,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.compiler import kernel
 from pipeline.export.glb_container import INDICES, VERSION, VERTICES, container
@@ -34,8 +33,6 @@ MATERIALS: Mapping[str, tuple[float, float, float]] = {
 PLANE_ID = "_PLANE_ID"
 """Vertex attribute: `plane_id` of the roof plane, -1 on walls and ground."""
 
-Float32Array = npt.NDArray[np.float32]
-
 _MM = 1000
 _FLOAT, _UNSIGNED_INT = 5126, 5125
 _AXES = (
@@ -46,18 +43,18 @@ _AXES = (
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Mesh:
+class SolidMesh:
     """The solids of one building as triangles."""
 
     lod: str
     """Their level of detail."""
     low_mm: IntArray
     """(3,) easting, northing, elevation below all corners: whole metres, in mm."""
-    positions: Float32Array
-    """(v, 3) metres from there, in glTF's axes; every face has corners of its own."""
-    normals: Float32Array
+    local_mm: IntArray
+    """(v, 3) mm from there; every face has corners of its own."""
+    normals: FloatArray
     """(v, 3) unit normals of the faces, outward."""
-    planes: Float32Array
+    planes: IntArray
     """(v,) number of the roof plane, -1 elsewhere."""
     triangles: tuple[tuple[str, str, IntArray], ...]
     """Name of the part, semantic surface, and its triangles (t, 3), counter-clockwise seen from outside."""
@@ -74,8 +71,8 @@ def glb_bytes(
     touches itself.
     """
     heading, *features = (json.loads(line) for line in lines)
-    frame = _Frame.of(heading["transform"], (horizontal_unit_m, horizontal_unit_m, vertical_unit_m))
-    modelled = [(feature, mesh) for feature in features if (mesh := _mesh(feature, frame, lod)) is not None]
+    frame = Frame.of(heading["transform"], (horizontal_unit_m, horizontal_unit_m, vertical_unit_m))
+    modelled = [(feature, mesh) for feature in features if (mesh := solid_mesh(feature, frame, lod)) is not None]
     if not modelled:
         return b""
     origin_mm = np.min([mesh.low_mm for _, mesh in modelled], axis=0)
@@ -96,7 +93,7 @@ def glb_bytes(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Frame:
+class Frame:
     """The transform of a CityJSONSeq text."""
 
     shift: IntArray
@@ -107,7 +104,8 @@ class _Frame:
     """(3,) metres in one unit."""
 
     @classmethod
-    def of(cls, transform: Mapping[str, Sequence[float]], units_m: Sequence[float]) -> _Frame:
+    def of(cls, transform: Mapping[str, Sequence[float]], units_m: Sequence[float]) -> Frame:
+        """The frame of a file's `transform`, in a CRS with these units, (3,)."""
         steps = np.array([10 ** round(-math.log10(scale)) for scale in transform["scale"]], dtype=np.int64)
         shift = np.rint(transform["translate"]).astype(np.int64) * steps
         return cls(shift=shift, steps=steps, units_m=np.array(units_m))
@@ -118,7 +116,7 @@ class _Frame:
         return np.rint(steps / self.steps * self.units_m * _MM).astype(np.int64)
 
 
-def _mesh(feature: Mapping[str, Any], frame: _Frame, lod: str | None) -> _Mesh | None:
+def solid_mesh(feature: Mapping[str, Any], frame: Frame, lod: str | None) -> SolidMesh | None:
     """The triangles of a feature's solids at the finest level up to `lod`; None where it has none."""
     corners, ring_starts, face_starts = [], [0], [0]
     face_keys: list[tuple[str, str]] = []
@@ -153,19 +151,19 @@ def _mesh(feature: Mapping[str, Any], frame: _Frame, lod: str | None) -> _Mesh |
         groups.setdefault(key, []).append(index)
     parts = list(dict.fromkeys(part for part, _ in face_keys))
     wanted = [(part, name) for part in parts for name in MATERIALS if (part, name) in groups]
-    return _Mesh(
+    return SolidMesh(
         lod=level,
         low_mm=low_mm,
-        positions=_gltf_axes(local_mm / _MM),
-        normals=_gltf_axes(normals),
-        planes=np.array(planes, dtype="<f4"),
+        local_mm=local_mm,
+        normals=normals,
+        planes=np.array(planes, np.int64),
         triangles=tuple((*key, triangles[np.isin(of_face, groups[key])]) for key in wanted),
     )
 
 
-def _gltf_axes(xyz: FloatArray) -> Float32Array:
-    """Easting, northing, elevation to x, y up, z minus northing: a turn, so that outward stays outward."""
-    return np.column_stack((xyz[:, 0], xyz[:, 2], 0.0 - xyz[:, 1])).astype("<f4")
+def gltf_axes(xyz: FloatArray) -> FloatArray:
+    """East, north, up to x, y up, z minus north: a turn, so that outward stays outward; (n, 3)."""
+    return np.column_stack((xyz[:, 0], xyz[:, 2], 0.0 - xyz[:, 1]))
 
 
 @kernel
@@ -211,14 +209,15 @@ class _Scene:
         self._accessors: list[dict[str, Any]] = []
         self._views = [_View(stride=12), _View(stride=12), _View(stride=4), _View(stride=None)]
 
-    def add(self, name: str, extras: Mapping[str, Any], mesh: _Mesh, origin_mm: IntArray) -> None:
+    def add(self, name: str, extras: Mapping[str, Any], mesh: SolidMesh, origin_mm: IntArray) -> None:
         """Append a building."""
         positions, normals, planes, indices = self._views
-        bounds = {f: [float(v) for v in getattr(mesh.positions, f)(axis=0)] for f in ("min", "max")}
+        corners = gltf_axes(mesh.local_mm / _MM).astype("<f4")
+        bounds = {f: [float(v) for v in getattr(corners, f)(axis=0)] for f in ("min", "max")}
         attributes = {
-            "POSITION": self._accessor(positions, mesh.positions, "VEC3", _FLOAT, **bounds),
-            "NORMAL": self._accessor(normals, mesh.normals, "VEC3", _FLOAT),
-            PLANE_ID: self._accessor(planes, mesh.planes, "SCALAR", _FLOAT),
+            "POSITION": self._accessor(positions, corners, "VEC3", _FLOAT, **bounds),
+            "NORMAL": self._accessor(normals, gltf_axes(mesh.normals).astype("<f4"), "VEC3", _FLOAT),
+            PLANE_ID: self._accessor(planes, mesh.planes.astype("<f4"), "SCALAR", _FLOAT),
         }
         primitives = [
             {
@@ -264,7 +263,7 @@ class _Scene:
             "scenes": [{"name": title, "nodes": [0]}],
             "nodes": [root, *self._nodes],
             "meshes": self._meshes,
-            "materials": [_material(name, colour) for name, colour in MATERIALS.items()],
+            "materials": [material(name, colour) for name, colour in MATERIALS.items()],
             "accessors": self._accessors,
             "bufferViews": views,
             "buffers": [{"byteLength": start}],
@@ -285,7 +284,7 @@ class _View:
         self.size += len(data)
 
 
-def _material(name: str, colour: Sequence[float]) -> dict[str, Any]:
+def material(name: str, colour: Sequence[float]) -> dict[str, Any]:
     """A dull material of one colour."""
     return {
         "name": name,

@@ -23,10 +23,13 @@ _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _MAGIC, _CONTAINER_VERSION = b"glTF", 2
 
 
-def container(document: Mapping[str, Any], pieces: Iterable[bytes]) -> bytes:
-    """A file: a header of twelve bytes, a chunk of JSON and one of the binary data, each padded to four bytes."""
+def container(document: Mapping[str, Any], pieces: Iterable[bytes], alignment: int = 4) -> bytes:
+    """A file: a header of twelve bytes, a chunk of JSON and one of the binary data, each padded to four bytes.
+
+    The binary data begin at a multiple of `alignment` bytes, 4 or 8.
+    """
     text = json.dumps(document, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
+    text += b" " * (-(len(text) + _HEADER.size + 2 * _CHUNK.size) % alignment)
     binary = b"".join(pieces)
     binary += b"\0" * (-len(binary) % 4)
     return b"".join(

@@ -71,10 +71,10 @@ def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_ev
     target = _target(run_dir, out, "a GeoPackage is", SUFFIX)
     _refuse_existing(target, overwrite)
     manifest = finished_run(run_dir)
-    stated = _stated_files(run_dir, {layer.name for layer in LAYERS})
+    stated = stated_files(run_dir, {layer.name for layer in LAYERS})
     filesystem, place = arrow_at(run_dir)
     with (
-        _disk_at(target),
+        disk_at(target),
         LocalStorage(root=target.parent).putting(target.name) as temporary,
         # a folder, since SQLite has a journal beside the file
         tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder,
@@ -92,7 +92,7 @@ def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_ev
             read = _batches(place, layer.name, layer.columns, filesystem, on_event)
             rows[layer.name] = made.write(layer, (stored_batch(batch, layer, tile) for tile, batch in read))
         made.write_styles(STYLES)
-        _check_complete(run_dir, manifest, rows, stated)
+        check_complete(run_dir, manifest, rows, stated)
         _refuse_existing(target, overwrite)
         made.path.replace(temporary)
     return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)
@@ -119,7 +119,7 @@ def publish_pmtiles(run_dir: str, out: str, *, overwrite: bool = False, on_event
     _refuse_existing(target, overwrite)
     manifest = finished_run(run_dir)
     project = projection_to(manifest.crs, pmtiles.CRS)
-    stated = _stated_files(run_dir, {pmtiles.LAYER})
+    stated = stated_files(run_dir, {pmtiles.LAYER})
     filesystem, place = arrow_at(run_dir)
     read = 0
 
@@ -130,13 +130,13 @@ def publish_pmtiles(run_dir: str, out: str, *, overwrite: bool = False, on_event
             yield pmtiles.map_batch(batch, tile, project)
 
     with (
-        _disk_at(target),
+        disk_at(target),
         LocalStorage(root=target.parent).putting(target.name) as temporary,
         tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder,
     ):
         made = Path(folder, target.name)
         rows = {pmtiles.LAYER: pmtiles.write_pmtiles(made, batches(), _facts(manifest))}
-        _check_complete(run_dir, manifest, {pmtiles.LAYER: read}, stated)
+        check_complete(run_dir, manifest, {pmtiles.LAYER: read}, stated)
         _refuse_existing(target, overwrite)
         made.replace(temporary)
     return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)
@@ -162,16 +162,11 @@ def publish_cityjson(run_dir: str, out: str, *, overwrite: bool = False, on_even
     on_event : callable
         Gets progress: tiles.
     """
-    target = _path_outside(run_dir, out, "CityJSON files are")
-    manifest, storage = finished_run(run_dir), storage_at(run_dir)
-    stated = _stated_files(run_dir, {_SEQUENCES})
-    keys = {
-        f"{key.split('/')[1].removeprefix(f'{TILE}=')}{CITYJSON}": key
-        for key in storage.keys(_SEQUENCES)
-        if PurePosixPath(key).match(f"{_SEQUENCES}/{TILE}=*/part-0.city.jsonl")
-    }
+    target = path_outside(run_dir, out, "CityJSON files are")
+    manifest, stated = finished_run(run_dir), stated_files(run_dir, {_SEQUENCES})
+    keys = {f"{tile}{CITYJSON}": key for tile, key in sequences_of(run_dir).items()}
     buildings = size = 0
-    with _disk_at(target), _folder(target, overwrite, keys, [f"*{CITYJSON}"]) as made:
+    with disk_at(target), _folder(target, overwrite, keys, [f"*{CITYJSON}"]) as made:
         for done, (name, key) in enumerate(keys.items(), start=1):
             city = _city(run_dir, key)
             buildings += sum(thing["type"] == "Building" for thing in city["CityObjects"].values())
@@ -179,7 +174,7 @@ def publish_cityjson(run_dir: str, out: str, *, overwrite: bool = False, on_even
             made.put(name, content)
             size += len(content)
             on_event(Event(kind="progress", stage=_SEQUENCES, done=done, total=len(keys)))
-        _check_complete(run_dir, manifest, {"buildings": buildings}, stated)
+        check_complete(run_dir, manifest, {"buildings": buildings}, stated)
     return Published(place=str(target), size_bytes=size, rows={"buildings": buildings})
 
 
@@ -203,14 +198,14 @@ def publish_stac(run_dir: str, out: str, *, overwrite: bool = False, on_event: L
     on_event : callable
         Gets progress: tiles.
     """
-    target = _path_outside(run_dir, out, "a catalogue is")
+    target = path_outside(run_dir, out, "a catalogue is")
     manifest, storage = finished_run(run_dir), storage_at(run_dir)
     project = projection_to(manifest.crs, stac.CRS)
     run = _run_of(run_dir, manifest)
     files = {state["tile"]: state["files"] for state in _states(run_dir) if state["files"]}
     names = [*(stac.item_name(tile) for tile in files), stac.COLLECTION]
     href = run_dir.rstrip("/") + "/" if is_url(run_dir) else _relative(Path(run_dir).resolve(), target)
-    with _disk_at(target), _folder(target, overwrite, names, ("*/*.json", stac.COLLECTION)) as made:
+    with disk_at(target), _folder(target, overwrite, names, ("*/*.json", stac.COLLECTION)) as made:
         items, rows, size = [], 0, 0
         for done, (tile, held) in enumerate(files.items(), start=1):
             facts = _tile_facts(run_dir, tile, held, manifest)
@@ -223,7 +218,7 @@ def publish_stac(run_dir: str, out: str, *, overwrite: bool = False, on_event: L
             raise RunError(f"the run in {run_dir} has no tile with files, so there is nothing to list")
         documents = [name for name in stac.DOCUMENTS if storage.has(name)]
         size += _put_json(made, stac.COLLECTION, stac.collection(run, items, documents, href))
-        _check_complete(run_dir, manifest, {"buildings": rows}, [name for held in files.values() for name in held])
+        check_complete(run_dir, manifest, {"buildings": rows}, [name for held in files.values() for name in held])
     return Published(place=str(target), size_bytes=size, rows={"items": len(items)})
 
 
@@ -295,6 +290,15 @@ def _folder(target: Path, overwrite: bool, names: Collection[str], patterns: Col
             made.root.replace(target)
 
 
+def sequences_of(run_dir: str) -> dict[str, str]:
+    """The CityJSONSeq files of a run by the keys of their tiles."""
+    return {
+        key.split("/")[1].removeprefix(f"{TILE}="): key
+        for key in storage_at(run_dir).keys(_SEQUENCES)
+        if PurePosixPath(key).match(f"{_SEQUENCES}/{TILE}=*/part-0.city.jsonl")
+    }
+
+
 def _city(run_dir: str, key: str) -> dict[str, Any]:
     """The CityJSON object of one tile; raises RunError if its file is damaged."""
     try:
@@ -304,7 +308,7 @@ def _city(run_dir: str, key: str) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _disk_at(target: Path) -> Iterator[None]:
+def disk_at(target: Path) -> Iterator[None]:
     """Say what cannot be read or written, as a RunError."""
     try:
         yield
@@ -332,13 +336,13 @@ def finished_run(run_dir: str) -> RunManifest:
 
 def _target(run_dir: str, out: str, what: str, suffix: str) -> Path:
     """The file to write; raises SettingsError if it cannot be a file of that format of this run."""
-    target = _path_outside(run_dir, out, what)
+    target = path_outside(run_dir, out, what)
     if target.suffix.lower() != suffix:
         raise SettingsError([f"--out {out} ends in {target.suffix or 'nothing'}: give a name that ends in {suffix}"])
     return target
 
 
-def _path_outside(run_dir: str, out: str, what: str) -> Path:
+def path_outside(run_dir: str, out: str, what: str) -> Path:
     """A place on a disk that is not in the run directory; raises SettingsError."""
     if is_url(out):
         raise SettingsError([f"--out {out}: {what} written to a disk. Give a path of this machine, then copy it"])
@@ -391,7 +395,7 @@ def _states(run_dir: str) -> Iterator[dict[str, Any]]:
     return (json.loads(storage.get(key)) for key in storage.keys("state"))
 
 
-def _stated_files(run_dir: str, folders: Collection[str]) -> list[str]:
+def stated_files(run_dir: str, folders: Collection[str]) -> list[str]:
     """The files in some folders of a run that the states of its tiles list."""
     return [name for state in _states(run_dir) for name in state["files"] if name.split("/")[0] in folders]
 
@@ -409,7 +413,7 @@ def _facts(manifest: RunManifest) -> dict[str, str]:
     return {name: value for name, value in facts.items() if value}
 
 
-def _check_complete(run_dir: str, manifest: RunManifest, rows: Mapping[str, int], stated: Collection[str]) -> None:
+def check_complete(run_dir: str, manifest: RunManifest, rows: Mapping[str, int], stated: Collection[str]) -> None:
     """Refuse a run that changed while it was read, or that lacks files or rows; raises RunError."""
     if read_manifest(run_dir) != manifest:
         raise RunError(f"the run in {run_dir} changed while it was published: publish it again when it is finished")
