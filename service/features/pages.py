@@ -26,7 +26,8 @@ from service.features.row_index import Box, Part
 from service.features.tables import GEOMETRY, TILE, Layer, OpenRun
 
 MAX_READ = 1000
-"""Most row groups of which rows are looked at for one page: a page that finds less is short, and its link goes on."""
+"""Row groups of which rows are looked at for one page. Then a page that has a feature is short, and its link goes on;
+one without goes on itself, since clients take an empty page for the last."""
 MAX_COUNTED = 250
 """Most row groups of which rows are looked at to count all matches; beyond, the answer has no number."""
 _KEPT_COUNTS = 4096
@@ -218,7 +219,7 @@ class _Search:
         for part in parts:
             if not counting and following is not None:
                 break
-            if not counting and looked_at == MAX_READ:
+            if not counting and features and looked_at >= MAX_READ:
                 following = part.first
                 break
             rows, was_read = self._rows(part)

@@ -81,19 +81,32 @@ class Layer:
             return f"{row['building_id']}.{row['plane_id']}"
         return str(row["object_id" if self.table == "rejected" else "building_id"])
 
-    def schema(self, *, filters_only: bool) -> dict[str, Any]:
-        """The JSON schemas of all properties, or of those that filters can name, with the geometry."""
-        found: dict[str, Any] = {}
-        for name, kind in self.properties.items():
-            if name in self.queryables or not filters_only:
-                found[name] = {"title": name, **json_type(kind)}
-                if (self.table, name) in _WORDS:
-                    found[name]["enum"] = [str(word) for word in _WORDS[self.table, name]]
-        found[GEOMETRY] = {
-            "title": GEOMETRY,
-            "x-ogc-role": "primary-geometry",
-            "format": "geometry-polygon-or-multipolygon",
+    def filter_schema(self) -> dict[str, Any]:
+        """The JSON schemas of the properties that filters can name, and of the geometry."""
+        found = {name: self._property(name) for name in self.queryables}
+        role = {"x-ogc-role": "primary-geometry", "format": "geometry-polygon-or-multipolygon"}
+        return {**found, GEOMETRY: {"title": GEOMETRY, **role}}
+
+    def feature_schema(self) -> dict[str, Any]:
+        """The JSON schemas of the members of a feature.
+
+        Types are single words with `nullable`, as in OpenAPI 3.0: GDAL takes a list of types for a text. For the same
+        reason lists of floating point numbers are left out.
+        """
+        listed = [name for name, kind in self.properties.items() if not _is_float_list(kind)]
+        nullable = {field.name for field in SCHEMAS[self.table] if field.nullable}
+        found = {name: self._property(name) | ({"nullable": True} if name in nullable else {}) for name in listed}
+        return {
+            "type": {"type": "string", "enum": ["Feature"]},
+            "id": {"type": "string"},
+            GEOMETRY: {"type": "object", "nullable": True},
+            "properties": {"type": "object", "properties": found, "required": listed},
         }
+
+    def _property(self, name: str) -> dict[str, Any]:
+        found = {"title": name, **json_type(self.properties[name])}
+        if (self.table, name) in _WORDS:
+            found["enum"] = [str(word) for word in _WORDS[self.table, name]]
         return found
 
 
@@ -114,6 +127,10 @@ def kind_of(kind: pa.DataType) -> str:
     if pa.types.is_timestamp(kind):
         return "time"
     return "number" if pa.types.is_integer(kind) or pa.types.is_floating(kind) else ""
+
+
+def _is_float_list(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_list(kind) and pa.types.is_floating(kind.value_type))
 
 
 def json_type(kind: pa.DataType) -> dict[str, Any]:

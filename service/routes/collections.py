@@ -249,7 +249,7 @@ def _described(run: OpenRun, layer: Layer, base: str) -> Collection:
         link(place, "self", "This collection"),
         link(f"{place}/items", "items", "The features", GEOJSON),
         link(f"{place}/queryables", f"{RELATIONS}queryables", "The properties for filters", SCHEMA_TYPE),
-        link(f"{place}/schema", "describedby", "The properties", SCHEMA_TYPE),
+        link(f"{place}/schema", "describedby", "The JSON schema of the features", SCHEMA_TYPE),
     ]
     if (run.licence or "").startswith(("http://", "https://")):
         links.append(Link(href=str(run.licence), rel="license", title="Licence of the source data"))
@@ -290,7 +290,7 @@ def queryables(runs: _Runs, base: Base, collection_id: _CollectionId) -> Respons
     responses=_SCHEMA_ANSWER,
 )
 def schema(runs: _Runs, base: Base, collection_id: _CollectionId) -> Response:
-    """All properties of the features, with their types."""
+    """A JSON schema of the features, with the types of their properties."""
     return _schema(runs, base, collection_id, "schema")
 
 
@@ -301,8 +301,8 @@ def _schema(runs: Catalogue, base: str, collection_id: str, kind: Literal["query
         **{"$schema": _SCHEMA, "$id": f"{base}/collections/{name}/{kind}"},
         type="object",
         title=f"{run.run.name}: {layer.table}",
-        additionalProperties=False,
-        properties=layer.schema(filters_only=kind == "queryables"),
+        additionalProperties=kind == "schema",
+        properties=layer.filter_schema() if kind == "queryables" else layer.feature_schema(),
     )
     return respond(found, media_type=SCHEMA_TYPE)
 
