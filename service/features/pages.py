@@ -18,12 +18,11 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import shapely
 
-from pipeline.errors import RunError
 from service.errors import NoSuchFeatureError
 from service.features.coordinates import NamedCrs
 from service.features.cql2 import Filter, Rows
 from service.features.row_index import Box, Part
-from service.features.tables import GEOMETRY, TILE, Layer, OpenRun
+from service.features.tables import GEOMETRY, TILE, Layer, OpenRun, unreadable
 
 MAX_READ = 1000
 """Row groups of which rows are looked at for one page. Then a page that has a feature is short, and its link goes on;
@@ -77,13 +76,13 @@ def feature_page(run: OpenRun, layer: Layer, query: FeatureQuery) -> FeaturePage
 
     Raises
     ------
-    RunError
+    NoSuchCollectionError
         A file of the run cannot be read.
     """
     try:
         return _Search(run, layer, query).page()
     except (OSError, pa.ArrowException) as error:
-        raise RunError(f"{layer.table} of run {run.run.name} cannot be read: {error}") from error
+        raise unreadable(run.run, error) from error
 
 
 def single_feature(run: OpenRun, layer: Layer, feature_id: str, crs: NamedCrs) -> bytes:
@@ -93,7 +92,7 @@ def single_feature(run: OpenRun, layer: Layer, feature_id: str, crs: NamedCrs) -
     ------
     NoSuchFeatureError
         There is none with this id.
-    RunError
+    NoSuchCollectionError
         A file of the run cannot be read.
     """
     parts, wanted = _places(run, layer, feature_id)
@@ -107,7 +106,7 @@ def single_feature(run: OpenRun, layer: Layer, feature_id: str, crs: NamedCrs) -
                 if mask.any():
                     return next(_features(run, layer, reader, np.flatnonzero(mask)[:1], crs))
     except (OSError, pa.ArrowException) as error:
-        raise RunError(f"{layer.table} of run {run.run.name} cannot be read: {error}") from error
+        raise unreadable(run.run, error) from error
     raise NoSuchFeatureError(f"{run.run.collection_id(layer.table)} holds no feature {feature_id[:80]!r}")
 
 

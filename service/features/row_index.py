@@ -132,6 +132,8 @@ def _add(connection: sqlite3.Connection, table: str, files: Any) -> None:
         tile = file.split("/")[-2].removeprefix("tile=")
         connection.executemany("INSERT OR IGNORE INTO object VALUES (?,?,?)", ((table, one, number) for one in ids))
         for group, (n, located, bounds, times) in enumerate(groups):
+            if not n:
+                continue  # of a tile without rows
             row = (table, number, file, tile, group, first, n, located, *(bounds or (None,) * 4), *times)
             connection.execute("INSERT INTO part VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?)", row)
             number += 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import logging
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -12,7 +13,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.fs as pafs
 
-from pipeline.errors import GableworkError, RunError
+from pipeline.errors import RunError
 from pipeline.export.records import SCHEMAS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
 from pipeline.io import arrow_at, is_url
@@ -27,6 +28,7 @@ from service.features.runs import TABLES, ServedRun, version_of
 GEOMETRY = "geometry"
 TILE = "tile"
 
+_log = logging.getLogger("gablework.service")
 _TRUST_S = 5.0
 """Seconds for which a run at a URL is not asked whether it changed."""
 _OPEN_RUNS = 64
@@ -184,11 +186,9 @@ def open_run(run: ServedRun) -> OpenRun:
     Raises
     ------
     NoSuchCollectionError
-        Its CRS is unknown.
+        Its CRS is unknown, or it cannot be read.
     ResultNotReadyError
         A published run is not finished, or is being replaced.
-    RunError
-        It cannot be read.
     """
     key = (run.name, run.place)
     with _guard:
@@ -198,10 +198,13 @@ def open_run(run: ServedRun) -> OpenRun:
         now_s = time.monotonic()
         if held is not None and (run.is_job or (is_url(run.place) and now_s - held[0] < _TRUST_S)):
             return held[2]
-        filesystem, place = arrow_at(run.place)
-        info = filesystem.get_file_info(f"{place.rstrip('/')}/{MANIFEST_NAME}")
-        state = (info.mtime_ns, info.size)
-        opened = held[2] if held is not None and held[1] == state else _opened(run, filesystem, place, state)
+        try:
+            filesystem, place = arrow_at(run.place)
+            info = filesystem.get_file_info(f"{place.rstrip('/')}/{MANIFEST_NAME}")
+            state = (info.mtime_ns, info.size)
+            opened = held[2] if held is not None and held[1] == state else _opened(run, filesystem, place, state)
+        except (RunError, OSError, pa.ArrowException) as error:
+            raise unreadable(run, error) from error
         with _guard:
             _open[key] = (now_s, state, opened)
             for old in list(_open)[:-_OPEN_RUNS]:
@@ -219,10 +222,7 @@ def _opened(run: ServedRun, filesystem: pafs.FileSystem, place: str, state: tupl
     version = version_of(run.place, manifest.content_sha256, manifest.finished_at, *state)
     path = run.index_dir / f"{run.name}-{version}.sqlite"
     if not path.is_file():
-        try:
-            write_index(path, place, filesystem)
-        except pa.ArrowException as error:
-            raise RunError(f"a table of run {run.name} cannot be read as Parquet: {error}") from error
+        write_index(path, place, filesystem)
         for old in path.parent.glob(f"{run.name}-{'?' * len(version)}.sqlite"):
             if old != path:
                 old.unlink(missing_ok=True)
@@ -236,6 +236,12 @@ def _opened(run: ServedRun, filesystem: pafs.FileSystem, place: str, state: tupl
     )
 
 
+def unreadable(run: ServedRun, error: Exception) -> NoSuchCollectionError:
+    """The error for a run whose files are gone or damaged. The log has the cause, since it can name a folder."""
+    _log.warning("run %s at %s cannot be read: %s", run.name, run.place, error)
+    return NoSuchCollectionError(f"files of run {run.name} are gone or damaged; the log of the service says which")
+
+
 def check_published(runs: Mapping[str, ServedRun]) -> None:
     """Read each published run once, and make its index.
 
@@ -247,8 +253,8 @@ def check_published(runs: Mapping[str, ServedRun]) -> None:
     for run in runs.values():
         try:
             open_run(run)
-        except (GableworkError, NoSuchCollectionError, ResultNotReadyError, OSError) as error:
-            raise StartUpError(f"the run {run.place} cannot be published: {error}") from error
+        except (NoSuchCollectionError, ResultNotReadyError) as error:
+            raise StartUpError(f"the run {run.place} cannot be published: {error.__cause__ or error}") from error
 
 
 def layers() -> Iterator[Layer]:

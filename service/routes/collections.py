@@ -380,7 +380,7 @@ def _query(run: OpenRun, layer: Layer, asked: _Asked, given: Sequence[tuple[str,
     bbox_crs, filter_crs = run.crs.named(asked.bbox_crs, "bbox-crs"), run.crs.named(asked.filter_crs, "filter-crs")
     unknown = [name for name, _ in given if name not in layer.queryables]
     if unknown:
-        known = ", ".join([*sorted(_NAMES), *layer.queryables])
+        known = f"{', '.join(sorted(_NAMES))}, or a property of its queryables"
         raise RequestError([f"query {name[:80]!r} is not known: use {known}" for name in dict.fromkeys(unknown)])
     names = [name for name, _ in given]
     twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
