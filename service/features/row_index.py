@@ -11,6 +11,7 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import datetime as dt
+import gc
 import math
 import os
 import sqlite3
@@ -27,7 +28,8 @@ from service.features.runs import TABLES
 Box = tuple[float, float, float, float]
 
 _READERS = 8
-"""Footers that are read at once: those of an object store take long to arrive."""
+"""Files that are read at once: those of an object store take long to arrive."""
+_AHEAD = 8 * _READERS
 _CACHE_KIB = 512
 _IDS = {"buildings": "building_id", "rejected": "object_id"}
 """Columns of ids that are looked up; a plane is found by its building, which lies in the same tile."""
@@ -119,8 +121,7 @@ def write_index(path: Path, place: str, filesystem: pafs.FileSystem) -> None:
         with concurrent.futures.ThreadPoolExecutor(_READERS) as readers:
             for table in TABLES:
                 files = table_files(place, table, filesystem)
-                found = readers.map(lambda file, of=table: _facts(filesystem, file, _IDS.get(of)), files)
-                _add(connection, table, zip(files, found, strict=True))
+                _add(connection, table, _all_facts(filesystem, files, _IDS.get(table), readers))
         connection.execute("COMMIT")
     temporary.replace(path)
 
@@ -138,6 +139,17 @@ def _add(connection: sqlite3.Connection, table: str, files: Any) -> None:
             connection.execute("INSERT INTO part VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?)", row)
             number += 1
             first += n
+
+
+def _all_facts(
+    filesystem: pafs.FileSystem, files: Sequence[str], id_column: str | None, readers: concurrent.futures.Executor
+) -> Iterator[tuple[str, tuple[list[Any], list[str]]]]:
+    """The facts of each file, a few files ahead of the caller."""
+    for start in range(0, len(files), _AHEAD):
+        some = files[start : start + _AHEAD]
+        yield from zip(some, readers.map(lambda path: _facts(filesystem, path, id_column), some), strict=True)
+        # a reader of Parquet is part of a cycle, and a process of ours seldom collects those
+        gc.collect(0)
 
 
 def _facts(filesystem: pafs.FileSystem, path: str, id_column: str | None) -> tuple[list[Any], list[str]]:
