@@ -243,7 +243,7 @@ def service() -> str:
     """The page of the service: paths, problems, keys, settings."""
     from service.keys import Scope
     from service.problems import FAILURES, FOREIGN, INTERNAL, KINDS
-    from service.routes.landing import CONFORMANCE
+    from service.routes.landing import CLASSES
 
     kinds = {(kind.status, kind.type_uri, kind.title) for kind in (*KINDS.values(), FOREIGN, INTERNAL)}
     problems: list[list[object]] = [[status, f"`{uri}`", title] for status, uri, title in sorted(kinds)]
@@ -255,8 +255,8 @@ def service() -> str:
         NOTE,
         "# The service",
         "",
-        "It speaks OGC API - Processes 1.0. `/openapi.json` (OpenAPI 3.0) has every parameter and answer, `/docs` the",
-        "same for people. How to run it: [serve](../how_to/serve.md).",
+        "It speaks OGC API - Processes 1.0 and OGC API - Features. `/openapi.json` (OpenAPI 3.0) has every",
+        "parameter and answer, `/docs` the same for people. How to run it: [serve](../how_to/serve.md).",
         "",
         "## Paths",
         "",
@@ -266,7 +266,7 @@ def service() -> str:
         "",
         "## Conformance",
         "",
-        *(f"- `{uri}`" for uri in CONFORMANCE),
+        *(f"- `{uri}`" for uri in CLASSES),
         "",
         "## Problems",
         "",

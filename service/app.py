@@ -13,6 +13,7 @@ from pipeline import __version__
 from service import openapi, problems
 from service.arrivals import Arrivals
 from service.compression import Compressed
+from service.features.runs import published_runs
 from service.files import StateFolder
 from service.guard import Guard
 from service.input_policy import check_hosts
@@ -21,6 +22,7 @@ from service.metrics import Measured, Metrics
 from service.rate_limits import RateLimiter
 from service.routes import (
     buildings,
+    collections,
     events,
     health,
     jobs,
@@ -55,6 +57,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     results.router,
     buildings.router,
     points.router,
+    collections.router,
     health.router,
 )
 """All routes, in the order of the documentation."""
@@ -66,7 +69,8 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     Raises
     ------
     StartUpError
-        At start: other machines can reach the address, and there are no keys.
+        A published run has no name that can be used. At start: other machines can reach the address, and there are
+        no keys; or a published run cannot be read.
     """
     kept = JobStore(settings.database, wait_s=settings.database_wait_s) if store is None else store
     streams = Streams()
@@ -98,6 +102,7 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     app.state.settings = settings
     app.state.store = kept
     app.state.folder = folder
+    app.state.published = published_runs(settings.publish, settings.state)
     app.state.limiter = RateLimiter(settings)
     app.state.streams = streams
     app.state.polled_jobs = PolledJobs(kept, settings.database_wait_s)
@@ -125,12 +130,17 @@ def start(settings: ServiceSettings, store: JobStore) -> None:
     Raises
     ------
     StartUpError
-        Other machines can reach the address, and there are no keys; or a listed host is not one.
+        Other machines can reach the address, and there are no keys; or a listed host is not one, or a published run
+        cannot be read.
     StoreError
         The database does not answer.
     """
     check_hosts(settings)
     StateFolder(settings.state).make()
+    if settings.publish:
+        from service.features.tables import check_published  # loads Arrow
+
+        check_published(published_runs(settings.publish, settings.state))
     store.migrate()
     store.fill_ballast(settings.reserve_bytes)
     settings.check_address(has_keys=store.has_keys())

@@ -143,6 +143,10 @@ def serve(
     input_host: Annotated[
         list[str] | None, typer.Option(metavar="HOST", help="Jobs may fetch inputs from this host; repeatable.")
     ] = None,
+    publish: Annotated[
+        list[str] | None,
+        typer.Option(metavar="[NAME=]RUN", help="Serve a finished run, a folder or URL, as features; repeatable."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Serve the REST API and the web page, with a job driver and a cluster."""
@@ -163,6 +167,7 @@ def serve(
             public_url=public_url,
             input_roots=input_root,
             input_hosts=input_host,
+            publish=publish,
         )
 
         if driver:

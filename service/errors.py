@@ -3,7 +3,7 @@
 ```
 ServiceError
 ├── NoSuchJobError, NoSuchProcessError, NoSuchUploadError, NoSuchBuildingError, NoSuchOutputError, NoSuchScheduleError
-├── NoSuchWebhookError, NoSuchDeliveryError
+├── NoSuchWebhookError, NoSuchDeliveryError, NoSuchCollectionError, NoSuchFeatureError
 ├── ResultNotReadyError      the job is not over yet, or was dismissed
 ├── RequestError             inputs that do not fit the process: lists all faults at once
 ├── OutsideAreaError         tiles far outside the area of use of their CRS: lists them all
@@ -52,6 +52,14 @@ class NoSuchJobError(ServiceError):
 
 class NoSuchProcessError(ServiceError):
     """The process does not exist."""
+
+
+class NoSuchCollectionError(ServiceError):
+    """The collection does not exist, belongs to another key, or has no place on the globe."""
+
+
+class NoSuchFeatureError(ServiceError):
+    """The collection has no such feature."""
 
 
 class NoSuchUploadError(ServiceError):

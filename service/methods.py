@@ -67,9 +67,10 @@ async def check_query(request: Request) -> None:
     known = _query_names(request.app).get((path, request.method.lower()))
     if known is None:
         return
-    takes = f"use {', '.join(known)}" if known else "this path has no query parameters"
+    takes = f"use {', '.join(map(str, known))}" if known else "this path has no query parameters"
     given = Counter(name for name, _ in request.query_params.multi_items())
-    faults = [f"query {shortened(name)} is not known: {takes}" for name in given if name not in known]
+    is_free = None in known  # the route knows the other names
+    faults = [f"query {shortened(name)} is not known: {takes}" for name in given if name not in known and not is_free]
     twice = [name for name, n in given.items() if n > 1 and known.get(name)]
     faults += [f"query {name} is given {given[name]} times: give it once" for name in twice]
     if faults:
@@ -77,12 +78,15 @@ async def check_query(request: Request) -> None:
 
 
 @functools.lru_cache(maxsize=8)
-def _query_names(app: FastAPI) -> Mapping[tuple[str, str], dict[str, bool]]:
-    """The query parameters of every documented operation, by path and method, and whether each has one value."""
+def _query_names(app: FastAPI) -> Mapping[tuple[str, str], dict[str | None, bool]]:
+    """The query parameters of every documented operation, by path and method, and whether each has one value.
+
+    The name is None for an object whose members are parameters of any names.
+    """
     paths: Mapping[str, Mapping[str, Any]] = app.openapi()["paths"]
     return {
         (path, method): {
-            given["name"]: given["schema"].get("type") != "array"
+            None if given["schema"].get("type") == "object" else given["name"]: given["schema"].get("type") != "array"
             for given in operation.get("parameters", ())
             if given["in"] == "query"
         }

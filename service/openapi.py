@@ -1,6 +1,6 @@
 """The OpenAPI document of the framework, with the problems that every path can answer, as version 3.0.
 
-OGC API - Processes and its clients need OpenAPI 3.0, while the framework writes 3.1. The two differ in a few words of
+The OGC standards and their clients need OpenAPI 3.0, while the framework writes 3.1. The two differ in a few words of
 JSON Schema, which are translated here.
 """
 
@@ -16,6 +16,7 @@ from pydantic.json_schema import models_json_schema
 from pipeline import __version__
 from service.routes.answers import problems
 from service.wire.buildings import CityJson, FeaturePage
+from service.wire.features import CollectionPage, JsonSchema
 from service.wire.jobs import JobForm, ServerSentEvent
 from service.wire.problems import Problem
 
@@ -30,15 +31,17 @@ TAGS = (
     {"name": "schedules", "description": "Jobs that run again and again: when, and what happened each time."},
     {"name": "webhooks", "description": "News that the service sends: receivers, signatures, the log of deliveries."},
     {"name": "results", "description": "Files and single buildings."},
+    {"name": "features", "description": "Buildings, roof planes and rejected objects of runs as collections."},
 )
 """Chapters of the document."""
 
 DESCRIPTION = (
-    "Valid LoD2 building models from raw airborne LiDAR tiles, by OGC API - Processes. Send tiles to `/uploads` or "
+    "Valid LoD2 building models from raw airborne LiDAR tiles, by OGC API - Processes; the models of "
+    "runs as features by OGC API - Features. Send tiles to `/uploads` or "
     "`/jobs`, follow the job, fetch its results. Every error is a problem document (RFC 9457)."
 )
 
-REFERENCED = (Problem, FeaturePage, CityJson, JobForm, ServerSentEvent)
+REFERENCED = (Problem, FeaturePage, CollectionPage, JsonSchema, CityJson, JobForm, ServerSentEvent)
 """Models that paths reference under other media types than JSON; the framework finds the others."""
 
 _METHODS = ("get", "put", "post", "delete", "patch", "head", "options")

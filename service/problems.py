@@ -70,6 +70,8 @@ KINDS: Mapping[type[Exception], Kind] = {
     errors.NoSuchProcessError: Kind(status=404, type_uri=f"{OGC}no-such-process", title="No such process"),
     errors.NoSuchUploadError: Kind(status=404, type_uri=f"{OWN}no-such-upload", title="No such upload"),
     errors.NoSuchBuildingError: Kind(status=404, type_uri=f"{OWN}no-such-building", title="No such building"),
+    errors.NoSuchCollectionError: Kind(status=404, type_uri=f"{OWN}no-such-collection", title="No such collection"),
+    errors.NoSuchFeatureError: Kind(status=404, type_uri=f"{OWN}no-such-feature", title="No such feature"),
     errors.NoSuchOutputError: Kind(status=404, type_uri=f"{OWN}no-such-output", title="No such output"),
     errors.NoSuchScheduleError: Kind(status=404, type_uri=f"{OWN}no-such-schedule", title="No such schedule"),
     errors.JobNotOverError: Kind(status=409, type_uri=f"{OWN}job-not-over", title="The job is not over yet"),

@@ -93,6 +93,13 @@ class ServiceSettings(BaseSettings):
         default=100, gt=0, description="Maximum number of unfinished resumable uploads of one key."
     )
 
+    # what is published
+    publish: tuple[str, ...] = Field(
+        default=(),
+        description="Run directories, or their URLs, whose buildings, planes and rejected objects are served as "
+        "collections of OGC API - Features, each as RUN or NAME=RUN; none by default. Every key may read them.",
+    )
+
     # limits
     max_upload_bytes_per_key: int = Field(
         default=0,

@@ -70,10 +70,11 @@ class FinishedJob:
 
 def _finished(job_id: JobId, store: Store, folder: Folder, caller: Reader) -> FinishedJob:
     """The job with its results; refused if it is not successful or its files are gone."""
-    return _results_of(store.get(job_id, owner=caller.owner), folder)
+    return results_of(store.get(job_id, owner=caller.owner), folder)
 
 
-def _results_of(job: Job, folder: StateFolder) -> FinishedJob:
+def results_of(job: Job, folder: StateFolder) -> FinishedJob:
+    """The job with its results; refused if it is not successful or its files are gone."""
     if job.status is JobStatus.FAILED and job.failure is not None:
         raise JobFailedError(job.failure)
     if job.status is JobStatus.DISMISSED:
@@ -125,7 +126,7 @@ def _buildings(job_id: JobId, store: Store, folder: Folder, caller: Reader, labe
     job = store.get(job_id, owner=caller.owner)
     if job.status is JobStatus.RUNNING and job.request.process_id == "reconstruct":
         return _run_of(_so_far(job, store, folder), label)
-    return _run_of(_results_of(job, folder), label)
+    return _run_of(results_of(job, folder), label)
 
 
 def _run(finished: _Finished, label: _Label = None) -> FinishedJob:

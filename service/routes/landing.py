@@ -10,6 +10,7 @@ from typing import Any
 from fastapi import APIRouter, Depends, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse
 
+from service.routes import collections
 from service.routes.answers import document, problems
 from service.routes.bound import Base, Settings_, visitor
 from service.routes.html import Format, PageRoute, in_either_form, wants_html
@@ -26,7 +27,10 @@ CONFORMANCE = tuple(
     f"{SPECIFICATION}{name}"
     for name in ("core", "json", "html", "oas30", "ogc-process-description", "job-list", "callback", "dismiss")
 )
-"""The implemented parts of the standard."""
+"""The implemented parts of OGC API - Processes."""
+
+CLASSES = (*CONFORMANCE, *collections.CONFORMANCE)
+"""All implemented parts of standards."""
 
 OPENAPI_TYPE = "application/vnd.oai.openapi+json;version=3.0"
 
@@ -59,8 +63,9 @@ def _for_machines(base: str) -> Response:
             link(f"{base}/?f=html", "alternate", "The web page", "text/html"),
             link(f"{base}/openapi.json", "service-desc", "The API", OPENAPI_TYPE),
             link(f"{base}/docs", "service-doc", "The API for people", "text/html"),
-            link(f"{base}/conformance", f"{RELATIONS}conformance", "The implemented parts of OGC API - Processes"),
+            link(f"{base}/conformance", f"{RELATIONS}conformance", "The implemented parts of OGC standards"),
             link(f"{base}/processes", f"{RELATIONS}processes", "The processes"),
+            link(f"{base}/collections", "data", "The buildings of runs as collections of features"),
             link(f"{base}/jobs", f"{RELATIONS}job-list", "The jobs"),
             link(f"{base}/schedules", "schedules", "The schedules"),
             link(f"{base}/webhooks/deliveries", "deliveries", "The log of webhooks"),
@@ -102,11 +107,11 @@ UNBUILT = """<!doctype html>
     "/conformance",
     summary="Conformance classes",
     dependencies=[in_either_form],
-    responses={200: document(Conformance, "The classes.", {"conformsTo": list(CONFORMANCE)})},
+    responses={200: document(Conformance, "The classes.", {"conformsTo": list(CLASSES)})},
 )
 def conformance() -> Response:
-    """List the implemented parts of OGC API - Processes."""
-    return respond(Conformance(conformsTo=list(CONFORMANCE)))
+    """List the implemented parts of OGC API - Processes and OGC API - Features."""
+    return respond(Conformance(conformsTo=list(CLASSES)))
 
 
 @router.get("/docs", include_in_schema=False)

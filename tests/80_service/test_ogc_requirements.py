@@ -106,8 +106,8 @@ def api_definition(service: runs.Service) -> None:
 @requirement("core/conformance-op", "core/conformance-success")
 def conformance(service: runs.Service) -> None:
     declared = service.client.get("/conformance").json()["conformsTo"]
-    assert declared == list(CONFORMANCE)
-    assert {uri.rpartition("/")[2] for uri in declared} == {name.partition("/")[0] for name in CHECKS}
+    assert declared[: len(CONFORMANCE)] == list(CONFORMANCE)
+    assert {uri.rpartition("/")[2] for uri in CONFORMANCE} == {name.partition("/")[0] for name in CHECKS}
 
 
 @requirement("core/http")

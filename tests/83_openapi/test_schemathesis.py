@@ -60,6 +60,7 @@ class Ids:
         self._finished = itertools.cycle([alone, service.compared()])
         page = service.client.get(f"/jobs/{alone}/buildings").json()
         self._buildings = itertools.cycle([feature["id"] for feature in page["features"]])
+        self._collections = itertools.cycle([f"{alone}.{table}" for table in ("buildings", "planes", "rejected")])
         self._outputs = itertools.cycle(["buildings", "report", "cityjson", "meshes", "page", "summary", "archive"])
         self._processes = itertools.cycle(["reconstruct", "compare", "classify"])
         self._methods = itertools.cycle(finished_runs.LABELS)
@@ -141,6 +142,10 @@ class Ids:
             parameters["uploadID"] = self._upload
         if "buildingID" in parameters:
             parameters["buildingID"] = next(self._buildings)
+        if "collectionID" in parameters:
+            parameters["collectionID"] = next(self._collections)
+        if "featureID" in parameters:
+            parameters["featureID"] = next(self._buildings)
         if "outputID" in parameters:
             parameters["outputID"] = next(self._outputs)
 

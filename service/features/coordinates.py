@@ -1,0 +1,214 @@
+"""The coordinate reference systems (CRS) of a collection: Part 2 of OGC API - Features."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyproj
+import shapely
+
+from service.errors import NoSuchCollectionError, RequestError
+from service.features.row_index import Box
+
+CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
+"""Longitude and latitude in WGS 84: the default."""
+_EPSG = "http://www.opengis.net/def/crs/EPSG/0/"
+_ALWAYS = {CRS84: "OGC:CRS84", f"{_EPSG}4326": "EPSG:4326", f"{_EPSG}3857": "EPSG:3857"}
+_DECIMALS_DEG, _DECIMALS = 9, 3
+_EDGE_POINTS = 21
+"""Points on each edge of a window whose image in another CRS is enclosed."""
+
+Geometries = npt.NDArray[np.object_]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NamedCrs:
+    """A CRS that clients may name."""
+
+    uri: str
+    """Its URI."""
+    crs: pyproj.CRS
+    """The CRS, two-dimensional."""
+
+    @functools.cached_property
+    def is_northing_first(self) -> bool:
+        """Whether its first axis points north, as in EPSG:4326."""
+        if self.uri == CRS84:
+            return False
+        return self.crs.axis_info[0].direction.lower() in {"north", "south"}
+
+    @property
+    def decimals(self) -> int:
+        """Decimals of its coordinates."""
+        return _DECIMALS_DEG if self.crs.is_geographic else _DECIMALS
+
+
+class CollectionCrs:
+    """The CRS of a run and those into which its features are transformed. Heights stay as they are.
+
+    Parameters
+    ----------
+    crs : mapping, optional
+        The `crs` entry of a run.json.
+    run : str
+        Name of the run, for the message.
+
+    Raises
+    ------
+    NoSuchCollectionError
+        The CRS is unknown: such features have no place on the globe.
+    """
+
+    def __init__(self, crs: Mapping[str, Any] | None, run: str) -> None:
+        if crs is None or crs.get("wkt") is None:
+            raise NoSuchCollectionError(
+                f"the coordinate reference system of run {run} is unknown, so its features have no place on the globe "
+                "and are no collection: model it again with --crs"
+            )
+        whole = pyproj.CRS.from_wkt(crs["wkt"])
+        self._own = (whole.sub_crs_list[0] if whole.is_compound else whole).to_2d()
+        self._wkt = self._own.to_wkt()
+        code = self._own.to_epsg()
+        self.storage_uri = None if code is None else f"{_EPSG}{code}"
+        """URI of the horizontal part of the run's CRS; None without an EPSG code."""
+        known = dict(_ALWAYS)
+        if self.storage_uri is not None:
+            known.setdefault(self.storage_uri, f"EPSG:{code}")
+        self._known = known
+
+    @property
+    def uris(self) -> list[str]:
+        """The CRS that clients may name, the default first."""
+        return list(self._known)
+
+    def named(self, uri: str | None, parameter: str) -> NamedCrs:
+        """The CRS of a query parameter.
+
+        Raises
+        ------
+        RequestError
+            The collection does not have it.
+        """
+        wanted = CRS84 if uri is None else uri.strip("[]")
+        if wanted not in self._known:
+            raise RequestError([f"query {parameter} is {wanted[:80]!r}: use one of {', '.join(self._known)}"])
+        return NamedCrs(uri=wanted, crs=_crs(self._known[wanted]))
+
+    def _transformer(self, target: NamedCrs) -> pyproj.Transformer | None:
+        """From the run's CRS, easting first; None if they are the same."""
+        if target.uri == self.storage_uri:
+            return None
+        return _own_transformer(self._wkt, self._known[target.uri], threading.get_ident())
+
+    def moved(self, geometries: Geometries, target: NamedCrs) -> Geometries:
+        """Geometries in another CRS, easting first, not rounded."""
+        transformer = self._transformer(target)
+        if transformer is None:
+            return geometries
+
+        def move(xy: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+            return np.column_stack([*transformer.transform(xy[:, 0], xy[:, 1]), *xy[:, 2:].T])
+
+        return np.asarray(_transformed(geometries, move), dtype=object)
+
+    def written(self, geometries: Geometries, target: NamedCrs) -> Geometries:
+        """Geometries in another CRS as answers have them.
+
+        Rounded, exterior rings counter-clockwise with the easting first, axes in the order of the CRS. One without
+        coordinates there becomes None.
+        """
+        moved = self.moved(geometries, target)
+        if moved is not geometries:
+            moved = np.asarray(_transformed(moved, lambda xyz: np.round(xyz, target.decimals) + 0.0), dtype=object)
+        moved = np.asarray(shapely.orient_polygons(moved), dtype=object)
+        moved[~shapely.is_missing(moved) & ~np.isfinite(shapely.bounds(moved)).all(axis=-1)] = None
+        if target.is_northing_first:
+            moved = np.asarray(_transformed(moved, _swapped), dtype=object)
+        return moved
+
+    def window(self, box: Box, source: NamedCrs) -> Box | None:
+        """A box of another CRS, easting first, enclosed in the run's own; None if it cannot be."""
+        transformer = self._transformer(source)
+        if transformer is None:
+            return box
+        inverse = pyproj.enums.TransformDirection.INVERSE
+        west, south, east, north = transformer.transform_bounds(*box, densify_pts=_EDGE_POINTS, direction=inverse)
+        if not np.isfinite([west, south, east, north]).all() or west > east:
+            return None
+        # edges bulge between the points
+        margin = 1e-3 * max(east - west, north - south) + 1e-6
+        return west - margin, south - margin, east + margin, north + margin
+
+    def outside(self, bounds: Box, target: NamedCrs) -> Box | None:
+        """Bounds of the run's CRS enclosed in another, easting first; None if they cannot be."""
+        transformer = self._transformer(target)
+        if transformer is None:
+            return bounds
+        found = transformer.transform_bounds(*bounds, densify_pts=_EDGE_POINTS)
+        return found if np.isfinite(found).all() and found[0] <= found[2] else None
+
+
+def _transformed(geometries: Geometries, move: Any) -> Any:
+    return shapely.transform(geometries, move, include_z=bool(shapely.has_z(geometries).any()))
+
+
+def _swapped(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return np.column_stack([xyz[:, 1], xyz[:, 0], *xyz[:, 2:].T])
+
+
+@functools.lru_cache(maxsize=64)
+def _crs(name: str) -> pyproj.CRS:
+    return pyproj.CRS.from_user_input(name)
+
+
+@functools.lru_cache(maxsize=256)
+def _own_transformer(source: str, target: str, thread: int) -> pyproj.Transformer:
+    """Of one thread: a transformer must not be used by two at once."""
+    del thread
+    return pyproj.Transformer.from_crs(source, target, always_xy=True)
+
+
+def in_easting_order(geometry: shapely.Geometry, crs: NamedCrs) -> shapely.Geometry:
+    """A client's geometry with its easting first."""
+    return shapely.transform(geometry, _swapped) if crs.is_northing_first else geometry
+
+
+def parsed_window(text: str, crs: NamedCrs) -> Sequence[Box]:
+    """The boxes of a query parameter bbox, easting first: two where a window in degrees crosses the 180th meridian.
+
+    Raises
+    ------
+    RequestError
+        It is not a window.
+
+    Examples
+    --------
+    >>> parsed_window("170,-10,-170,10", NamedCrs(uri=CRS84, crs=pyproj.CRS("OGC:CRS84")))
+    [(170.0, -10.0, 180.0, 10.0), (-180.0, -10.0, -170.0, 10.0)]
+    """
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) == 6 and np.isfinite(values).all():
+        raise RequestError([f"query bbox is {text[:80]!r}: {crs.uri} has no vertical axis, give four numbers"])
+    if len(values) != 4 or not np.isfinite(values).all():
+        raise RequestError([f"query bbox is {text[:80]!r}: give four numbers, such as 4.35,52.00,4.37,52.01"])
+    if crs.is_northing_first:
+        values = [values[1], values[0], values[3], values[2]]
+    west, south, east, north = values
+    if crs.crs.is_geographic and (max(abs(west), abs(east)) > 180.0 or max(abs(south), abs(north)) > 90.0):
+        raise RequestError([f"query bbox is {text[:80]!r}: longitudes reach from -180 to 180, latitudes to 90"])
+    if south > north:
+        raise RequestError([f"query bbox is {text[:80]!r}: its south {south:g} lies north of its north {north:g}"])
+    if west <= east:
+        return [(west, south, east, north)]
+    if not crs.crs.is_geographic:
+        raise RequestError([f"query bbox is {text[:80]!r}: its west {west:g} lies east of its east {east:g}"])
+    return [(west, south, 180.0, north), (-180.0, south, east, north)]
