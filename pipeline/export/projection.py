@@ -29,12 +29,21 @@ def horizontal_crs(crs: Mapping[str, Any] | None) -> pyproj.CRS:
 def projection_to(crs: Mapping[str, Any] | None, target: str) -> Project:
     """The projection from the horizontal part of a run's CRS to another one, x or longitude first.
 
-    Raises RunError if the CRS is unknown.
+    Raises RunError if the CRS is unknown or has no place on the earth; so does the projection, outside the CRS.
     """
-    transformer = pyproj.Transformer.from_crs(horizontal_crs(crs), target, always_xy=True)
+    try:
+        transformer = pyproj.Transformer.from_crs(horizontal_crs(crs), target, always_xy=True)
+    except pyproj.exceptions.ProjError as fault:
+        raise RunError(
+            f"the CRS of the run has no place on the earth ({str(fault)[:160]}): run it again with --crs"
+        ) from fault
 
     def project(xy: FloatArray) -> FloatArray:
         found: FloatArray = np.column_stack(transformer.transform(xy[:, 0], xy[:, 1]))
+        outside = ~np.isfinite(found).all(axis=1)
+        if outside.any():
+            x, y = xy[outside][0]
+            raise RunError(f"{x:.0f}, {y:.0f} lies outside the CRS of the run: run it again with the right --crs")
         return found
 
     return project

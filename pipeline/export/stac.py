@@ -49,6 +49,8 @@ DOCUMENTS: Mapping[str, tuple[str, str, str, str]] = {
     "points/tileset.json": ("points", "application/json", "visual", "3D Tiles: the points over the models"),
 }
 """Name, media type, role and title of the assets of a Collection, by their files in the run directory."""
+_DEGREE_DIGITS = 7
+"""Decimals of degrees: about a centimetre."""
 _SPDX = re.compile(r"[A-Za-z0-9.+-]+")
 """What an SPDX identifier may be."""
 
@@ -83,7 +85,7 @@ class TileFacts:
     key: str
     """Key of the tile: the id of the Item."""
     files: Mapping[str, str]
-    """The sha256 of its files by their paths in the run directory."""
+    """The sha256 of its files by their paths in the run directory, from `listed`."""
     bounds: tuple[float, float, float, float]
     """Smallest x and y, largest x and y of its buildings and rejected objects, in CRS units."""
     acquired: tuple[dt.datetime, dt.datetime] | None
@@ -114,6 +116,24 @@ def asset_name(path: str, tile: str) -> str | None:
     return name if name in ASSETS else None
 
 
+def listed(files: Mapping[str, str], tile: str) -> dict[str, str]:
+    """Those of a tile's files that become assets, with their sha256.
+
+    >>> listed({"meshes/t1/abc.obj": "00", "planes/tile=t1/part-0.parquet": "01"}, "t1")
+    {'planes/tile=t1/part-0.parquet': '01'}
+    """
+    return {path: digest for path, digest in files.items() if asset_name(path, tile) is not None}
+
+
+def dated(tiles: Sequence[TileFacts]) -> list[TileFacts]:
+    """Give tiles without a time, such as those without buildings, the first and the last one of all."""
+    times = [at for tile in tiles if tile.acquired is not None for at in tile.acquired]
+    if not times:
+        return list(tiles)
+    span = min(times), max(times)
+    return [dataclasses.replace(tile, acquired=tile.acquired or span) for tile in tiles]
+
+
 def item(tile: TileFacts, run: Run, project: Project, href: str) -> dict[str, Any]:
     """The Item of a tile.
 
@@ -128,7 +148,9 @@ def item(tile: TileFacts, run: Run, project: Project, href: str) -> dict[str, An
     href : str
         The run directory as seen from the Item, ending in a slash.
     """
-    place = shapely.transform(shapely.box(*tile.bounds), project)
+    low_x, low_y, high_x, high_y = tile.bounds
+    corners = np.array([(low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)])
+    place = shapely.Polygon(np.round(project(corners), _DEGREE_DIGITS))
     return {
         "type": "Feature",
         "stac_version": VERSION,
@@ -136,7 +158,7 @@ def item(tile: TileFacts, run: Run, project: Project, href: str) -> dict[str, An
         "id": tile.key,
         "collection": run.name,
         "bbox": _rounded(shapely.bounds(place)),
-        "geometry": shapely.geometry.mapping(shapely.set_precision(place, 1e-7)),
+        "geometry": shapely.geometry.mapping(shapely.orient_polygons(place)),
         "properties": {
             "title": f"Buildings of tile {tile.key}",
             **_times(tile, run),
@@ -152,7 +174,7 @@ def item(tile: TileFacts, run: Run, project: Project, href: str) -> dict[str, An
         "assets": {
             name: _asset(name, path, digest, href) | _row_count(tile.rows.get(name))
             for path, digest in sorted(tile.files.items())
-            if (name := asset_name(path, tile.key)) is not None
+            if (name := asset_name(path, tile.key))
         },
     }
 
@@ -172,8 +194,13 @@ def collection(run: Run, items: Sequence[Mapping[str, Any]], documents: Sequence
         The run directory as seen from the Collection, ending in a slash.
     """
     boxes = np.array([one["bbox"] for one in items])
-    times = sorted(one["properties"].get("start_datetime") or one["properties"]["datetime"] for one in items)
-    ends = sorted(one["properties"].get("end_datetime") or one["properties"]["datetime"] for one in items)
+    first, last = (
+        order(
+            (one["properties"].get(name) or one["properties"]["datetime"] for one in items),
+            key=dt.datetime.fromisoformat,
+        )
+        for order, name in ((min, "start_datetime"), (max, "end_datetime"))
+    )
     return {
         "type": "Collection",
         "stac_version": VERSION,
@@ -184,7 +211,7 @@ def collection(run: Run, items: Sequence[Mapping[str, Any]], documents: Sequence
         "license": _licence(run),
         "extent": {
             "spatial": {"bbox": [[*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]]},
-            "temporal": {"interval": [[times[0], ends[-1]]]},
+            "temporal": {"interval": [[first, last]]},
         },
         "item_assets": {
             name: {**_described(ASSETS[name]), "table:columns": _columns(name)} for name in ASSETS if name in COLUMNS
@@ -253,4 +280,4 @@ def _columns(table: str) -> list[dict[str, str]]:
 
 def _rounded(bounds: Any) -> list[float]:
     """Degrees, to about a centimetre."""
-    return [round(float(degrees), 7) for degrees in bounds]
+    return [round(float(degrees), _DEGREE_DIGITS) for degrees in bounds]

@@ -7,7 +7,7 @@ import dataclasses
 import json
 import os
 import tempfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote
@@ -166,7 +166,7 @@ def publish_cityjson(run_dir: str, out: str, *, overwrite: bool = False, on_even
     manifest, stated = finished_run(run_dir), stated_files(run_dir, {_SEQUENCES})
     keys = {f"{tile}{CITYJSON}": key for tile, key in sequences_of(run_dir).items()}
     buildings = size = 0
-    with disk_at(target), _folder(target, overwrite, keys, [f"*{CITYJSON}"]) as made:
+    with disk_at(target), _folder(target, overwrite, keys, lambda: target.glob(f"*{CITYJSON}")) as made:
         for done, (name, key) in enumerate(keys.items(), start=1):
             city = _city(run_dir, key)
             buildings += sum(thing["type"] == "Building" for thing in city["CityObjects"].values())
@@ -202,20 +202,23 @@ def publish_stac(run_dir: str, out: str, *, overwrite: bool = False, on_event: L
     manifest, storage = finished_run(run_dir), storage_at(run_dir)
     project = projection_to(manifest.crs, stac.CRS)
     run = _run_of(run_dir, manifest)
-    files = {state["tile"]: state["files"] for state in _states(run_dir) if state["files"]}
+    files = {state["tile"]: stac.listed(state["files"], state["tile"]) for state in _states(run_dir) if state["files"]}
     names = [*(stac.item_name(tile) for tile in files), stac.COLLECTION]
     href = run_dir.rstrip("/") + "/" if is_url(run_dir) else _relative(Path(run_dir).resolve(), target)
-    with disk_at(target), _folder(target, overwrite, names, ("*/*.json", stac.COLLECTION)) as made:
-        items, rows, size = [], 0, 0
+    with disk_at(target):
+        _refuse_other_catalogue(target / stac.COLLECTION, href)
+    with disk_at(target), _folder(target, overwrite, names, lambda: _catalogue_files(target)) as made:
+        facts = []
         for done, (tile, held) in enumerate(files.items(), start=1):
-            facts = _tile_facts(run_dir, tile, held, manifest)
-            rows += facts.rows["buildings"]
-            item = stac.item(facts, run, project, href if is_url(href) else f"../{href}")
-            items.append({name: item[name] for name in ("id", "bbox", "properties")})
-            size += _put_json(made, stac.item_name(tile), item)
+            facts.append(_tile_facts(run_dir, tile, held, manifest))
             on_event(Event(kind="progress", stage="items", done=done, total=len(files)))
-        if not items:
+        if not facts:
             raise RunError(f"the run in {run_dir} has no tile with files, so there is nothing to list")
+        items, rows, size = [], sum(tile.rows["buildings"] for tile in facts), 0
+        for tile_facts in stac.dated(facts):
+            item = stac.item(tile_facts, run, project, href if is_url(href) else f"../{href}")
+            items.append({name: item[name] for name in ("id", "bbox", "properties")})
+            size += _put_json(made, stac.item_name(tile_facts.key), item)
         documents = [name for name in stac.DOCUMENTS if storage.has(name)]
         size += _put_json(made, stac.COLLECTION, stac.collection(run, items, documents, href))
         check_complete(run_dir, manifest, {"buildings": rows}, [name for held in files.values() for name in held])
@@ -259,6 +262,24 @@ def _tile_facts(run_dir: str, tile: str, files: Mapping[str, str], manifest: Run
     )
 
 
+def _catalogue_files(target: Path) -> list[Path]:
+    """Files in a folder that a catalogue may have written."""
+    items = [path for path in target.glob("*/*.json") if path.stem == path.parent.name]
+    return [*items, *target.glob(stac.COLLECTION)]
+
+
+def _refuse_other_catalogue(collection: Path, href: str) -> None:
+    """Refuse a folder with a Collection that is not of the run at `href`; raises RunError."""
+    if not collection.is_file():
+        return
+    try:
+        held = json.loads(collection.read_text(encoding="utf-8"))["assets"]["run"]["href"]
+    except (ValueError, KeyError, TypeError):
+        held = "something else"
+    if held != f"{href}run.json":
+        raise RunError(f"{collection} is of another run or catalogue ({str(held)[:160]}): give another --out")
+
+
 def _relative(run: Path, target: Path) -> str:
     """The run directory as seen from a folder, percent-encoded and ending in a slash."""
     return quote(Path(os.path.relpath(run, target)).as_posix()) + "/"
@@ -272,16 +293,21 @@ def _put_json(storage: LocalStorage, name: str, document: Mapping[str, Any]) -> 
 
 
 @contextlib.contextmanager
-def _folder(target: Path, overwrite: bool, names: Collection[str], patterns: Collection[str]) -> Iterator[LocalStorage]:
-    """A folder for files of some names, which get their place at the end; the last name is placed last."""
-    _refuse_occupied(target, overwrite, names, patterns)
+def _folder(
+    target: Path, overwrite: bool, names: Collection[str], held: Callable[[], Iterable[Path]]
+) -> Iterator[LocalStorage]:
+    """A folder for files of some names, which get their place at the end; the last name is placed last.
+
+    `held` finds the files in the folder that may be of an earlier time.
+    """
+    _refuse_occupied(target, overwrite, names, held())
     beside = target if target.is_dir() else target.parent
     beside.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=beside) as folder:
         made = LocalStorage(root=Path(folder, "new"))
         made.make()
         yield made
-        _refuse_occupied(target, overwrite, names, patterns)
+        _refuse_occupied(target, overwrite, names, held())
         if target.is_dir():
             for name in names:
                 (target / name).parent.mkdir(exist_ok=True)
@@ -360,12 +386,14 @@ def _refuse_existing(target: Path, overwrite: bool) -> None:
         raise RunError(f"{target} exists already: give another --out, or --overwrite to replace it")
 
 
-def _refuse_occupied(target: Path, overwrite: bool, names: Collection[str], patterns: Collection[str]) -> None:
+def _refuse_occupied(target: Path, overwrite: bool, names: Collection[str], present: Iterable[Path]) -> None:
     """Refuse a folder with such files of other tiles, or with these unless they are to be replaced; RunError."""
     if target.exists() and not target.is_dir():
         raise RunError(f"{target} is a file: give the name of a folder")
-    found = [path for pattern in patterns for path in target.glob(pattern)]
-    held = sorted(path.relative_to(target).as_posix() for path in found)
+    blocked = [(target / name).parent for name in names if (target / name).parent.is_file()]
+    if blocked:
+        raise RunError(f"{blocked[0]} is a file, where a folder must be: move it, or give another --out")
+    held = sorted(path.relative_to(target).as_posix() for path in present)
     others = [name for name in held if name not in names or not (target / name).is_file()]
     if others:
         raise RunError(f"{target} holds {others[0]}, which is of no tile of this run: give another --out")

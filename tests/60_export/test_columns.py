@@ -34,6 +34,8 @@ def test_every_column_has_a_name_of_its_own_a_known_type_and_a_meaning(table: st
         assert kind_of(column.kind) in KINDS
         assert column.meaning.strip() == column.meaning != ""
         assert not column.meaning.endswith("."), column.name
+    meanings = [column.meaning for column in COLUMNS[table]]
+    assert len(set(meanings)) == len(meanings)
 
 
 def test_a_name_with_a_unit_means_that_unit() -> None:

@@ -1,5 +1,6 @@
 """STAC: a valid catalogue whose files, places and times are those of the run."""
 
+import dataclasses
 import datetime as dt
 import hashlib
 import json
@@ -21,6 +22,7 @@ from pipeline.errors import RunError, SettingsError
 from pipeline.export import stac
 from pipeline.export.columns import COLUMNS
 from pipeline.export.geoparquet import read_table
+from pipeline.export.projection import projection_to
 from pipeline.io import storage_at
 from pipeline.runtime.manifest import RunStatus
 from pipeline.runtime.publishing import publish_stac
@@ -119,6 +121,62 @@ def test_times_are_those_of_the_points_and_else_that_of_the_run(run_dir: Path, t
     later = stac.item(tile, run, lambda xy: xy, "") | {"id": "u"}
     collection = stac.collection(run, [later], [], "")
     assert collection["extent"]["temporal"]["interval"] == [[known["start_datetime"], known["end_datetime"]]]
+    bare = dataclasses.replace(tile, acquired=None)
+    earlier = dataclasses.replace(tile, acquired=(start - dt.timedelta(days=1), start))
+    assert [one.acquired for one in stac.dated([tile, bare, earlier])] == [
+        (start, end),
+        (start - dt.timedelta(days=1), end),
+        (start - dt.timedelta(days=1), start),
+    ]
+    assert stac.dated([bare]) == [bare]
+
+
+def test_times_are_compared_as_times_not_as_texts() -> None:
+    """As a text, half a second after comes before."""
+    at = ("2020-05-01T00:00:00Z", "2020-05-01T00:00:00.500000Z")
+    items = [{"id": text, "bbox": [0.0, 0.0, 1.0, 1.0], "properties": {"datetime": text}} for text in at]
+    run = stac.Run(name="r", version="1", method="m", finished_at=MADE, licence=None, crs=RD)
+    assert stac.collection(run, items, [], "")["extent"]["temporal"]["interval"] == [list(at)]
+
+
+def test_rings_run_counterclockwise(run_dir: Path, tmp_path: Path) -> None:
+    publish_stac(str(run_dir), str(tmp_path / "out"))
+    for tile in ("t1", "t2"):
+        place = json.loads((tmp_path / "out" / tile / f"{tile}.json").read_text())["geometry"]
+        assert shapely.is_ccw(shapely.geometry.shape(place).exterior)
+
+
+def test_a_catalogue_of_another_run_is_kept_and_other_files_do_not_matter(run_dir: Path, tmp_path: Path) -> None:
+    out, other = tmp_path / "out", write_whole_run(tmp_path / "other" / "my models")
+    restated(other, crs=RD, finished_at=MADE, tiles=("t1", "t2"))
+    (out / "models").mkdir(parents=True)
+    (out / "models" / "run.json").write_text("{}")
+    publish_stac(str(run_dir), str(out))
+    before = content(out)
+    with pytest.raises(RunError, match=r"collection\.json is of another run or catalogue"):
+        publish_stac(str(other), str(out), overwrite=True)
+    (out / "collection.json").write_text("[]")
+    with pytest.raises(RunError, match="another run or catalogue"):
+        publish_stac(str(run_dir), str(out), overwrite=True)
+    assert {**content(out), "collection.json": b""} == {**before, "collection.json": b""}
+
+
+def test_a_file_where_a_folder_must_be_is_kept(run_dir: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "t2").write_text("mine")
+    with pytest.raises(RunError, match="t2 is a file, where a folder must be"):
+        publish_stac(str(run_dir), str(tmp_path / "out"))
+    assert content(tmp_path / "out") == {"t2": b"mine"}
+
+
+def test_a_place_that_is_not_on_the_earth_is_refused(run_dir: Path, tmp_path: Path) -> None:
+    local = 'ENGCRS["site",EDATUM["site"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
+    restated(run_dir, crs={**RD, "wkt": local, "epsg": None})
+    with pytest.raises(RunError, match=r"has no place on the earth.*--crs"):
+        publish_stac(str(run_dir), str(tmp_path / "out"))
+    project = projection_to({"wkt": pyproj.CRS.from_epsg(32631).to_wkt()}, stac.CRS)
+    with pytest.raises(RunError, match=r"1000000000000000, 5 lies outside the CRS.*--crs"):
+        project(np.array([(500_000.0, 5e6), (1e15, 5.0)]))
 
 
 @pytest.mark.parametrize(
