@@ -1,11 +1,14 @@
 """Solar energy of a run: every plane, nothing of the run changed, one tile or two, any unit, with and without a CRS."""
 
 import dataclasses
+import hashlib
 import json
 import math
 from pathlib import Path
 from typing import Any
 
+import geopandas
+import geoparquet_validator
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -16,6 +19,7 @@ import shapely
 import small_buildings as small
 from command_line import invoke
 from small_runs import moved, street, write_run
+from weather_files import write_epw
 
 import pipeline.runtime.solar as runs
 from pipeline.errors import RunError, SettingsError
@@ -23,13 +27,15 @@ from pipeline.export.geoparquet import read_table
 from pipeline.export.records import RecordContext
 from pipeline.export.solar_table import COLUMNS, FACTS, SolarFile
 from pipeline.export.tile import write_tile
-from pipeline.io import SpatialReference
+from pipeline.io import SpatialReference, storage_at
 from pipeline.io.true_north import convergence_deg
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus, read_manifest, write_manifest
+from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.solar import solar
 from pipeline.solar.roof_planes import RoofPlanes
 from pipeline.solar.settings import SolarSettings
+from pipeline.solar.weather import Site, clear_sky
 
 TILES = 20
 ENERGY = ("irradiation_kwh_m2", "irradiation_kwh", "beam_kwh_m2", "sky_kwh_m2", "ground_kwh_m2", "beam_loss")
@@ -84,8 +90,9 @@ def test_every_plane_has_a_row_and_the_run_stays_as_it_is(run_dir: Path, tmp_pat
 
 
 def test_the_file_is_geoparquet_with_its_assumptions(run_dir: Path, tmp_path: Path) -> None:
-    geopandas = pytest.importorskip("geopandas")
     sky(placed(run_dir), tmp_path / "sky.parquet")
+    report = geoparquet_validator.check_bytes("table.parquet", (tmp_path / "sky.parquet").read_bytes())
+    assert geoparquet_validator.failed(report) == []
     read = geopandas.read_parquet(tmp_path / "sky.parquet")
     assert read.crs.to_epsg() == 28992
     metadata = pq.read_metadata(tmp_path / "sky.parquet").metadata
@@ -165,6 +172,32 @@ def test_energy_is_the_sum_of_its_parts_and_fits_pvlib(run_dir: Path, tmp_path: 
     again = tmp_path / "again.parquet"
     solar(str(run_dir), str(again), settings=SolarSettings(linke_turbidity=3.0))
     assert again.read_bytes() == (tmp_path / "year.parquet").read_bytes()
+
+
+def test_weather_of_another_place_is_used_with_a_warning(run_dir: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pvlib")
+    here, warned = Site(longitude_deg=4.37, latitude_deg=52.01, altitude_m=0.0), {}
+    for word, site in (("near", here), ("far", dataclasses.replace(here, latitude_deg=48.0))):
+        weather = tmp_path / f"{word}.epw"
+        write_epw(weather, clear_sky(site, 3.0), site, utc_offset_h=1)
+        events: list[Event] = []
+        solar(str(placed(run_dir)), str(tmp_path / f"{word}.parquet"), weather=str(weather), on_event=events.append)
+        warned[word] = [event.message for event in events if event.kind == "warning"]
+        facts = json.loads(pq.read_metadata(tmp_path / f"{word}.parquet").metadata[FACTS.encode()])
+        assert facts["file"] == weather.name
+        assert facts["file_sha256"] == hashlib.sha256(weather.read_bytes()).hexdigest()
+    assert warned["near"] == []
+    assert "far.epw is of a place 446 km away" in warned["far"][0]
+
+
+@pytest.mark.slow
+def test_a_run_in_an_object_store_gives_the_same_file(run_dir: Path, tmp_path: Path, bucket: str) -> None:
+    stored = storage_at(f"{bucket}/run")
+    for name, data in content(run_dir).items():
+        stored.put(name, data)
+    for place, out in ((f"{bucket}/run", "remote.parquet"), (str(run_dir), "local.parquet")):
+        solar(place, str(tmp_path / out), sky_only=True)
+    assert (tmp_path / "remote.parquet").read_bytes() == (tmp_path / "local.parquet").read_bytes()
 
 
 def test_without_a_crs_the_sky_is_known_and_energy_is_refused(run_dir: Path, tmp_path: Path) -> None:
