@@ -22,7 +22,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 UV := $(BIN)/uv --no-progress
 COMPILE := $(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml --extra otel --extra postgres --extra s3
+	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml --extra otel --extra postgres --extra s3 \
+	--extra solar
 
 KERNEL_SOURCES := $(shell grep -rl --include='*.py' kernel pipeline | LC_ALL=C sort)
 KERNEL_LIST := pipeline/compiler/kernels.json

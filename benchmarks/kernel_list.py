@@ -50,6 +50,7 @@ def commands(folder: Path) -> dict[str, list[str]]:
         "terrain": [f"reconstruct {tile} --out {folder}/terrain --classes ignore --workers 0 --terrain tin"],
         "compare": [f"compare {tile} --methods {every},{faithful} --out {folder}/compared"],
         "diff": [f"batch diff {folder}/plain {folder}/trusted --out {folder}/changes"],
+        "solar": [f"solar {folder}/plain --out {folder}/solar.parquet"],
     }
 
 

@@ -15,7 +15,7 @@ import typer
 
 from pipeline.batch.batch_file import TABLES
 from pipeline.console import EXIT_CODES
-from pipeline.export import cityjson, geopackage, pmtiles
+from pipeline.export import cityjson, geopackage, pmtiles, solar_table
 from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, Column
 from pipeline.methods import METHODS
 from pipeline.parameters import Parameters
@@ -477,6 +477,21 @@ def columns() -> str:
     return "\n".join(lines) + "\n"
 
 
+def solar() -> str:
+    """The page of the columns of `gablework solar`."""
+    lines = [
+        NOTE,
+        "# Solar energy of roof planes",
+        "",
+        "The table of `gablework solar`: [how to use it](../how_to/solar.md). A row is a roof plane; rows are ordered",
+        "by tile, building and plane. Units and *null* are as in [columns](columns.md). A column `bbox` covers the",
+        "geometry. The entry `gablework_solar` of the file's metadata holds the assumptions as JSON.",
+        "",
+        *table(["column", "type", "unit", "null", "meaning"], column_rows(solar_table.COLUMNS)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
 PAGES: Mapping[str, Callable[[], str]] = {
     "settings.md": settings,
     "batch_file.md": batch_file,
@@ -487,6 +502,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "measures.md": measures,
     "changes.md": changes,
     "columns.md": columns,
+    "solar.md": solar,
 }
 """The generated pages by file name."""
 

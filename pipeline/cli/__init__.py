@@ -9,12 +9,13 @@ from pipeline.cli.modelling import compare, reconstruct, replay, rerun
 from pipeline.cli.options import AsJson
 from pipeline.cli.publishing import publish
 from pipeline.cli.simulating import demo, simulate, warm_up
+from pipeline.cli.solar import solar
 
 __all__ = ["AsJson", "app"]
 
 # in the order of `gablework --help`
 _COMMANDS = (
-    *(reconstruct, rerun, compare, classify, inspect, evaluate, report, publish, digest, replay),
+    *(reconstruct, rerun, compare, classify, inspect, evaluate, report, publish, solar, digest, replay),
     *(simulate, demo, warm_up, worker),
 )
 for _command in _COMMANDS:

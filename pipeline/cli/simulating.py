@@ -123,8 +123,8 @@ def warm_up(
         list[str] | None,
         typer.Argument(
             metavar="WHAT",
-            help="What to compile for: reconstruct, simulate, evaluate, classify, terrain, compare, diff or all; "
-            "default reconstruct by the default method.",
+            help="What to compile for: reconstruct, simulate, evaluate, classify, terrain, compare, diff, solar or "
+            "all; default reconstruct by the default method.",
         ),
     ] = None,
     into: Annotated[

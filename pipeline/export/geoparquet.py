@@ -31,7 +31,8 @@ VERSION = "1.1.0"
 ROWS_A_GROUP = 20_000
 """Rows in one row group."""
 
-_BBOX = pa.struct([pa.field(name, pa.float64(), nullable=False) for name in ("xmin", "ymin", "xmax", "ymax")])
+BBOX = pa.struct([pa.field(name, pa.float64(), nullable=False) for name in ("xmin", "ymin", "xmax", "ymax")])
+"""The type of the column `bbox`."""
 _DIMENSION_SUFFIX = {2: "", 3: " Z"}
 
 
@@ -39,7 +40,7 @@ def stored_schema(table_name: str) -> pa.Schema:
     """The schema of a table's files: the record's columns, then `bbox`; `decisions` has no geometry and no `bbox`."""
     if table_name == DECISIONS_NAME:
         return DECISIONS
-    return SCHEMAS[table_name].append(pa.field("bbox", _BBOX))
+    return SCHEMAS[table_name].append(pa.field("bbox", BBOX))
 
 
 def shape_names(table_name: str) -> tuple[str, ...]:
@@ -103,17 +104,21 @@ def geo_table(table_name: str, rows: Sequence[Mapping[str, Any]], projjson: Mapp
     ordered = sorted(rows, key=lambda row: tuple(row[column] for column in key))
     table = pa.Table.from_pylist([dict(row) for row in ordered], schema=schema)
     geometries = _from_wkb(ordered, "geometry")
-    missing = shapely.is_missing(geometries)
-    bounds = shapely.bounds(geometries).reshape(-1, 4)
-    bbox = pa.StructArray.from_arrays(
-        [pa.array(np.where(missing, 0.0, bounds[:, i])) for i in range(4)],
-        fields=list(_BBOX),
-        mask=pa.array(missing, pa.bool_()),
-    )
-    table = table.append_column(pa.field("bbox", _BBOX), bbox)
+    table = table.append_column(pa.field("bbox", BBOX), bbox_column(geometries))
     shapes = {name: _from_wkb(ordered, name) for name in shape_names(table_name)}
     geo = json.dumps(geo_metadata(geometries, projjson, shapes), sort_keys=True, separators=(",", ":"))
     return table.replace_schema_metadata({"geo": geo})
+
+
+def bbox_column(geometries: Any) -> pa.StructArray:
+    """The boxes around geometries, (n,), as the column `bbox`; null where there is none."""
+    missing = shapely.is_missing(geometries)
+    bounds = shapely.bounds(geometries).reshape(-1, 4)
+    return pa.StructArray.from_arrays(
+        [pa.array(np.where(missing, 0.0, bounds[:, i])) for i in range(4)],
+        fields=list(BBOX),
+        mask=pa.array(missing, pa.bool_()),
+    )
 
 
 def _from_wkb(rows: Sequence[Mapping[str, Any]], column: str) -> Any:

@@ -68,8 +68,8 @@ def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_ev
     on_event : callable
         Gets progress: tiles of each layer.
     """
-    target = _target(run_dir, out, "a GeoPackage is", SUFFIX)
-    _refuse_existing(target, overwrite)
+    target = file_outside(run_dir, out, "a GeoPackage is", SUFFIX)
+    refuse_existing(target, overwrite)
     manifest = finished_run(run_dir)
     stated = stated_files(run_dir, {layer.name for layer in LAYERS})
     filesystem, place = arrow_at(run_dir)
@@ -83,7 +83,7 @@ def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_ev
             path=Path(folder, target.name),
             wkt=(manifest.crs or {}).get("wkt"),
             at=manifest.finished_at or manifest.started_at,
-            facts=_facts(manifest),
+            facts=facts_of(manifest),
         )
         rows = {}
         for layer in LAYERS:
@@ -93,7 +93,7 @@ def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_ev
             rows[layer.name] = made.write(layer, (stored_batch(batch, layer, tile) for tile, batch in read))
         made.write_styles(STYLES)
         check_complete(run_dir, manifest, rows, stated)
-        _refuse_existing(target, overwrite)
+        refuse_existing(target, overwrite)
         made.path.replace(temporary)
     return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)
 
@@ -115,8 +115,8 @@ def publish_pmtiles(run_dir: str, out: str, *, overwrite: bool = False, on_event
     on_event : callable
         Gets progress: tiles.
     """
-    target = _target(run_dir, out, "PMTiles are", pmtiles.SUFFIX)
-    _refuse_existing(target, overwrite)
+    target = file_outside(run_dir, out, "PMTiles are", pmtiles.SUFFIX)
+    refuse_existing(target, overwrite)
     manifest = finished_run(run_dir)
     project = projection_to(manifest.crs, pmtiles.CRS)
     stated = stated_files(run_dir, {pmtiles.LAYER})
@@ -135,9 +135,9 @@ def publish_pmtiles(run_dir: str, out: str, *, overwrite: bool = False, on_event
         tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder,
     ):
         made = Path(folder, target.name)
-        rows = {pmtiles.LAYER: pmtiles.write_pmtiles(made, batches(), _facts(manifest))}
+        rows = {pmtiles.LAYER: pmtiles.write_pmtiles(made, batches(), facts_of(manifest))}
         check_complete(run_dir, manifest, {pmtiles.LAYER: read}, stated)
-        _refuse_existing(target, overwrite)
+        refuse_existing(target, overwrite)
         made.replace(temporary)
     return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)
 
@@ -360,7 +360,7 @@ def finished_run(run_dir: str) -> RunManifest:
     return manifest
 
 
-def _target(run_dir: str, out: str, what: str, suffix: str) -> Path:
+def file_outside(run_dir: str, out: str, what: str, suffix: str) -> Path:
     """The file to write; raises SettingsError if it cannot be a file of that format of this run."""
     target = path_outside(run_dir, out, what)
     if target.suffix.lower() != suffix:
@@ -378,7 +378,7 @@ def path_outside(run_dir: str, out: str, what: str) -> Path:
     return target
 
 
-def _refuse_existing(target: Path, overwrite: bool) -> None:
+def refuse_existing(target: Path, overwrite: bool) -> None:
     """Refuse what is there already; raises RunError."""
     if target.is_dir():
         raise RunError(f"{target} is a folder: give the name of a file")
@@ -428,7 +428,7 @@ def stated_files(run_dir: str, folders: Collection[str]) -> list[str]:
     return [name for state in _states(run_dir) for name in state["files"] if name.split("/")[0] in folders]
 
 
-def _facts(manifest: RunManifest) -> dict[str, str]:
+def facts_of(manifest: RunManifest) -> dict[str, str]:
     """What the file says about the run."""
     facts = {
         "engine_version": manifest.engine_version,

@@ -48,6 +48,7 @@ GENERATED = (
     "measures.md",
     "changes.md",
     "columns.md",
+    "solar.md",
 )
 
 

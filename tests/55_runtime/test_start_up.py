@@ -35,3 +35,20 @@ cycle.itself = cycle
 """
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert ended.stdout.split() == (["closed"] if ours else ["closed", "collected"])
+
+
+def test_pandas_is_hidden_in_processes_of_ours_except_from_pvlib() -> None:
+    pytest.importorskip("pvlib", reason="the extra solar is not installed")
+    script = """
+from pipeline.runtime.isolation.start_up import start_own_process
+start_own_process()
+try:
+    import pandas
+except ModuleNotFoundError:
+    print("hidden")
+import pvlib
+import pandas
+print(pvlib.location.Location(52.0, 4.4).latitude)
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert ended.stdout.split() == ["hidden", "52.0"]

@@ -15,7 +15,7 @@ from pipeline.cli.options import worker_count
 
 COMMANDS = (
     *("reconstruct", "rerun", "compare", "classify", "inspect", "simulate", "digest"),
-    *("evaluate", "warm-up", "demo", "replay", "report", "publish", "worker", "batch"),
+    *("evaluate", "warm-up", "demo", "replay", "report", "publish", "solar", "worker", "batch"),
 )
 
 

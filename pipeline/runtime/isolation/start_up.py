@@ -33,8 +33,9 @@ NOT_OURS = frozenset({"cffi", "pandas", "requests", "pygments"})
 three, httpx the last, for a command line of its own. A run would take a third of a second longer with the first three,
 and the start of a service or a client with the last."""
 
-_SENDS_TRACES = "opentelemetry.exporter.otlp.proto.http"
-"""The package that sends traces needs requests; it is loaded where traces are on, before anything needs it."""
+_NEEDED_BY = {"pandas": ("pvlib",), "requests": ("opentelemetry.exporter.otlp.proto.http", "pvlib")}
+"""Packages that do need some of them: traces are sent with requests, pvlib computes with pandas and imports both. They
+are loaded only where they are wanted."""
 
 
 class _Blocker(MetaPathFinder):
@@ -42,7 +43,7 @@ class _Blocker(MetaPathFinder):
 
     def find_spec(self, name: str, *_: object) -> None:
         """Leave a module to the other finders."""
-        if name in NOT_OURS and not (name == "requests" and _SENDS_TRACES in sys.modules):
+        if name in NOT_OURS and not any(package in sys.modules for package in _NEEDED_BY.get(name, ())):
             raise ModuleNotFoundError(f"No module named {name!r} in a process of gablework", name=name)
 
 
