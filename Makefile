@@ -22,8 +22,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 UV := $(BIN)/uv --no-progress
 COMPILE := $(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml --extra otel --extra postgres --extra s3 \
-	--extra solar
+	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml --extra otel --extra postgres --extra s3
 
 KERNEL_SOURCES := $(shell grep -rl --include='*.py' kernel pipeline | LC_ALL=C sort)
 KERNEL_LIST := pipeline/compiler/kernels.json
@@ -72,7 +71,7 @@ $(VENV)/.warm-stamp: requirements.lock $(KERNEL_SOURCES) $(KERNEL_LIST) | $(VENV
 	@touch $@
 
 lock: $(VENV)/.build-stamp
-	$(COMPILE) --group test -o requirements-test.lock
+	$(COMPILE) --extra solar --group test -o requirements-test.lock
 	$(COMPILE) -c requirements-test.lock -o requirements.lock
 	$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-emit-find-links --custom-compile-command "make lock" --group build \

@@ -73,8 +73,7 @@ def the_pvlib() -> Any:
         import pvlib
     except ImportError as fault:
         raise RunError(
-            f"irradiation needs pvlib, which is not installed ({fault}): pip install 'gablework[solar]', or give "
-            "--sky-only"
+            f"irradiation needs pvlib, which is not installed ({fault}): pip install pvlib, or give --sky-only"
         ) from fault
     return pvlib
 
