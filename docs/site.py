@@ -27,7 +27,7 @@ MOVED = {"README.md": "index.md", "docs/index.md": "pages.md", "CONTRIBUTING.md"
 """Pages of the repository with another name on the site."""
 FIRST = ("index.md", "pages.md")
 LAST = ("contributing.md",)
-"""Pages before and after the sections of the index."""
+"""Pages before all others and after them. Those that the index names above its sections come after the sections."""
 KINDS = {".md", ".png", ".ipynb", ".js"}
 """Files of docs/ that go to the site."""
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
@@ -49,8 +49,8 @@ def page_of(name: str) -> str:
 def with_links_of_the_site(text: str, source: str, files: dict[str, str]) -> str:
     """The Markdown of a page with links as the site has them.
 
-    A link to a file that is in the repository and not on the site, such as a module, becomes its text. A link that leads
-    nowhere stays, so that the build finds it.
+    A link to a file that is in the repository and not on the site, such as a module, becomes its text. A link that
+    leads nowhere stays, so that the build finds it.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def with_links_of_the_site(text: str, source: str, files: dict[str, str]) -> str
 
 
 def with_deep_lists(text: str) -> str:
-    """Markdown whose lists are indented by four, as Python-Markdown wants it; the pages have two or three, as CommonMark."""
+    """Markdown whose lists are indented by four, as Python-Markdown wants; the pages have two or three, as in CommonMark."""
     lines, starts, code = [], [], False
     for line in text.splitlines():
         words = line.lstrip(" ")
@@ -130,7 +130,7 @@ def navigation(index: str, files: dict[str, str]) -> list[Any]:
             entries += [{group[1]: pages}] if group and pages else pages
         if entries:
             sections.append({title: entries})
-    return [*FIRST, *_pages(index.partition("\n## ")[0], files), *sections, *LAST]
+    return [*FIRST, *sections, *_pages(index.partition("\n## ")[0], files), *LAST]
 
 
 def _pages(text: str, files: dict[str, str]) -> Iterator[str]:

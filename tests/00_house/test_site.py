@@ -26,13 +26,15 @@ def test_the_index_lists_every_page_once(site: ModuleType, tmp_path: Path) -> No
     assert (tmp_path / "docs" / "index.md").read_text().startswith("# gablework")
 
 
-def test_a_page_that_the_index_does_not_list_is_named(site: ModuleType, tmp_path: Path) -> None:
+def test_a_page_that_the_index_does_not_list_is_named(
+    site: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lost = ROOT / "docs" / "lost.md"
     files = {**site.sources(), "docs/lost.md": "lost.md"}
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit, match=r"for: lost\.md$"):
-        patch.setattr(site, "sources", lambda: files)
-        read = Path.read_text
-        patch.setattr(Path, "read_text", lambda path, *args: "# Lost\n" if path == lost else read(path, *args))
+    read = Path.read_text
+    monkeypatch.setattr(site, "sources", lambda: files)
+    monkeypatch.setattr(Path, "read_text", lambda path, *args: "# Lost\n" if path == lost else read(path, *args))
+    with pytest.raises(SystemExit, match=r"for: lost\.md$"):
         site.write(tmp_path)
 
 
@@ -41,11 +43,13 @@ def test_sections_and_groups_follow_the_index(site: ModuleType) -> None:
     assert site.navigation(index, FILES) == [
         "index.md",
         "pages.md",
-        "b.md",
         {"One": [{"Named": ["how_to/a.md"]}]},
+        "b.md",
         "contributing.md",
     ]
-    assert site.navigation("## One\n\n- [a](how_to/a.md), [b](b.md)\n", FILES)[2] == {"One": ["how_to/a.md", "b.md"]}
+    assert site.navigation("# All\n\n## One\n\n- [a](how_to/a.md), [b](b.md)\n", FILES)[2] == {
+        "One": ["how_to/a.md", "b.md"]
+    }
 
 
 @pytest.mark.parametrize(
