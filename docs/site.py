@@ -80,7 +80,7 @@ def with_links_of_the_site(text: str, source: str, files: dict[str, str]) -> str
 
 
 def with_deep_lists(text: str) -> str:
-    """Markdown whose lists are indented by four, as Python-Markdown wants; the pages have two or three, as in CommonMark."""
+    """Markdown whose lists are indented by four, as Python-Markdown wants; CommonMark, as in the pages, takes less."""
     lines, starts, code = [], [], False
     for line in text.splitlines():
         words = line.lstrip(" ")
