@@ -49,8 +49,8 @@ def page_of(name: str) -> str:
 def with_links_of_the_site(text: str, source: str, files: dict[str, str]) -> str:
     """The Markdown of a page with links as the site has them.
 
-    A link to a file that is in the repository and not on the site, such as a module, becomes its text. A link that
-    leads nowhere stays, so that the build finds it.
+    A link to a file that is in the repository and not on the site, such as a module, becomes its text. Zensical
+    checks anchors and links, and overlooks missing pictures.
 
     Parameters
     ----------
@@ -58,6 +58,11 @@ def with_links_of_the_site(text: str, source: str, files: dict[str, str]) -> str
         Path of the page in the repository.
     files : dict of str to str
         `sources()`.
+
+    Raises
+    ------
+    SystemExit
+        A link leads to no file of the repository.
     """
     here = PurePosixPath(files[source]).parent
 
@@ -70,7 +75,9 @@ def with_links_of_the_site(text: str, source: str, files: dict[str, str]) -> str
         if found in files:
             new = os.path.relpath(page_of(files[found]), here)
             return f"{mark}[{words}]({new}{hash_mark}{anchor})"
-        return words if (ROOT / found).exists() else match[0]
+        if not (ROOT / found).exists():
+            sys.exit(f"{source}: {target} leads nowhere")
+        return words
 
     parts, code = [], False
     for line in text.splitlines(keepends=True):
@@ -156,7 +163,7 @@ def write(folder: Path) -> None:
     Raises
     ------
     SystemExit
-        docs/index.md does not list a page, or lists it twice.
+        docs/index.md does not list a page, or lists it twice; or a link leads nowhere.
     """
     files = sources()
     for source, name in files.items():
@@ -184,7 +191,7 @@ def build() -> None:
     Raises
     ------
     SystemExit
-        Zensical is not installed, or found a broken link or anchor.
+        Zensical is not installed, or there is a broken link or anchor.
     """
     zensical = Path(sys.executable).with_name("zensical")
     if not zensical.is_file():

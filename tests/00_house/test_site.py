@@ -59,7 +59,6 @@ def test_sections_and_groups_follow_the_index(site: ModuleType) -> None:
         ("[r](../../README.md)", "[r](../index.md)"),
         ("[all](../index.md)", "[all](../pages.md)"),
         ("[`x`](../../pipeline/scene.py)", "`x`"),
-        ("[gone](../gone.md)", "[gone](../gone.md)"),
         ("[web](https://a.org/b.md)", "[web](https://a.org/b.md)"),
         ("[here](#an-anchor)", "[here](#an-anchor)"),
         ("```\n[r](../../README.md)\n```", "```\n[r](../../README.md)\n```"),
@@ -67,6 +66,12 @@ def test_sections_and_groups_follow_the_index(site: ModuleType) -> None:
 )
 def test_links_lead_to_pages_of_the_site(site: ModuleType, link: str, on_the_site: str) -> None:
     assert site.with_links_of_the_site(link, "docs/how_to/a.md", FILES) == on_the_site
+
+
+@pytest.mark.parametrize("link", ["[gone](../gone.md)", "![gone](pictures/gone.png)", "[`x`](../../pipeline/gone.py)"])
+def test_a_link_that_leads_nowhere_is_named(site: ModuleType, link: str) -> None:
+    with pytest.raises(SystemExit, match=r"^docs/how_to/a\.md: \S*gone\.\w+ leads nowhere$"):
+        site.with_links_of_the_site(link, "docs/how_to/a.md", FILES)
 
 
 def test_lists_are_indented_by_four(site: ModuleType) -> None:
