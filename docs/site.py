@@ -28,7 +28,7 @@ MOVED = {"README.md": "index.md", "docs/index.md": "pages.md", "CONTRIBUTING.md"
 FIRST = ("index.md", "pages.md")
 LAST = ("contributing.md",)
 """Pages before all others and after them. Those that the index names above its sections come after the sections."""
-KINDS = {".md", ".png", ".ipynb", ".js"}
+KINDS = {".md", ".png", ".ipynb", ".js", ".css"}
 """Files of docs/ that go to the site."""
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 FENCE = re.compile(r"^ *```")
@@ -87,17 +87,23 @@ def with_links_of_the_site(text: str, source: str, files: dict[str, str]) -> str
 
 
 def with_deep_lists(text: str) -> str:
-    """Markdown whose lists are indented by four, as Python-Markdown wants; CommonMark, as in the pages, takes less."""
-    lines, starts, code = [], [], False
+    """Markdown as Python-Markdown wants it: lists are indented by four, and an item after a paragraph has a blank line.
+
+    The pages are CommonMark, which takes less.
+    """
+    lines, starts, code, paragraphs = [], [], False, False
     for line in text.splitlines():
         words = line.lstrip(" ")
         indent = len(line) - len(words)
         while not code and words and starts and indent < starts[-1]:
             starts.pop()
         here = starts[-1] if starts else 0
+        item = None if code else re.match(r"([-*]|\d+\.) +", words)
+        if item and paragraphs and lines[-1]:
+            lines.append("")
+        paragraphs = not item and (paragraphs or not words)
         lines.append(f"{' ' * (4 * len(starts) + max(indent - here, 0))}{words}" if words else "")
         code ^= words.startswith("```")
-        item = None if code else re.match(r"([-*]|\d+\.) +", words)
         if item:
             starts.append(indent + item.end())
     return "\n".join([*lines, ""])

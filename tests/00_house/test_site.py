@@ -74,9 +74,9 @@ def test_a_link_that_leads_nowhere_is_named(site: ModuleType, link: str) -> None
         site.with_links_of_the_site(link, "docs/how_to/a.md", FILES)
 
 
-def test_lists_are_indented_by_four(site: ModuleType) -> None:
+def test_lists_are_indented_by_four_and_items_after_a_paragraph_have_a_blank_line(site: ModuleType) -> None:
     text = "1. one\n\n   ```sh\n     deep\n   ```\n\n   more\n   - inner\n     lines\n2. two\n\nEnd\n"
-    deep = "1. one\n\n    ```sh\n      deep\n    ```\n\n    more\n    - inner\n        lines\n2. two\n\nEnd\n"
+    deep = "1. one\n\n    ```sh\n      deep\n    ```\n\n    more\n\n    - inner\n        lines\n2. two\n\nEnd\n"
     assert site.with_deep_lists(text) == deep
 
 
