@@ -6,6 +6,7 @@
 #   make everything  both at once, as CI does
 #   make wheel     a wheel for this platform, with the web page and compiled kernels
 #   make kernels   list anew which kernels are compiled ahead (after a kernel was added or is called in a new way)
+#   make site      the documentation as web pages, in build/docs/site: open index.html
 #   make viewer    build the web page (types, unit tests, bundle); brings its own Node
 #   make serve     the service on this machine, web page and all
 #   make ruler     every suite and real tile, reconstructed and measured: all tables of docs/results/ (an hour)
@@ -28,7 +29,7 @@ KERNEL_SOURCES := $(shell grep -rl --include='*.py' kernel pipeline | LC_ALL=C s
 KERNEL_LIST := pipeline/compiler/kernels.json
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check unit slow everything all-tests viewer wheel kernels serve ruler lock docs format clean
+.PHONY: help demo test check unit slow everything all-tests viewer site wheel kernels serve ruler lock docs format clean
 .DELETE_ON_ERROR:
 
 help:
@@ -79,12 +80,24 @@ lock: $(VENV)/.build-stamp
 	$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-emit-find-links --custom-compile-command "make lock" --group viewer \
 		-c requirements-test.lock -o requirements-viewer.lock
+	$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+		--no-emit-find-links --custom-compile-command "make lock" --group site \
+		-c requirements-test.lock -o requirements-site.lock
 
 # The web page, by the Node that its lock names. The environment of the tests may or may not hold it.
 VIEWER_SOURCES := $(shell find service/viewer -type f -not -path '*/node_modules/*' -not -path '*/dist/*' 2>/dev/null)
 service/viewer/dist/index.html: $(VIEWER_SOURCES) hatch_build.py requirements-viewer.lock $(VENV)/.build-stamp
 	$(UV) pip install --quiet --python $(BIN)/python --require-hashes -r requirements-viewer.lock
 	$(BIN)/python hatch_build.py
+	@touch $@
+
+# The documentation as web pages; a broken link ends it. A sync of the environment removes what it needs, hence the stamp.
+$(VENV)/.site-stamp: requirements-site.lock $(VENV)/.build-stamp $(wildcard $(VENV)/.test-stamp)
+	$(UV) pip install --quiet --python $(BIN)/python --require-hashes -r requirements-site.lock
+	@touch $@
+
+build/docs/site/index.html: $(VENV)/.site-stamp README.md CONTRIBUTING.md $(shell find docs -type f)
+	$(BIN)/python docs/site.py
 	@touch $@
 
 # --- the two commands ------------------------------------------------------------------------------------------------
@@ -114,13 +127,15 @@ slow: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer
 	$(PYTEST) --numprocesses 4 -m slow
 
 # What CI runs: style, types and imports beside all tests at once, so that quick tests run where slow ones wait.
-everything: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer
+everything: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer site
 	@$(MAKE) --no-print-directory --jobs 2 check all-tests
 
-all-tests: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer
+all-tests: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer site
 	$(PYTEST) --numprocesses 4 -m "slow or not slow"
 
 viewer: service/viewer/dist/index.html
+
+site: build/docs/site/index.html
 
 # A wheel for this platform and Python, with all kernels compiled: the first model compiles nothing. What was compiled for
 # it is removed however this ends, since a checkout that holds it would use it.
@@ -154,5 +169,5 @@ format: $(VENV)/.test-stamp
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) pipeline/compiled .cache .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis demo runs
+	rm -rf $(VENV) pipeline/compiled .cache .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis demo runs build
 	find pipeline service tests docs -name __pycache__ -type d -prune -exec rm -rf {} +

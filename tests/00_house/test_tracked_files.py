@@ -10,7 +10,7 @@ import pytest
 import pipeline
 
 ROOT = Path(__file__).resolve().parents[2]
-LOCKS = ("requirements.lock", "requirements-test.lock", "requirements-build.lock")
+LOCKS = ("requirements.lock", "requirements-test.lock", "requirements-build.lock", "requirements-site.lock")
 SHORT_LINES, SHORT_SHARE, MAX_LINES = 300, 0.8, 700
 """A file is one published term: at least this share is shorter than the first bound, none longer than the last."""
 
@@ -49,9 +49,10 @@ def test_a_lock_pins_every_package_by_hash_and_names_no_host(name: str) -> None:
 
 def test_the_locks_agree_with_one_another() -> None:
     pins = [dict(re.findall(r"^([a-z0-9._-]+)==(\S+)", (ROOT / name).read_text(), re.MULTILINE)) for name in LOCKS]
-    run, test, build = pins
+    run, test, build, site = pins
     assert run.items() <= test.items()
-    assert {name: version for name, version in build.items() if test.get(name, version) != version} == {}
+    for lock in (build, site):
+        assert {name: version for name, version in lock.items() if test.get(name, version) != version} == {}
 
 
 def test_the_locks_hold_every_declared_dependency() -> None:
@@ -60,6 +61,7 @@ def test_the_locks_hold_every_declared_dependency() -> None:
         "requirements.lock": project["project"]["dependencies"],
         "requirements-test.lock": project["project"]["dependencies"] + project["dependency-groups"]["test"],
         "requirements-build.lock": project["dependency-groups"]["build"],
+        "requirements-site.lock": project["dependency-groups"]["site"],
     }
     for lock, requirements in groups.items():
         pinned = set(re.findall(r"^([a-z0-9._-]+)(?:\[[a-z,]+\])?==", (ROOT / lock).read_text(), re.MULTILINE))
@@ -106,6 +108,7 @@ def test_no_tracked_file_is_large() -> None:
 def test_the_version_is_one() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert pipeline.__version__ == project["version"]
+    assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 def test_the_supported_pythons_are_reported_alike() -> None:
