@@ -97,7 +97,7 @@ def terrain_mesh(
     if not is_terrain.any():
         return _no_mesh()
     found = refine(tin, z_mm, is_terrain, drawn.lattice_points(), tolerance_mm)
-    return _mesh(found, floor_of_region, core)
+    return _mesh(found, drawn.floors_beyond(found, floor_of_region), core)
 
 
 def _no_mesh() -> TerrainMesh:
@@ -322,6 +322,23 @@ class _Drawn:
         cells = np.floor((places + self._low) / CELL_MM).astype(np.int64) - np.array(self.corner)
         return floor, (floor == NO_DATA) & self.known[cells[:, 1], cells[:, 0]]
 
+    def floors_beyond(self, found: RefinedTin, floor_of_region: IntArray) -> IntArray:
+        """The floor of the building beyond each edge of the facets, (t, 3); NO_DATA where there is none.
+
+        Beyond the border of the tile it is that of the outlines 1 mm from there.
+        """
+        floor: IntArray = np.concatenate((floor_of_region, np.full(1, NO_DATA, np.int64)))[found.beyond]
+        t, k = np.nonzero(found.beyond < 0)
+        ends = found.vertices_mm[np.stack((found.facets[t, k], found.facets[t, (k + 1) % 3]), axis=1), :2]
+        places, is_on_border = ends.mean(axis=1), np.zeros(len(t), np.bool_)
+        for axis in (0, 1):
+            for border, step in ((0, -1.0), (self._side, 1.0)):
+                on = (ends[:, :, axis] == border).all(axis=1)
+                places[on, axis] += step
+                is_on_border |= on
+        floor[t[is_on_border], k[is_on_border]] = self.judged(places[is_on_border])[0]
+        return floor
+
     def lattice_points(self) -> LatticePoints:
         """The middles of the cells that count."""
         middle = np.array(self.corner) * CELL_MM + CELL_MM // 2 - self._low
@@ -341,10 +358,12 @@ class _Drawn:
         )
 
 
-def _mesh(found: RefinedTin, floor_of_region: IntArray, core: Window) -> TerrainMesh:
-    """The facets and the upright triangles between them and floors, in canonical order and absolute coordinates."""
+def _mesh(found: RefinedTin, floor: IntArray, core: Window) -> TerrainMesh:
+    """The facets and the upright triangles between them and floors, in canonical order and absolute coordinates.
+
+    `floor` (t, 3) is that of the building beyond each edge, NO_DATA without one.
+    """
     vertices, facets = found.vertices_mm, found.facets
-    floor = np.append(floor_of_region, NO_DATA)[found.beyond]
     t, k = np.nonzero(floor != NO_DATA)
     u, v, z_floor = facets[t, k], facets[t, (k + 1) % 3], floor[t, k]
     raised_u, raised_v = vertices[u].copy(), vertices[v].copy()

@@ -243,3 +243,26 @@ def test_cells_without_terrain_are_left_out() -> None:
     mesh = terrain_mesh(core, terrain, np.ones((cells, cells), np.bool_), (-REACH_M, -REACH_M), [], TOLERANCE)
     assert mesh.vertices_mm.min(axis=0).tolist() == [3000, 0, 1000]
     assert len(mesh.triangles) == 2
+
+
+def box_at(x0: int, y0: int, x1: int, y1: int, z: int) -> Outline:
+    return Outline(rings=(np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]),), z_mm=z)
+
+
+@pytest.mark.parametrize(
+    "houses",
+    [
+        [box_at(3000, SIDE, 9000, SIDE + 9000, 3000), box_at(9000, SIDE, 15000, SIDE + 9000, 3400)],
+        [box_at(15000, 5000, SIDE, 14000, 3000), box_at(SIDE, 5000, 33000, 14000, 3400)],
+        [box_at(15000, 15000, SIDE, SIDE, 3000), box_at(SIDE, SIDE, 33000, 33000, 3400)],
+    ],
+    ids=["walls on a border", "a common wall on a border", "one vertex on a corner"],
+)
+def test_the_step_to_a_lower_floor_is_closed_on_a_border_too(houses: list[Outline]) -> None:
+    found = edges_of([tile_at((SIDE * i, SIDE * k), houses) for i in (0, 1) for k in (0, 1)])
+    free = [(a, b) for a, b in found if (b, a) not in found]
+    inside = [(a, b) for a, b in free if not any(a[d] == b[d] and a[d] in (0, 2 * SIDE) for d in (0, 1))]
+    upright = [(a, b) for a, b in inside if a[:2] == b[:2]]
+    # the ends of a common wall are free: there is no terrain between the floors
+    assert {(a[2], b[2]) for a, b in inside if (a, b) not in upright} == {(3000, 3000), (3400, 3400)}
+    assert max(found.values()) == 1

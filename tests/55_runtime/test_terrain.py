@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 
 from pipeline.export.terrain import TerrainTriangles, read_terrain
 from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
@@ -178,6 +179,42 @@ def test_a_tile_that_fails_costs_only_its_own_terrain_and_a_rerun_removes_all(
     assert (manifest.tiles_without_terrain, counts(manifest)) == ((), {})
     assert any("run again with --terrain tin" in text for text in manifest.warnings)
     assert manifest.settings["general"]["terrain"] == "none"
+
+
+def test_a_tile_that_fails_keeps_no_terrain_of_an_earlier_run(
+    out: Path, suburb: Path, reconstruct: Reconstruct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = {"out": str(tmp_path / "run"), "work": str(tmp_path / "work")}
+    reconstruct(suburb, settings={**SETTINGS, "terrain_tolerance_m": 0.5}, **place)
+    key = sorted(read_manifest(out).tiles)[1]
+    written = terrain._written
+
+    def fails(task: terrain.TerrainTask) -> terrain.TileTerrain:
+        if task.tile.key == key:
+            raise OSError("the disk is on fire")
+        return written(task)
+
+    monkeypatch.setattr(terrain, "_written", fails)
+    summary = reconstruct(suburb, settings=SETTINGS, **place)
+    assert summary.tiles_without_terrain == (key,)
+    assert files(summary.run_dir) == {n: data for n, data in files(out).items() if f"tile={key}/" not in n}
+
+
+def test_no_terrain_lies_within_the_floor_of_a_building_wider_than_its_tile(
+    suburb: Path, reconstruct: Reconstruct
+) -> None:
+    summary = reconstruct(suburb, settings={**SETTINGS, "tile_size_m": 6.0})
+    run_dir = Path(summary.run_dir)
+    triangles = np.concatenate([one.vertices[one.triangles][:, :, :2] for one in tiles(run_dir).values()])
+    middles = shapely.points(triangles.mean(axis=1))
+    wide = 0
+    for path in sorted(run_dir.glob("meshes/*/*.obj")):
+        lines = shapely.linestrings([[a[:2], b[:2]] for a, b in floor_edges(path)])
+        floor = shapely.transform(shapely.polygonize(lines), lambda xy: xy / 1000.0)
+        west, _, east, _ = shapely.bounds(floor)
+        wide += east - west > 12.0
+        assert not shapely.contains_properly(shapely.buffer(floor, -0.002), middles).any()
+    assert wide > 0
 
 
 def test_in_a_work_folder_terrain_is_written_once_and_follows_the_settings(

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.errors import RunCancelledError
+from pipeline.errors import RunCancelledError, RunError
 from pipeline.export.coordinates import SpatialReference
 from pipeline.export.terrain import FOLDER, in_crs, terrain_lines, terrain_obj, terrain_path
 from pipeline.io import storage_at
@@ -28,11 +28,9 @@ from pipeline.runtime.stages.reconstruct import Models
 from pipeline.runtime.stages.surroundings import FOLDER as GROUND
 from pipeline.runtime.stages.surroundings import surroundings_of
 from pipeline.settings import RunSettings
-from pipeline.terrain.terrain_tin import REACH_M, Outline, TerrainMesh, terrain_mesh
+from pipeline.terrain.terrain_tin import BESIDE_MM, REACH_M, Outline, TerrainMesh, terrain_mesh
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
-_OVERHANG_M = 25
-"""Buildings of tiles nearer than this may reach into a tile, although all their points lie in others."""
 _BYTES_PER_CELL = 150
 _FLOORS = "floors"
 
@@ -60,7 +58,7 @@ class TerrainTask:
     scratch: Scratch
     """Terrain and models in."""
     floors: tuple[Place, ...]
-    """Outcomes with the floors of the buildings of the tile and of those around it."""
+    """Outcomes with the floors of the tiles of which a building reaches into this one, or beside it."""
     reference: SpatialReference
     """CRS and units of the files."""
     tolerance_m: float
@@ -107,12 +105,13 @@ def write_terrain(
     stage, there = writing_terrain(run_dir), set[str]()
     if scratch.attempt:
         there = {key for key in storage.keys(FOLDER) if not key.rpartition("/")[2].startswith(".")}
-    floors = _floors_by_tile(context, models)
+    floors = _floors_reaching(context, models)
     tasks = {}
     for tile in sorted(ground.tiles):
-        task = _task(context, settings, floors, tile, run_dir, meshes)
+        owners = floors.get(tile, [])
+        task = _task(context, settings, [place for _, place in owners], tile, run_dir, meshes)
         seen = [ground.tiles[other].zones for other in _around(task.grid, tile, REACH_M) if other in ground.tiles]
-        near = [models.contents.get(other, "") for other in _around(task.grid, tile, _OVERHANG_M)]
+        near = [models.contents[owner] for owner, _ in owners]
         key = key_of(run_dir, tile, task.grid, task.tolerance_m, task.obj, task.reference, seen, near)
         tasks[Place(stage, tile.key, key)] = task
     # terrain that a user removed from the run directory is written again
@@ -124,6 +123,11 @@ def write_terrain(
         if one.error:
             context.progress.warn("terrain", f"the terrain of tile {one.tile.key} could not be written: {one.error}")
             scratch.path(place.name).unlink(missing_ok=True)  # so that a resumed run tries it again
+            for name in there.intersection(_paths(tasks[place])):
+                try:
+                    storage.delete(name)  # of an earlier run: it would not fit the models
+                except (OSError, RunError) as fault:
+                    context.progress.warn("terrain", f"{name} of an earlier run remains: {fault}")
     wanted = {name for task in tasks.values() for name in _paths(task)}
     for name in sorted(there - wanted):
         storage.delete(name)
@@ -131,9 +135,12 @@ def write_terrain(
     return TerrainOutcome(counts=_counts(good), failed=tuple(one.tile.key for one in written.values() if one.error))
 
 
-def _floors_by_tile(context: RunContext, models: Models) -> dict[Tile, Place]:
-    """Where the floors of each tile with buildings are stored."""
-    scratch = context.scratch
+def _floors_reaching(context: RunContext, models: Models) -> dict[Tile, list[tuple[Tile, Place]]]:
+    """The tiles of which a building reaches into each tile, or beside it, and where their floors are stored.
+
+    A building is stored by the tile of its smallest point, and may be wider than several tiles.
+    """
+    scratch, grid = context.scratch, context.plan.grid
     tasks = {
         tile: (
             Place(_FLOORS, tile.key, key_of(models.contents[tile])),
@@ -142,13 +149,18 @@ def _floors_by_tile(context: RunContext, models: Models) -> dict[Tile, Place]:
         for tile, places in models.places.items()
     }
     drop_outcomes(scratch, _FLOORS, [place for place, _ in tasks.values()])
-    files: Files[FloorsTask, int] = Files(reads=lambda task: {place.folder for place in task.batches})
-    context.map_stored("terrain", store_floors, dict(tasks.values()), brief_within, files=files, quiet=True)
-    return {tile: place for tile, (place, _) in tasks.items()}
+    files: Files[FloorsTask, tuple[Window, ...]] = Files(reads=lambda task: {place.folder for place in task.batches})
+    boxes = context.map_stored("terrain", store_floors, dict(tasks.values()), brief_within, files=files, quiet=True)
+    reaching: dict[Tile, list[tuple[Tile, Place]]] = {}
+    for owner, (place, _) in sorted(tasks.items()):
+        for box in boxes[place]:
+            for tile in grid.tiles_over(box.grown(BESIDE_MM)):
+                reaching.setdefault(tile, []).append((owner, place))
+    return reaching
 
 
-def store_floors(task: FloorsTask) -> InParts[int]:
-    """The floors of the buildings of one tile; the brief is their number."""
+def store_floors(task: FloorsTask) -> InParts[tuple[Window, ...]]:
+    """The floors of the buildings of one tile; the brief is the box around them, none without floors."""
     found = [
         floor
         for place in task.batches
@@ -156,7 +168,11 @@ def store_floors(task: FloorsTask) -> InParts[int]:
         if not entry.is_rejected
         for floor in floors_of(entry.result)
     ]
-    return InParts(brief=len(found), parts=(found,))
+    if not found:
+        return InParts(brief=(), parts=(found,))
+    corners = np.concatenate([ring for floor in found for ring in floor.rings])
+    (x0, y0), (x1, y1) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+    return InParts(brief=(Window(x0_mm=x0, y0_mm=y0, x1_mm=x1, y1_mm=y1),), parts=(found,))
 
 
 def _around(grid: TileGrid, tile: Tile, metres: int) -> list[Tile]:
@@ -164,7 +180,7 @@ def _around(grid: TileGrid, tile: Tile, metres: int) -> list[Tile]:
 
 
 def _task(
-    context: RunContext, settings: RunSettings, floors: Mapping[Tile, Place], tile: Tile, run_dir: str, meshes: str
+    context: RunContext, settings: RunSettings, floors: Sequence[Place], tile: Tile, run_dir: str, meshes: str
 ) -> TerrainTask:
     grid = context.plan.grid
     return TerrainTask(
@@ -172,7 +188,7 @@ def _task(
         grid=grid,
         run_dir=run_dir,
         scratch=context.scratch,
-        floors=tuple(floors[other] for other in _around(grid, tile, _OVERHANG_M) if other in floors),
+        floors=tuple(floors),
         reference=context.plan.reference,
         tolerance_m=settings.general.terrain_tolerance_m,
         obj=meshes != "none",
