@@ -148,17 +148,15 @@ def item(tile: TileFacts, run: Run, project: Project, href: str) -> dict[str, An
     href : str
         The run directory as seen from the Item, ending in a slash.
     """
-    low_x, low_y, high_x, high_y = tile.bounds
-    corners = np.array([(low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)])
-    place = shapely.Polygon(np.round(project(corners), _DEGREE_DIGITS))
+    geometry, bbox = _place(tile.bounds, project)
     return {
         "type": "Feature",
         "stac_version": VERSION,
         "stac_extensions": [PROJECTION, PROCESSING, FILE, TABLE],
         "id": tile.key,
         "collection": run.name,
-        "bbox": _rounded(shapely.bounds(place)),
-        "geometry": shapely.geometry.mapping(shapely.orient_polygons(place)),
+        "bbox": bbox,
+        "geometry": shapely.geometry.mapping(geometry),
         "properties": {
             "title": f"Buildings of tile {tile.key}",
             **_times(tile, run),
@@ -193,7 +191,6 @@ def collection(run: Run, items: Sequence[Mapping[str, Any]], documents: Sequence
     href : str
         The run directory as seen from the Collection, ending in a slash.
     """
-    boxes = np.array([one["bbox"] for one in items])
     first, last = (
         order(
             (one["properties"].get(name) or one["properties"]["datetime"] for one in items),
@@ -210,7 +207,7 @@ def collection(run: Run, items: Sequence[Mapping[str, Any]], documents: Sequence
         "description": f"{run.lineage}. Licence of the source data: {run.licence or 'unknown'}.",
         "license": _licence(run),
         "extent": {
-            "spatial": {"bbox": [[*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]]},
+            "spatial": {"bbox": [_around([one["bbox"] for one in items])]},
             "temporal": {"interval": [[first, last]]},
         },
         "item_assets": {
@@ -278,6 +275,28 @@ def _columns(table: str) -> list[dict[str, str]]:
     return [{"name": one.name, "type": kind_of(one.kind), "description": one.comment} for one in COLUMNS[table]]
 
 
-def _rounded(bounds: Any) -> list[float]:
-    """Degrees, to about a centimetre."""
-    return [round(float(degrees), _DEGREE_DIGITS) for degrees in bounds]
+def _place(bounds: Sequence[float], project: Project) -> tuple[Any, list[float]]:
+    """A box of the CRS in degrees, to about a centimetre, and its `bbox`; across 180 deg, split as RFC 7946 asks."""
+    corners = np.round(project(shapely.get_coordinates(shapely.box(*bounds))), _DEGREE_DIGITS)
+    if np.ptp(corners[:, 0]) > 180.0:
+        corners[:, 0] %= 360.0
+    place = shapely.Polygon(corners)
+    if not place.is_valid:  # without an area
+        low, high = corners.min(axis=0) - 10.0**-_DEGREE_DIGITS, corners.max(axis=0) + 10.0**-_DEGREE_DIGITS
+        place = shapely.box(*np.round([*low, *high], _DEGREE_DIGITS).tolist())
+    bbox = _around([list(place.bounds)])
+    if bbox[0] > bbox[2]:
+        east = place.intersection(shapely.box(180, -90, 360, 90))
+        east = shapely.transform(east, lambda xy: np.round(xy - (360.0, 0.0), _DEGREE_DIGITS))
+        west = place.intersection(shapely.box(0, -90, 180, 90))
+        place = shapely.MultiPolygon([part for part in (west, east) if part.area > 0.0])
+    return shapely.orient_polygons(place), bbox
+
+
+def _around(boxes: Sequence[Sequence[float]]) -> list[float]:
+    """The `bbox` of several; across 180 deg, its west is greater than its east."""
+    west, south, east, north = np.array(boxes).T
+    if (west > east).any() or np.max(east) - np.min(west) > 180.0:
+        west, east = west % 360.0, east % 360.0
+    ends = [degrees - 360.0 if degrees > 180.0 else degrees for degrees in (np.min(west), np.max(east))]
+    return [round(float(v), _DEGREE_DIGITS) for v in (ends[0], np.min(south), ends[1], np.max(north))]

@@ -132,9 +132,9 @@ def publish_pmtiles(run_dir: str, out: str, *, overwrite: bool = False, on_event
     with (
         disk_at(target),
         LocalStorage(root=target.parent).putting(target.name) as temporary,
-        tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder,
+        tempfile.TemporaryDirectory(prefix=".gablework-", dir=target.parent) as folder,
     ):
-        made = Path(folder, target.name)
+        made = Path(folder, f"run{pmtiles.SUFFIX}")  # GDAL fails at some names, such as those with a `!`
         rows = {pmtiles.LAYER: pmtiles.write_pmtiles(made, batches(), facts_of(manifest))}
         check_complete(run_dir, manifest, {pmtiles.LAYER: read}, stated)
         refuse_existing(target, overwrite)

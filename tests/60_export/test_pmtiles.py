@@ -1,5 +1,6 @@
 """PMTiles: every column in the tiles as the reference says, buildings in their place, and a file that is whole."""
 
+import base64
 import gzip
 import json
 from pathlib import Path
@@ -159,7 +160,7 @@ def test_header_and_metadata_lead_a_map_to_the_data(run_dir: Path, tmp_path: Pat
 
 
 def test_the_same_run_gives_the_same_bytes_and_is_replaced_only_where_asked(run_dir: Path, tmp_path: Path) -> None:
-    first, second = tmp_path / "run.pmtiles", tmp_path / "other" / "run.pmtiles"
+    first, second = tmp_path / "run.pmtiles", tmp_path / "other" / "new!.pmtiles"
     for path in (first, second):
         publish_pmtiles(str(run_dir), str(path))
     assert first.read_bytes() == second.read_bytes()
@@ -191,6 +192,23 @@ def test_of_too_many_buildings_the_largest_stay_and_the_last_zoom_has_all(
     assert "b19" in at[pmtiles.MIN_ZOOM]
     assert "b0" not in at[pmtiles.MIN_ZOOM]
     assert len(at[pmtiles.MAX_ZOOM]) == 20
+
+
+def test_long_attributes_do_not_make_coordinates_coarse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pmtiles, "MIN_ZOOM", pmtiles.MAX_ZOOM)
+    # random words, since the limit is on compressed bytes
+    text = base64.b64encode(np.random.default_rng(7).bytes(60_000)).decode()
+    empty: dict[str, Any] = dict.fromkeys(pmtiles.READ)
+    drawn = [
+        empty | {"building_id": f"b{n}", "geometry": shapely.box(n, 0, n + 9, 9).wkb, "source_attributes": text[n:]}
+        for n in range(100, 200)
+    ]
+    schema = pa.schema([pa.field(name, BUILDINGS[name].kind) for name in pmtiles.READ])
+    batch = pmtiles.map_batch(pa.RecordBatch.from_pylist(drawn, schema=schema), "t", lambda xy: xy)
+    pmtiles.write_pmtiles(tmp_path / "run.pmtiles", [batch], {})
+    places = tiles_of(tmp_path / "run.pmtiles")
+    assert max(len(features) for _, features in places.values()) == 100
+    assert {extent for extent, _ in places.values()} == {4096}
 
 
 def test_what_cannot_be_a_map_is_refused(run_dir: Path, tmp_path: Path) -> None:

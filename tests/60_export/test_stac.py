@@ -179,6 +179,34 @@ def test_a_place_that_is_not_on_the_earth_is_refused(run_dir: Path, tmp_path: Pa
         project(np.array([(500_000.0, 5e6), (1e15, 5.0)]))
 
 
+@pytest.mark.parametrize("flip", [1.0, -1.0])
+@pytest.mark.parametrize("size", [0.0, 1e-9, 3e-8, 1e-3])
+def test_rings_are_counterclockwise_and_never_empty(flip: float, size: float) -> None:
+    run = stac.Run(name="r", version="1", method="m", finished_at=MADE, licence=None, crs=RD)
+    tile = stac.TileFacts(key="t", files={}, bounds=(5.0, 50.0, 5.0 + size, 50.0), acquired=None, rows={})
+    item = stac.item(tile, run, lambda xy: xy * (flip, 1.0), "")
+    place = shapely.geometry.shape(item["geometry"])
+    assert place.is_valid
+    assert place.area > 0.0
+    assert place.exterior.is_ccw
+    assert item["bbox"] == list(place.bounds)
+
+
+def test_a_tile_across_180_deg_is_split_there() -> None:
+    run = stac.Run(name="r", version="1", method="m", finished_at=MADE, licence=None, crs=RD)
+    items = []
+    for west, east in ((179.5, 180.25), (180.0, 180.5), (179.0, 179.5)):
+        tile = stac.TileFacts(key="t", files={}, bounds=(west, -17.0, east, -16.0), acquired=None, rows={})
+        items.append(stac.item(tile, run, lambda xy: np.where(xy > 180.0, xy - 360.0, xy), ""))
+    assert items[0]["bbox"] == [179.5, -17.0, -179.75, -16.0]
+    parts = shapely.geometry.shape(items[0]["geometry"]).geoms
+    assert [part.bounds for part in parts] == [(179.5, -17.0, 180.0, -16.0), (-180.0, -17.0, -179.75, -16.0)]
+    assert all(part.exterior.is_ccw for part in parts)
+    assert shapely.geometry.shape(items[1]["geometry"]).bounds == (-180.0, -17.0, -179.5, -16.0)
+    extent = stac.collection(run, items, [], "")["extent"]["spatial"]["bbox"]
+    assert extent == [[179.0, -17.0, -179.5, -16.0]]
+
+
 @pytest.mark.parametrize(
     ("licence", "stated", "link"),
     [
