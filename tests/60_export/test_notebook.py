@@ -33,7 +33,6 @@ def run_all(parts: list[str]) -> dict[str, object]:
     return names
 
 
-@pytest.mark.slow
 def test_the_notebook_reads_a_run(models: Path) -> None:
     import matplotlib.pyplot as plt
 
