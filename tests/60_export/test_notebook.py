@@ -2,10 +2,8 @@
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import pytest
 from small_runs import street, write_run
 
@@ -14,12 +12,10 @@ NOTEBOOK = TUTORIALS / "read_a_run.ipynb"
 
 
 @pytest.fixture
-def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run directory `models` in the current folder."""
     monkeypatch.chdir(tmp_path)
-    plt.switch_backend("agg")
-    yield write_run(tmp_path / "models", street())
-    plt.close("all")
+    return write_run(tmp_path / "models", street())
 
 
 def cells() -> list[str]:
@@ -37,9 +33,12 @@ def run_all(parts: list[str]) -> dict[str, object]:
     return names
 
 
-@pytest.mark.slow
 def test_the_notebook_reads_a_run(models: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    plt.switch_backend("agg")
     names = run_all(cells())
+    plt.close("all")
     assert sorted(names["buildings"]["status"]) == ["failed", "fallback", "ok", "ok"]  # type: ignore[index]
     assert len(names["delivered"]) == 2  # type: ignore[arg-type]
     assert names["planes"].count_rows() > 0  # type: ignore[attr-defined]
