@@ -217,7 +217,7 @@ def test_without_pvlib_the_error_says_how_to_install_it(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pvlib", None)
-    with pytest.raises(RunError, match=r"gablework\[solar\].*--sky-only"):
+    with pytest.raises(RunError, match=r"pip install pvlib.*--sky-only"):
         solar(str(placed(run_dir)), str(tmp_path / "year.parquet"))
     sky(run_dir, tmp_path / "sky.parquet")
 
