@@ -119,15 +119,18 @@ def _values(column: pa.ChunkedArray) -> list[Any]:
     """A column as Python values; None for those that Python cannot hold, such as years beyond 9999."""
     import pyarrow as pa
 
+    # an unknown time zone is a KeyError where pytz is installed
+    not_held = (pa.ArrowException, ValueError, OverflowError, KeyError)
+
     def value(scalar: pa.Scalar) -> Any:
         try:
             return scalar.as_py()
-        except (pa.ArrowException, ValueError, OverflowError):
+        except not_held:
             return None
 
     try:
         return list(column.to_pylist())
-    except (pa.ArrowException, ValueError, OverflowError):
+    except not_held:
         return [value(scalar) for scalar in column]
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import datetime as dt
 import itertools
+import sys
 import zoneinfo
 
 import pytest
@@ -318,7 +319,11 @@ def test_expression_and_zone_are_reported_at_once() -> None:
     assert len(raised.value.faults) == 2
 
 
-def test_without_a_database_of_zones_utc_works_and_the_others_tell_what_to_install() -> None:
+def test_without_a_database_of_zones_utc_works_and_the_others_tell_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("tzdata", *(name for name in sys.modules if name.startswith("tzdata."))):
+        monkeypatch.setitem(sys.modules, name, None)  # pandas brings it
     before = zoneinfo.TZPATH
     zoneinfo.reset_tzpath(to=[])
     zoneinfo.ZoneInfo.clear_cache()
