@@ -130,8 +130,8 @@ def start(settings: ServiceSettings, store: JobStore) -> None:
     Raises
     ------
     StartUpError
-        Other machines can reach the address, and there are no keys; or a listed host is not one, or a published run
-        cannot be read.
+        Other machines can reach the address, and there are no keys; or a listed host is not a host name; or a
+        published run cannot be read.
     StoreError
         The database does not answer.
     """

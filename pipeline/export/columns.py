@@ -339,8 +339,8 @@ DECISIONS = (
     Column("detail", TEXT, NONE, "how the form was drawn and cleaned up, or why it was refused", required=True),
     Column("value", FLOAT64, NONE, "the figure of a check"),
     Column("limit", FLOAT64, NONE, "the limit of a check, from which on it is `met`"),
-    Column("n_faces", INT32, COUNT, "roof faces of a form that was drawn"),
-    Column("n_planes", INT32, COUNT, "roof planes of a form that was drawn"),
+    Column("n_faces", INT32, COUNT, "roof faces of a form or level that was drawn"),
+    Column("n_planes", INT32, COUNT, "roof planes of a form or level that was drawn"),
     Column(
         "levelled_share",
         FLOAT64,
@@ -370,7 +370,7 @@ COLUMNS: Mapping[str, tuple[Column, ...]] = {
     "rejected": REJECTED,
     "decisions": DECISIONS,
 }
-"""The columns of each table, in the order of its files; `bbox`, which covers the geometry, is no part of the record."""
+"""The columns of each table, in the order of its files, without `bbox`, which only covers the geometry."""
 
 TILE_COLUMN = Column("tile", TEXT, NONE, "key of the tile on the lattice, such as `x85_y447`", required=True)
 """The column that the names of a run's folders hold; other formats have it as a column of its own."""
