@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.normal_equations import moments_of, solve_plane_moments
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 
@@ -45,53 +46,71 @@ _AGREEING = 0.75
 
 
 @kernel(inline="always")
-def _find_nearest(points: FloatArray, strip: LabelArray, place: int, squares: FloatArray, nearest: LabelArray) -> None:
-    """The nearest points of every strip to the point `place`, in plan: squared distances and numbers, nearest first.
+def _find_nearest(
+    points: FloatArray, members: LabelArray, place: int, squares: FloatArray, nearest: LabelArray
+) -> None:
+    """The nearest ones in plan to the point `place` among some points: squared distances and numbers, nearest first.
 
-    They go into `squares` and `nearest`, both (strips, k); a distance is infinite where a strip has fewer points.
+    They go into `squares` and `nearest`, both (k,), of equally near ones the first; a distance is infinite where there
+    are fewer. The points ascend by x and `members` (m,) are ascending numbers of them, so the search goes west and east
+    until all others are too far.
     """
     squares[:] = np.inf
-    for j in range(len(points)):
-        s = strip[j]
-        if s < 0:
-            continue
-        dx, dy = points[j, 0] - points[place, 0], points[j, 1] - points[place, 1]
+    x, y = points[place, 0], points[place, 1]
+    east = np.searchsorted(members, place)
+    west = east - 1
+    while True:
+        to_west = x - points[members[west], 0] if west >= 0 else np.inf
+        to_east = points[members[east], 0] - x if east < len(members) else np.inf
+        dx = min(to_west, to_east)
+        if dx == np.inf or dx * dx > squares[_NEAREST - 1]:
+            return
+        if to_west < to_east:
+            j = members[west]
+            west -= 1
+        else:
+            j = members[east]
+            east += 1
+        dy = points[j, 1] - y
         square = dx * dx + dy * dy
-        if square < squares[s, _NEAREST - 1]:
-            k = _NEAREST - 1
-            while k > 0 and squares[s, k - 1] > square:
-                squares[s, k], nearest[s, k] = squares[s, k - 1], nearest[s, k - 1]
-                k -= 1
-            squares[s, k], nearest[s, k] = square, np.int32(j)
+        k = _NEAREST - 1
+        if square > squares[k] or (square == squares[k] and j > nearest[k]):
+            continue
+        while k > 0 and (squares[k - 1] > square or (squares[k - 1] == square and nearest[k - 1] > j)):
+            squares[k], nearest[k] = squares[k - 1], nearest[k - 1]
+            k -= 1
+        squares[k], nearest[k] = square, j
 
 
 @kernel
 def _comparisons(points: FloatArray, strip: LabelArray, places: IntArray, strips: int) -> FloatArray:
     """Local planes of two strips at the same place, (k, 6): the strips, difference, slopes a and b, variance.
 
-    `strip` (n,) is the number of the strip of each of the points (n, 3), -1 for others; `places` are numbers of points.
+    `strip` (n,) is the number of the strip of each of the points (n, 3), which ascend by x, -1 for others; `places` are
+    numbers of points.
     The difference of elevation in metres is that of the first strip over the second; its variance is in those of a
     point.
     """
     rows = np.empty((len(places) * max(strips - 1, 0), 6))
     count = 0
-    squares = np.empty((strips, _NEAREST))
-    nearest = np.zeros((strips, _NEAREST), np.int32)
+    start, members = counting_sort(strip, strips)
+    squares = np.empty(_NEAREST)
+    nearest = np.zeros(_NEAREST, np.int32)
     found = np.empty((strips, 4))
     for i in places:
         own = strip[i]
         if own < 0:
             continue
         x, y = points[i, 0], points[i, 1]
-        _find_nearest(points, strip, i, squares, nearest)
         for s in range(strips):
             found[s, 3] = np.inf
-            if squares[s, _NEAREST - 1] == np.inf:
+            _find_nearest(points, members[start[s] : start[s + 1]], i, squares, nearest)
+            if squares[_NEAREST - 1] == np.inf:
                 continue
-            m = moments_of(points, nearest[s])
+            m = moments_of(points, nearest)
             a, b = solve_plane_moments(m.xx, m.xy, m.yy, m.xz, m.yz)
             error = 0.0
-            for j in nearest[s]:
+            for j in nearest:
                 error += (points[j, 2] - m.z - a * (points[j, 0] - m.x) - b * (points[j, 1] - m.y)) ** 2
             det = m.xx * m.yy - m.xy * m.xy
             if error > _NEAREST * _MAX_ROUGHNESS_M**2 or det <= 1e-2 * m.xx * m.yy:
@@ -171,8 +190,8 @@ def _offsets(rows: FloatArray, strips: int) -> FloatArray:
 def strip_offsets_m(points: FloatArray, strip: npt.NDArray[np.uint16], min_offset_m: float) -> FloatArray:
     """Offset of the strip of every point from the mean of all points, (n, 3) float64, metres; 0 where strips fit.
 
-    `points` (n, 3) in metres, `strip` (n,) their flight lines. The offsets are 0 unless strips disagree by more than
-    `min_offset_m`, root mean square of the elevations over the surfaces that both saw.
+    `points` (n, 3) in metres, ascending by x, `strip` (n,) their flight lines. The offsets are 0 unless strips disagree
+    by more than `min_offset_m`, root mean square of the elevations over the surfaces that both saw.
     """
     offsets = np.zeros((len(points), 3))
     names, numbers, counts = np.unique(strip, return_inverse=True, return_counts=True)

@@ -122,11 +122,12 @@ class LocalStorage:
         self.root.mkdir(parents=True, exist_ok=True)
 
     @contextlib.contextmanager
-    def putting(self, key: str) -> Iterator[Path]:
+    def putting(self, key: str, *, sync_folder: bool = True) -> Iterator[Path]:
         """A temporary path beside the final one, for the caller to write; renamed when the block ends.
 
-        When the block raises, the temporary file is removed and what was under the key stays. Raises RunError if the
-        folder cannot be made, or the block wrote nothing to the path.
+        When the block raises, the temporary file is removed and what was under the key stays. Without `sync_folder` a
+        power loss can undo the rename until the caller syncs the folder. Raises RunError if the folder cannot be made,
+        or the block wrote nothing to the path.
         """
         final = self.path(key)
         try:
@@ -143,7 +144,8 @@ class LocalStorage:
             temporary.replace(final)
         finally:
             temporary.unlink(missing_ok=True)
-        _sync_folder(final.parent)
+        if sync_folder:
+            _sync_folder(final.parent)
 
     def put(self, key: str, content: bytes) -> None:
         """Put bytes under a key and replace what was there."""
@@ -152,8 +154,10 @@ class LocalStorage:
 
     @contextlib.contextmanager
     def several(self, check: Callable[[], None]) -> Iterator[Puts]:
-        """Puts one after the other: a disk gains nothing by several at once."""
-        yield _OneByOne(self, check)
+        """Puts one after the other; their folders reach the disk together."""
+        puts = _OneByOne(self, check)
+        yield puts
+        puts.wait()
 
     def get(self, key: str) -> bytes:
         """The bytes under a key; raises RunError if there is nothing."""
@@ -205,18 +209,27 @@ class LocalStorage:
 
 @dataclasses.dataclass(frozen=True)
 class _OneByOne:
-    """Puts that are done when they return."""
+    """Puts that are there when they return, and survive a power loss from the next wait on.
+
+    To sync a folder takes far longer than to sync a small file in it.
+    """
 
     storage: LocalStorage
     check: Callable[[], None]
+    folders: set[Path] = dataclasses.field(default_factory=set)
+    """Folders that have new names since the last wait."""
 
     def put(self, key: str, content: bytes) -> None:
         """Put at once."""
         self.check()
-        self.storage.put(key, content)
+        self.folders.add(self.storage.path(key).parent)
+        with self.storage.putting(key, sync_folder=False) as temporary:
+            temporary.write_bytes(content)
 
     def wait(self) -> None:
-        """Return at once."""
+        """Bring the new names to the disk."""
+        while self.folders:
+            _sync_folder(self.folders.pop())
 
 
 def _sync_folder(folder: Path) -> None:

@@ -23,6 +23,7 @@ import numpy as np
 import shapely
 
 from pipeline.compiler import kernel
+from pipeline.kernels.bounds import bounds_of
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray
@@ -102,8 +103,8 @@ class EdgePoints:
         `split` is True where the pulse went on to a lower return; all False where the file does not record it.
         """
         cell = max(1000, math.ceil(_DEPTH_SPACINGS * spacing_m * 1e3))
-        low = xy_mm.min(axis=0)
-        columns, rows = ((xy_mm.max(axis=0) - low) // cell + 1).tolist()
+        low, high = bounds_of(np.ascontiguousarray(xy_mm, dtype=np.int64))
+        columns, rows = ((high - low) // cell + 1).tolist()
         place = (xy_mm[:, 1] - low[1]) // cell * columns + (xy_mm[:, 0] - low[0]) // cell
         order = np.argsort(place, kind="stable")
         starts = np.concatenate(([0], np.cumsum(np.bincount(place, minlength=columns * rows)))).astype(np.int64)

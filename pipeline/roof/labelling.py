@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.bounds import bounds_of
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
@@ -100,7 +103,8 @@ def _nearest(x: IntArray, y: IntArray, query_x: IntArray, query_y: IntArray, cel
 
 def _cell_size(xy_mm: IntArray) -> int:
     """Side in mm of a cell that holds about two points, without exceeding `_MAX_CELLS`."""
-    width, depth = (int(v) + 1 for v in xy_mm.max(axis=0) - xy_mm.min(axis=0))
+    low, high = bounds_of(np.ascontiguousarray(xy_mm, dtype=np.int64))
+    width, depth = (int(v) + 1 for v in high - low)
     cell = max(50, int((2.0 * width * depth / len(xy_mm)) ** 0.5))
     while (width // cell + 1) * (depth // cell + 1) > _MAX_CELLS:
         cell *= 2
@@ -133,28 +137,47 @@ def fill_labels(xy_mm: IntArray, labels: LabelArray) -> LabelArray:
     return filled
 
 
-def empty_samples(
-    xy_mm: IntArray, low: IntArray, high: IntArray, pitch_mm: int, gap_m: float
-) -> tuple[IntArray, LabelArray, FloatArray]:
+@kernel
+def _far_samples(xy: IntArray, low: IntArray, shape: tuple[int, int], pitch: int, gap_m: float) -> IntArray:
+    """The samples (s, 2) of a lattice, row after row, that lie farther than a gap from every point (n, 2).
+
+    It has some rows and columns from its lower left corner on. Every other row is shifted by half a pitch: an
+    equilateral lattice has no ties for the Delaunay triangulation.
+    """
+    rows, columns = shape
+    near = np.zeros((rows, columns), np.bool_)
+    reach = math.ceil(gap_m * 1e3)
+    for i in range(len(xy)):
+        x, y = xy[i, 0] - low[0], xy[i, 1] - low[1]
+        for r in range(max((y - reach) // pitch, 0), min((y + reach) // pitch + 1, rows)):
+            shift = (r & 1) * (pitch // 2)
+            dy = r * pitch - y
+            for c in range(max((x - shift - reach) // pitch, 0), min((x - shift + reach) // pitch + 1, columns)):
+                dx = c * pitch + shift - x
+                near[r, c] |= math.sqrt(dx * dx + dy * dy) * 1e-3 <= gap_m
+    samples = np.empty((rows * columns - near.sum(), 2), np.int64)
+    count = 0
+    for r in range(rows):
+        for c in range(columns):
+            if not near[r, c]:
+                samples[count, 0] = low[0] + c * pitch + (r & 1) * (pitch // 2)
+                samples[count, 1] = low[1] + r * pitch
+                count += 1
+    return samples
+
+
+def empty_samples(xy_mm: IntArray, low: IntArray, high: IntArray, pitch_mm: int, gap_m: float) -> IntArray:
     """Lattice samples around and between the points, where no point is near.
 
     The lattice between the corners `low` and `high` starts at the lower left one, so it moves with the points. Samples
     are `pitch_mm` apart, more where it would give more than a million of them; those nearer to a point than `gap_m` are
-    dropped. Returns the samples (s, 2) in millimetres, the nearest point of each, and its distance in metres.
+    dropped. Returns the samples, (s, 2) in millimetres.
     """
     while float((high - low).prod()) / pitch_mm**2 > _MAX_CELLS / 4:
         pitch_mm *= 2
-    columns = np.arange(low[0], high[0] + pitch_mm, pitch_mm)
-    rows = np.arange(low[1], high[1] + pitch_mm, pitch_mm)
-    lattice = np.empty((len(rows), len(columns), 2), np.int64)
-    lattice[:, :, 0] = columns
-    lattice[:, :, 1] = rows[:, None]
-    # every other row is shifted by half a pitch: an equilateral lattice has no ties for the Delaunay triangulation
-    lattice[1::2, :, 0] += pitch_mm // 2
-    samples = lattice.reshape(-1, 2)
-    index, distance = nearest_points(xy_mm, samples)
-    empty: BoolArray = distance > gap_m
-    return samples[empty], index[empty], distance[empty]
+    columns, rows = (-(-(high - low) // pitch_mm) + 1).tolist()
+    samples: IntArray = _far_samples(np.ascontiguousarray(xy_mm), low, (rows, columns), pitch_mm, gap_m)
+    return samples
 
 
 @kernel

@@ -14,6 +14,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.geometry import spacing_over_area_m
+from pipeline.kernels.bounds import bounds_of
 from pipeline.model import (
     BoolArray,
     Decision,
@@ -31,7 +32,7 @@ from pipeline.roof.eaves import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
 from pipeline.roof.facades import FacadePoints, walls_beneath
 from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, outline, polygons_of
-from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
+from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels, nearest_points
 from pipeline.roof.named_form import TRACED, NamedForm
 from pipeline.roof.partition import (
     OUTSIDE,
@@ -151,14 +152,15 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
     """The plan of `partition_roof`; where only its outline is wanted, faces need not be `continued` beyond it."""
     given = roof.footprint_mm
     margin = round(_MARGIN_SPACINGS * roof.spacing_m * 1e3)
-    low, high = roof.xy_mm.min(axis=0) - margin, roof.xy_mm.max(axis=0) + margin
+    low, high = bounds_of(np.ascontiguousarray(roof.xy_mm))
+    low, high = low - margin, high + margin
     if given is not None:
         bounds = np.rint(given.bounds).astype(np.int64)
         low, high = np.minimum(low, bounds[:2] - margin), np.maximum(high, bounds[2:] + margin)
     _require_extent(float((high - low).max()) * 1e-3)
     pitch = max(50, round(_PITCH_SPACINGS * roof.spacing_m * 1e3))
     gap_m = settings.gap_spacings * roof.spacing_m
-    samples, nearest, distance_m = empty_samples(roof.xy_mm, low, high, pitch, gap_m)
+    samples = empty_samples(roof.xy_mm, low, high, pitch, gap_m)
     frame = _frame(low, high, margin)
     xy_mm = np.concatenate((roof.xy_mm, samples, frame))
     tin = triangulate(xy_mm)
@@ -174,6 +176,7 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
     else:
         counted[: n + m] = in_footprint(given, xy_mm[: n + m])
         # beyond the footprint the faces go on, within it they close gaps that are not too wide
+        nearest, distance_m = nearest_points(roof.xy_mm, samples)
         follows = (counted[n : n + m] == 0) | (distance_m <= settings.void_distance_m)
         labels[n : n + m][follows] = labels[nearest[follows]]
     z = np.zeros(len(xy_mm))
@@ -194,7 +197,8 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
     if continued:
         labels[:n] = fill_labels(roof.xy_mm, labels[:n])
         outside = np.flatnonzero(labels[n : n + m] < 0)
-        labels[n + outside] = labels[nearest[outside]]
+        nearest, _ = nearest_points(roof.xy_mm, samples[outside])
+        labels[n + outside] = labels[nearest]
         labels = continue_crossings(x, y, tin.facets, labels, known, coefficients)
         faces = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
     drawn = roof.outline_mm

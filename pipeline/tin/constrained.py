@@ -12,6 +12,7 @@ import dataclasses
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.bounds import bounds_of
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.tin.delaunay import hilbert_order, insert_all
@@ -224,8 +225,8 @@ def triangulate_constrained(xy_mm: IntArray, edges: IntArray) -> ConstrainedTin:
     Edges number their ends. They may meet at points only; a point on an edge divides it. Raises ValueError if the
     points extend over more than 2^21 mm, if two are equal, or if all lie on one line.
     """
-    low = xy_mm.min(axis=0)
-    extent = int((xy_mm.max(axis=0) - low).max())
+    low, high = bounds_of(xy_mm)
+    extent = int((high - low).max())
     if extent > MAX_EXTENT_MM:
         raise ValueError(f"points extend over {extent / 1000:.3f} m: use at most {MAX_EXTENT_MM / 1000:.3f} m")
     n, order = len(xy_mm), hilbert_order(xy_mm)

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.compiler import kernel
+from pipeline.kernels.bounds import bounds_of
 from pipeline.model import FloatArray, IntArray, LabelArray, Tin
 from pipeline.tin.half_edges import canonical_facets, locate, restore_delaunay, split_facet, start_sphere
 from pipeline.tin.predicates import orientation
@@ -82,8 +83,8 @@ def hilbert_order(xy_mm: IntArray) -> LabelArray:
 
     The cells of the curve are the 2^16th part of the extent; points of one cell are ordered by index.
     """
-    low = xy_mm.min(axis=0)
-    extent = int((xy_mm.max(axis=0) - low).max())
+    low, high = bounds_of(xy_mm)
+    extent = int((high - low).max())
     keys = _hilbert_keys(xy_mm, int(low[0]), int(low[1]), max(0, extent.bit_length() - _HILBERT_BITS))
     keys.sort()
     return (keys & np.uint64(0xFFFFFFFF)).astype(np.int32)
@@ -111,8 +112,8 @@ def triangulate(xy_mm: IntArray) -> Tin:
     no_facets = np.empty((0, 3), np.int32)
     if n == 0:
         return Tin(facets=no_facets, neighbours=no_facets)
-    low = xy_mm.min(axis=0)
-    extent = int((xy_mm.max(axis=0) - low).max())
+    low, high = bounds_of(xy_mm)
+    extent = int((high - low).max())
     if extent > MAX_WINDOW_MM:
         raise ValueError(f"points extend over {extent / 1000:.3f} m: triangulate windows of at most 2000 m")
     order = hilbert_order(xy_mm)
@@ -163,8 +164,8 @@ def unique_xy_ranked(xy_mm: IntArray, z_mm: IntArray) -> tuple[IntArray, LabelAr
     """As `unique_xy`, and the rank of every kept point, (u,) int32, in the lexicographic order of (x, y)."""
     if len(xy_mm) == 0:
         return np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0, np.int32)
-    low = xy_mm.min(axis=0)
-    extent = xy_mm.max(axis=0) - low
+    low, high = bounds_of(np.ascontiguousarray(xy_mm, dtype=np.int64))
+    extent = high - low
     if extent.max() >= 1 << 31:
         raise ValueError(f"points extend over {extent.max() / 1000:.3f} m: use coordinates of at most 2^31 mm extent")
     position = ((xy_mm[:, 0] - low[0]) << 31) + (xy_mm[:, 1] - low[1])

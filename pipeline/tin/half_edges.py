@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import FloatArray, LabelArray
 from pipeline.tin.predicates import lies_in_circumcircle, orientation
 
@@ -190,6 +189,7 @@ def canonical_facets(
     n = len(order)
     first_edge = np.full(n_facets, -1, np.int32)
     smallest = np.full(n_facets, -1, np.int32)
+    starts = np.zeros(n + 1, np.int32)
     for t in range(n_facets):
         e = 4 * t
         a, b, c = origin[e], origin[e + 1], origin[e + 2]
@@ -205,33 +205,37 @@ def canonical_facets(
             a = c
         first_edge[t] = e + k
         smallest[t] = a
-    start, edges = counting_sort(smallest, n)
-    n_real = len(edges)
-    seconds = np.empty(n_real, np.int32)
+        starts[a + 1] += 1
     for v in range(n):
-        for s in range(start[v], start[v + 1]):
-            t = edges[s]
-            e = first_edge[t]
-            b = order[origin[4 * t + ((e & 3) + 1) % 3]]
-            # insertion into the few facets whose smallest vertex this is, by their second vertex
-            i = s
-            while i > start[v] and seconds[i - 1] > b:
-                edges[i] = edges[i - 1]
-                seconds[i] = seconds[i - 1]
-                i -= 1
-            edges[i] = e
-            seconds[i] = b
+        starts[v + 1] += starts[v]
+    # the facets of each smallest vertex, few, by their second one, which goes before the facet in one whole number
+    n_real = starts[n]
+    sorted_facets = np.empty(n_real, np.int64)
+    ends = starts[:n].copy()
+    for t in range(n_facets):
+        v = smallest[t]
+        if v < 0:
+            continue
+        facet = (np.int64(order[origin[following(first_edge[t])]]) << 32) | t
+        i = ends[v]
+        while i > starts[v] and sorted_facets[i - 1] > facet:
+            sorted_facets[i] = sorted_facets[i - 1]
+            i -= 1
+        sorted_facets[i] = facet
+        ends[v] += 1
     number = np.full(n_facets, -1, np.int32)
     for i in range(n_real):
-        number[edges[i] >> 2] = i
+        number[sorted_facets[i] & 0xFFFFFFFF] = i
+    # facet after facet as they were made: what it refers to is then near in memory
     facets = np.empty((n_real, 3), np.int32)
     neighbours = np.empty((n_real, 3), np.int32)
-    for i in range(n_real):
-        e = edges[i]
-        base = e - (e & 3)
+    for t in range(n_facets):
+        i = number[t]
+        if i < 0:
+            continue
+        e = first_edge[t]
         for k in range(3):
-            here = base + ((e & 3) + k) % 3
-            opposite = base + ((e & 3) + k + 1) % 3
-            facets[i, k] = order[origin[here]]
-            neighbours[i, k] = number[twin[opposite] >> 2]
+            facets[i, k] = order[origin[e]]
+            e = following(e)
+            neighbours[i, k] = number[twin[e] >> 2]
     return facets, neighbours, number

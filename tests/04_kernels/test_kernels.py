@@ -10,6 +10,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.kernels.bounds import bounds_of
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
 from pipeline.kernels.merge_sort import ascending_order, in_order
@@ -52,6 +53,15 @@ def test_whole_numbers_are_sorted_and_ties_keep_their_order(values: list[int]) -
     keys = np.array(values, np.int64)
     assert ascending_order(keys).tolist() == sorted(range(len(values)), key=values.__getitem__)
     assert in_order(keys).tolist() == sorted(values)
+
+
+@given(st.lists(st.tuples(st.integers(-(2**62), 2**62), st.integers(-3, 3)), min_size=1, max_size=20))
+@settings(deadline=None)
+def test_bounds_are_the_lowest_and_the_highest_of_each_column(places: list[tuple[int, int]]) -> None:
+    xy = np.array(places, np.int64)
+    low, high = bounds_of(xy)
+    assert low.tolist() == xy.min(axis=0).tolist()
+    assert high.tolist() == xy.max(axis=0).tolist()
 
 
 @given(st.lists(st.floats() | st.sampled_from([0.0, 1.0, math.inf, math.nan]), max_size=60))

@@ -1,13 +1,16 @@
 """What has a name in storage is complete: one contract for folders and object stores."""
 
 import hashlib
+import os
 import threading
+from pathlib import Path
 
 import pytest
 
 from pipeline.errors import RunError
 from pipeline.io import LocalStorage, sha256_of, storage_at
 from pipeline.io.object_storage import ObjectStorage
+from pipeline.io.storage import TEMPORARY_SUFFIX
 
 
 @pytest.fixture(params=["folder", "object store"])
@@ -113,6 +116,28 @@ def test_several_puts_are_all_there_when_the_block_ends(storage):
     assert [storage.get(key) for key in storage.keys("meshes")] == [bytes([k]) for k in range(30)]
     assert storage.has("buildings")
     assert len(asked) >= 31
+
+
+def test_several_names_survive_a_power_loss_from_the_next_wait_on(tmp_path, monkeypatch):
+    """A folder is synced after its last new name, once for all of them; a file before it gets its name."""
+    synced = []
+
+    def sync(handle: int) -> None:
+        names = sorted(path.name for path in (tmp_path / "meshes").iterdir())
+        synced.append((Path(f"/proc/self/fd/{handle}").readlink(), names))
+
+    monkeypatch.setattr(os, "fsync", sync)
+    storage = LocalStorage(root=tmp_path)
+    with storage.several(lambda: None) as puts:
+        for name in ("a", "b", "c"):
+            puts.put(f"meshes/{name}", b"x")
+        assert [path.suffix for path, _ in synced] == [TEMPORARY_SUFFIX] * 3
+        assert all(path.name in names for path, names in synced)
+        puts.wait()
+        assert synced[3:] == [(tmp_path / "meshes", ["a", "b", "c"])]
+        puts.put("buildings", b"x")
+    assert [path.parent for path, _ in synced[4:5]] == [tmp_path]
+    assert [path for path, _ in synced[5:]] == [tmp_path]
 
 
 def test_what_the_check_raises_ends_several_puts(storage):

@@ -31,12 +31,12 @@ def test_unlabelled_points_take_the_nearest_label() -> None:
 def test_samples_keep_their_distance_and_leave_no_gap_wider_than_it() -> None:
     rng = np.random.default_rng(0)
     points = rng.integers(0, 5000, (40, 2))
-    samples, nearest, distance = empty_samples(points, np.array([-2000, -2000]), np.array([7000, 7000]), 300, 0.5)
-    squared = ((samples[:, None] - points) ** 2).sum(axis=2)
-    assert distance.min() > 0.5
-    assert np.sqrt(squared.min(axis=1)) / 1e3 == pytest.approx(distance)
-    assert (squared.argmin(axis=1) == nearest).mean() > 0.99
-    shifted = empty_samples(points + 7000, np.array([5000, 5000]), np.array([14_000, 14_000]), 300, 0.5)[0]
+    samples = empty_samples(points, np.array([-2000, -2000]), np.array([7000, 7000]), 300, 0.5)
+    rows = [np.arange(-2000 + 150 * (r % 2), 7000 + 150 * (r % 2) + 1, 300) for r in range(31)]
+    lattice = np.array([(x, -2000 + 300 * r) for r, row in enumerate(rows) for x in row])
+    distance = np.sqrt(((lattice[:, None] - points) ** 2).sum(axis=2).min(axis=1)) * 1e-3
+    assert samples.tolist() == lattice[distance > 0.5].tolist()
+    shifted = empty_samples(points + 7000, np.array([5000, 5000]), np.array([14_000, 14_000]), 300, 0.5)
     assert np.array_equal(shifted, samples + 7000)
 
 
@@ -45,7 +45,8 @@ def test_a_ridge_goes_on_straight_beyond_its_points() -> None:
     points = rng.integers(0, 8000, (300, 2))
     points = np.unique(points, axis=0)
     planes = np.array([[0.0, 0.7, 3.0], [0.0, -0.7, 3.0 + 5.6]])
-    samples, nearest, _ = empty_samples(points, np.array([-3000, -3000]), np.array([11_000, 11_000]), 400, 0.6)
+    samples = empty_samples(points, np.array([-3000, -3000]), np.array([11_000, 11_000]), 400, 0.6)
+    nearest, _ = nearest_points(points, samples)
     labels = (points[:, 1] > 4000).astype(np.int32)
     xy = np.concatenate((points, samples))
     before = np.concatenate((labels, labels[nearest])).astype(np.int32)

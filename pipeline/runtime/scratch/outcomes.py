@@ -85,8 +85,14 @@ def _plain(value: object) -> bytes:
 
 
 def _add(update: Callable[[bytes], None], value: object) -> None:
-    if type(value) is float:  # most are
+    kind = type(value)
+    if kind is float:  # the usual kinds first, and without a look at what else they might be
         update(b"float " + struct.pack("<d", value))
+    elif kind is int or kind is str:
+        text = str(value).encode()
+        update(b"%b %d %b" % (kind.__name__.encode(), len(text), text))
+    elif isinstance(value, tuple):
+        _add_sequence(update, value)
     elif value is None or isinstance(value, bool | int | str | bytes | dt.date):
         update(_plain(value))
     elif isinstance(value, enum.Enum):
@@ -110,11 +116,15 @@ def _add(update: Callable[[bytes], None], value: object) -> None:
         update(f"array {value.dtype.str} {value.shape} ".encode())
         update(np.ascontiguousarray(value).tobytes())
     elif isinstance(value, Sequence):
-        update(f"sequence {len(value)} ".encode())
-        for entry in value:
-            _add(update, entry)
+        _add_sequence(update, value)
     else:
-        raise TypeError(f"the content of a {type(value).__name__} is not known to key_of")
+        raise TypeError(f"the content of a {kind.__name__} is not known to key_of")
+
+
+def _add_sequence(update: Callable[[bytes], None], values: Sequence[object]) -> None:
+    update(b"sequence %d " % len(values))
+    for value in values:
+        _add(update, value)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
