@@ -83,6 +83,7 @@ def hilbert_order(xy_mm: IntArray) -> LabelArray:
 
     The cells of the curve are the 2^16th part of the extent; points of one cell are ordered by index.
     """
+    xy_mm = np.ascontiguousarray(xy_mm)
     low, high = bounds_of(xy_mm)
     extent = int((high - low).max())
     keys = _hilbert_keys(xy_mm, int(low[0]), int(low[1]), max(0, extent.bit_length() - _HILBERT_BITS))
