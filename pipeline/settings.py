@@ -14,8 +14,7 @@ from typing import Any
 from pipeline.errors import SettingsError
 from pipeline.methods import LODS, METHODS, PRESETS, ReconstructSettings, method_named
 from pipeline.parameters import Parameters, build, parameter
-from pipeline.roof.given_heights import FootprintSettings
-from pipeline.roof.settings import ArrangementSettings, RoofSettings, RoofTypeSettings
+from pipeline.roof.settings import ArrangementSettings, FootprintSettings, RoofSettings, RoofTypeSettings
 from pipeline.terrain.class_codes import ClassCodeSettings
 from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.terrain.settings import (

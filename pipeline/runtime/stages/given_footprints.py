@@ -14,7 +14,8 @@ from pipeline.errors import SettingsError, UnreadableInputError
 from pipeline.io import shown
 from pipeline.io.footprints import FootprintIssue, Footprints, read_footprints
 from pipeline.model import GivenHeights
-from pipeline.roof.given_heights import FootprintSettings, given_heights
+from pipeline.roof.given_heights import given_heights
+from pipeline.roof.settings import FootprintSettings
 from pipeline.runtime.plan import Plan
 from pipeline.tiling import MM, Tile, TileGrid
 
