@@ -20,7 +20,6 @@ WALLS = (
         HORIZONTAL,
         "the part that both walls share, in 3D: a Polygon Z or MultiPolygon Z half-way between both, counter-clockwise "
         "seen from outside building a",
-        required=True,
     ),
     Column("area_m2", FLOAT64, "m2", "area of that part", required=True),
     Column(
@@ -33,7 +32,7 @@ WALLS = (
 BUILDINGS = (
     Column("tile", TEXT, NONE, "tile of the run", required=True),
     Column("building_id", TEXT, NONE, "as in the run", required=True),
-    Column("geometry", WKB, HORIZONTAL, "footprint, as in the run", required=True),
+    Column("geometry", WKB, HORIZONTAL, "footprint, as in the run"),
     Column("wall_area_m2", FLOAT64, "m2", "area of all walls of the model", required=True),
     Column(
         "shared_wall_area_m2",
