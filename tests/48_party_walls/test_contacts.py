@@ -175,7 +175,7 @@ def test_an_opening_in_a_wall_touches_nothing() -> None:
 
 def test_what_touches_two_neighbours_counts_once_and_small_contacts_not_at_all() -> None:
     both = ("b", box(10, 0, 20, 5, 0, 6)), ("c", box(10.05, 4, 20, 8, 0, 6))
-    of = walls(("a", box(0, 0, 10, 8, 0, 6)), *both)
+    of = walls(("a", box(0, 0, 10, 12, 0, 6)), *both)
     pairs = found(of)
     of_a = [area for (name, *_), area in zip(named(of, pairs), pairs.area_m2, strict=True) if name == "a"]
     assert of_a == pytest.approx([30.0, 24.0])
