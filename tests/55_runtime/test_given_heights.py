@@ -15,6 +15,7 @@ from run_tables import rows
 from shapely import Polygon
 
 from pipeline.errors import SettingsError, UnreadableInputError
+from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import Candidate, GivenHeights
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.isolation.replay_bundle import Bundle, Incident, read_bundle, write_bundle
@@ -22,7 +23,11 @@ from pipeline.runtime.request import RunRequest
 from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.stages.gather import gather
+from pipeline.runtime.stages.sites import CandidateSite
 from pipeline.settings import RunSettings
+from pipeline.tiling import Tile, TileGrid
 
 HEIGHTS = {"footprints": {"height": "h", "roof_elevation": "roof", "storeys": "n", "ground_elevation": "ground"}}
 
@@ -187,6 +192,18 @@ def test_a_column_that_is_not_there_ends_the_run_before_it_begins(
     assert not (tmp_path / "never").exists()
     with pytest.raises(SettingsError, match=r"\[footprints\] height name.*none are given"):
         reconstruct(holes, settings={"footprints": {"height": "h"}}, out=str(tmp_path / "never"))
+
+
+def test_a_district_is_no_block(tmp_path: Path) -> None:
+    def heights(side_m: float) -> GivenHeights | None:
+        known = GivenHeights(height_m=7.0)
+        outline = shapely.box(0.0, 0.0, side_m, 10.0)
+        site = CandidateSite(building_id="a", owner=Tile(0, 0), ranges=(), points=0, footprint=outline, given=known)
+        grid = TileGrid(size_mm=1_000_000, halo_mm=0, origin_x_mm=0, origin_y_mm=0)
+        return gather(Scratch(str(tmp_path), ""), grid, site, GpsTimeKind.NONE)[0].given
+
+    assert heights(2000.0) is not None
+    assert heights(2001.0) is None
 
 
 def test_terrain_that_is_missing_beside_roof_points_comes_from_the_attribute(

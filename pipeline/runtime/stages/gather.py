@@ -42,6 +42,8 @@ _EDGE_CELLS = 5
 """A roof this near to such a square touches the edge of the data."""
 _BESIDE_CELLS = 2
 """Points within these cells of the roof lie beside it."""
+_LARGEST_M = 2000
+"""Longest side of a block by attributes: what is larger is a district, or a slip."""
 _HALF_DIAGONAL_M = 0.71
 """A cell that a footprint touches has its centre this near."""
 _HEIGHT_WITHOUT_TERRAIN_MM = 2500
@@ -246,10 +248,15 @@ def _ground_mm(
 
 
 def _given(site: CandidateSite, scratch: Scratch, grid: TileGrid, origin_z_mm: int) -> GivenHeights | None:
-    """The heights of a site by attributes, in local elevations, with the terrain at the outline of its footprint."""
+    """The heights of a site by attributes, in local elevations, with the terrain at the outline of its footprint.
+
+    None without any, and for a footprint that is too large for a building.
+    """
     if site.given is None or site.footprint is None:
         return None
     x0, y0, x1, y1 = (round(value * MM) for value in site.footprint.bounds)
+    if max(x1 - x0, y1 - y0) > _LARGEST_M * MM:
+        return None
     view = Window(x0_mm=x0, y0_mm=y0, x1_mm=x1 + 1, y1_mm=y1 + 1).grown(_VIEW_M * MM)
     around = surroundings_of(scratch, grid, view)
     rows, columns = around.occupied.shape
