@@ -68,7 +68,8 @@ def _metres(value: Any, unit_m: float, allowed: _Range) -> tuple[float | None, s
         return None, f"{str(value)[:40]!r}: not a number"
     number *= unit_m
     if not allowed.least <= number <= allowed.most:
-        return None, f"{number:g} {allowed.unit}: a building has {allowed.least:g} to {allowed.most:g} {allowed.unit}"
+        said = f"{number:g} {allowed.unit}" if unit_m == 1.0 else f"{str(value)[:40]} ({number:g} {allowed.unit})"
+        return None, f"{said}: a building has {allowed.least:g} to {allowed.most:g} {allowed.unit}"
     return number, ""
 
 

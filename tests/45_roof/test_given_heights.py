@@ -78,6 +78,10 @@ def test_feet_become_metres_and_storeys_do_not() -> None:
     assert found.height_m == pytest.approx(6.096)
     assert (found.roof_z_m, found.ground_z_m) == pytest.approx((36.576, 30.48))
     assert found.storeys_m == 9.0
+    # a fault names the value as the file has it
+    assert given_heights({"h": "20000"}, FootprintSettings(height="h"), 0.3048)[1] == [
+        "its h is 20000 (6096 m): a building has 0.1 to 1000 m"
+    ]
 
 
 @pytest.mark.parametrize(
