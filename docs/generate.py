@@ -15,7 +15,7 @@ import typer
 
 from pipeline.batch.batch_file import TABLES
 from pipeline.console import EXIT_CODES
-from pipeline.export import cityjson, geopackage, pmtiles, solar_table
+from pipeline.export import cityjson, geopackage, party_wall_tables, pmtiles, solar_table
 from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, Column
 from pipeline.methods import METHODS
 from pipeline.parameters import Parameters
@@ -492,6 +492,32 @@ def solar() -> str:
     return "\n".join(lines) + "\n"
 
 
+def party_walls() -> str:
+    """The page of the columns of `gablework party-walls`."""
+    header = ["column", "type", "unit", "null", "meaning"]
+    lines = [
+        NOTE,
+        "# Party walls",
+        "",
+        "The tables of `gablework party-walls`: [how to use them](../how_to/party_walls.md). Units and *null* are as",
+        "in [columns](columns.md). A column `bbox` covers the geometry. The entry `gablework_party_walls` of the",
+        "files' metadata holds the tolerances as JSON.",
+        "",
+        "## Pairs of walls",
+        "",
+        "The file of `--out`. A row is a pair of walls that touch; rows are ordered by tile, building and face.",
+        "",
+        *table(header, column_rows(party_wall_tables.WALLS)),
+        "",
+        "## Buildings",
+        "",
+        "The file of `--buildings`. A row is a building with a model; rows are ordered by tile and building.",
+        "",
+        *table(header, column_rows(party_wall_tables.BUILDINGS)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
 PAGES: Mapping[str, Callable[[], str]] = {
     "settings.md": settings,
     "batch_file.md": batch_file,
@@ -503,6 +529,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "changes.md": changes,
     "columns.md": columns,
     "solar.md": solar,
+    "party_walls.md": party_walls,
 }
 """The generated pages by file name."""
 

@@ -46,7 +46,7 @@ class Inspection:
     dropped: dict[str, int]
     """Points that a run would leave out, by cause."""
     classes: dict[int, int]
-    """Used points by ASPRS class."""
+    """Used points by class: the file's own codes, or ASPRS codes if the settings say what the file's codes mean."""
     returns: dict[int, int]
     """Used points by the number of returns of their pulse."""
     elevation_m: tuple[float, float]
@@ -107,12 +107,19 @@ class Inspection:
         ]
 
 
-def inspect(path: str | Path, options: ReadOptions | None, on_progress: Callable[[int, int], None]) -> Inspection:
-    """Read a tile once, streamed, and describe its content.
+def inspect(
+    path: str | Path,
+    options: ReadOptions | None,
+    on_progress: Callable[[int, int], None],
+    settings: RunSettings | None = None,
+) -> Inspection:
+    """Read a tile once, streamed, and describe its content as a run with some settings sees it, by default the usual.
 
     `on_progress` is called with points read and points promised. Raises InputError if the file or its points cannot be
     read.
     """
+    settings = settings or RunSettings()
+    options = dataclasses.replace(options or ReadOptions(), class_table=settings.class_codes.table)
     source = open_source(path, options)
     raster = _Raster(source.info)
     classes = np.zeros(256, dtype=np.int64)
@@ -126,14 +133,16 @@ def inspect(path: str | Path, options: ReadOptions | None, on_progress: Callable
         lowest = min(lowest, float(cloud.xyz[:, 2].min()))
         highest = max(highest, float(cloud.xyz[:, 2].max()))
         on_progress(used, source.info.point_count)
-    options = options or ReadOptions()
-    plan = make_plan([str(path)], options, RunSettings())
-    return _inspection(source, raster, classes, returns, used, (lowest, highest), _forecast(path, options, plan))
+    plan = make_plan([str(path)], options, settings)
+    run = _forecast(path, options, plan, settings)
+    return _inspection(source, raster, classes, returns, used, (lowest, highest), run)
 
 
-def _forecast(path: str | Path, options: ReadOptions, plan: Plan) -> Forecast:
-    """The forecast of a run with the default settings."""
-    request = RunRequest(inputs=(str(path),), out="", crs=options.crs, vertical_unit=options.vertical_unit)
+def _forecast(path: str | Path, options: ReadOptions, plan: Plan, settings: RunSettings) -> Forecast:
+    """The forecast of a run."""
+    request = RunRequest(
+        inputs=(str(path),), out="", crs=options.crs, vertical_unit=options.vertical_unit, settings=settings
+    )
     at = workers_that_fit(cores(), memory_bytes(), plan.window_bytes)
     engine, workers = engine_of(Resources(), expected_cpu_s=sum(expected(plan).cpu_s().values()), at=at)
     return forecast(request, plan, [str(path)], engine=engine, workers=workers)

@@ -37,6 +37,7 @@ class Reason(StrEnum):
     INVALID_SOLID = "invalid_solid"
     TOO_COMPLEX = "too_complex"
     NO_FOOTPRINT = "no_footprint"
+    HEIGHT_GIVEN = "height_given"
     INTERNAL_ERROR = "internal_error"
     CRASHED = "crashed"
     TIMED_OUT = "timed_out"
@@ -61,6 +62,8 @@ REASONS: Mapping[Reason, str] = {
     Reason.INVALID_SOLID: "the solid broke a validity rule; `validity_codes` lists which",
     Reason.TOO_COMPLEX: "the counted work passed its bound",
     Reason.NO_FOOTPRINT: "no outline could be made from the points",
+    Reason.HEIGHT_GIVEN: "no model could be made of the points; the block has the height that an attribute of its "
+    "footprint gives",
     Reason.INTERNAL_ERROR: "a fault of gablework in this one building; the detail names the exception; kept as a "
     "bundle",
     Reason.CRASHED: "its process died at it, twice, the second time alone; the detail names the signal or the exit "
@@ -91,6 +94,23 @@ class RoofType(StrEnum):
     COMBINATION = "combination"
     UNKNOWN = "unknown"
     NONE = "none"
+
+
+class HeightSource(StrEnum):
+    """Where the height of a model comes from: points, or an attribute of its footprint."""
+
+    POINTS = "points"
+    HEIGHT = "height"
+    ROOF_ELEVATION = "roof_elevation"
+    STOREYS = "storeys"
+
+
+class GroundSource(StrEnum):
+    """Where the floor of a building comes from: the terrain, an attribute of its footprint, or neither."""
+
+    TERRAIN = "terrain"
+    ATTRIBUTE = "attribute"
+    ASSUMED = "assumed"
 
 
 class FaceKind(StrEnum):
@@ -196,6 +216,22 @@ class Plane:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class GivenHeights:
+    """Heights of one building by the attributes of its given footprint; nan if unknown."""
+
+    height_m: float = math.nan
+    """Height above ground, metres."""
+    roof_z_m: float = math.nan
+    """Elevation of the roof, metres."""
+    storeys_m: float = math.nan
+    """Height of all storeys together, metres."""
+    ground_z_m: float = math.nan
+    """Elevation of the ground, metres."""
+    terrain_z_m: float = math.nan
+    """Lowest terrain at the outline of the footprint, metres: not an attribute, found by the points around."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Candidate:
     """The points of one possible building, and the terrain around it."""
 
@@ -209,6 +245,8 @@ class Candidate:
     """(m, 3) float64, local metres: samples of the terrain around and beneath, on a 1 m lattice."""
     ground_z_m: float
     """Local elevation of the lowest terrain at the outline: where the walls end."""
+    ground_source: GroundSource | None = None
+    """Where that elevation comes from; None if it is unknown."""
     split_returns: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """(k, 3) float64, those of the points whose pulse went on to a lower return: it met them with a part of its beam.
     Empty where the file has no returns."""
@@ -216,6 +254,8 @@ class Candidate:
     """Given footprint in local metres; None where none was given."""
     source_id: str | None = None
     """The given footprint's own id."""
+    given: GivenHeights | None = None
+    """Its heights by attributes, elevations in local metres; None without any."""
     outline: MultiPolygon | None = None
     """Its part of the outline that it was drawn with the units it touches, local metres; None where it touches none."""
     beside: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
@@ -477,6 +517,10 @@ class BuildingResult:
     """Codes of the faults that kept the method's own solid from delivery; empty where there were none."""
     ground_z_m: float
     """Local elevation of the floor."""
+    height_source: HeightSource | None = None
+    """Where the height of the model comes from; None without a model."""
+    ground_source: GroundSource | None = None
+    """Where the elevation of the floor comes from; None if it is unknown."""
     n_points: int
     """Points of the candidate."""
     density_per_m2: float
@@ -486,7 +530,7 @@ class BuildingResult:
     p95_m: float = math.nan
     """95th percentile of the absolute vertical distances; nan without a model."""
     coverage: float = 0.0
-    """Share of points that have a roof above or below them; 0 without a model."""
+    """Share of points that have a roof above or below them; 0 without a model, nan for one by attributes."""
     quality: ModelQuality = ModelQuality()
     """How well the points support the model."""
     touches_data_edge: bool

@@ -24,6 +24,7 @@ from pipeline.model import (
     Candidate,
     Decision,
     DecisionKind,
+    HeightSource,
     LodModel,
     Outcome,
     Plane,
@@ -44,6 +45,7 @@ from pipeline.roof.floor_cut import cut_at_floor
 from pipeline.roof.flush_walls import unite_flush_walls
 from pipeline.roof.footprint import hull_of_points, outline
 from pipeline.roof.forms import UNDRAWABLE, FaceForm, arranged_forms, template_forms, traced_forms, undrawable
+from pipeline.roof.given_heights import given_block
 from pipeline.roof.lower_lods import LodParts, lower_lods
 from pipeline.roof.named_form import BLOCK, PRIMITIVE, NamedForm
 from pipeline.roof.partition import RoofPartition
@@ -64,6 +66,8 @@ storey."""
 _FEW_EXPLAINED = 0.75
 """Share of its roof points that a model has to explain where they are fewer than usual, or show no plane though they
 are dense: a tree would make a roof, too."""
+_GIVEN_TOLERANCE_M = 0.5
+"""Largest change to an outline that is hard to draw, for a block without points, whose spacing would decide."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -124,6 +128,16 @@ def reconstruct_building(candidate: Candidate, method: str, settings: Reconstruc
         raise
     except Exception as error:  # noqa: BLE001 - the record holds it, with its place
         result = failed_building(candidate, method, Reason.INTERNAL_ERROR, _describe(error))
+    if result.status is Status.FAILED and result.reason is not Reason.INTERNAL_ERROR and candidate.given is not None:
+        without = dataclasses.replace(candidate, points=np.zeros((0, 3)))
+        blind = _Building(
+            candidate=without,
+            method=method,
+            settings=settings,
+            roof=RoofPoints.none(candidate.footprint),
+            decisions=decisions,
+        )
+        result = _given_model(blind, result)
     return dataclasses.replace(result, decisions=tuple(decisions))
 
 
@@ -441,6 +455,36 @@ def _blocks(building: _Building, plan: RoofPlan | None) -> Iterator[NamedForm[_M
             yield NamedForm(BLOCK, partial(_block_model, form, plane), f"on {words}")
 
 
+def _given_model(building: _Building, failed: BuildingResult) -> BuildingResult:
+    """The block that the attributes of its footprint give a building that failed; else its record, which says why.
+
+    The few points that it may have do not count: the block does not come from them, so its accuracy is unknown.
+    """
+    lack, roof = BuildingError(failed.reason or Reason.NO_FOOTPRINT, failed.reason_detail), building.roof
+    try:
+        given = given_block(building.candidate, lack)
+        assert roof.footprint_mm is not None
+        least_m2 = building.settings.roof.min_part_area_m2
+        forms = block_forms(roof.footprint_mm, given.plane, given.ground_z_m, _GIVEN_TOLERANCE_M, least_m2)
+        blocks = (NamedForm(BLOCK, partial(_block_model, form, given.plane), given.words) for form in forms)
+        block, _ = _first_valid(blocks, building)
+        if block is None:
+            raise BuildingError(lack.reason, f"{lack.detail}; no block on the footprint is valid")
+    except UNDRAWABLE as error:
+        fault = error if isinstance(error, BuildingError) else BuildingError(lack.reason, f"{lack.detail}; {error}")
+        return dataclasses.replace(failed, reason=fault.reason, reason_detail=fault.detail)
+    record = _record(building, block, BuildingError(Reason.HEIGHT_GIVEN, f"{lack.detail}; {given.words}"))
+    return dataclasses.replace(
+        record,
+        ground_z_m=given.ground_z_m,
+        height_source=given.height_source,
+        ground_source=given.ground_source,
+        n_points=failed.n_points,
+        density_per_m2=failed.n_points / record.footprint.area if record.footprint else math.nan,
+        coverage=math.nan,
+    )
+
+
 def _block_model(form: Callable[[], list[SolidPart]], plane: Plane) -> _Model:
     """The block that a form draws."""
     return _Model(lod="1.2", parts=form(), planes=[plane])
@@ -489,6 +533,8 @@ def _record(
         solids=solids,
         validity_codes=codes,
         ground_z_m=candidate.ground_z_m,
+        height_source=HeightSource.POINTS,
+        ground_source=candidate.ground_source,
         n_points=len(candidate.points),
         density_per_m2=len(candidate.points) / footprint.area,
         rmse_m=residuals.rmse_m,
@@ -538,6 +584,7 @@ def failed_building(candidate: Candidate, method: str, reason: Reason, detail: s
         method=method,
         footprint=footprint,
         ground_z_m=candidate.ground_z_m,
+        ground_source=candidate.ground_source,
         n_points=len(candidate.points),
         density_per_m2=len(candidate.points) / area if area > 0.0 else math.nan,
         touches_data_edge=candidate.touches_data_edge,

@@ -14,7 +14,7 @@ from typing import Any
 from pipeline.errors import SettingsError
 from pipeline.methods import LODS, METHODS, PRESETS, ReconstructSettings, method_named
 from pipeline.parameters import Parameters, build, parameter
-from pipeline.roof.settings import ArrangementSettings, RoofSettings, RoofTypeSettings
+from pipeline.roof.settings import ArrangementSettings, FootprintSettings, RoofSettings, RoofTypeSettings
 from pipeline.terrain.class_codes import ClassCodeSettings
 from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.terrain.settings import (
@@ -85,6 +85,7 @@ class GeneralSettings(Parameters):
 
 SECTIONS: Mapping[str, type[Parameters]] = {
     "class-codes": ClassCodeSettings,
+    "footprints": FootprintSettings,
     "outliers": OutlierSettings,
     "ground": GroundSettings,
     "vegetation": VegetationSettings,
@@ -96,6 +97,8 @@ SECTIONS: Mapping[str, type[Parameters]] = {
     "roof-type": RoofTypeSettings,
 }
 """Tables of the settings file that every method shares; each method adds one of its own name."""
+_OPTIONAL = frozenset({"footprints"})
+"""Tables that count in the settings hash only if they differ from the defaults, with which they do nothing."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -106,6 +109,8 @@ class RunSettings:
     """The run as a whole."""
     class_codes: ClassCodeSettings = dataclasses.field(default_factory=ClassCodeSettings)
     """Meaning of the class codes in the file."""
+    footprints: FootprintSettings = dataclasses.field(default_factory=FootprintSettings)
+    """Heights among the attributes of given footprints."""
     scene: SceneSettings = dataclasses.field(default_factory=SceneSettings)
     """From a tile's points to candidates."""
     building: ReconstructSettings = dataclasses.field(default_factory=ReconstructSettings)
@@ -140,6 +145,7 @@ class RunSettings:
         return {
             "general": self.general,
             "class-codes": self.class_codes,
+            "footprints": self.footprints,
             "outliers": self.scene.outliers,
             "ground": self.scene.ground,
             "vegetation": self.scene.vegetation,
@@ -166,6 +172,7 @@ class RunSettings:
                 if field.metadata.get("changes_geometry", True)
             }
             for name, section in self.sections().items()
+            if name not in _OPTIONAL or section != type(section)()
         }
         text = json.dumps(content, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
@@ -203,6 +210,7 @@ class RunSettings:
         return cls(
             general=general or GeneralSettings(),
             class_codes=built.get("class-codes", ClassCodeSettings()),
+            footprints=built.get("footprints", FootprintSettings()),
             scene=scene,
             building=building,
         )

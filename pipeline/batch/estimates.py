@@ -127,7 +127,8 @@ def _estimated(batch: Batch, worth_s: float, known: tuple[int, int]) -> Estimate
         )
     buildings, known_from = None, None
     if request.footprints is not None:
-        buildings, known_from = len(given_footprints(request.footprints, plan).polygons), "the given footprints"
+        given = given_footprints(request.footprints, plan, request.settings.footprints)
+        buildings, known_from = len(given.polygons), "the given footprints"
         work = dataclasses.replace(work, buildings=buildings)
     elif known[0] and known[1] == work.points:
         buildings, known_from, worth_s = known[0], "as many as in the run before", math.inf

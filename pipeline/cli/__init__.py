@@ -7,6 +7,7 @@ from pipeline.cli.cluster import worker
 from pipeline.cli.measuring import digest, evaluate, inspect, report
 from pipeline.cli.modelling import compare, reconstruct, replay, rerun
 from pipeline.cli.options import AsJson
+from pipeline.cli.party_walls import party_walls
 from pipeline.cli.publishing import publish
 from pipeline.cli.simulating import demo, simulate, warm_up
 from pipeline.cli.solar import solar
@@ -15,7 +16,8 @@ __all__ = ["AsJson", "app"]
 
 # in the order of `gablework --help`
 _COMMANDS = (
-    *(reconstruct, rerun, compare, classify, inspect, evaluate, report, publish, solar, digest, replay),
+    *(reconstruct, rerun, compare, classify, inspect, evaluate, report, publish, solar, party_walls),
+    *(digest, replay),
     *(simulate, demo, warm_up, worker),
 )
 for _command in _COMMANDS:

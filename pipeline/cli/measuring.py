@@ -15,6 +15,7 @@ from pipeline.cli.options import (
     Crs,
     Points,
     Quiet,
+    SettingsFile,
     Truth,
     VerticalUnit,
 )
@@ -31,6 +32,7 @@ def inspect(
     ],
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
+    settings: SettingsFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -39,6 +41,8 @@ def inspect(
         from pipeline.inspection import inspect as inspect_tile
         from pipeline.io.source import ReadOptions
         from pipeline.runtime.monitoring.events import Event
+        from pipeline.settings import RunSettings
+        from pipeline.terrain.class_codes import ClassCodeSettings
 
         if _is_run(tile):
             from pipeline.report.statistics import run_statistics
@@ -51,12 +55,16 @@ def inspect(
         def on_progress(done: int, total: int) -> None:
             console.on_event(Event(kind="progress", stage="read", done=done, total=total))
 
-        found = inspect_tile(tile, ReadOptions(crs=crs, vertical_unit=vertical_unit), on_progress)
+        options = ReadOptions(crs=crs, vertical_unit=vertical_unit)
+        found = inspect_tile(tile, options, on_progress, RunSettings.from_toml(settings, {}))
         for warning in found.warnings:
             console.warn(warning)
         console.table(tile, ["fact", "value"], found.rows())
-        shares = [[n, count, f"{100.0 * count / found.used_points:.1f} %"] for n, count in found.classes.items()]
-        console.table("Classes", ["class", "points", "share"], shares)
+        shares = [
+            [n, ClassCodeSettings.role(n), count, f"{100.0 * count / found.used_points:.1f} %"]
+            for n, count in found.classes.items()
+        ]
+        console.table("Classes", ["class", "meaning", "points", "share"], shares)
         console.document(dataclasses.asdict(found))
 
 

@@ -118,6 +118,14 @@ BUILDINGS = (
     Column("solid_lod13_parts", INT32S, NONE, "like `solid_parts`, for LoD1.3"),
     Column("solid_lod13_surfaces", TEXTS, NONE, "like `solid_surfaces`, for LoD1.3"),
     Column("ground_z", FLOAT64, VERTICAL, "elevation of the floor: the lowest terrain at the outline"),
+    Column(
+        "ground_source",
+        TEXT,
+        NONE,
+        "where `ground_z` comes from: `terrain`, `attribute` (of the given footprint), or `assumed` (2.5 m below the "
+        "lowest point, without terrain); null if it is unknown",
+        page="../how_to/footprints.md#heights-from-attributes",
+    ),
     Column("eave_z", FLOAT64, VERTICAL, "median elevation of the eave edges, weighted by roof area"),
     Column("ridge_z", FLOAT64, VERTICAL, "highest roof point"),
     Column("h_min", FLOAT64, VERTICAL, "elevation of the lowest roof point"),
@@ -125,6 +133,14 @@ BUILDINGS = (
     Column("h_70p", FLOAT64, VERTICAL, "70th percentile of the roof's elevation over plan area"),
     Column("h_max", FLOAT64, VERTICAL, "elevation of the highest roof point"),
     Column("height_m", FLOAT64, "m", "ridge above floor"),
+    Column(
+        "height_source",
+        TEXT,
+        NONE,
+        "where the height comes from: `points`, or an attribute of the given footprint (`height`, `roof_elevation`, "
+        "`storeys`); null without a model",
+        page="../how_to/footprints.md#heights-from-attributes",
+    ),
     Column("footprint_area_m2", FLOAT64, "m2", "plan area"),
     Column(
         "footprint_share",
@@ -162,7 +178,12 @@ BUILDINGS = (
         "root mean square vertical distance of the candidate's original points to the model's top surface",
     ),
     Column("p95_m", FLOAT64, "m", "95th percentile of the absolute distances"),
-    Column("coverage", FLOAT64, SHARE, "share of the points that have a roof above or below them"),
+    Column(
+        "coverage",
+        FLOAT64,
+        SHARE,
+        "share of the points that have a roof above or below them; null if the height is an attribute",
+    ),
     Column("point_spacing_m", FLOAT64, "m", "typical distance of neighbouring roof points in plan"),
     Column(
         "noise_m",

@@ -86,6 +86,7 @@ def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: s
         **solid_columns(result, context.reference),
         **_elevations(result, measured, context.reference),
         "height_m": _or_none(measured.ridge_z_m - result.ground_z_m),
+        "height_source": None if result.height_source is None else result.height_source.value,
         "footprint_area_m2": None if footprint is None else _or_none(footprint.area),
         "footprint_share": _or_none(result.footprint_share, 4),
         "roof_area_m2": _or_none(measured.roof_area_m2) if modelled else None,
@@ -144,14 +145,18 @@ def _walls(result: BuildingResult, reference: SpatialReference) -> dict[str, byt
     }
 
 
-def _elevations(result: BuildingResult, measured: Dimensions, reference: SpatialReference) -> dict[str, float | None]:
+def _elevations(
+    result: BuildingResult, measured: Dimensions, reference: SpatialReference
+) -> dict[str, float | str | None]:
     """The elevation columns in the CRS's vertical unit."""
     columns = ("ground_z", "eave_z", "ridge_z", "h_min", "h_50p", "h_70p", "h_max")
     local = (result.ground_z_m, measured.eave_z_m, measured.ridge_z_m, *measured.roof_z_m)
-    return {
-        name: None if math.isnan(z) else crs_elevation(z, result.origin, reference)
+    ground, *roof = (
+        (name, None if math.isnan(z) else crs_elevation(z, result.origin, reference))
         for name, z in zip(columns, local, strict=True)
-    }
+    )
+    source = None if result.ground_source is None else result.ground_source.value
+    return dict([ground, ("ground_source", source), *roof])
 
 
 def plane_rows(result: BuildingResult, context: RecordContext) -> list[dict[str, Any]]:

@@ -51,6 +51,7 @@ PROBLEMS = {
     "outside_crs": "outside the run's CRS",
     "no_area": "invalid and without area",
     "invalid": "invalid",
+    "bad_value": "with an attribute that cannot be used",
 }
 """What can be wrong with a footprint, and how a message counts it."""
 ACCURACY_LIMIT_M = 0.5
@@ -91,6 +92,10 @@ class Footprints:
     """2D, valid, in metres of the run's CRS."""
     attributes: tuple[dict[str, Any], ...]
     """All columns by name, as JSON knows values, dates as ISO 8601; None where empty."""
+    features: tuple[int, ...] = ()
+    """The file's own numbers of the features; empty if they were not read from a file."""
+    columns: tuple[str, ...] = ()
+    """Names of the file's columns, also if no footprint is kept."""
     warnings: tuple[str, ...] = ()
     """What was repaired, left out or assumed, one sentence each."""
     issues: tuple[FootprintIssue, ...] = ()
@@ -185,6 +190,8 @@ def read_footprints(
         ids=ids,
         polygons=tuple(polygons.tolist()),
         attributes=tuple({field: table[field][row] for field in table} for row in kept.tolist()),
+        features=tuple(found.feature_ids[kept].tolist()),
+        columns=tuple(found.columns),
         warnings=(*warnings, *_summary(issues)),
         issues=issues,
         elsewhere=found.elsewhere,

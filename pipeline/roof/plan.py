@@ -76,6 +76,19 @@ class RoofPoints:
     facades: FacadePoints | None = None
     """Points that show the walls beneath; None where no wall is asked for."""
 
+    @classmethod
+    def none(cls, footprint: Polygon | MultiPolygon | None) -> RoofPoints:
+        """No points in a given footprint, in local metres; their spacing is nan."""
+        return cls(
+            points=np.zeros((0, 3)),
+            xy_mm=np.zeros((0, 2), np.int64),
+            index=np.zeros(0, np.int64),
+            labels=np.zeros(0, np.int32),
+            split=np.zeros(0, np.bool_),
+            spacing_m=math.nan,
+            footprint_mm=None if footprint is None else footprint_in_mm(footprint),
+        )
+
 
 def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[Decision] | None = None) -> RoofPoints:
     """Select the roof points of a candidate, in its order, without labels; their number is added to `decisions`.

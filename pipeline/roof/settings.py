@@ -318,3 +318,25 @@ class RoofTypeSettings(Parameters):
         minimum=0.0,
         maximum=1.0,
     )
+
+
+class FootprintSettings(Parameters):
+    """Columns of the given footprints that hold heights; used only where points give no model, or no ground."""
+
+    height: str = parameter(
+        "", "Column with the height of a building above its ground, in the vertical unit of the run's CRS."
+    )
+    roof_elevation: str = parameter(
+        "", "Column with the elevation of its roof, in the vertical unit and datum of the run's CRS."
+    )
+    storeys: str = parameter("", "Column with its number of storeys above ground.")
+    storey_height_m: float = parameter(3.0, "Height of a storey.", unit="m", minimum=1.0, maximum=10.0)
+    ground_elevation: str = parameter(
+        "", "Column with the elevation of its ground, like `roof_elevation`; points of the ground come first."
+    )
+
+    @property
+    def columns(self) -> dict[str, str]:
+        """The columns that are named, by setting."""
+        names = ("height", "roof_elevation", "storeys", "ground_elevation")
+        return {name: getattr(self, name) for name in names if getattr(self, name)}

@@ -26,8 +26,11 @@ from pipeline.export.geoparquet import stored_schema, table_batches
 from pipeline.export.records import KEYS
 from pipeline.io import arrow_at
 
-NOT_CONTENT = frozenset({"tile", "mesh_path", "input_hash", "settings_hash", "engine_version"})
-"""Columns that may differ between runs with equal results: by tiling, names of settings, or the version."""
+NOT_CONTENT = frozenset(
+    {"tile", "mesh_path", "input_hash", "settings_hash", "engine_version", "height_source", "ground_source"}
+)
+"""Columns that may differ between runs with equal results (by tiling, names of settings, or the version), and those
+that say where figures come from: the figures themselves and the reasons count."""
 FIGURES_ONLY = "reason_detail"
 """The column whose figures count and whose words do not."""
 ROWS_A_BATCH = 8192

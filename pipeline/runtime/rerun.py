@@ -53,7 +53,7 @@ from pipeline.runtime.scratch.location import run_scratch
 from pipeline.runtime.stages.apply_overrides import WARNING, EntryOutcome, apply_overrides
 from pipeline.runtime.stages.batch_figures import REJECTED, Modelled
 from pipeline.runtime.stages.gather import gather
-from pipeline.runtime.stages.given_footprints import GivenFootprints, given_footprints
+from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints_of_run
 from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested, points_by_tile
@@ -153,7 +153,7 @@ def _rerun(
     if unknown:
         raise RunError(f"{', '.join(unknown)}: no building of {earlier.run_dir}. Give ids of its buildings table")
     plan, paths = plan_inputs(dataclasses.replace(wanted, resources=request.resources), progress, cancelled, executor)
-    footprints = None if wanted.footprints is None else given_footprints(wanted.footprints, plan)
+    footprints = footprints_of_run(wanted.footprints, plan, wanted.settings.footprints)
     overrides = () if wanted.overrides is None else read_overrides(wanted.overrides, plan.reference, wanted.settings)
     check_outlines(earlier.manifest, wanted)
     with run_context(

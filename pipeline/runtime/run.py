@@ -47,7 +47,7 @@ from pipeline.runtime.stages.cleanup import OVERRIDDEN, publishing, tidy
 from pipeline.runtime.stages.content_digest import STAGE as DIGEST
 from pipeline.runtime.stages.content_digest import content_digest
 from pipeline.runtime.stages.counts import run_counts
-from pipeline.runtime.stages.given_footprints import GivenFootprints, given_footprints
+from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints_of_run
 from pipeline.runtime.stages.ground import Ground, find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested
@@ -207,7 +207,7 @@ def run_variants(
     progress = Progress(on_event)
     progress.tell("run", "plan", f"run into {request.out}")
     plan, paths = plan_inputs(request, progress, cancelled, executor)
-    footprints = None if request.footprints is None else given_footprints(request.footprints, plan)
+    footprints = footprints_of_run(request.footprints, plan, request.settings.footprints)
     for warning in () if footprints is None else footprints.warnings:
         progress.warn("plan", warning)
     overrides = () if request.overrides is None else read_overrides(request.overrides, plan.reference, settings)

@@ -8,15 +8,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-import pyarrow.fs as pafs
 import shapely
 
 from pipeline.errors import RunError
-from pipeline.export.geoparquet import table_batches, table_files
+from pipeline.export.geoparquet import table_batches
 from pipeline.export.solar_table import SUFFIX, SolarFile
-from pipeline.io import LocalStorage, SpatialReference, arrow_at
+from pipeline.io import LocalStorage, SpatialReference
 from pipeline.io.true_north import convergence_deg, longitude_and_latitude
-from pipeline.model import FloatArray
 from pipeline.runtime.manifest import RunManifest
 from pipeline.runtime.monitoring.events import Event, Listener, ignore
 from pipeline.runtime.publishing import (
@@ -29,6 +27,7 @@ from pipeline.runtime.publishing import (
     refuse_existing,
     stated_files,
 )
+from pipeline.runtime.run_tiles import TILES_IN_MEMORY, RunTiles
 from pipeline.solar.figures import Figures, figures
 from pipeline.solar.horizon import obstacles_of
 from pipeline.solar.roof_planes import RoofPlanes
@@ -40,8 +39,6 @@ _COLUMNS = (
     *("building_id", "plane_id", "geometry", "slope_deg", "aspect_deg", "area_m2"),
     *("origin_x", "origin_y", "origin_z", "coefficients"),
 )
-_TILES_IN_MEMORY = 16
-"""Tiles that are kept for their neighbours."""
 _FAR_KM = 100.0
 """A weather file from farther away gets a warning."""
 
@@ -99,38 +96,19 @@ def solar(  # each is an option of the command
     return Published(place=str(target), size_bytes=target.stat().st_size, rows={"planes": file.rows})
 
 
-class _Run:
+class _Run(RunTiles):
     """The roof planes of a run by tile, in metres; a bounded number of tiles is in memory."""
 
     def __init__(self, run_dir: str, manifest: RunManifest) -> None:
-        self._filesystem: pafs.FileSystem
-        self._filesystem, self._place = arrow_at(run_dir)
-        crs = manifest.crs or {}
-        self.reference = SpatialReference(
-            **{name: crs[name] for name in ("wkt", "name", "horizontal_unit_m", "vertical_unit_m") if name in crs}
-        )
-        files = table_files(self._place, _TABLE, self._filesystem)
-        self.tiles = [path.split("/")[-2].removeprefix("tile=") for path in files]
-        self.bounds = np.array([self._bounds(tile) for tile in self.tiles]).reshape(-1, 4)
+        super().__init__(run_dir, manifest, _TABLE)
         self.tile: Callable[[str], tuple[Mapping[str, Any], RoofPlanes]]
-        self.tile = functools.lru_cache(_TILES_IN_MEMORY)(self._tile)
-
-    def _bounds(self, tile: str) -> FloatArray:
-        """Bounds of a tile's planes in metres; nan without any."""
-        low, high = np.full(2, np.nan), np.full(2, np.nan)
-        for batch in table_batches(self._place, _TABLE, ["bbox"], self._filesystem, [tile]):
-            box = batch.column("bbox").drop_null()
-            if len(box):
-                x0, y0, x1, y1 = (np.asarray(values) for values in box.flatten())
-                low, high = np.fmin(low, [x0.min(), y0.min()]), np.fmax(high, [x1.max(), y1.max()])
-        found: FloatArray = np.concatenate([low, high]) * self.reference.horizontal_unit_m
-        return found
+        self.tile = functools.lru_cache(TILES_IN_MEMORY)(self._tile)
 
     def _tile(self, tile: str) -> tuple[Mapping[str, Any], RoofPlanes]:
         """The columns of a tile's planes as they are stored, and the planes in metres."""
-        batches = list(table_batches(self._place, _TABLE, _COLUMNS, self._filesystem, [tile]))
+        batches = list(self.batches(_COLUMNS, tile))
         columns = {name: [value for batch in batches for value in batch.column(name).to_pylist()] for name in _COLUMNS}
-        unit = np.array([self.reference.horizontal_unit_m] * 2 + [self.reference.vertical_unit_m])
+        unit = self.unit_m
         faces = shapely.from_wkb(np.array([*columns["geometry"], None], dtype=object)[:-1])
         columns["faces"] = faces
         coefficients = np.array(columns["coefficients"], float).reshape(-1, 4)
@@ -144,16 +122,6 @@ class _Run:
             aspect_deg=np.array(columns["aspect_deg"], float),
             through=origin * unit,
         )
-
-    def near(self, tile: str, reach_m: float) -> list[str]:
-        """The tiles whose planes may be within a distance of a tile's, itself among them."""
-        x0, y0, x1, y1 = self.bounds[self.tiles.index(tile)]
-        others = self.bounds
-        with np.errstate(invalid="ignore"):  # tiles without planes are near to none
-            apart_x = np.maximum(others[:, 0] - x1, x0 - others[:, 2])
-            apart_y = np.maximum(others[:, 1] - y1, y0 - others[:, 3])
-            found = np.maximum(apart_x, apart_y) <= reach_m
-        return [name for name, is_near in zip(self.tiles, found, strict=True) if is_near]
 
     def site(self) -> Site | None:
         """The centre of the run at the mean elevation of the ground under its buildings; None without planes."""

@@ -30,6 +30,16 @@ class ClassCodeSettings(Parameters):
         maximum=255,
     )
 
+    @classmethod
+    def role(cls, code: int) -> str:
+        """What an ASPRS code means to a run: the name of its list, or `other`.
+
+        >>> [ClassCodeSettings.role(code) for code in (2, 6, 9, OTHER)]
+        ['ground', 'building', 'other', 'other']
+        """
+        lists: dict[str, tuple[int, ...]] = dataclasses.asdict(cls())
+        return next((name for name, codes in lists.items() if code in codes), "other")
+
     def cross_faults(self) -> list[str]:
         """A code means one thing."""
         groups: dict[int, list[str]] = {}

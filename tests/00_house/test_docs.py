@@ -49,6 +49,7 @@ GENERATED = (
     "changes.md",
     "columns.md",
     "solar.md",
+    "party_walls.md",
 )
 
 

@@ -1,11 +1,13 @@
 """Codes of a producer's own: 67 can be a building, wherever classes are believed or looked at."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import laspy
 import numpy as np
 import pytest
+from command_line import invoke
 from run_tables import rows
 
 from pipeline.errors import SettingsError
@@ -61,6 +63,42 @@ def test_a_mapped_code_counts_as_the_class_that_it_is_mapped_to(
 def test_codes_mean_nothing_where_classes_are_ignored(classified: Path, of_a_producer: Path, reconstruct: Any) -> None:
     digests = {reconstruct(path, settings={"classes": "ignore"}).digest for path in (classified, of_a_producer)}
     assert len(digests) == 1
+
+
+def test_classify_writes_the_classes_that_own_codes_mean(
+    of_a_producer: Path, run_classify: Any, tmp_path: Path
+) -> None:
+    las = laspy.read(of_a_producer)
+    codes = np.array(las.classification)
+    codes[:20], codes[20:40] = 99, 9
+    las.classification = codes
+    las.write(tmp_path / "own.laz")
+    out = tmp_path / "classified"
+    run_classify(tmp_path / "own.laz", settings={"classes": "trust", **OWN}, out=str(out))
+    found = np.array(laspy.read(out / "own.laz").classification)
+    for code, classes in ((40, {2}), (67, {6}), (6, {6}), (99, {99})):
+        assert set(found[codes == code]) == classes
+    assert set(found[codes == 9]) <= {1, 5}, "what is in no list is neither ground nor building"
+    assert set(found[codes == 41]) <= {1, 5}
+
+
+def test_inspect_shows_what_own_codes_mean(of_a_producer: Path, tmp_path: Path) -> None:
+    words = ("inspect", str(of_a_producer), "--crs", "EPSG:25832")
+    (tmp_path / "codes.toml").write_text(
+        "[settings.class-codes]\nground = [40]\nbuilding = [6, 67]\nvegetation = [41]\n"
+    )
+    as_stored, mapped = (
+        {int(code): count for code, count in json.loads(invoke(*words, *more, "--json")[1])["classes"].items()}
+        for more in ((), ("--settings", str(tmp_path / "codes.toml")))
+    )
+    assert {6, 40, 41, 67} <= set(as_stored)
+    assert mapped[2] == as_stored[40]
+    assert mapped[6] == as_stored[6] + as_stored[67]
+    assert mapped[3] == as_stored[41]
+    assert not {40, 41, 67} & set(mapped)
+    said = invoke(*words, "--settings", str(tmp_path / "codes.toml"))[1]
+    assert "building" in said
+    assert "vegetation" in said
 
 
 def test_codes_of_noise_are_left_out(classified: Path, tmp_path: Path) -> None:

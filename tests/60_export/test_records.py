@@ -25,7 +25,8 @@ from pipeline.quality.detection import detection_confidence
 
 DESIGNED = """building_id, source_id, source_attributes, status, reason, reason_detail, overridden, method, roof_type,
 geometry, lod, solid, solid_parts, solid_surfaces, solid_planes, solid_lod12, solid_lod12_parts, solid_lod12_surfaces,
-solid_lod13, solid_lod13_parts, solid_lod13_surfaces, ground_z, eave_z, ridge_z, h_min, h_50p, h_70p, h_max, height_m,
+solid_lod13, solid_lod13_parts, solid_lod13_surfaces, ground_z, ground_source, eave_z, ridge_z, h_min, h_50p,
+h_70p, h_max, height_m, height_source,
 footprint_area_m2, footprint_share, roof_area_m2, volume_m3, n_points, density_per_m2, through_share,
 detection_confidence, n_planes, rmse_m, p95_m, coverage, point_spacing_m, noise_m, share_within_0_2m, unexplained_m2,
 largest_hole_m, ridge_z_sigma_m, bic_margin,
@@ -97,7 +98,7 @@ def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts: Contexts) 
         *("footprint_area_m2", "footprint_share", "roof_area_m2", "volume_m3", "density_per_m2", "rmse_m", "p95_m"),
         *("point_spacing_m", "noise_m", "share_within_0_2m", "unexplained_m2", "largest_hole_m", "ridge_z_sigma_m"),
         *("strip_offset_m", "wall_outline", "overhang_m", "overhang_sigma_m"),
-        *("through_share", "detection_confidence"),
+        *("through_share", "detection_confidence", "ground_source", "height_source"),
         *("bic_margin", "source_attributes", "overridden", "mesh_path", "input_hash"),
         *("solid", "solid_parts", "solid_surfaces", "solid_planes"),
         *("solid_lod12", "solid_lod12_parts", "solid_lod12_surfaces"),

@@ -32,6 +32,7 @@ from pipeline.io.true_north import convergence_deg
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus, read_manifest, write_manifest
 from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.run_tiles import TILES_IN_MEMORY
 from pipeline.runtime.solar import solar
 from pipeline.solar.roof_planes import RoofPlanes
 from pipeline.solar.settings import SolarSettings
@@ -298,7 +299,7 @@ def test_memory_holds_some_tiles_and_not_the_run(tmp_path: Path, monkeypatch: py
     sky(run_dir, tmp_path / "sky.parquet")
     memory = kept[0].tile.cache_info()
     # two empty tiles are near to none; the others are read once, although their neighbours need them, too
-    assert (memory.currsize, memory.misses) == (runs._TILES_IN_MEMORY, TILES + 2)
+    assert (memory.currsize, memory.misses) == (TILES_IN_MEMORY, TILES + 2)
     assert memory.hits > TILES
 
 

@@ -15,7 +15,8 @@ from pipeline.cli.options import worker_count
 
 COMMANDS = (
     *("reconstruct", "rerun", "compare", "classify", "inspect", "simulate", "digest"),
-    *("evaluate", "warm-up", "demo", "replay", "report", "publish", "solar", "worker", "batch"),
+    *("evaluate", "warm-up", "demo", "replay", "report", "publish", "solar", "party-walls"),
+    *("worker", "batch"),
 )
 
 

@@ -47,6 +47,7 @@ def test_the_fields_of_the_form_are_inputs_of_the_processes() -> None:
         {"candidates": {"min_area_m2": 15}, "method": "fuzzy-sart"},
         {"class-codes": {"building": [6, 2], "noise": [7, 6, 300]}},
         {"class-codes": {"ground": [2, 6]}, "candidates": {"min_area_m2": -1}},
+        {"footprints": {"height": 7.5, "storeys": "levels", "storey_height_m": 99.0}},
     ],
 )
 def test_the_service_finds_the_faults_of_settings_that_a_run_finds(settings: dict) -> None:

@@ -27,7 +27,7 @@ from pipeline.errors import UnreadableInputError
 from pipeline.io import place_below, storage_at
 from pipeline.io.crs import SpatialReference
 from pipeline.methods import ReconstructSettings, method_named
-from pipeline.model import Candidate, FloatArray
+from pipeline.model import Candidate, FloatArray, GivenHeights
 from pipeline.settings import RunSettings
 
 SUFFIX = ".bundle"
@@ -72,6 +72,11 @@ class Bundle:
     """CRS and units of its outputs."""
 
 
+def _known(given: GivenHeights) -> dict[str, float]:
+    """Heights by attributes, those that are known."""
+    return {name: value for name, value in dataclasses.asdict(given).items() if not math.isnan(value)}
+
+
 def is_whole(path: Path) -> bool:
     """Whether a bundle is as it was written, by its own checksums."""
     try:
@@ -99,6 +104,7 @@ def write_bundle(folder: str, bundle: Bundle) -> str:
         "origin": list(candidate.origin),
         "ground_z_m": candidate.ground_z_m if math.isfinite(candidate.ground_z_m) else None,
         "footprint": None if footprint is None else shapely.to_wkb(footprint, hex=True),
+        "given": None if candidate.given is None else _known(candidate.given),
         "outline": None if candidate.outline is None else shapely.to_wkb(candidate.outline, hex=True),
         "touches_data_edge": candidate.touches_data_edge,
         "strip_offset_m": None if math.isnan(candidate.strip_offset_m) else candidate.strip_offset_m,
@@ -214,6 +220,7 @@ def _bundle(
         ground_z_m=math.nan if document["ground_z_m"] is None else float(document["ground_z_m"]),
         footprint=footprint,
         source_id=None if source_id is None else str(source_id),
+        given=None if document.get("given") is None else GivenHeights(**document["given"]),
         outline=outline,
         touches_data_edge=bool(document["touches_data_edge"]),
         strip_offset_m=math.nan if document.get("strip_offset_m") is None else float(document["strip_offset_m"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime as dt
 import hashlib
 import math
@@ -16,7 +17,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.compiler import kernel
 from pipeline.export.facts import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
-from pipeline.model import BoolArray, Candidate, IntArray
+from pipeline.model import BoolArray, Candidate, GivenHeights, GroundSource, IntArray
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.sites import CandidateSite, PointRange
@@ -41,6 +42,10 @@ _EDGE_CELLS = 5
 """A roof this near to such a square touches the edge of the data."""
 _BESIDE_CELLS = 2
 """Points within these cells of the roof lie beside it."""
+_LARGEST_M = 2000
+"""Longest side of a block by attributes: what is larger is a district, or a slip."""
+_HALF_DIAGONAL_M = 0.71
+"""A cell that a footprint touches has its centre this near."""
 _HEIGHT_WITHOUT_TERRAIN_MM = 2500
 """Assumed height of the lowest point above ground where no terrain is known."""
 
@@ -183,7 +188,7 @@ def gather(
     view = Window(x0_mm=int(low[0]), y0_mm=int(low[1]), x1_mm=int(high[0]) + 1, y1_mm=int(high[1]) + 1).grown(margin)
     around = surroundings_of(scratch, grid, view)
     ground_mm, lowest_mm, own, touches_data_edge = _terrain_by(columns_mm[0], columns_mm[1], around)
-    ground_z = _ground_mm(lowest_mm, ground_mm[:, 2], xyz[:, 2])
+    ground_z, ground_source = _ground_mm(lowest_mm, ground_mm[:, 2], xyz[:, 2], site.given)
     digest = hashlib.sha256(points.tobytes())
     digest.update(ground_mm.tobytes())
     beside_mm = later_mm = np.empty((0, 3), np.int64)
@@ -204,8 +209,10 @@ def gather(
         ground=(ground_mm - origin_mm) / MM,
         split_returns=(xyz[is_split] - origin_mm) / MM,
         ground_z_m=math.nan if ground_z is None else (ground_z - int(origin_mm[2])) / MM,
+        ground_source=ground_source,
         footprint=None if footprint is None else _moved(footprint, origin_mm),
         source_id=site.source_id,
+        given=_given(site, scratch, grid, int(origin_mm[2])),
         outline=None if site.outline is None else _moved(site.outline, origin_mm),
         beside=(beside_mm - origin_mm) / MM,
         beside_later=(later_mm - origin_mm) / MM,
@@ -223,12 +230,49 @@ def gather(
     return candidate, facts
 
 
-def _ground_mm(outline_mm: IntArray, terrain_mm: IntArray, points_mm: IntArray) -> int | None:
-    """Ground elevation: lowest of the terrain around the outline, else of all terrain, else below the points."""
+def _ground_mm(
+    outline_mm: IntArray, terrain_mm: IntArray, points_mm: IntArray, given: GivenHeights | None
+) -> tuple[int | None, GroundSource | None]:
+    """Ground elevation and its source: lowest of the terrain around the outline, else of all terrain, else given.
+
+    Else it lies below the points; None without any.
+    """
     for elevations in (outline_mm, terrain_mm):
         if len(elevations):
-            return int(elevations.min())
-    return int(points_mm.min()) - _HEIGHT_WITHOUT_TERRAIN_MM if len(points_mm) else None
+            return int(elevations.min()), GroundSource.TERRAIN
+    if given is not None and not math.isnan(given.ground_z_m):
+        return round(given.ground_z_m * MM), GroundSource.ATTRIBUTE
+    if len(points_mm):
+        return int(points_mm.min()) - _HEIGHT_WITHOUT_TERRAIN_MM, GroundSource.ASSUMED
+    return None, None
+
+
+def _given(site: CandidateSite, scratch: Scratch, grid: TileGrid, origin_z_mm: int) -> GivenHeights | None:
+    """The heights of a site by attributes, in local elevations, with the terrain at the outline of its footprint.
+
+    None without any, and for a footprint that is too large for a building.
+    """
+    if site.given is None or site.footprint is None:
+        return None
+    x0, y0, x1, y1 = (round(value * MM) for value in site.footprint.bounds)
+    if max(x1 - x0, y1 - y0) > _LARGEST_M * MM:
+        return None
+    view = Window(x0_mm=x0, y0_mm=y0, x1_mm=x1 + 1, y1_mm=y1 + 1).grown(_VIEW_M * MM)
+    around = surroundings_of(scratch, grid, view)
+    rows, columns = around.occupied.shape
+    x = (np.arange(columns, dtype=np.int64) + around.column0) * CELL_MM + CELL_MM // 2
+    y = (np.arange(rows, dtype=np.int64) + around.row0) * CELL_MM + CELL_MM // 2
+    x, y = (axis.ravel() for axis in np.meshgrid(x, y))
+    touched = shapely.buffer(site.footprint, _HALF_DIAGONAL_M)
+    inside = shapely.intersects_xy(touched, x / MM, y / MM)
+    ground_mm, lowest_mm, _, _ = _terrain_by(x[inside], y[inside], around)
+    terrain_mm, _ = _ground_mm(lowest_mm, ground_mm[:, 2], np.empty(0, np.int64), None)
+    return dataclasses.replace(
+        site.given,
+        roof_z_m=site.given.roof_z_m - origin_z_mm / MM,
+        ground_z_m=site.given.ground_z_m - origin_z_mm / MM,
+        terrain_z_m=math.nan if terrain_mm is None else (terrain_mm - origin_z_mm) / MM,
+    )
 
 
 def _beside(

@@ -10,8 +10,12 @@ from typing import Any, TypeAlias
 import shapely
 from shapely import MultiPolygon, Polygon
 
+from pipeline.errors import SettingsError, UnreadableInputError
 from pipeline.io import shown
-from pipeline.io.footprints import read_footprints
+from pipeline.io.footprints import FootprintIssue, Footprints, read_footprints
+from pipeline.model import GivenHeights
+from pipeline.roof.given_heights import given_heights
+from pipeline.roof.settings import FootprintSettings
 from pipeline.runtime.plan import Plan
 from pipeline.tiling import MM, Tile, TileGrid
 
@@ -32,16 +36,32 @@ class GivenFootprints:
     """Their own ids."""
     attributes: tuple[str, ...]
     """Their columns, each as the text of a JSON object."""
+    heights: tuple[GivenHeights | None, ...]
+    """Their heights by attributes, elevations in the vertical datum; None where none is known or asked for."""
     warnings: tuple[str, ...]
     """What is odd but usable."""
     report: dict[str, Any]
     """The content of `footprints.json`: how many were read, used, repaired and left out, and every single fault."""
 
 
-def given_footprints(path: str, plan: Plan) -> GivenFootprints:
+def footprints_of_run(path: str | None, plan: Plan, settings: FootprintSettings) -> GivenFootprints | None:
+    """The footprints of a run with the heights that its settings name; None without a file.
+
+    Raises InputError as `given_footprints`, and SettingsError if columns are named, but no file.
+    """
+    if path is not None:
+        return given_footprints(path, plan, settings)
+    if settings.columns:
+        names = ", ".join(settings.columns)
+        raise SettingsError([f"[footprints] {names} name columns of given footprints, and none are given: give them"])
+    return None
+
+
+def given_footprints(path: str, plan: Plan, settings: FootprintSettings | None = None) -> GivenFootprints:
     """Read the footprints of a run, within the bounds of its inputs, cut by --bbox and --aoi.
 
-    Raises InputError if the file cannot be used.
+    `settings` name the columns of heights; None reads none. Raises InputError if the file cannot be used, or does not
+    have these columns.
     """
     area = shapely.union_all([shapely.box(*i.bounds_m[:2], *i.bounds_m[3:5]) for i in plan.sources])
     unit = plan.reference.horizontal_unit_m
@@ -50,32 +70,78 @@ def given_footprints(path: str, plan: Plan) -> GivenFootprints:
     if plan.options.aoi is not None:
         area &= shapely.transform(plan.options.aoi, lambda xy: xy * unit)
     found = read_footprints(path, plan.reference, area=area)
+    settings = settings or FootprintSettings()
+    _check_columns(path, found, settings)
     shapely.prepare(area)  # many inputs give it many corners, and every footprint is tested against it
     inside = [k for k, polygon in enumerate(found.polygons) if area.intersects(polygon)]
     # a fault far from the data does not concern this run; one without a place may
     issues = [i for i in found.issues if i.bounds_m is None or shapely.box(*i.bounds_m).intersects(area)]
+    lost = sum(issue.action == "left out" for issue in issues)
+    repaired = len(issues) - lost
+    # overlaps are decided by this order
+    inside.sort(key=lambda k: (found.polygons[k].bounds, found.ids[k]))
+    heights, faults = _heights(found, inside, settings, plan.reference.vertical_unit_m)
+    issues += faults
     warnings = [*found.warnings, *(str(issue) for issue in issues[:_ISSUES_NAMED])]
     if len(issues) > _ISSUES_NAMED:
         warnings.append(f"{len(issues) - _ISSUES_NAMED} more faults of footprints, each in footprints.json of a run")
     polygons = len(found.polygons) + found.elsewhere
     if len(inside) < polygons:
         warnings.append(f"{polygons - len(inside)} of {polygons} footprints lie off the data")
-    # overlaps are decided by this order
-    inside.sort(key=lambda k: (found.polygons[k].bounds, found.ids[k]))
+    about_heights = {"values_not_used": len(faults), "without_heights": heights.count(None)}
     return GivenFootprints(
         polygons=tuple(found.polygons[k] for k in inside),
         ids=tuple(found.ids[k] for k in inside),
         attributes=tuple(json.dumps(found.attributes[k], ensure_ascii=False) for k in inside),
+        heights=heights,
         warnings=tuple(warnings),
         report={
             "path": shown(path),
             "used": len(inside),
             "off_the_data": polygons - len(inside),
-            "repaired": sum(issue.action != "left out" for issue in issues),
-            "left_out": sum(issue.action == "left out" for issue in issues),
+            "repaired": repaired,
+            "left_out": lost,
+            **(about_heights if settings.columns else {}),
             "issues": [dataclasses.asdict(issue) for issue in issues],
         },
     )
+
+
+def _check_columns(path: str, found: Footprints, settings: FootprintSettings) -> None:
+    """Refuse settings that name columns which the file does not have, all at once."""
+    missing = [
+        f"{column!r} ([settings.footprints] {setting})"
+        for setting, column in settings.columns.items()
+        if column not in found.columns
+    ]
+    if missing:
+        have = ", ".join(found.columns) or "(none)"
+        raise UnreadableInputError(
+            shown(path), f"it has no column {', '.join(missing)}", f"Name columns of the file: {have}"
+        )
+
+
+def _heights(
+    found: Footprints, inside: Sequence[int], settings: FootprintSettings, vertical_unit_m: float
+) -> tuple[tuple[GivenHeights | None, ...], list[FootprintIssue]]:
+    """The heights of some footprints by their attributes, and one fault for each value that cannot be used."""
+    heights: list[GivenHeights | None] = []
+    issues = []
+    for k in inside:
+        known, faults = given_heights(found.attributes[k], settings, vertical_unit_m)
+        heights.append(known)
+        issues += [
+            FootprintIssue(
+                feature=found.features[k],
+                source_id=found.ids[k],
+                problem="bad_value",
+                detail=fault,
+                action="the value is not used",
+                bounds_m=found.polygons[k].bounds,
+            )
+            for fault in faults
+        ]
+    return tuple(heights), issues
 
 
 def numbers_by_tile(tiles: Iterable[Tile], grid: TileGrid, outlines: Sequence[Outline]) -> dict[Tile, list[int]]:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import shapely
 
 from pipeline.kernels.union_find import united
-from pipeline.model import BoolArray, IntArray
+from pipeline.model import BoolArray, GivenHeights, IntArray
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
@@ -278,6 +278,7 @@ def join(
                 footprints.ids,
                 crs_name,
                 footprints.attributes,
+                footprints.heights,
             )
             counter.add(1)
         clear_units(context.scratch, ())
@@ -361,6 +362,7 @@ def join_footprints(
     source_ids: Sequence[str],
     crs_name: str,
     attributes: Sequence[str | None] | None = None,
+    heights: Sequence[GivenHeights | None] | None = None,
 ) -> FoundSites:
     """The candidates where footprints were given: one per footprint, also where it holds no point; splits in any order.
 
@@ -374,6 +376,8 @@ def join_footprints(
         Goes into the ids. A footprint without points is named by its smallest corner and its own id.
     attributes : sequence of str or None, optional
         Their columns, each as the text of a JSON object.
+    heights : sequence of GivenHeights or None, optional
+        Their heights by attributes.
     """
     ranges: dict[int, list[PointRange]] = {}
     lowest: dict[int, tuple[int, ...]] = {}
@@ -402,6 +406,7 @@ def join_footprints(
                 footprint=footprint,
                 source_id=source_id,
                 source_attributes=None if attributes is None else attributes[number],
+                given=None if heights is None else heights[number],
             )
         )
     return FoundSites(candidates=largest_first(candidates), rejected=())

@@ -10,6 +10,7 @@ from typing import Generic, TypeVar
 
 from shapely import MultiPolygon, Polygon
 
+from pipeline.model import GivenHeights
 from pipeline.runtime.overrides.overrides_file import Override
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import Place, part_of
@@ -55,6 +56,8 @@ class CandidateSite:
     """Its own id."""
     source_attributes: str | None = None
     """The given footprint's columns as the text of a JSON object; None where none was given."""
+    given: GivenHeights | None = None
+    """Its heights by attributes, elevations in the vertical datum in metres; None where none is known."""
     block: str | None = None
     """The id of the candidate from which the unit was divided; None where it was not divided."""
     outline: MultiPolygon | None = None

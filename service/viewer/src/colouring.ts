@@ -56,6 +56,7 @@ const REASON_COLOURS: Record<string, string> = {
   invalid_solid: "#cc79a7",
   too_complex: "#0072b2",
   no_footprint: "#f0e442",
+  height_given: "#882255",
 };
 const REASONS = new Map(Object.entries(REASON_COLOURS).map(([name, colour]) => [name, { label: reasonWords(name), colour }]));
 const NO_REASON: ColourClass = { label: "none: modelled in full", colour: GREY };
