@@ -30,6 +30,7 @@ from service.routes import (
     log,
     points,
     processes,
+    published,
     results,
     schedules,
     tus,
@@ -57,6 +58,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     results.router,
     buildings.router,
     points.router,
+    published.router,
     collections.router,
     health.router,
 )

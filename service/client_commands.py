@@ -189,6 +189,18 @@ def submit(
         typer.Option(help="One OBJ per building (default), one OBJ per tile, one GLB per tile, or none."),
     ] = None,
     points: WithPoints = False,
+    formats: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--publish",
+            metavar="FORMAT",
+            help="Also 3dtiles, geopackage, pmtiles, cityjson, stac or solar; repeat --publish for several.",
+        ),
+    ] = None,
+    geoid_height: Annotated[
+        float | None,
+        typer.Option(metavar="METRES", help="Height of the geoid above the ellipsoid, for --publish 3dtiles."),
+    ] = None,
     raster_cell: Annotated[
         float | None, typer.Option(metavar="SIDE", help="Side of the cells of rasters, in the CRS's units; classify.")
     ] = None,
@@ -222,6 +234,8 @@ def submit(
         "lods": lods,
         "meshes": meshes,
         "points": points or None,
+        "publish": list(formats or ()) or None,
+        "geoidHeight": geoid_height,
         "rasterCell": raster_cell,
         "licence": licence,
         "title": title,
@@ -412,7 +426,10 @@ def _watched(remote: Remote, job_id: str) -> None:
     """Show the events of a job; end as it ended."""
     job = remote.client.wait(job_id, on_event=lambda event: _show_event(remote.console, event))
     _shown_job(remote.console, job)
-    if any(job.summary.get(name) for name in ("failed_tiles", "tiles_without_points", "tiles_without_terrain")):
+    if any(
+        job.summary.get(name)
+        for name in ("failed_tiles", "tiles_without_points", "tiles_without_terrain", "unpublished")
+    ):
         raise typer.Exit(ExitCode.TILES_FAILED)
 
 

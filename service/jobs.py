@@ -126,6 +126,10 @@ class JobRequest:
     """building or tile: one OBJ file for each; glb: one GLB file per tile; or none."""
     points: bool = False
     """Whether the points are delivered, too, as 3D Tiles. Only for `reconstruct`."""
+    publish: tuple[str, ...] = ()
+    """Further formats of the results, words of `service.outputs.kinds.FORMATS`. Only for `reconstruct`."""
+    geoid_height: float | None = None
+    """Metres of the geoid above the ellipsoid, added to the elevations of 3D Tiles."""
     licence: str | None = None
     """Licence of the source data."""
     outputs: tuple[str, ...] | None = None
@@ -166,7 +170,7 @@ class JobRequest:
             values["footprints"] = InputReference(**stored["footprints"])
         if stored.get("subscriber") is not None:
             values["subscriber"] = Subscriber(**stored["subscriber"])
-        for name in ("bbox", "outputs", "methods"):
+        for name in ("bbox", "outputs", "methods", "publish"):
             if stored.get(name) is not None:
                 values[name] = tuple(stored[name])
         return cls(**values)

@@ -110,6 +110,8 @@ def execute_request(request: JobRequest, base: str, priority: int) -> Execute:
         "rasterCell": request.raster_cell,
         "meshes": request.meshes if request.has_buildings else None,
         "points": request.points or None,
+        "publish": list(request.publish) or None,
+        "geoidHeight": request.geoid_height,
         "licence": request.licence,
         "title": request.title,
         "priority": priority or None,

@@ -178,7 +178,15 @@ def publish_cityjson(run_dir: str, out: str, *, overwrite: bool = False, on_even
     return Published(place=str(target), size_bytes=size, rows={"buildings": buildings})
 
 
-def publish_stac(run_dir: str, out: str, *, overwrite: bool = False, on_event: Listener = ignore) -> Published:
+def publish_stac(
+    run_dir: str,
+    out: str,
+    *,
+    overwrite: bool = False,
+    name: str | None = None,
+    documents: Collection[str] = tuple(stac.DOCUMENTS),
+    on_event: Listener = ignore,
+) -> Published:
     """Write a STAC catalogue of a finished run: a Collection, and an Item per tile that has files.
 
     A new folder appears whole; in one that exists, each file does, after all are made, and the Collection last.
@@ -195,13 +203,17 @@ def publish_stac(run_dir: str, out: str, *, overwrite: bool = False, on_event: L
         The folder to write, a path of this machine. Its files refer to those of the run.
     overwrite : bool
         Replace the catalogue of the same tiles.
+    name : str, optional
+        Id of the Collection; the name of the run directory by default.
+    documents : collection of str
+        Files about the whole run to list, of `stac.DOCUMENTS`, if they exist.
     on_event : callable
         Gets progress: tiles.
     """
     target = path_outside(run_dir, out, "a catalogue is")
     manifest, storage = finished_run(run_dir), storage_at(run_dir)
     project = projection_to(manifest.crs, stac.CRS)
-    run = _run_of(run_dir, manifest)
+    run = _run_of(run_dir, manifest, name)
     files = {state["tile"]: stac.listed(state["files"], state["tile"]) for state in _states(run_dir) if state["files"]}
     names = [*(stac.item_name(tile) for tile in files), stac.COLLECTION]
     href = run_dir.rstrip("/") + "/" if is_url(run_dir) else _relative(Path(run_dir).resolve(), target)
@@ -219,16 +231,16 @@ def publish_stac(run_dir: str, out: str, *, overwrite: bool = False, on_event: L
             item = stac.item(tile_facts, run, project, href if is_url(href) else f"../{href}")
             items.append({name: item[name] for name in ("id", "bbox", "properties")})
             size += _put_json(made, stac.item_name(tile_facts.key), item)
-        documents = [name for name in stac.DOCUMENTS if storage.has(name)]
-        size += _put_json(made, stac.COLLECTION, stac.collection(run, items, documents, href))
+        listed = [document for document in documents if storage.has(document)]
+        size += _put_json(made, stac.COLLECTION, stac.collection(run, items, listed, href))
         check_complete(run_dir, manifest, {"buildings": rows}, [name for held in files.values() for name in held])
     return Published(place=str(target), size_bytes=size, rows={"items": len(items)})
 
 
-def _run_of(run_dir: str, manifest: RunManifest) -> stac.Run:
+def _run_of(run_dir: str, manifest: RunManifest, name: str | None) -> stac.Run:
     """What a catalogue says about a run."""
     return stac.Run(
-        name=PurePosixPath(run_dir.rstrip("/") if is_url(run_dir) else Path(run_dir).resolve().as_posix()).name,
+        name=name or PurePosixPath(run_dir.rstrip("/") if is_url(run_dir) else Path(run_dir).resolve().as_posix()).name,
         version=manifest.engine_version,
         method=manifest.method,
         finished_at=manifest.finished_at or manifest.started_at,

@@ -36,6 +36,7 @@ from service.files import StateFolder
 from service.jobs import JobRequest
 from service.outputs import write_classification_outputs, write_comparison_outputs, write_echo, write_outputs
 from service.outputs.kinds import RASTERS
+from service.outputs.published import publish
 from service.settings import ServiceSettings
 from service.store import JobStore
 
@@ -95,6 +96,22 @@ class WriteOutputs(Protocol):
         """Assemble the outputs."""
 
 
+class Publish(Protocol):
+    """`service.outputs.published.publish`."""
+
+    def __call__(
+        self,
+        run_dir: Path,
+        out_dir: Path,
+        formats: Sequence[str],
+        *,
+        name: str,
+        geoid_height_m: float | None,
+        on_progress: Callable[[int, int], None],
+    ) -> dict[str, str]:
+        """Write further formats."""
+
+
 class WriteComparison(Protocol):
     """`service.outputs.write_comparison_outputs`."""
 
@@ -140,6 +157,7 @@ class Tools:
     run: Run = run
     compare: Compare = compare
     classify: Classify = classify
+    publish: Publish = publish
     write_outputs: WriteOutputs = write_outputs
     write_comparison: WriteComparison = write_comparison_outputs
     write_classification: WriteClassification = write_classification_outputs
@@ -236,12 +254,36 @@ def _reconstruct(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], o
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
         with shown_while_watched(held, run_dir, folder.so_far(job.job_id, job.attempt)):
             summary = shop.tools.run(request, held.record, executor, held.cancelled)
-        begin = _outputs_begin(held)
+        problems = _published(held, shop, run_dir, out_dir)
+        begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
             shop.tools.write_outputs(Path(request.out), out_dir, job.request.outputs, begin)
-        return outcome(summary), digest_of(summary, held.scrub, __version__)
+        found = digest_of(summary, held.scrub, __version__) | ({"unpublished": problems} if problems else {})
+        return outcome(summary, problems), found
 
     return work
+
+
+def _published(held: LeasedJob, shop: DriverParts, run_dir: Path, out_dir: Path) -> dict[str, str]:
+    """Write the further formats of a job, if it wants any; why some could not be made, for clients."""
+    request = held.job.request
+    if not request.publish:
+        return {}
+    on_progress = _begun(held, "formats")
+    held.scrub.name(str(run_dir), "this job")
+    with tracing.span("stage formats", stage="formats"):
+        found = shop.tools.publish(
+            run_dir,
+            out_dir,
+            request.publish,
+            name=held.job.job_id,
+            geoid_height_m=request.geoid_height,
+            on_progress=on_progress,
+        )
+    problems = {form: held.scrub(problem) for form, problem in found.items()}
+    for form, problem in problems.items():
+        held.record(Event(kind="warning", stage="formats", message=f"{form} could not be published: {problem}"))
+    return problems
 
 
 def _compare(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outlines: Fetched | None) -> _Work:
@@ -252,7 +294,7 @@ def _compare(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outli
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
         summary = shop.tools.compare(request, held.record, executor, held.cancelled)
-        begin = _outputs_begin(held)
+        begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
             shop.tools.write_comparison(place, list(summary.runs), out_dir, job.request.outputs, begin)
         return comparison_outcome(summary), comparison_digest(summary, held.scrub, __version__)
@@ -268,7 +310,7 @@ def _classify(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outl
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
         summary = shop.tools.classify(request, held.record, executor, held.cancelled)
-        begin = _outputs_begin(held)
+        begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
             shop.tools.write_classification(summary, out_dir, job.request.outputs, begin, held.scrub)
         return classification_outcome(summary), classification_digest(summary, held.scrub, __version__)
@@ -284,7 +326,7 @@ def _echo(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outlines
 
     def work(_executor: Executor) -> tuple[str, dict[str, Any]]:
         held.wait(asked["delay"])
-        _outputs_begin(held)
+        _begun(held, "outputs")
         write_echo(asked["message"], shop.folder.outputs(job.job_id, job.attempt))
         return "echoed", {"engine_version": __version__}
 
@@ -297,14 +339,14 @@ WORK: Mapping[str, Callable[[LeasedJob, DriverParts, Sequence[Fetched], Fetched 
 """The work of each process: checks the request with the fetched inputs, and returns the rest of the work."""
 
 
-def _outputs_begin(held: LeasedJob) -> Callable[[int, int], None]:
-    """Record that outputs are assembled now; returns a function that records the progress."""
+def _begun(held: LeasedJob, stage: str) -> Callable[[int, int], None]:
+    """Record that a stage of the driver's own begins; returns a function that records the progress."""
     _check(held)
-    held.record(Event(kind="stage", stage="outputs"))
+    held.record(Event(kind="stage", stage=stage))
 
     def written(done: int, total: int) -> None:
         _check(held)
-        held.record(Event(kind="progress", stage="outputs", done=done, total=total))
+        held.record(Event(kind="progress", stage=stage, done=done, total=total))
 
     return written
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -53,8 +53,8 @@ class Scrubber:
         return as_inputs(_ABSOLUTE.sub(lambda found: found[1] or "…", _ADDRESS.sub("", message)))
 
 
-def outcome(summary: RunSummary) -> str:
-    """The result of a run, in one sentence."""
+def outcome(summary: RunSummary, unpublished: Collection[str] = ()) -> str:
+    """The result of a run, in one sentence; with the formats that could not be published."""
     sentence = f"{_buildings(summary)}: {_by_status(summary)}"
     rejected = sum(summary.rejected.values())
     if rejected:
@@ -69,6 +69,8 @@ def outcome(summary: RunSummary) -> str:
     if summary.tiles_without_terrain:
         count = len(summary.tiles_without_terrain)
         sentence += f"; the terrain of {count} {'tile' if count == 1 else 'tiles'} could not be written"
+    if unpublished:
+        sentence += f"; {', '.join(unpublished)} could not be published"
     if summary.warnings:
         sentence += f"; {len(summary.warnings)} {'warning' if len(summary.warnings) == 1 else 'warnings'}"
     return sentence

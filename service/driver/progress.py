@@ -15,15 +15,16 @@ WEIGHTS = MappingProxyType(
         "split": 18,
         "join": 1,
         "outline": 6,
-        "reconstruct": 37,
+        "reconstruct": 35,
         "publish": 4,
         "octree": 5,
         "terrain": 1,
-        "outputs": 8,
+        "formats": 3,
+        "outputs": 7,
     }
 )
 """The stages of a job in their order, with their share of the time in percent; measured on city blocks. A job without
-points or terrain skips their stages."""
+points, terrain or further formats skips their stages."""
 
 CLASSIFY_WEIGHTS = MappingProxyType(
     {
@@ -58,6 +59,7 @@ WORDS = MappingProxyType(
         "publish": "tiles are written",
         "octree": "points are arranged for viewing",
         "terrain": "the terrain is written",
+        "formats": "further formats are written",
         "classify": "points are classified",
         "write": "files are written",
         "rasters": "rasters are drawn",
@@ -94,7 +96,7 @@ def percent(stage: str, done: int, total: int, weights: Mapping[str, int] = WEIG
     Examples
     --------
     >>> percent("inputs", 0, 1), percent("reconstruct", 0, 80), percent("reconstruct", 40, 80), percent("outputs", 3, 3)
-    (0, 45, 63, 99)
+    (0, 45, 62, 99)
     """
     if stage not in weights:
         return 0

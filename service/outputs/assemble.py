@@ -14,7 +14,7 @@ from pipeline.export.point_files import FOLDER as POINTS_FOLDER
 from pipeline.export.point_files import TILESET
 from service.outputs.catalogue import NAME as CATALOGUE_NAME
 from service.outputs.catalogue import Catalogue, StoredOutput
-from service.outputs.kinds import OUTPUTS, chosen
+from service.outputs.kinds import ON_REQUEST, OUTPUTS, chosen
 
 if TYPE_CHECKING:
     from service.outputs.building_index import BuildingIndexFile
@@ -79,7 +79,7 @@ def write_outputs(
         Folder to write into; made if it is missing.
     wanted : sequence of str, optional
         Ids of `OUTPUTS`; all by default. The file of features and the index are always written: the service needs
-        them for single buildings.
+        them for single buildings. Those of `ON_REQUEST` count if their files are there.
     on_progress : callable
         Gets the number of finished tiles and of all tiles.
 
@@ -119,6 +119,8 @@ def write_outputs(
         # the request left out the points
         names.discard("tileset")
         (out_dir / OUTPUTS["tileset"].filename).unlink(missing_ok=True)
+    # these were written before, those that the request named
+    names -= {name for name in names & ON_REQUEST if not (out_dir / OUTPUTS[name].filename).is_file()}
     stored = {}
     for kind in chosen(names):
         path = out_dir / kind.filename

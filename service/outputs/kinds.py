@@ -26,6 +26,10 @@ HTML = "text/html"
 """Media type of a page."""
 ZIP = "application/zip"
 """Media type of a zip file."""
+GEOPACKAGE = "application/geopackage+sqlite3"
+"""Media type of GeoPackage."""
+PMTILES = "application/vnd.pmtiles"
+"""Media type of PMTiles."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -124,6 +128,70 @@ _OF_A_RUN = (
     ),
 )
 
+_PUBLISHED = (
+    OutputKind(
+        output_id="3dtiles",
+        title="Models as 3D Tiles",
+        description="The tileset for globes such as CesiumJS, if the input publish names 3dtiles: 3D Tiles 1.1 in "
+        "EPSG:4978, with the records. Its files, and a copy of it with paths of its own, are below this output.",
+        media_type="application/json",
+        filename="3dtiles.json",
+        schema={"type": "object", "contentMediaType": "application/json"},
+    ),
+    OutputKind(
+        output_id="3dtiles-zip",
+        title="Models as 3D Tiles in a zip file",
+        description="The same tileset with all its files, to be served elsewhere.",
+        media_type=ZIP,
+        filename="3dtiles.zip",
+        schema=_binary(ZIP),
+    ),
+    OutputKind(
+        output_id="geopackage",
+        title="All tables as GeoPackage",
+        description="One file with all layers and their styles, for GIS, if the input publish names geopackage.",
+        media_type=GEOPACKAGE,
+        filename="models.gpkg",
+        schema=_binary(GEOPACKAGE),
+    ),
+    OutputKind(
+        output_id="pmtiles",
+        title="Footprints as PMTiles",
+        description="Vector tiles of the footprints in one file, for maps on the web, which read it in ranges; if the "
+        "input publish names pmtiles.",
+        media_type=PMTILES,
+        filename="models.pmtiles",
+        schema=_binary(PMTILES),
+    ),
+    OutputKind(
+        output_id="cityjson-zip",
+        title="One CityJSON file per tile in a zip file",
+        description="CityJSON 2.0 with all levels of detail, for programs that do not read sequences; if the input "
+        "publish names cityjson.",
+        media_type=ZIP,
+        filename="cityjson.zip",
+        schema=_binary(ZIP),
+    ),
+    OutputKind(
+        output_id="stac",
+        title="Catalogue of the tiles",
+        description="A STAC 1.1 Collection, with an Item per tile below this output, if the input publish names stac. "
+        "Their assets are the files of the run.",
+        media_type="application/json",
+        filename="stac.json",
+        schema={"type": "object", "contentMediaType": "application/json"},
+    ),
+    OutputKind(
+        output_id="solar",
+        title="Solar energy per roof plane as GeoParquet",
+        description="One row per roof plane: sky view, horizon, and irradiation of a year under clear skies; if the "
+        "input publish names solar.",
+        media_type=GEOPARQUET,
+        filename="solar.parquet",
+        schema=_binary(GEOPARQUET),
+    ),
+)
+
 _OF_A_COMPARISON = (
     OutputKind(
         output_id="page",
@@ -196,8 +264,20 @@ _OF_A_CLASSIFICATION = (
     ),
 )
 
-OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _OF_A_RUN}
+OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in (*_OF_A_RUN, *_PUBLISHED)}
 """The outputs of a run by their ids, in the order of lists: those of the process `reconstruct`."""
+
+FORMATS: Mapping[str, tuple[str, ...]] = {
+    "3dtiles": ("3dtiles", "3dtiles-zip"),
+    "geopackage": ("geopackage",),
+    "pmtiles": ("pmtiles",),
+    "cityjson": ("cityjson-zip",),
+    "stac": ("stac",),
+    "solar": ("solar",),
+}
+"""The ids of those that are made on request, by the words of the input `publish`."""
+ON_REQUEST = frozenset(name for ids in FORMATS.values() for name in ids)
+"""All of these."""
 
 COMPARISON_OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _OF_A_COMPARISON}
 """The outputs of the process `compare`."""

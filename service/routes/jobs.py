@@ -104,7 +104,7 @@ async def _read(submission: Submission) -> Execute:
             inputs.setdefault(name, []).append({"href": text.strip()})
         elif name == "outputs":
             outputs = [*(outputs or ()), *_words(text)]
-        elif name == "methods":
+        elif name in {"methods", "publish"}:
             if words := _words(text):  # an empty field counts as absent, as for any other field
                 inputs.setdefault(name, []).extend(words)
         elif name in inputs:
@@ -136,9 +136,12 @@ def _words(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
+_AS_JSON = frozenset({"settings", "subscriber", "bbox", "priority", "allowOutsideAreaOfUse", "points", "geoidHeight"})
+
+
 def _value(name: str, text: str, faults: list[str]) -> Any:
     """A field's value: settings, subscriber, numbers and permissions (true, false) are JSON, anything else is text."""
-    if name not in {"settings", "subscriber", "bbox", "priority", "allowOutsideAreaOfUse", "points"}:
+    if name not in _AS_JSON:
         return text.strip()
     if name == "bbox" and not text.strip().startswith(("[", "{")):
         text = f"[{text}]"

@@ -11,8 +11,7 @@ from pipeline.export.point_files import FOLDER, NAMED_FILE, TILESET
 from service.errors import NoSuchOutputError
 from service.outputs.kinds import GLB
 from service.routes.finished_jobs import FinishedJob, FinishedRun
-from service.routes.negotiation import preferred
-from service.routes.results import file_answers, sent_file
+from service.routes.results import file_answers, unchanging_file
 
 router = APIRouter(tags=["results"])
 
@@ -57,15 +56,10 @@ def _answer(request: Request, finished: FinishedJob, name: str) -> Response:
     """The answer to a request for a file."""
     path = _path(finished.run_dir / FOLDER, name)
     media_type = GLB if name.endswith(".glb") else _JSON
-    preferred(request.headers.get("accept"), [media_type])
     try:
-        found = path.stat()
+        return unchanging_file(request, finished, path, media_type)
     except FileNotFoundError:
         raise NoSuchOutputError(f"the points of this job have no file {name}: start at {FOLDER}/{TILESET}") from None
-    # results never change: the job and the path name the content
-    etag = f'"{finished.job.job_id}-{found.st_mtime_ns:x}-{found.st_size:x}"'
-    headers = {"ETag": etag, "Cache-Control": "private, max-age=31536000, immutable", "Vary": "Accept"}
-    return sent_file(request, path, found.st_size, media_type=media_type, headers=headers, stat_result=found)
 
 
 def _path(folder: FilePath, name: str) -> FilePath:

@@ -16,7 +16,7 @@ from service.outputs import KINDS, OUTPUTS, output_file
 from service.outputs.kinds import HTML
 from service.routes.answers import JOB_ID, document, header, problems
 from service.routes.bound import Base
-from service.routes.finished_jobs import Finished
+from service.routes.finished_jobs import Finished, FinishedJob
 from service.routes.html import PageRoute, in_either_form
 from service.routes.negotiation import preferred
 from service.status import results_document
@@ -159,6 +159,16 @@ def sent_file(request: Request, path: FilePath, size: int, *, headers: Mapping[s
         return Response(status_code=304, headers=headers)
     _check_range(request, size)
     return FileResponse(path, headers=headers, **options)
+
+
+def unchanging_file(request: Request, finished: FinishedJob, path: FilePath, media_type: str) -> Response:
+    """A file of a finished job that clients may keep for good; FileNotFoundError if it is not there."""
+    preferred(request.headers.get("accept"), [media_type])
+    found = path.stat()
+    # results never change: the job and the path name the content
+    etag = f'"{finished.job.job_id}-{found.st_mtime_ns:x}-{found.st_size:x}"'
+    headers = {"ETag": etag, "Cache-Control": "private, max-age=31536000, immutable", "Vary": "Accept"}
+    return sent_file(request, path, found.st_size, media_type=media_type, headers=headers, stat_result=found)
 
 
 def _saved_name(job_id: str, label: str | None, path: FilePath) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import unicodedata
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, get_args
@@ -12,7 +13,10 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, Wit
 from pipeline.errors import CrsError
 from pipeline.io.crs import LARGEST_COORDINATE, UNITS_M, horizontal_unit_of
 from service.drafts import Draft, Inline
+from service.errors import RequestError
 from service.input_policy import checked_crs
+from service.outputs.kinds import FORMATS
+from service.outputs.published import formats_of
 from service.run_settings import DEFAULTS, VARIANTS, choices, settings_faults, settings_schema
 from service.wire.base import OneOf, Request
 from service.wire.faults import FaultsError, shortened
@@ -123,7 +127,7 @@ _LISTS = ("tiles", "methods")
 
 
 def _unwrapped(name: str, value: Any) -> Any:
-    if isinstance(value, list) and len(value) == 1 and name not in {"methods", "bbox"}:
+    if isinstance(value, list) and len(value) == 1 and name not in {"methods", "bbox", "publish"}:
         value = value[0]
     if isinstance(value, Mapping) and set(value) <= {"value", "mediaType"} and "value" in value:
         return value["value"]
@@ -264,6 +268,17 @@ class BuildingInputs(Inputs):
         return {"bbox": bbox, "meshes": self.meshes, "licence": self.licence}
 
 
+def _as_list(given: Any) -> Any:
+    return given if isinstance(given, list) else [given]
+
+
+def _makeable(formats: list[str]) -> list[str]:
+    """Formats, each once; the service must have what they take."""
+    if "solar" in formats and importlib.util.find_spec("pvlib") is None:
+        raise FaultsError(["publish holds solar, which needs pvlib, and this service lacks it: leave solar out"])
+    return list(dict.fromkeys(formats))
+
+
 class ReconstructInputs(BuildingInputs):
     """The inputs of `reconstruct`."""
 
@@ -286,12 +301,41 @@ class ReconstructInputs(BuildingInputs):
         title="Points",
         description="Also deliver the points as 3D Tiles, with their classes and their distances to the models.",
     )
+    publish: Annotated[list[Annotated[str, OneOf(*FORMATS)]], BeforeValidator(_as_list), AfterValidator(_makeable)] = (
+        Field(
+            default_factory=list,
+            title="Publish",
+            description="Also deliver the models in these formats: 3D Tiles, GeoPackage, PMTiles, CityJSON files, a "
+            "STAC catalogue, solar energy per roof plane. Naming one of their outputs does the same.",
+            json_schema_extra={"uniqueItems": True},
+        )
+    )
+    geoidHeight: float | None = Field(
+        None,
+        ge=-200.0,
+        le=200.0,
+        allow_inf_nan=False,
+        title="Height of the geoid",
+        description="Metres of the geoid above the ellipsoid of WGS 84, added to the elevations of 3D Tiles. Default: "
+        "by PROJ, if it has the grid, else nothing.",
+    )
     settings: RunSettings = _settings()
 
     @field_validator("settings")
     @classmethod
     def _complete(cls, settings: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
         return _completed(settings, info, "method", "preset", "lods", "classes")
+
+    def draft(self, process_id: str, outputs: tuple[str, ...] | None) -> Draft:
+        """The draft of a job; outputs are None for all. A format is made if its output is named, and the reverse."""
+        asked = {*self.publish, *formats_of(outputs or ())}
+        if self.geoidHeight is not None and "3dtiles" not in asked:
+            raise RequestError([f"geoidHeight is {self.geoidHeight:g}, which is for 3D Tiles: add 3dtiles to publish"])
+        if outputs is not None:
+            outputs = (*outputs, *(i for form in self.publish for i in FORMATS[form] if i not in outputs))
+        plain = super().draft(process_id, outputs)
+        values = {"publish": tuple(form for form in FORMATS if form in asked), "geoid_height": self.geoidHeight}
+        return dataclasses.replace(plain, values={**plain.values, **values})
 
     def of_process(self) -> dict[str, Any]:
         """Points and settings, too."""
@@ -300,10 +344,6 @@ class ReconstructInputs(BuildingInputs):
 
 Variant = Annotated[str, OneOf(*VARIANTS)]
 """METHOD or METHOD:PRESET."""
-
-
-def _as_list(given: Any) -> Any:
-    return given if isinstance(given, list) else [given]
 
 
 def _distinct(words: list[str]) -> list[str]:
@@ -321,6 +361,7 @@ class CompareInputs(BuildingInputs):
     HINTS: ClassVar[Mapping[str, str]] = {
         **BuildingInputs.HINTS,
         "methods": f"give 2 to {MAX_METHODS} of {', '.join(VARIANTS)}",
+        "publish": "it is about the models of one method; submit reconstruct once per method",
         "points": "they show the distances to the models of one method; submit reconstruct with points once per method",
     }
 

@@ -130,6 +130,10 @@ class JobForm(Answer):
     settings: str | None = Field(None, description="JSON.")
     meshes: str | None = None
     points: bool | None = Field(None, description="Whether to deliver the points, too, as 3D Tiles.")
+    publish: list[str] | None = Field(
+        None, description="Further formats of the models: the field several times, or with commas."
+    )
+    geoidHeight: float | None = Field(None, description="Metres of the geoid above the ellipsoid, for 3D Tiles.")
     licence: str | None = None
     title: str | None = None
     priority: int | None = None

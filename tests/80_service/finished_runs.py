@@ -32,6 +32,7 @@ from service.app import create_app
 from service.files import StateFolder
 from service.jobs import InputReference, Job, JobFailure, JobRequest
 from service.outputs import write_comparison_outputs, write_outputs
+from service.outputs.published import publish
 from service.settings import ServiceSettings
 from service.store import JobStore
 
@@ -243,12 +244,17 @@ class Service:
         assert job is not None
         return job
 
-    def finished(self, write: Callable[[Path], object] = write_run, **request: Any) -> str:
-        """The id of a job whose run is there."""
+    def finished(
+        self, write: Callable[[Path], object] = write_run, problems: dict[str, str] | None = None, **request: Any
+    ) -> str:
+        """The id of a job whose run is there; takes the problems of its formats, if it may have any."""
         job = self.running(**request)
-        run_dir = self.folder.run(job.job_id, job.attempt)
+        run_dir, out_dir = self.folder.run(job.job_id, job.attempt), self.folder.outputs(job.job_id, job.attempt)
         write(run_dir)
-        write_outputs(run_dir, self.folder.outputs(job.job_id, job.attempt), job.request.outputs)
+        found = publish(run_dir, out_dir, job.request.publish, name=job.job_id)
+        assert problems is not None or not found, found
+        (problems if problems is not None else {}).update(found)
+        write_outputs(run_dir, out_dir, job.request.outputs)
         self.store.succeed(job, message="done", summary={})
         return job.job_id
 

@@ -58,7 +58,7 @@ def test_it_takes_what_all_processes_take_and_the_cell_of_its_rasters(local_serv
     reconstruct, described = (
         local_service.client.get(f"/processes/{name}").json() for name in ("reconstruct", "classify")
     )
-    of_models = {"method", "preset", "lods", "bbox", "meshes", "points", "licence"}
+    of_models = {"method", "preset", "lods", "bbox", "meshes", "points", "publish", "geoidHeight", "licence"}
     assert set(described["inputs"]) == set(reconstruct["inputs"]) - of_models | {"rasterCell"}
     assert set(described["outputs"]) == set(CLASSIFICATION_OUTPUTS)
 

@@ -87,13 +87,16 @@ def test_every_option_of_submit_arrives(site: Site) -> None:
         "title": "a",
         "priority": -1,
     }
+    formats = ("--publish", "3dtiles", "--publish", "pmtiles", "--geoid-height", "43.2", "--json")
+    inputs = json.loads(done("submit", tile, "--crs", "EPSG:28992", *formats))["request"]["inputs"]
+    assert (inputs["publish"], inputs["geoidHeight"]) == (["3dtiles", "pmtiles"], 43.2)
     compared = json.loads(done("submit", tile, "--crs", "EPSG:28992", "--methods", "kmeans, fuzzy-sart", "--json"))
     assert (compared["processID"], compared["request"]["inputs"]["methods"]) == ("compare", ["kmeans", "fuzzy-sart"])
     classified = ("submit", tile, "--crs", "EPSG:28992", "--process", "classify", "--raster-cell", "2", "--json")
     assert json.loads(done(*classified))["request"]["inputs"]["rasterCell"] == 2.0
 
 
-@pytest.mark.parametrize("field", ["failed_tiles", "tiles_without_points", "tiles_without_terrain"])
+@pytest.mark.parametrize("field", ["failed_tiles", "tiles_without_points", "tiles_without_terrain", "unpublished"])
 def test_submit_and_wait_ends_as_the_job_does(site: Site, field: str) -> None:
     job = site.runs.running(process_id="echo", echo={"message": "a", "delay": 0.0})
     site.store.succeed(job, message="all good", summary={field: ["x1_y1"]})

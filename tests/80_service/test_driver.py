@@ -108,6 +108,46 @@ def test_a_dismissal_is_seen_while_outputs_are_assembled(bench: Bench) -> None:
     assert bench.over(job).status is JobStatus.DISMISSED
 
 
+def test_further_formats_are_written_before_the_outputs_and_may_fail(bench: Bench) -> None:
+    seen: list[Any] = []
+
+    def publish(run_dir: Path, out_dir: Path, formats: Any, *, on_progress: Any, **options: Any) -> dict[str, str]:
+        seen.append((out_dir.exists(), formats, options))
+        on_progress(1, 2)
+        return {"pmtiles": f"the CRS of the run in {run_dir} is unknown: run it again with --crs"}
+
+    bench.tools["publish"] = publish
+    job = bench.submit({"publish": ("3dtiles", "pmtiles"), "geoid_height": 43.2})
+    bench.driver()
+    done = bench.over(job)
+    assert seen == [(False, ("3dtiles", "pmtiles"), {"name": done.job_id, "geoid_height_m": 43.2})]
+    assert done.summary["unpublished"] == {
+        "pmtiles": "the CRS of the run in this job is unknown: run it again with the input crs"
+    }
+    assert "pmtiles could not be published" in done.message
+    events = bench.store.events(done.job_id)
+    assert [event.stage for event in events if event.kind == "stage"] == ["inputs", "plan", "formats", "outputs"]
+    assert [event.message for event in events if event.kind == "warning" and event.stage == "formats"]
+
+
+def test_a_dismissal_is_seen_while_formats_are_written(bench: Bench) -> None:
+    began = threading.Event()
+
+    def endless(*_: Any, on_progress: Callable[[int, int], None], **_options: Any) -> dict[str, str]:
+        began.set()
+        while True:
+            on_progress(0, 1)
+            time.sleep(0.01)
+
+    bench.tools["publish"] = endless
+    job = bench.submit({"publish": ("3dtiles",)})
+    bench.driver()
+    assert began.wait(LONG_S)
+    bench.store.dismiss(job.job_id)
+    assert bench.over(job).status is JobStatus.DISMISSED
+    assert not bench.folder.job(job.job_id).exists()
+
+
 def test_a_driver_that_ends_lets_running_jobs_finish_and_claims_no_more(bench: Bench) -> None:
     first, second = bench.submit(priority=1), bench.submit()
     bench.script.waits()

@@ -1,0 +1,240 @@
+"""Further formats by REST: made by a job after its run, listed among its outputs, and served by path."""
+
+import functools
+import hashlib
+import io
+import json
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+from urllib.parse import urljoin
+
+import finished_runs as runs
+import pyarrow.parquet as pq
+import pyogrio
+import pytest
+from starlette.testclient import TestClient
+
+from pipeline.export.glb_container import read_document
+from pipeline.runtime.manifest import RunStatus
+from service.keys import Scope, new_key
+from service.outputs.kinds import FORMATS, ON_REQUEST, OUTPUTS
+
+WITHOUT_SOLAR = tuple(form for form in FORMATS if form != "solar")
+
+
+@pytest.fixture(scope="module")
+def job_id(service: runs.Service) -> str:
+    """A job that published everything but solar energy."""
+    return service.finished(publish=WITHOUT_SOLAR)
+
+
+@pytest.fixture(scope="module")
+def bare(service: runs.Service) -> str:
+    """A job without further formats."""
+    return service.finished()
+
+
+def test_further_formats_are_outputs_with_sizes_and_sums(client: TestClient, job_id: str, bare: str) -> None:
+    found = client.get(f"/jobs/{job_id}/results").json()
+    assert list(found) == [name for name in OUTPUTS if name != "solar"]
+    for name in ON_REQUEST - {"solar"}:
+        answer = client.get(found[name]["href"])
+        assert answer.headers["content-type"] == found[name]["type"] == OUTPUTS[name].media_type
+        assert len(answer.content) == found[name]["bytes"]
+        assert hashlib.sha256(answer.content).hexdigest() == found[name]["sha256"]
+    assert set(client.get(f"/jobs/{bare}/results").json()).isdisjoint(ON_REQUEST)
+
+
+@pytest.mark.parametrize("start", ["results/3dtiles", "results/3dtiles/tileset.json"])
+def test_a_globe_finds_all_models_from_either_tileset(client: TestClient, job_id: str, start: str) -> None:
+    address = f"http://127.0.0.1/jobs/{job_id}/{start}"
+    tileset = client.get(address).json()
+    assert tileset["asset"]["version"] == "1.1"
+    waiting, buildings = [tileset["root"]], set()
+    for node in waiting:
+        if "content" in node:
+            answer = client.get(urljoin(address, node["content"]["uri"]))
+            assert (answer.status_code, answer.headers["content-type"]) == (200, "model/gltf-binary")
+            table = read_document(answer.content)[0]["extensions"]["EXT_structural_metadata"]["propertyTables"][0]
+            buildings.add((node["content"]["uri"].rpartition("/")[2], table["count"]))
+        waiting.extend(node.get("children", ()))
+    assert buildings == {("x850_y4470.glb", 2), ("x851_y4470.glb", 1), ("x850_y4471.glb", 2)}
+
+
+def test_files_of_a_tileset_are_kept_for_good_and_sent_in_ranges_and_compressed(
+    client: TestClient, job_id: str
+) -> None:
+    address = f"/jobs/{job_id}/results/3dtiles/models/x850_y4470.glb"
+    whole = client.get(address)
+    assert whole.headers["cache-control"] == "private, max-age=31536000, immutable"
+    again = client.get(address, headers={"If-None-Match": whole.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    part = client.get(address, headers={"Range": "bytes=0-3"})
+    assert (part.status_code, part.content) == (206, b"glTF")
+    packed = client.get(address, headers={"Accept-Encoding": "gzip"})
+    assert (packed.headers["content-encoding"], packed.content) == ("gzip", whole.content)
+
+
+def test_the_zip_file_holds_the_tileset_as_it_is_served(client: TestClient, job_id: str) -> None:
+    place = f"/jobs/{job_id}/results"
+    with zipfile.ZipFile(io.BytesIO(client.get(f"{place}/3dtiles-zip").content)) as archive:
+        assert "tileset.json" in archive.namelist()
+        for name in archive.namelist():
+            assert archive.read(name) == client.get(f"{place}/3dtiles/{name}").content, name
+
+
+def test_maps_and_gis_read_the_files(client: TestClient, job_id: str, tmp_path: Path) -> None:
+    for name, count in (("geopackage", 6), ("pmtiles", 5)):
+        path = tmp_path / OUTPUTS[name].filename
+        path.write_bytes(client.get(f"/jobs/{job_id}/results/{name}").content)
+        options = {"ZOOM_LEVEL": 16} if name == "pmtiles" else {}
+        assert len(pyogrio.read_dataframe(path, "buildings", use_arrow=False, **options)) >= count
+    with zipfile.ZipFile(io.BytesIO(client.get(f"/jobs/{job_id}/results/cityjson-zip").content)) as archive:
+        cities = [json.loads(archive.read(name)) for name in archive.namelist()]
+    assert {city["type"] for city in cities} == {"CityJSON"}
+    assert sum(thing["type"] == "Building" for city in cities for thing in city["CityObjects"].values()) == 6
+
+
+@pytest.mark.parametrize("start", ["results/stac", "results/stac/collection.json"])
+def test_the_catalogue_leads_to_every_file_it_lists(client: TestClient, job_id: str, start: str) -> None:
+    address = f"http://127.0.0.1/jobs/{job_id}/{start}"
+    collection = client.get(address).json()
+    assert (collection["id"], collection["assets"]) == (job_id, {})
+    items = [urljoin(address, link["href"]) for link in collection["links"] if link["rel"] == "item"]
+    assert len(items) == 4
+    for place in items:
+        answer = client.get(place)
+        assert answer.headers["content-type"] == "application/geo+json"
+        for link in answer.json()["links"]:
+            assert client.get(urljoin(place, link["href"])).json()["id"] == job_id
+        assets = answer.json()["assets"]
+        assert {"buildings", "planes", "rejected", "cityjson"} <= set(assets)
+        for asset in assets.values():
+            file = client.get(urljoin(place, asset["href"]))
+            assert f"1220{hashlib.sha256(file.content).hexdigest()}" == asset["file:checksum"]
+            assert file.headers["content-type"] == asset["type"]
+    assert "/srv/" not in client.get(address).text
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["results/3dtiles/..%2f..%2frun%2frun.json", "results/3dtiles/outputs.json", "results/3dtiles/models/x1_y1.glb",
+     "results/3dtiles/..%2findex.sqlite", "results/stac/x850_y4470/x851_y4470.json", "results/report/tileset.json",
+     "results/nothing/tileset.json", "results/3dtiles/tileset.json%0a", "run/state/x850_y4470/x850_y4470.json",
+     "run/buildings/tile=x850_y4470/..%2f..%2frun.json", "run/buildings/tile=x1_y1/part-0.parquet",
+     "results/3dtiles/skylines/x1_y1.glb"],
+)  # fmt: skip
+def test_nothing_else_is_served(client: TestClient, job_id: str, path: str) -> None:
+    answer = client.get(f"/jobs/{job_id}/{path}")
+    assert (answer.status_code, answer.headers["content-type"]) == (404, "application/problem+json")
+
+
+def test_a_job_without_further_formats_says_so(client: TestClient, bare: str) -> None:
+    for path in ("results/3dtiles/tileset.json", "results/geopackage"):
+        assert "the request left out" in runs.problem(client.get(f"/jobs/{bare}/{path}"), 404, "no-such-output")
+    of_run = client.get(f"/jobs/{bare}/run/buildings/tile=x850_y4470/part-0.parquet")
+    assert "publish stac" in runs.problem(of_run, 404, "no-such-output")
+
+
+def test_formats_of_another_key_are_not_seen(tmp_path: Path) -> None:
+    with runs.service(tmp_path / "state") as service:
+        keys = [new_key(name, Scope.SUBMIT, now=service.store.now()) for name in ("mine", "theirs")]
+        for key, _ in keys:
+            service.store.add_key(key)
+        job = service.finished(owner=keys[0][0].key_id, publish=("3dtiles", "stac"))
+        for path in ("results/3dtiles/tileset.json", "results/stac/x850_y4470/x850_y4470.json",
+                     "run/buildings/tile=x850_y4470/part-0.parquet"):  # fmt: skip
+            answers = [
+                service.client.get(f"/jobs/{job}/{path}", headers={"Authorization": f"Bearer {secret}"}).status_code
+                for _, secret in keys
+            ]
+            assert answers == [200, 404]
+            assert service.client.get(f"/jobs/{job}/{path}").status_code == 401
+
+
+def test_what_cannot_be_made_leaves_the_rest(service: runs.Service, client: TestClient) -> None:
+    unknown = functools.partial(runs.write_run, epsg=None)
+    problems: dict[str, str] = {}
+    job = service.finished(unknown, publish=WITHOUT_SOLAR, problems=problems)
+    assert set(problems) == {"3dtiles", "pmtiles", "stac"}
+    assert all("CRS" in problem for problem in problems.values())
+    assert {"geopackage", "cityjson-zip"} == set(client.get(f"/jobs/{job}/results").json()) & set(ON_REQUEST)
+    holes = functools.partial(runs.write_run, failed_tile="x9_y9", status=RunStatus.INCOMPLETE)
+    problems.clear()
+    service.finished(holes, publish=("geopackage",), problems=problems)
+    assert "would have holes" in problems["geopackage"]
+
+
+def test_the_solar_table_is_an_output(service: runs.Service, client: TestClient) -> None:
+    pytest.importorskip("pvlib")
+    job = service.finished(publish=("solar",))
+    solar, planes = (
+        pq.read_table(io.BytesIO(client.get(f"/jobs/{job}/results/{name}").content)) for name in ("solar", "planes")
+    )
+    assert solar.num_rows == planes.num_rows > 0
+    assert min(solar["irradiation_kwh_m2"].to_pylist()) > 0.0
+
+
+# --- the request
+
+
+def submitted(client: TestClient, inputs: dict[str, Any], outputs: dict[str, Any] | None = None) -> Any:
+    """The answer to a request for a job."""
+    tile = client.post("/uploads?filename=a.xyz", content=b"1 2 3\n4 5 6\n7 9 9\n").headers["location"]
+    body: dict[str, Any] = {
+        "inputs": {"tiles": {"href": tile}, "crs": "EPSG:28992", "allowOutsideAreaOfUse": True, **inputs}
+    }
+    return client.post(
+        "/processes/reconstruct/execution", json=body | ({} if outputs is None else {"outputs": outputs})
+    )
+
+
+def test_a_format_is_asked_for_by_input_or_by_output(client: TestClient) -> None:
+    by_input = submitted(client, {"publish": ["pmtiles", "3dtiles"], "geoidHeight": 43.2}, {"report": {}}).json()
+    assert by_input["request"]["inputs"]["publish"] == ["3dtiles", "pmtiles"]
+    assert by_input["request"]["inputs"]["geoidHeight"] == 43.2
+    assert list(by_input["request"]["outputs"]) == ["report", "pmtiles", "3dtiles", "3dtiles-zip"]
+    by_output = submitted(client, {}, {"3dtiles-zip": {}}).json()
+    assert by_output["request"]["inputs"]["publish"] == ["3dtiles"]
+    assert list(by_output["request"]["outputs"]) == ["3dtiles-zip"]
+    plain = submitted(client, {}).json()
+    assert "publish" not in plain["request"]["inputs"]
+    assert submitted(client, {"publish": "geopackage"}).json()["request"]["inputs"]["publish"] == ["geopackage"]
+
+
+def test_a_form_asks_for_formats_with_commas(client: TestClient) -> None:
+    fields = {
+        "crs": "EPSG:28992",
+        "allowOutsideAreaOfUse": "true",
+        "publish": "pmtiles, 3dtiles",
+        "geoidHeight": "43.2",
+    }
+    answer = client.post("/jobs", data=fields, files={"tile": ("a.xyz", b"1 2 3\n4 5 6\n7 9 9\n")})
+    assert answer.status_code == 201, answer.text
+    inputs = answer.json()["request"]["inputs"]
+    assert (inputs["publish"], inputs["geoidHeight"]) == (["3dtiles", "pmtiles"], 43.2)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "said"),
+    [({"publish": ["shapefile"]}, "3dtiles, geopackage"),
+     ({"publish": ["pmtiles"], "geoidHeight": 43.0}, "add 3dtiles"),
+     ({"publish": ["3dtiles"], "geoidHeight": 900.0}, "geoidHeight")],
+)  # fmt: skip
+def test_a_wish_that_makes_no_sense_is_refused(client: TestClient, inputs: dict[str, Any], said: str) -> None:
+    assert said in runs.problem(submitted(client, inputs), 400, "invalid-request")
+
+
+def test_a_service_without_pvlib_refuses_solar(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    reported = runs.problem(submitted(client, {"publish": ["solar"]}), 400, "invalid-request")
+    assert re.search("needs pvlib.*leave solar out", reported)
+
+
+def test_a_comparison_refuses_formats(client: TestClient) -> None:
+    methods = ["kmeans", "fuzzy-sart"]
+    inputs = {"tiles": {"href": "/uploads/" + "a" * 32}, "methods": methods, "publish": ["3dtiles"]}
+    answer = client.post("/processes/compare/execution", json={"inputs": inputs})
+    assert "submit reconstruct" in runs.problem(answer, 400, "invalid-request")
