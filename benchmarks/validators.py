@@ -32,6 +32,8 @@ from benchmarks.entries import markdown_table
 from benchmarks.results_page import filled
 from pipeline.ruler.simulation.suites import SUITES
 
+SIMULATED = [name for name in SUITES if name != "sweep"]
+"""The sweep is one scene that is surveyed many times."""
 LODS = "1.2,1.3,2.2"
 CITIES = {f"city-{split}{draw}": (split, draw) for split in ("dev", "test") for draw in range(2)}
 """Draws of the simulated city, 500 m by 500 m each."""
@@ -79,7 +81,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--entries", nargs="*", default=[*SUITES, *CITIES, *REAL])
+    parser.add_argument("--entries", nargs="*", default=[*SIMULATED, *REAL, *CITIES])
     parser.add_argument("--page", type=Path)
     arguments = parser.parse_args()
     val3dity, check = os.environ["GABLEWORK_VAL3DITY"], schema_faults(Path(os.environ["GABLEWORK_CITYJSON_SCHEMAS"]))

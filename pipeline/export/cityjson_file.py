@@ -7,29 +7,55 @@ from collections.abc import Iterable
 from typing import Any
 
 
-def city_of(lines: Iterable[str]) -> dict[str, Any]:
-    """The object of a CityJSON file with all features of a sequence, in their order; each vertex is listed once.
+def city_of(*sequences: Iterable[str]) -> dict[str, Any]:
+    """The object of a CityJSON file with all features of some sequences, in their order; each vertex is listed once.
 
-    Raises ValueError if the first line is not the metadata.
+    The metadata are those of the first sequence, with the extent of all. Raises ValueError if the first line of one is
+    not the metadata, or if their CRS or steps differ.
 
     >>> feature = {"type": "CityJSONFeature", "CityObjects": {"b": {"type": "Building"}}, "vertices": [[1, 2, 3]]}
     >>> city_of(['{"type": "CityJSON", "CityObjects": {}, "vertices": []}', json.dumps(feature)])["vertices"]
     [[1, 2, 3]]
     """
-    remaining = iter(lines)
-    city: dict[str, Any] | None = next((json.loads(line) for line in remaining), None)
-    if city is None or city.get("type") != "CityJSON":
-        raise ValueError("the first line is not the metadata of a CityJSONSeq file")
-    number: dict[tuple[int, ...], int] = {}
-    for line in remaining:
-        feature = json.loads(line)
-        places = [number.setdefault(tuple(vertex), len(number)) for vertex in feature["vertices"]]
-        for name, thing in feature["CityObjects"].items():
-            for geometry in thing.get("geometry", ()):
-                geometry["boundaries"] = _renumbered(geometry["boundaries"], places)
-            city["CityObjects"][name] = thing
+    city: dict[str, Any] | None = None
+    number: dict[tuple[int, int, int], int] = {}
+    for lines in sequences:
+        remaining = iter(lines)
+        heading: dict[str, Any] | None = next((json.loads(line) for line in remaining), None)
+        if heading is None or heading.get("type") != "CityJSON":
+            raise ValueError("the first line is not the metadata of a CityJSONSeq file")
+        city = heading if city is None else city
+        away = _between(city, heading)
+        for line in remaining:
+            feature = json.loads(line)
+            vertices = (
+                tuple(value + by for value, by in zip(vertex, away, strict=True)) for vertex in feature["vertices"]
+            )
+            places = [number.setdefault(vertex, len(number)) for vertex in vertices]
+            for name, thing in feature["CityObjects"].items():
+                for geometry in thing.get("geometry", ()):
+                    geometry["boundaries"] = _renumbered(geometry["boundaries"], places)
+                city["CityObjects"][name] = thing
+    if city is None:
+        raise ValueError("there is no sequence")
     city["vertices"] = [list(vertex) for vertex in number]
     return city
+
+
+def _between(first: dict[str, Any], other: dict[str, Any]) -> list[int]:
+    """Steps from the origin of the first sequence to that of another, whose extent joins that of the first."""
+    if first is other:
+        return [0, 0, 0]
+    names = [heading.get("metadata", {}).get("referenceSystem") for heading in (first, other)]
+    one, two = first["transform"], other["transform"]
+    if one["scale"] != two["scale"] or names[0] != names[1]:
+        raise ValueError("the sequences differ in CRS or scale")
+    held, more = (heading.get("metadata", {}).get("geographicalExtent") for heading in (first, other))
+    if more is not None:
+        low, high = [*map(min, held or more, more)][:3], [*map(max, held or more, more)][3:]
+        first.setdefault("metadata", {})["geographicalExtent"] = low + high
+    # origins are whole units
+    return [round((b - a) / step) for a, b, step in zip(one["translate"], two["translate"], one["scale"], strict=True)]
 
 
 def _renumbered(boundaries: list[Any], places: list[int]) -> list[Any]:

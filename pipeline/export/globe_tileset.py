@@ -26,6 +26,8 @@ SKYLINE_FROM = 4000
 and what replaces the lowest are some dozens of files."""
 LEAST_ERROR_M = 5.0
 """Least geometric error of blocks: CesiumJS then shows models instead from about 300 m, whatever their roofs."""
+TERRAIN_ERROR_M = 20.0
+"""Geometric error of a place without its terrain: CesiumJS then shows terrain from about a kilometre."""
 
 _RADIUS_M = 6_371_000.0
 _MARGIN = np.array([[-1e-7, -1e-7, -0.02], [1e-7, 1e-7, 0.02]])
@@ -104,6 +106,12 @@ def grown(
         error_m = max(round(blocks[MOST_BLOCKS].size_m, 3), *(node.error_m for node in nodes))
         nodes = (Node(region=region, error_m=error_m, uri=content.uri, matrix=content.matrix, children=nodes),)
     return Branch(nodes=nodes, blocks=blocks, buildings=count)
+
+
+def terrain_node(content: Content, region: FloatArray) -> Node:
+    """The node of a tile's terrain, which has no coarser content: nothing far away, then all."""
+    shown = Node(region=region, error_m=0.0, uri=content.uri, matrix=content.matrix)
+    return Node(region=region, error_m=TERRAIN_ERROR_M, children=(shown,))
 
 
 def _region_around(nodes: Sequence[Node]) -> FloatArray:

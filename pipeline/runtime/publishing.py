@@ -25,6 +25,8 @@ from pipeline.export.geopackage import LAYERS, SUFFIX, TILE, GeoPackage, stored_
 from pipeline.export.geoparquet import table_batches, table_files
 from pipeline.export.projection import projection_to
 from pipeline.export.qml import STYLES
+from pipeline.export.terrain import FOLDER as TERRAIN
+from pipeline.export.terrain import terrain_path
 from pipeline.io import LocalStorage, arrow_at, is_url, storage_at
 from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
 from pipeline.runtime.monitoring.events import Event, Listener, ignore
@@ -143,7 +145,7 @@ def publish_pmtiles(run_dir: str, out: str, *, overwrite: bool = False, on_event
 
 
 def publish_cityjson(run_dir: str, out: str, *, overwrite: bool = False, on_event: Listener = ignore) -> Published:
-    """Write a finished run as one CityJSON file per tile, `<tile>.city.json`, in a folder.
+    """Write a finished run as one CityJSON file per tile, `<tile>.city.json`, in a folder, with its terrain if any.
 
     A new folder appears whole; in one that exists, each file does, after all are made. Nothing else in it changes.
 
@@ -164,11 +166,15 @@ def publish_cityjson(run_dir: str, out: str, *, overwrite: bool = False, on_even
     """
     target = path_outside(run_dir, out, "CityJSON files are")
     manifest, stated = finished_run(run_dir), stated_files(run_dir, {_SEQUENCES})
-    keys = {f"{tile}{CITYJSON}": key for tile, key in sequences_of(run_dir).items()}
+    sequences, terrains = sequences_of(run_dir), terrains_of(run_dir)
+    keys = {
+        f"{tile}{CITYJSON}": [found[tile] for found in (sequences, terrains) if tile in found]
+        for tile in sorted({*sequences, *terrains})
+    }
     buildings = size = 0
     with disk_at(target), _folder(target, overwrite, keys, lambda: target.glob(f"*{CITYJSON}")) as made:
-        for done, (name, key) in enumerate(keys.items(), start=1):
-            city = _city(run_dir, key)
+        for done, (name, of_tile) in enumerate(keys.items(), start=1):
+            city = _city(run_dir, of_tile)
             buildings += sum(thing["type"] == "Building" for thing in city["CityObjects"].values())
             content = json.dumps(city, separators=(",", ":"), ensure_ascii=False).encode()
             made.put(name, content)
@@ -337,12 +343,22 @@ def sequences_of(run_dir: str) -> dict[str, str]:
     }
 
 
-def _city(run_dir: str, key: str) -> dict[str, Any]:
-    """The CityJSON object of one tile; raises RunError if its file is damaged."""
+def terrains_of(run_dir: str) -> dict[str, str]:
+    """The files with the terrain of a run, by the keys of their tiles."""
+    return {
+        key.split("/")[1].removeprefix(f"{TILE}="): key
+        for key in storage_at(run_dir).keys(TERRAIN)
+        if key == terrain_path(key.split("/")[1].removeprefix(f"{TILE}="), "city.jsonl")
+    }
+
+
+def _city(run_dir: str, keys: Sequence[str]) -> dict[str, Any]:
+    """The CityJSON object of the sequences of one tile; raises RunError if a file is damaged."""
+    sequences = [lines_of(storage_at(run_dir).get(key).decode()) for key in keys]
     try:
-        return city_of(lines_of(storage_at(run_dir).get(key).decode()))
+        return city_of(*sequences)
     except (ValueError, KeyError, TypeError) as fault:
-        raise RunError(f"{key} of the run in {run_dir} is damaged ({str(fault)[:160]}): run it again") from fault
+        raise RunError(f"{keys[0]} of the run in {run_dir} is damaged ({str(fault)[:160]}): run it again") from fault
 
 
 @contextlib.contextmanager

@@ -14,8 +14,10 @@ from pipeline.export.cityjson import lines_of
 from pipeline.export.geoparquet import table_batches
 from pipeline.export.glb import Frame, SolidMesh, solid_mesh
 from pipeline.export.globe_glb import Content, Placed, block_feature, globe_glb, local_axes, placed, region_of
-from pipeline.export.globe_tileset import LEAST_ERROR_M, Branch, Node, blocks_of, globe_tileset, grown
+from pipeline.export.globe_terrain import PlacedTerrain, placed_terrain, terrain_glb
+from pipeline.export.globe_tileset import LEAST_ERROR_M, Branch, Node, blocks_of, globe_tileset, grown, terrain_node
 from pipeline.export.property_table import BLOCK_COLUMNS, COLUMNS, TILE, StoredColumn
+from pipeline.export.terrain import TerrainTriangles, read_terrain
 from pipeline.io import LocalStorage, arrow_at, storage_at
 from pipeline.io.crs import SpatialReference
 from pipeline.io.globe import Geodesy, geodesy
@@ -30,13 +32,16 @@ from pipeline.runtime.publishing import (
     path_outside,
     sequences_of,
     stated_files,
+    terrains_of,
 )
 from pipeline.tiling import Tile
 
 NAME = "tileset.json"
 """The file to open."""
-_BLOCKS, _MODELS, _SKYLINES = "blocks", "models", "skylines"
-_MADE = frozenset({NAME, _BLOCKS, _MODELS, _SKYLINES})
+TERRAIN_NAME = "terrain.json"
+"""The tileset of the terrain, if the run has any."""
+_BLOCKS, _MODELS, _SKYLINES, _TERRAIN = "blocks", "models", "skylines", "terrain"
+_MADE = frozenset({NAME, TERRAIN_NAME, _BLOCKS, _MODELS, _SKYLINES, _TERRAIN})
 """All that a folder may hold to be replaced."""
 
 
@@ -57,6 +62,8 @@ def publish_3dtiles(
     on_event: Listener = ignore,
 ) -> PublishedTileset:
     """Write a finished run as 3D Tiles in a folder, tile by tile; the folder appears whole, or stays what it was.
+
+    If the run has terrain, a second tileset beside the first shows it.
 
     Raises SettingsError if `out` cannot be such a folder, and RunError if it holds something else, or a tileset that is
     not to be replaced, if the CRS is unknown, if the run is not finished, changes meanwhile, lacks buildings or has no
@@ -92,6 +99,10 @@ def publish_3dtiles(
             if tree is None:
                 raise RunError(f"no building of the run in {run_dir} has a model, so there is nothing to show")
             extras = {**way.facts, "content_sha256": manifest.content_sha256, "licence": manifest.source_licence}
+            terrain = tiles.terrain()
+            if terrain:
+                made.put(TERRAIN_NAME, globe_tileset(Branch(nodes=terrain, blocks=(), buildings=0), extras))
+                extras["terrain"] = TERRAIN_NAME
             made.put(NAME, globe_tileset(tree, extras))
             size = sum(path.stat().st_size for path in made.root.rglob("*") if path.is_file())
             _refuse_occupied(target, overwrite)
@@ -135,11 +146,13 @@ class _Tiles:
             models, blocks = self._meshes(key, records)
             branch = self._branch(tile, placed(models, self.geodesy), placed(blocks, self.geodesy)) if models else None
         except (ValueError, KeyError, TypeError, IndexError) as fault:
-            raise RunError(
-                f"{key} of the run in {self.run_dir} cannot be placed on the globe ({str(fault)[:160]}): run it again"
-            ) from fault
+            raise self._misplaced(key, fault) from fault
         self.on_event(Event(kind="progress", stage="3dtiles", done=self.counts["tiles"], total=self.total))
         return branch
+
+    def _misplaced(self, key: str, fault: Exception) -> RunError:
+        problem = f"{key} of the run in {self.run_dir} cannot be placed on the globe ({str(fault)[:160]})"
+        return RunError(f"{problem}: run it again")
 
     def _records(self, tile: Tile) -> dict[str, dict[str, Any]]:
         """The records of a tile by their ids."""
@@ -176,6 +189,28 @@ class _Tiles:
         child = Node(region=region, error_m=0.0, uri=fine.uri, matrix=fine.matrix)
         node = Node(region=region, error_m=error_m, uri=coarse.uri, matrix=coarse.matrix, children=(child,))
         return Branch(nodes=(node,), blocks=blocks_of(blocks), buildings=len(models))
+
+    def terrain(self) -> tuple[Node, ...]:
+        """Store the terrain of all tiles that have some; their nodes."""
+        keys = {Tile.from_key(name): key for name, key in terrains_of(self.run_dir).items()}
+        found = []
+        for done, tile in enumerate(sorted(keys), start=1):
+            lines = lines_of(storage_at(self.run_dir).get(keys[tile]).decode())
+            try:
+                placed = self._terrain(read_terrain(lines))
+            except (ValueError, KeyError, TypeError, IndexError) as fault:
+                raise self._misplaced(keys[tile], fault) from fault
+            matrix = local_axes(placed.region)
+            content = Content(uri=f"{_TERRAIN}/{tile.key}.glb", matrix=matrix)
+            self.made.put(content.uri, terrain_glb(placed, matrix))
+            found.append(terrain_node(content, placed.region))
+            self.on_event(Event(kind="progress", stage="terrain", done=done, total=len(keys)))
+        return tuple(found)
+
+    def _terrain(self, read: TerrainTriangles) -> PlacedTerrain:
+        """The terrain of a tile on the globe."""
+        units_m = (*[self.reference.horizontal_unit_m] * 2, self.reference.vertical_unit_m)
+        return placed_terrain(read.vertices * units_m, read.triangles, self.geodesy)
 
     def skyline(self, name: str, blocks: Sequence[Placed], region: FloatArray) -> Content:
         """Store the largest blocks of a square of tiles."""

@@ -13,6 +13,13 @@ const OUTPUTS: Record<string, [string, string, string]> = {
   rejected: ["GeoParquet, rejected", "Objects that are not buildings, with reasons", "rejected.parquet"],
   geojson: ["GeoJSON", "Footprints with the record, for any GIS", "buildings.geojson"],
   report: ["Report", "Settings, inputs, counts, timings, digest", "report.json"],
+  "3dtiles": ["3D Tiles", "Tileset for CesiumJS, which opens the address of this link", "tileset.json"],
+  "3dtiles-zip": ["3D Tiles, zip", "The tileset with its files, for another server", "3dtiles.zip"],
+  geopackage: ["GeoPackage", "All tables with styles, for QGIS", "models.gpkg"],
+  pmtiles: ["PMTiles", "Footprints as vector tiles, for maps on the web", "models.pmtiles"],
+  "cityjson-zip": ["CityJSON, files", "One file per tile, zipped", "cityjson.zip"],
+  stac: ["STAC", "A catalogue of the tiles and their files", "collection.json"],
+  solar: ["Solar energy, GeoParquet", "Sky view and irradiation of every roof plane", "solar.parquet"],
 };
 
 /** Outputs of a classification. */

@@ -10,8 +10,19 @@ export const LABELS = {
   classes: "Classes of the file",
   footprints: "Footprints",
   points: "Keep the points",
+  publish: "Publish as",
   title: "Title",
 } as const;
+
+/** Further formats of the models by the words of the input `publish`. */
+export const FORMATS: Record<string, string> = {
+  "3dtiles": "3D Tiles, for globes",
+  geopackage: "GeoPackage, for GIS",
+  pmtiles: "PMTiles, for web maps",
+  cityjson: "CityJSON files",
+  stac: "STAC catalogue",
+  solar: "Solar energy of the roofs",
+};
 
 /** A message that names fields in place of inputs, and no settings of the operator. */
 export function inFields(message: string): string {

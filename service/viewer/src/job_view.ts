@@ -63,7 +63,7 @@ const SIDE_BY_SIDE: typeof STAGES = [
 ];
 
 /** Stages in which a job has some of its buildings. */
-const HAS_MODELS = new Set(["reconstruct", "publish", "outputs"]);
+const HAS_MODELS = new Set(["reconstruct", "publish", "formats", "outputs"]);
 
 /** The further stage of a job that keeps the points. */
 const WITH_POINTS: typeof STAGES = [["octree", "Write the points", "tiles"]];
@@ -71,9 +71,13 @@ const WITH_POINTS: typeof STAGES = [["octree", "Write the points", "tiles"]];
 /** The further stage of a job that writes the terrain. */
 const WITH_TERRAIN: typeof STAGES = [["terrain", "Write the terrain", "tiles"]];
 
+/** The further stage of a job that publishes other formats. */
+const WITH_FORMATS: typeof STAGES = [["formats", "Write other formats", "formats"]];
+
 interface Asked {
   points?: boolean;
-  settings?: { settings?: { terrain?: string } };
+  publish?: string[];
+  settings?: { terrain?: string };
 }
 
 function stagesOf(job: StatusInfo): typeof STAGES {
@@ -82,7 +86,8 @@ function stagesOf(job: StatusInfo): typeof STAGES {
   const asked = (job.request?.inputs ?? {}) as Asked;
   const beside = [
     ...(asked.points === true ? WITH_POINTS : []),
-    ...(asked.settings?.settings?.terrain === "tin" ? WITH_TERRAIN : []),
+    ...(asked.settings?.terrain === "tin" ? WITH_TERRAIN : []),
+    ...((asked.publish ?? []).length > 0 ? WITH_FORMATS : []),
   ];
   const more = job.processID === "compare" ? SIDE_BY_SIDE : beside;
   return [...STAGES.slice(0, -1), ...more, ...STAGES.slice(-1)];

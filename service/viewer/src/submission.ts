@@ -1,7 +1,7 @@
 import { variantOf } from "./address";
 import { Problem, getJson, request, type UploadInfo } from "./api";
 import { el, svg } from "./elements";
-import { LABELS, capital } from "./fields";
+import { FORMATS, LABELS, capital } from "./fields";
 import { choice, field } from "./form_fields";
 import { type Interrupted, fingerprint, forget, interrupted, keyOf } from "./interrupted";
 import { levelWords, levelsOffered, lodsInput } from "./levels_of_detail";
@@ -57,6 +57,7 @@ export class Submission {
   private readonly levelsHint = el("p", { class: "hint", id: "lods-hint" });
   private readonly classes = choice("classes", {});
   private readonly points = el("input", { id: "with-points", type: "checkbox", "aria-describedby": "points-hint" });
+  private readonly formats = el("div", { class: "boxes" });
   private readonly title = el("input", { id: "title", type: "text", autocomplete: "off", maxlength: 200 });
   private readonly options = el("details", { class: "options" });
 
@@ -108,6 +109,7 @@ export class Submission {
         el("label", {}, this.points, ` ${LABELS.points}`),
         el("p", { class: "hint", id: "points-hint" }, "To see them over the models, with their distances to the roofs. Takes longer."),
       ),
+      el("fieldset", { class: "field" }, el("legend", {}, LABELS.publish), this.formats),
       field(LABELS.title, this.title),
     );
     for (const control of [this.method, this.preset, this.levels, this.anywhere]) {
@@ -167,6 +169,7 @@ export class Submission {
       this.usualPreset = this.preset.value;
       const lods = process.inputs["lods"]?.schema;
       this.offerLevels(levelsOffered(lods?.enum ?? []), levelsOffered([lods?.default ?? ""]));
+      this.offerFormats(process.inputs["publish"]?.schema.items?.enum ?? []);
       const comparison = await getJson<{ inputs: Record<string, InputDescription> }>("processes/compare");
       this.offerOthers(comparison.inputs["methods"]?.schema.items?.enum ?? []);
     } catch (error) {
@@ -195,6 +198,14 @@ export class Submission {
           ` LoD${value}: ${levelWords(value)}`,
         ),
       ),
+    );
+    this.draw();
+  }
+
+  /** A box for every further format. */
+  private offerFormats(formats: string[]): void {
+    this.formats.replaceChildren(
+      ...formats.map((value) => el("label", {}, el("input", { type: "checkbox", value }), ` ${FORMATS[value] ?? value}`)),
     );
     this.draw();
   }
@@ -332,6 +343,8 @@ export class Submission {
       else {
         chosen.push(["method", this.method.value], ["preset", this.preset.value], ["lods", this.lods()]);
         if (this.points.checked) inputs["points"] = true;
+        const formats = [...this.formats.querySelectorAll<HTMLInputElement>("input:checked")].map(({ value }) => value);
+        if (formats.length > 0) inputs["publish"] = formats;
       }
       for (const [name, value] of chosen) if (value !== "") inputs[name] = value;
       if (this.anywhere.checked) inputs["allowOutsideAreaOfUse"] = true;
@@ -385,7 +398,7 @@ export class Submission {
     // by another CRS the tiles lie elsewhere, which the service finds out
     const unplaced = isFar && this.crs.value.trim() === "" && !this.anywhere.checked;
     const ready = this.tiles.length > 0 && !refused && !waiting && !noLevel && !unplaced && !this.starting;
-    for (const box of [...levelBoxes, this.points]) box.disabled = comparison;
+    for (const box of [...levelBoxes, ...this.formats.querySelectorAll("input"), this.points]) box.disabled = comparison;
     this.levelsHint.textContent = comparison ? "Comparisons are made at LoD2.2." : "One or several; the records describe the finest.";
     const chosen = this.chosen();
     for (const box of this.others.querySelectorAll("input")) box.disabled = box.value === chosen;
