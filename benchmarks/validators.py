@@ -25,8 +25,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jsonschema
-import referencing
+import jsonschema_rs  # schemathesis brings it: the library of the tests takes minutes for a town
 
 from benchmarks.entries import markdown_table
 from benchmarks.results_page import filled
@@ -198,11 +197,9 @@ def faults_of(report: Mapping[str, Any]) -> Iterator[str]:
 def schema_faults(folder: Path) -> Callable[[Mapping[str, Any]], list[str]]:
     """A function that holds a CityJSON object or feature against the official schema."""
     files = {path.name: json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.schema.json")}
-    registry: Any = referencing.Registry().with_resources(
-        (schema["$id"], referencing.Resource.from_contents(schema)) for schema in files.values()
-    )
+    registry = jsonschema_rs.Registry([(schema["$id"], schema) for schema in files.values()])
     validators = {
-        kind: jsonschema.Draft7Validator(files[f"{kind.lower()}.schema.json"], registry=registry)
+        kind: jsonschema_rs.Draft7Validator(files[f"{kind.lower()}.schema.json"], registry=registry)
         for kind in ("CityJSON", "CityJSONFeature")
     }
     return lambda document: [error.message[:100] for error in validators[document["type"]].iter_errors(document)]

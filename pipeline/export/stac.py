@@ -37,6 +37,7 @@ ASSETS: Mapping[str, tuple[str, str, str]] = {
     "rejected": (_PARQUET, "metadata", "GeoParquet: objects that are not buildings, with the reason"),
     "decisions": (_PARQUET, "metadata", "Parquet: what was checked and tried for each building"),
     "cityjson": ("application/city+json-seq", "data", "CityJSONSeq 2.0: solids with semantic surfaces"),
+    "terrain": ("application/city+json-seq", "data", "CityJSONSeq 2.0: the terrain as triangles"),
     "mesh": ("", "data", "the meshes of all buildings"),
     "mesh-lod12": ("", "data", "the meshes of all buildings in LoD1.2"),
     "mesh-lod13": ("", "data", "the meshes of all buildings in LoD1.3"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import os
 import tempfile
@@ -221,6 +222,8 @@ def publish_stac(
     project = projection_to(manifest.crs, stac.CRS)
     run = _run_of(run_dir, manifest, name)
     files = {state["tile"]: stac.listed(state["files"], state["tile"]) for state in _states(run_dir) if state["files"]}
+    for tile, key in terrains_of(run_dir).items():
+        files.setdefault(tile, {})[key] = hashlib.sha256(storage.get(key)).hexdigest()
     names = [*(stac.item_name(tile) for tile in files), stac.COLLECTION]
     href = run_dir.rstrip("/") + "/" if is_url(run_dir) else _relative(Path(run_dir).resolve(), target)
     with disk_at(target):
@@ -261,6 +264,8 @@ def _tile_facts(run_dir: str, tile: str, files: Mapping[str, str], manifest: Run
     boxes, times, rows = [], [], {}
     for table, columns in (("buildings", ["acquired_from", "acquired_to", "bbox"]), ("rejected", ["bbox"])):
         rows[table] = 0
+        if not any(name.startswith(f"{table}/") for name in files):  # nothing but terrain
+            continue
         for batch in table_batches(place, table, columns, filesystem, [tile], ROWS):
             rows[table] += batch.num_rows
             boxes += [tuple(box.values()) for box in batch.column("bbox").to_pylist() if box]

@@ -34,7 +34,7 @@ _FILES: Mapping[str, re.Pattern[str]] = MappingProxyType(
 ROOTS: Mapping[str, str] = MappingProxyType({"3dtiles": "tileset.json", "stac": "collection.json"})
 """The file to open first, by output."""
 RUN_FILE = re.compile(
-    rf"(buildings|planes|rejected|decisions)/tile={_TILE}/part-0\.parquet|cityjson/tile={_TILE}/part-0\.city\.jsonl|"
+    rf"(buildings|planes|rejected|decisions)/tile={_TILE}/part-0\.parquet|(cityjson|terrain)/tile={_TILE}/part-0\.city\.jsonl|"
     rf"meshes/(?P<tile>{_TILE})/(?P=tile)(-lod1[23])?\.(obj|glb)",
     re.ASCII,
 )

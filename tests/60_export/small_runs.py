@@ -4,14 +4,17 @@ import dataclasses
 import datetime as dt
 import hashlib
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
+import pyproj
 import small_buildings as small
 
 from pipeline.export.records import RecordContext, RejectedObject
 from pipeline.export.tile import write_tile
 from pipeline.io import storage_at
+from pipeline.io.crs import SpatialReference
 from pipeline.model import BuildingResult, Reason, Status
 from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest, write_manifest
 
@@ -78,3 +81,25 @@ def content(folder: Path) -> dict[str, bytes]:
 def restated(run_dir: Path, **changes: Any) -> None:
     """Change the manifest of a run."""
     write_manifest(run_dir, dataclasses.replace(read_manifest(run_dir), **changes))
+
+
+def reference_of(epsg: int, **units: float) -> SpatialReference:
+    """A CRS by its code."""
+    return SpatialReference(wkt=pyproj.CRS.from_epsg(epsg).to_wkt(), name=str(epsg), epsg=epsg, **units)
+
+
+def tiled_run(folder: Path, tiles: dict[str, list[BuildingResult]], contexts: small.Contexts) -> Path:
+    """A finished run near Delft with these buildings on these tiles."""
+    write_run(folder, [])
+    for table in ("buildings", "planes", "rejected", "decisions", "cityjson"):
+        shutil.rmtree(folder / table, ignore_errors=True)
+    for key, results in tiles.items():
+        write_tile(folder, key, results, [], contexts["compound"])
+        files = {str(path.relative_to(folder)): "0" for path in folder.rglob(f"tile={key}/*")}
+        storage_at(folder).put(f"state/{key}.json", json.dumps({"tile": key, "state": "done", "files": files}).encode())
+    facts = dataclasses.asdict(reference_of(7415))
+    facts.pop("vertical_unit_assumed")
+    count = sum(map(len, tiles.values()))
+    changed = dataclasses.replace(read_manifest(folder), crs=facts, counts={"candidates": count})
+    write_manifest(folder, changed)
+    return folder

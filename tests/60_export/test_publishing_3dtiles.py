@@ -4,7 +4,6 @@ import dataclasses
 import json
 import math
 import re
-import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,7 @@ import pytest
 import small_buildings as small
 from command_line import invoke
 from glb_rules import chunks
-from small_runs import moved, street, write_run
+from small_runs import moved, reference_of, street, tiled_run
 
 from pipeline.errors import RunError, SettingsError
 from pipeline.export import globe_tileset
@@ -26,8 +25,6 @@ from pipeline.export.geoparquet import read_table
 from pipeline.export.property_table import BLOCK_COLUMNS, COLUMNS, STORED_TYPES, StoredColumn, stored_column
 from pipeline.export.records import SCHEMAS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
-from pipeline.export.tile import write_tile
-from pipeline.io import storage_at
 from pipeline.io.crs import SpatialReference
 from pipeline.io.globe import geodesy, to_globe
 from pipeline.model import BuildingResult
@@ -39,27 +36,6 @@ from pipeline.tiling import Tile
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 GEOID_M = 43.2
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "how_to" / "3d_tiles.md"
-
-
-def reference_of(epsg: int, **units: float) -> SpatialReference:
-    return SpatialReference(wkt=pyproj.CRS.from_epsg(epsg).to_wkt(), name=str(epsg), epsg=epsg, **units)
-
-
-def tiled_run(folder: Path, tiles: dict[str, list[BuildingResult]], contexts: small.Contexts) -> Path:
-    """A finished run near Delft with these buildings on these tiles."""
-    write_run(folder, [])
-    for table in ("buildings", "planes", "rejected", "decisions", "cityjson"):
-        shutil.rmtree(folder / table, ignore_errors=True)
-    for key, results in tiles.items():
-        write_tile(folder, key, results, [], contexts["compound"])
-        files = {str(path.relative_to(folder)): "0" for path in folder.rglob(f"tile={key}/*")}
-        storage_at(folder).put(f"state/{key}.json", json.dumps({"tile": key, "state": "done", "files": files}).encode())
-    facts = dataclasses.asdict(reference_of(7415))
-    facts.pop("vertical_unit_assumed")
-    count = sum(map(len, tiles.values()))
-    changed = dataclasses.replace(read_manifest(folder), crs=facts, counts={"candidates": count})
-    write_manifest(folder, changed)
-    return folder
 
 
 @pytest.fixture
