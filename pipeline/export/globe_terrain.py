@@ -18,7 +18,7 @@ from pipeline.model import FloatArray, LabelArray
 
 NAME = "Terrain"
 """Name of the material."""
-COLOUR = (0.20, 0.25, 0.12)
+COLOUR = (0.32, 0.35, 0.22)
 """Its colour in linear RGB."""
 _BYTE, _UNSIGNED_INT, _FLOAT = 5120, 5125, 5126
 

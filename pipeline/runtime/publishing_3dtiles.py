@@ -110,6 +110,8 @@ def publish_3dtiles(
                 target.replace(Path(folder, "old"))
             made.root.replace(target)
     rows = {"buildings": tiles.counts["buildings"], "models": tree.buildings}
+    if terrain:
+        rows["tiles of terrain"] = len(terrain)
     return PublishedTileset(place=str(target), size_bytes=size, rows=rows, georeference=way.facts)
 
 
