@@ -4,11 +4,11 @@ r"""The field's validators on all that is written: `python -m benchmarks.validat
       python -m benchmarks.validators --out DIR [--data ../shared/data] [--entries suburb delft …] [--page FILE]
 
 Each simulated suite and each real tile is modelled with all levels of detail and with its terrain, and published as
-CityJSON. val3dity judges the sequences, the terrain and the published files, with its own tolerances; the schema of
-CityJSON 2.0 judges each line and each file. Both are on no package registry: GABLEWORK_VAL3DITY names the program (2.5
-or later), GABLEWORK_CITYJSON_SCHEMAS a folder with the files `*.schema.json` of its maintainers. Each entry's figures
-are in DIR/ENTRY/validators.json and are not made again while that file is there. DIR/validators.md holds the table.
-The exit code is 1 if anything is invalid.
+CityJSON. val3dity judges the sequences, the terrain and the published files, with its own tolerances, and the terrain
+also with vertices snapped within half a millimetre; the schema of CityJSON 2.0 judges each line and each file. Both are
+on no package registry: GABLEWORK_VAL3DITY names the program (2.5 or later), GABLEWORK_CITYJSON_SCHEMAS a folder with
+the files `*.schema.json` of its maintainers. Each entry's figures are in DIR/ENTRY/validators.json; what is there is
+not made again. DIR/validators.md holds the table. The exit code is 1 if anything is invalid.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,24 @@ REAL: Mapping[str, tuple[str, ...]] = {
 """Files below the data folder, and options."""
 
 
+JUDGED = {
+    "models": "faults of models",
+    "schema": "faults by schema",
+    "terrain": "faults of terrain",
+    "finely": "faults of terrain, snapped within 0.5 mm",
+}
+"""What is judged, and how it is called in the table."""
+COUNTED = {
+    "buildings": "buildings",
+    "solids": "solids",
+    "triangles": "triangles of terrain",
+    "surfaces": "surfaces of terrain",
+    "files": "files",
+    "documents": "documents held against the schema",
+}
+"""What is counted, likewise."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Figures:
     """What the validators say about one entry."""
@@ -71,8 +89,8 @@ class Figures:
     """Published CityJSON files that val3dity judged."""
     documents: int
     """Lines and files that were held against the schema."""
-    invalid: Mapping[str, int]
-    """Faults by what was judged and their code or message."""
+    invalid: Mapping[str, Mapping[str, int]]
+    """Faults of `JUDGED` by their code or message."""
 
 
 def main() -> int:
@@ -90,7 +108,8 @@ def main() -> int:
         known = arguments.out / name / "validators.json"
         if not known.exists():
             try:
-                made(name, arguments.out / name, arguments.data)
+                if not (arguments.out / name / "cityjson").exists():
+                    made(name, arguments.out / name, arguments.data)
             except RuntimeError as error:
                 print(f"{name}: {error}", file=sys.stderr)
                 failed.append(name)
@@ -104,7 +123,7 @@ def main() -> int:
         arguments.page.write_text(
             filled(arguments.page.read_text(encoding="utf-8"), arguments.out)[0], encoding="utf-8"
         )
-    return int(bool(failed) or any(figures.invalid for figures in found.values()))
+    return int(bool(failed) or any(faults for figures in found.values() for faults in figures.invalid.values()))
 
 
 def made(name: str, folder: Path, data: Path) -> None:
@@ -134,7 +153,7 @@ def _gablework(*words: str) -> None:
 
 def judged(folder: Path, val3dity: str, check: Callable[[Mapping[str, Any]], list[str]]) -> Figures:
     """What the validators say about the files of an entry."""
-    faults: collections.Counter[str] = collections.Counter()
+    faults: dict[str, collections.Counter[str]] = {name: collections.Counter() for name in JUDGED}
     counts: collections.Counter[str] = collections.Counter()
     places = {
         "models": sorted(folder.glob("run/cityjson/*/*.city.jsonl")),
@@ -145,7 +164,7 @@ def judged(folder: Path, val3dity: str, check: Callable[[Mapping[str, Any]], lis
         for file in files:
             documents = list(read(file))
             counts["documents"] += len(documents)
-            faults.update(f"{kind}: schema: {fault}" for document in documents for fault in check(document))
+            faults["schema"].update(fault for document in documents for fault in check(document))
             for thing in (thing for document in documents for thing in document.get("CityObjects", {}).values()):
                 if kind != "files":
                     counts["buildings"] += thing["type"] == "Building"
@@ -154,7 +173,12 @@ def judged(folder: Path, val3dity: str, check: Callable[[Mapping[str, Any]], lis
                     )
             report = reported(file, val3dity)
             counts[kind] += sum(kept["total"] for kept in report["primitives_overview"]) if kind != "files" else 1
-            faults.update(f"{kind}: {fault}" for fault in faults_of(report))
+            for judged_as, fault in faults_of(report):
+                faults[judged_as][fault] += 1
+            if kind == "terrain":
+                faults["finely"].update(
+                    fault for _, fault in faults_of(reported(file, val3dity, "--snap_tol", "0.0005"))
+                )
     return Figures(
         buildings=counts["buildings"],
         solids=counts["models"],
@@ -162,7 +186,7 @@ def judged(folder: Path, val3dity: str, check: Callable[[Mapping[str, Any]], lis
         surfaces=counts["terrain"],
         files=counts["files"],
         documents=counts["documents"],
-        invalid=dict(faults),
+        invalid={name: dict(found) for name, found in faults.items()},
     )
 
 
@@ -172,12 +196,12 @@ def read(file: Path) -> Iterator[dict[str, Any]]:
     return map(json.loads, text.splitlines() if file.suffix == ".jsonl" else [text])
 
 
-def reported(file: Path, val3dity: str) -> dict[str, Any]:
+def reported(file: Path, val3dity: str, *options: str) -> dict[str, Any]:
     """val3dity's report of a file; its exit code says nothing about validity."""
     with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
         place = Path(folder, "report.json")
         done = subprocess.run(
-            [val3dity, str(file), "--report", str(place)], capture_output=True, text=True, check=False
+            [val3dity, str(file), "--report", str(place), *options], capture_output=True, text=True, check=False
         )
         if not place.exists():
             raise RuntimeError(f"{val3dity} gives no report of {file}: {(done.stdout + done.stderr)[-300:]}")
@@ -185,13 +209,14 @@ def reported(file: Path, val3dity: str) -> dict[str, Any]:
         return found
 
 
-def faults_of(report: Mapping[str, Any]) -> Iterator[str]:
-    """The faults in a report, by their codes."""
-    yield from (f"dataset {error['code']} {error['description']}" for error in report["dataset_errors"])
+def faults_of(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The faults in a report by their codes, with what they are of; a file that cannot be judged is one of models."""
+    yield from (("models", f"{error['code']} {error['description']}") for error in report["dataset_errors"])
     for feature in report["features"]:
-        yield from (f"{error['code']} {error['description']}" for error in feature["errors"])
+        kind = "terrain" if feature["type"] == "TINRelief" else "models"
+        yield from ((kind, f"{error['code']} {error['description']}") for error in feature["errors"])
         if not feature["validity"] and not feature["errors"]:
-            yield "invalid without a code"
+            yield kind, "invalid without a code"
 
 
 def schema_faults(folder: Path) -> Callable[[Mapping[str, Any]], list[str]]:
@@ -211,25 +236,18 @@ def table(found: Mapping[str, Figures]) -> str:
     for name, figures in found.items():
         is_shape = name in SUITES and SUITES[name].size_m == (40.0, 40.0)
         rows.setdefault("single roof shapes" if is_shape else name, []).append(figures)
-    names = ("buildings", "solids", "triangles", "surfaces", "files", "documents")
-    lines = [[name, *_counted(parts, names)] for name, parts in rows.items()]
-    lines.append(["**all**", *_counted(list(found.values()), names)])
-    header = [
-        "data",
-        "buildings",
-        "solids",
-        "triangles of terrain",
-        "terrains",
-        "published files",
-        "documents by schema",
-    ]
-    return markdown_table([*header, "faults"], lines)
+    lines = [[name, *_summed(parts)] for name, parts in rows.items()]
+    lines.append(["**all**", *_summed(list(found.values()))])
+    return markdown_table(["data", *COUNTED.values(), *JUDGED.values()], lines)
 
 
-def _counted(parts: Sequence[Figures], names: Iterable[str]) -> list[str]:
-    faults = sum((collections.Counter(part.invalid) for part in parts), collections.Counter[str]())
-    reported_faults = "; ".join(f"{count} x {fault}" for fault, count in sorted(faults.items())) or "0"
-    return [*(f"{sum(getattr(part, name) for part in parts):,}" for name in names), reported_faults]
+def _summed(parts: Sequence[Figures]) -> list[str]:
+    """The cells of a row."""
+    cells = [f"{sum(getattr(part, name) for part in parts):,}" for name in COUNTED]
+    for name in JUDGED:
+        faults = sum((collections.Counter(part.invalid[name]) for part in parts), collections.Counter[str]())
+        cells.append("; ".join(f"{count} of {fault}" for fault, count in sorted(faults.items())) or "0")
+    return cells
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from chromium import Visit
+from finished_jobs import finished_job
 from processes import missing, program
 
 from pipeline.export.geoparquet import read_table
@@ -32,6 +33,10 @@ PICKED = """() => {
   }
 }"""
 """Where a building is drawn."""
+(_SCRIPT,) = re.findall(r"^```js\n(Cesium\..*?)^```$", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+TERRAIN_SCRIPT = _SCRIPT.replace("terrain =>", "terrain => window.terrain =")
+"""The line of the docs that adds the terrain, which stays at hand."""
+TERRAIN_DRAWN = "() => window.terrain && terrain.tilesLoaded && terrain.statistics.selected > 0"
 
 
 @pytest.fixture(scope="module")
@@ -96,12 +101,30 @@ def test_every_file_is_valid_gltf(site: Path, node: Path) -> None:
 def test_cesium_shows_the_terrain_beneath_the_models(site: Path, served: str, visit: Callable[..., Visit]) -> None:
     page = visit(served).page
     page.wait_for_function(DRAWN)
-    (script,) = re.findall(r"^```js\n(Cesium\..*?)^```$", PAGE.read_text(), re.DOTALL | re.MULTILINE)
-    page.evaluate(f"() => {{ {script.replace('terrain =>', 'terrain => window.terrain =')} }}")
-    page.wait_for_function("() => window.terrain && terrain.tilesLoaded && terrain.statistics.selected > 0")
+    page.evaluate(f"() => {{ {TERRAIN_SCRIPT} }}")
+    page.wait_for_function(TERRAIN_DRAWN)
     paths = sorted((site / "run" / "terrain").glob("*/*.city.jsonl"))
     triangles = sum(len(read_terrain(path.read_text().splitlines()).triangles) for path in paths)
     assert page.evaluate("() => terrain.statistics.numberOfTrianglesSelected") == triangles
+
+
+def test_cesium_loads_the_models_of_a_job_by_path_from_the_service(
+    site: Path, service: str, tile: Path, visit: Callable[..., Visit]
+) -> None:
+    job = finished_job(service, tile, publish=["3dtiles"], geoidHeight=43.2, settings={"terrain": "tin"})
+    place = f"{service}jobs/{job}/results/3dtiles/"
+    opened = visit(service)
+    page = opened.page
+    # as behind a proxy that puts page and service under one origin
+    page.route(f"{service}globe/**", lambda route: route.fulfill(path=site / route.request.url.partition("/globe/")[2]))
+    html = (site / "index.html").read_text().replace("city/tileset.json", f"{place}tileset.json")
+    (site / "served.html").write_text(html)
+    page.goto(f"{service}globe/served.html")
+    page.wait_for_function(DRAWN)
+    page.evaluate(f"() => {{ {TERRAIN_SCRIPT.replace('city/', place)} }}")
+    page.wait_for_function(TERRAIN_DRAWN)
+    shown = {url.removeprefix(place).partition("/")[0] for url in opened.urls if url.startswith(place)}
+    assert {"tileset.json", "terrain.json", "blocks", "terrain"} <= shown
 
 
 def test_cesium_shows_the_models_and_a_click_shows_a_record(
