@@ -57,18 +57,18 @@ REAL: Mapping[str, tuple[str, ...]] = {
 
 JUDGED = {
     "models": "faults of models",
-    "schema": "faults by schema",
-    "terrain": "faults of terrain",
-    "finely": "faults of terrain, snapped within 0.5 mm",
+    "schema": "of documents",
+    "terrain": "of terrain",
+    "finely": "of terrain, 0.5 mm",
 }
 """What is judged, and how it is called in the table."""
 COUNTED = {
     "buildings": "buildings",
     "solids": "solids",
-    "triangles": "triangles of terrain",
-    "surfaces": "surfaces of terrain",
+    "triangles": "triangles",
+    "surfaces": "surfaces",
     "files": "files",
-    "documents": "documents held against the schema",
+    "documents": "documents",
 }
 """What is counted, likewise."""
 
@@ -246,7 +246,7 @@ def _summed(parts: Sequence[Figures]) -> list[str]:
     cells = [f"{sum(getattr(part, name) for part in parts):,}" for name in COUNTED]
     for name in JUDGED:
         faults = sum((collections.Counter(part.invalid[name]) for part in parts), collections.Counter[str]())
-        cells.append("; ".join(f"{count} of {fault}" for fault, count in sorted(faults.items())) or "0")
+        cells.append(", ".join(f"{count} of {fault.split()[0]}" for fault, count in sorted(faults.items())) or "0")
     return cells
 
 

@@ -128,6 +128,8 @@ def test_further_formats_are_written_before_the_outputs_and_may_fail(bench: Benc
     events = bench.store.events(done.job_id)
     assert [event.stage for event in events if event.kind == "stage"] == ["inputs", "plan", "formats", "outputs"]
     assert [event.message for event in events if event.kind == "warning" and event.stage == "formats"]
+    # what comes before takes 90 of 100
+    assert [event.progress for event in events if event.kind == "progress" and event.stage == "formats"] == [91]
 
 
 def test_a_dismissal_is_seen_while_formats_are_written(bench: Bench) -> None:
