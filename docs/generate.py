@@ -205,7 +205,7 @@ def validity() -> str:
         "",
         *table(["code", "fault"], [[code, fault] for code, fault in codes]),
         "",
-        "The tolerances are val3dity's:",
+        "The tolerances are val3dity's ([its last report](../results/validators.md)):",
         "",
         *table(["tolerance", "value", "unit", "meaning"], tolerances),
     ]
