@@ -12,6 +12,7 @@ from finished_runs import ident, write_comparison, write_run
 from live_service import POINTS, las_bytes
 
 from service.outputs import write_comparison_outputs, write_outputs
+from service.outputs.published import publish
 
 HOW_TO = Path(__file__).resolve().parents[2] / "docs" / "how_to"
 METHODS = ["fuzzy-sart", "fuzzy-sart:faithful"]
@@ -43,6 +44,7 @@ def driven(site: Site) -> Iterator[None]:
                 write_comparison_outputs(written, labels, outputs, job.request.outputs)
             elif job.request.process_id == "reconstruct":
                 run_dir = write_run(folder.run(job.job_id, job.attempt))
+                publish(run_dir, outputs, job.request.publish, name=job.job_id)
                 write_outputs(run_dir, outputs, job.request.outputs)
             site.store.succeed(job, message="done", summary={})
 
