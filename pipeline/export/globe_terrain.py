@@ -20,7 +20,9 @@ NAME = "Terrain"
 """Name of the material."""
 COLOUR = (0.32, 0.35, 0.22)
 """Its colour in linear RGB."""
-_BYTE, _UNSIGNED_INT, _FLOAT = 5120, 5125, 5126
+_MOST_SHORT = 65_535
+"""Most vertices that numbers of 16 bits can name; the largest number restarts a primitive."""
+_BYTE, _UNSIGNED_SHORT, _UNSIGNED_INT, _FLOAT = 5120, 5123, 5125, 5126
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,7 +54,8 @@ def terrain_glb(terrain: PlacedTerrain, matrix: FloatArray) -> bytes:
     positions = metres.astype("<f4")
     normals = np.zeros((len(metres), 4), "|i1")  # each at a multiple of four bytes
     normals[:, :3] = np.rint(_normals(metres, terrain.triangles) * 127.0)
-    index = terrain.triangles.astype("<u4")
+    is_short = len(metres) <= _MOST_SHORT
+    index = terrain.triangles.astype("<u2" if is_short else "<u4")
     pieces = [positions.tobytes(), normals.tobytes(), index.tobytes()]
     starts = np.cumsum([0, *map(len, pieces)]).tolist()
     views: list[dict[str, Any]] = [
@@ -66,7 +69,12 @@ def terrain_glb(terrain: PlacedTerrain, matrix: FloatArray) -> bytes:
     accessors = [
         {"bufferView": 0, "componentType": _FLOAT, "count": len(metres), "type": "VEC3", **bounds},
         {"bufferView": 1, "componentType": _BYTE, "normalized": True, "count": len(metres), "type": "VEC3"},
-        {"bufferView": 2, "componentType": _UNSIGNED_INT, "count": index.size, "type": "SCALAR"},
+        {
+            "bufferView": 2,
+            "componentType": _UNSIGNED_SHORT if is_short else _UNSIGNED_INT,
+            "count": index.size,
+            "type": "SCALAR",
+        },
     ]
     document = {
         "asset": {"version": VERSION, "generator": "gablework"},

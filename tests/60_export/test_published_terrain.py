@@ -14,6 +14,7 @@ from glb_rules import chunks
 from small_runs import content, moved, restated, street, tiled_run
 
 from pipeline.errors import RunError
+from pipeline.export.globe_terrain import PlacedTerrain, terrain_glb
 from pipeline.export.terrain import TerrainTriangles, read_terrain, terrain_lines, terrain_path
 from pipeline.io import storage_at
 from pipeline.runtime.manifest import read_manifest
@@ -72,7 +73,7 @@ def triangles_at(path: Path, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     vertices = turned(values(primitive["attributes"]["POSITION"], "<f4", 3).astype(float)) + matrix[:3, 3]
     normals = turned(values(primitive["attributes"]["NORMAL"], "|i1", 4)[:, :3] / 127.0)
-    return vertices, normals, values(primitive["indices"], "<u4", 1).reshape(-1, 3)
+    return vertices, normals, values(primitive["indices"], "<u2", 1).reshape(-1, 3)
 
 
 def placed(out: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -165,6 +166,19 @@ def test_a_catalogue_lists_terrain_also_of_a_tile_without_buildings(run_dir: Pat
         assert asset["file:checksum"] == f"1220{hashlib.sha256(file.read_bytes()).hexdigest()}"
         assert ("buildings" in item["assets"]) == (key != ALONE)
     assert item["properties"]["proj:bbox"] == [87_000.0, 447_000.0, 88_000.0, 448_000.0]
+
+
+@pytest.mark.parametrize(("count", "component", "kind"), [(65_535, 5123, "<u2"), (65_536, 5125, "<u4")])
+def test_triangles_name_every_vertex_of_a_large_tile(count: int, component: int, kind: str) -> None:
+    triangles = np.array([[0, 1, count - 1]], np.int32)
+    terrain = PlacedTerrain(
+        geocentric=np.random.default_rng(1).random((count, 3)), triangles=triangles, region=np.eye(3)
+    )
+    document, binary = chunks(terrain_glb(terrain, np.eye(4)))
+    accessor = document["accessors"][document["meshes"][0]["primitives"][0]["indices"]]
+    start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    assert accessor["componentType"] == component
+    assert np.frombuffer(binary, kind, 3, start).tolist() == triangles[0].tolist()
 
 
 def test_damaged_terrain_is_named(run_dir: Path, tmp_path: Path) -> None:

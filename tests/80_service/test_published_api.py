@@ -167,6 +167,7 @@ def test_what_cannot_be_made_leaves_the_rest(service: runs.Service, client: Test
     assert "would have holes" in problems["geopackage"]
 
 
+@pytest.mark.slow
 def test_the_solar_table_is_an_output(service: runs.Service, client: TestClient) -> None:
     pytest.importorskip("pvlib")
     job = service.finished(publish=("solar",))
