@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from shapely import MultiPolygon, Polygon
+from shapely import LineString, MultiPolygon, Polygon
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -215,6 +215,27 @@ class Plane:
         return self.c / math.sqrt(1.0 + self.a * self.a + self.b * self.b)
 
 
+class GuideKind(StrEnum):
+    """What a given line of a roof is."""
+
+    RIDGE = "ridge"
+    HIP = "hip"
+    VALLEY = "valley"
+    EAVE = "eave"
+    STEP = "step"
+    ANY = "any"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Guide:
+    """A line of a roof that an operator gave."""
+
+    kind: GuideKind
+    """What it is; `any` where that is not known."""
+    line: LineString
+    """In plan, metres."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GivenHeights:
     """Heights of one building by the attributes of its given footprint; nan if unknown."""
@@ -267,6 +288,8 @@ class Candidate:
     """True where the data end at the candidate: it may be cut."""
     strip_offset_m: float = math.nan
     """Largest offset between two flight strips that was taken out of the points, metres; nan where none was."""
+    guides: tuple[Guide, ...] = ()
+    """Given lines near its points, in local metres."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -539,6 +562,8 @@ class BuildingResult:
     """As the candidate's."""
     walls: WallOutline | None = None
     """The walls beneath the footprint; None where it was given, or where no wall is asked for or seen."""
+    guides: tuple[int, int] | None = None
+    """Guides that its faces follow, and others over or beside them; None without a model, or without any guide near."""
     decisions: tuple[Decision, ...] = ()
     """What was checked and tried, in this order; empty where the building ended its process."""
     coarser: tuple[LodModel, ...] = ()

@@ -46,6 +46,7 @@ from pipeline.roof.flush_walls import unite_flush_walls
 from pipeline.roof.footprint import hull_of_points, outline
 from pipeline.roof.forms import UNDRAWABLE, FaceForm, arranged_forms, template_forms, traced_forms, undrawable
 from pipeline.roof.given_heights import given_block
+from pipeline.roof.guides import followed
 from pipeline.roof.lower_lods import LodParts, lower_lods
 from pipeline.roof.named_form import BLOCK, PRIMITIVE, NamedForm
 from pipeline.roof.partition import RoofPartition
@@ -120,6 +121,9 @@ def reconstruct_building(candidate: Candidate, method: str, settings: Reconstruc
     try:
         cloud = prepare_cloud(candidate, settings.roof.max_points)
         roof = roof_points(cloud, settings.roof, decisions)
+        if candidate.guides:
+            distance_m = settings.guides.distance_of(roof.spacing_m)
+            roof = dataclasses.replace(roof, guides=candidate.guides, guide_distance_m=distance_m)
         building = _Building(candidate=candidate, method=method, settings=settings, roof=roof, decisions=decisions)
         result = _reconstruct(building, cloud, segment, is_arranged=is_arranged)
     except BuildingError as error:
@@ -507,6 +511,7 @@ def _record(
     )
     solids = tuple(_renumbered(part.solid, number) for part in model.parts)
     footprint = _united([part.footprint for part in model.parts])
+    guides = followed(candidate.guides, [face.polygon for face in faces], roof.guide_distance_m)
     residuals, quality = model_quality(
         candidate.points,
         faces,
@@ -544,6 +549,7 @@ def _record(
         touches_data_edge=candidate.touches_data_edge,
         strip_offset_m=candidate.strip_offset_m,
         walls=walls_of(footprint, roof, building.settings.roof),
+        guides=guides,
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 from pipeline.errors import SettingsError
 from pipeline.methods import LODS, METHODS, PRESETS, ReconstructSettings, method_named
 from pipeline.parameters import Parameters, build, parameter
-from pipeline.roof.settings import ArrangementSettings, FootprintSettings, RoofSettings, RoofTypeSettings
+from pipeline.roof.settings import ArrangementSettings, FootprintSettings, GuideSettings, RoofSettings, RoofTypeSettings
 from pipeline.terrain.class_codes import ClassCodeSettings
 from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.terrain.settings import (
@@ -95,9 +95,10 @@ SECTIONS: Mapping[str, type[Parameters]] = {
     "roof": RoofSettings,
     "plan": ArrangementSettings,
     "roof-type": RoofTypeSettings,
+    "guides": GuideSettings,
 }
 """Tables of the settings file that every method shares; each method adds one of its own name."""
-_OPTIONAL = frozenset({"footprints"})
+_OPTIONAL = frozenset({"footprints", "guides"})
 """Tables that count in the settings hash only if they differ from the defaults, with which they do nothing."""
 
 
@@ -155,6 +156,7 @@ class RunSettings:
             "roof": self.building.roof,
             "plan": self.building.plan,
             "roof-type": self.building.roof_type,
+            "guides": self.building.guides,
             self.general.method: method,
         }
 
@@ -206,6 +208,7 @@ class RunSettings:
             roof=built.get("roof", RoofSettings()),
             plan=built.get("plan", ArrangementSettings()),
             roof_type=built.get("roof-type", RoofTypeSettings()),
+            guides=built.get("guides", GuideSettings()),
         )
         return cls(
             general=general or GeneralSettings(),

@@ -71,6 +71,10 @@ Footprints = Annotated[
     str | None,
     typer.Option(metavar="FILE", help="Building outlines (GeoPackage, GeoJSON, Shapefile, GeoParquet) to model."),
 ]
+Guides = Annotated[
+    str | None,
+    typer.Option(metavar="FILE", help="Lines of roofs (ridges, eaves, ...) that models follow; docs/how_to/guides.md."),
+]
 Bbox = Annotated[
     tuple[float, float, float, float] | None,
     typer.Option(metavar="XMIN YMIN XMAX YMAX", help="Only this rectangle, in the CRS's units."),

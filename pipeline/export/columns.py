@@ -264,6 +264,21 @@ BUILDINGS = (
         "m",
         "standard error of `overhang_m`, from the thickness of the walls' points and the differences between walls",
     ),
+    Column(
+        "guides_followed",
+        INT32,
+        COUNT,
+        "given guides that edges of the roof faces follow over at least half of their length here; null without a "
+        "model or without any guide near",
+        page="../how_to/guides.md",
+    ),
+    Column(
+        "guides_not_followed",
+        INT32,
+        COUNT,
+        "other given guides that run over the roof or beside it",
+        page="../how_to/guides.md",
+    ),
     Column("acquired_from", TIME, NONE, "earliest acquisition; null if the file has no absolute time"),
     Column("acquired_to", TIME, NONE, "latest acquisition"),
     Column("mesh_path", TEXT, NONE, "the OBJ or GLB file, relative to the run directory; null without one"),

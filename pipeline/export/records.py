@@ -105,6 +105,8 @@ def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: s
         "touches_data_edge": result.touches_data_edge,
         "strip_offset_m": _or_none(result.strip_offset_m),
         **_walls(result, context.reference),
+        "guides_followed": None if result.guides is None else result.guides[0],
+        "guides_not_followed": None if result.guides is None else result.guides[1],
         "acquired_from": facts.acquired_from,
         "acquired_to": facts.acquired_to,
         "mesh_path": mesh_path,

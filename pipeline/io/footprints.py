@@ -9,20 +9,18 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon, Polygon
 
-from pipeline.errors import CrsError, EmptyInputError, InconsistentInputError, UnreadableInputError
-from pipeline.io.crs import SpatialReference, horizontal_part, horizontal_unit_of, parse_crs
+from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
+from pipeline.io.crs import SpatialReference
+from pipeline.io.placed_features import boxes_around, in_metres
 from pipeline.io.urls import shown
 from pipeline.io.vector_layer import VectorLayer, read_layer
-
-if TYPE_CHECKING:
-    import pyproj
 
 ID_COLUMNS = (
     "building_id",
@@ -54,10 +52,6 @@ PROBLEMS = {
     "bad_value": "with an attribute that cannot be used",
 }
 """What can be wrong with a footprint, and how a message counts it."""
-ACCURACY_LIMIT_M = 0.5
-"""A coarser reprojection gives a warning."""
-AROUND_M = 100.0
-"""How far off an area footprints are still read: more than its edges bend, and operations differ, between two CRS."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -151,7 +145,7 @@ def read_footprints(
     warnings: list[str] = []
 
     def boxes(own: str | None) -> npt.NDArray[np.float64] | None:
-        return None if area is None else _boxes(area, own if crs is None else crs, reference, name)
+        return None if area is None else boxes_around(area, own if crs is None else crs, reference, name)
 
     found = read_layer(path, layer, None if area is None else boxes)
     problems: dict[int, tuple[str, str]] = {}
@@ -162,7 +156,7 @@ def read_footprints(
         lost = f"none of the {len(found.geometries)} features is a polygon"
         raise EmptyInputError(name, lost, "Give polygons of buildings")
     polygons = shapely.force_2d(geometries[kept])
-    polygons = _in_metres(name, polygons, found.crs if crs is None else crs, reference, warnings)
+    polygons = in_metres(name, "footprints", polygons, found.crs if crs is None else crs, reference, warnings)
     whole = np.isfinite(shapely.bounds(polygons)).all(axis=1)
     for row in kept[~whole].tolist():
         problems[row] = ("outside_crs", "it cannot be reprojected to the run's CRS")
@@ -198,24 +192,6 @@ def read_footprints(
     )
 
 
-def _boxes(
-    area: shapely.Geometry, crs: str | None, reference: SpatialReference, name: str
-) -> npt.NDArray[np.float64] | None:
-    """Boxes around the parts of an area in a layer's CRS, (k, 4); None if they cannot be computed there."""
-    own, target = None if crs is None else horizontal_part(parse_crs(crs, path=name)), reference.horizontal_crs
-    around = shapely.bounds(shapely.get_parts(area)) + AROUND_M * np.array([-1.0, -1.0, 1.0, 1.0])
-    boxes: npt.NDArray[np.float64] = around / reference.horizontal_unit_m
-    if own is not None and target is not None and not own.equals(target, ignore_axis_order=True):
-        import pyproj
-
-        project = pyproj.Transformer.from_crs(target, own, always_xy=True).transform_bounds
-        boxes = np.array([project(x0, y0, x1, y1, 21) for x0, y0, x1, y1 in boxes.tolist()]).reshape(-1, 4)
-        # a box across the antimeridian comes with its sides swapped
-        if not np.isfinite(boxes).all() or (boxes[:, :2] > boxes[:, 2:]).any():
-            return None
-    return boxes
-
-
 def _polygons_only(layer: VectorLayer, problems: dict[int, tuple[str, str]]) -> npt.NDArray[np.object_]:
     """Geometries, None if a feature is not a polygon; the reason goes to the problems, by row."""
     geometries = layer.geometries.copy()
@@ -248,60 +224,6 @@ def _summary(issues: Sequence[FootprintIssue]) -> list[str]:
     if n_repaired:
         warnings.append(f"{n_repaired} footprints are invalid and were repaired")
     return warnings
-
-
-def _in_metres(
-    name: str, polygons: npt.NDArray[np.object_], crs: str | None, reference: SpatialReference, warnings: list[str]
-) -> npt.NDArray[np.object_]:
-    """The polygons in metres of the run's CRS."""
-    own, target = None if crs is None else horizontal_part(parse_crs(crs, path=name)), reference.horizontal_crs
-    if own is None:
-        warnings.append("the footprints have no CRS: that of the points is assumed")
-    elif target is None:
-        # Raises where the footprints are in degrees: metres and degrees cannot meet.
-        if not math.isclose(horizontal_unit_of(own, path=name), reference.horizontal_unit_m, rel_tol=1e-9):
-            raise CrsError(
-                name,
-                f"the footprints are in {own.name!r} and the points' CRS is unknown, with another unit",
-                "Give --crs for the points",
-            )
-        warnings.append(f"the points' CRS is unknown: that of the footprints, {own.name!r}, is assumed to be the same")
-    elif len(polygons) and not own.equals(target, ignore_axis_order=True):
-        polygons = _reprojected(name, polygons, own, target, warnings)
-    if reference.horizontal_unit_m == 1.0:
-        return polygons
-    scaled: npt.NDArray[np.object_] = shapely.transform(polygons, lambda xy: xy * reference.horizontal_unit_m)
-    return scaled
-
-
-def _reprojected(
-    name: str, polygons: npt.NDArray[np.object_], own: pyproj.CRS, target: pyproj.CRS, warnings: list[str]
-) -> npt.NDArray[np.object_]:
-    """The polygons in another CRS, with a word on how well that can be done."""
-    import pyproj
-
-    transformer = pyproj.Transformer.from_crs(own, target, always_xy=True)
-
-    def project(xy: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        return np.column_stack(transformer.transform(xy[:, 0], xy[:, 1]))
-
-    moved: npt.NDArray[np.object_] = shapely.transform(polygons, project)
-    if not np.isfinite(shapely.bounds(moved)).any():
-        raise CrsError(
-            name,
-            f"the footprints cannot be reprojected from {own.name!r} to {target.name!r}: they lie outside its area",
-            "Check the CRS of the footprints and that of the points",
-        )
-    # Of the operations that PROJ weighs, the one that it used for these points.
-    accuracy_m = transformer.get_last_used_operation().accuracy
-    if accuracy_m is None or not 0.0 <= accuracy_m <= ACCURACY_LIMIT_M:
-        good_to = (
-            "an unknown accuracy" if accuracy_m is None or accuracy_m < 0.0 else f"an accuracy of {accuracy_m:g} m"
-        )
-        warnings.append(f"the footprints are reprojected from {own.name!r} to {target.name!r} with {good_to}")
-    else:
-        warnings.append(f"the footprints are reprojected from {own.name!r} to {target.name!r}")
-    return moved
 
 
 def _repaired(

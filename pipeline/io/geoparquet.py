@@ -17,7 +17,7 @@ import numpy.typing as npt
 import shapely
 
 from pipeline.errors import UnreadableInputError
-from pipeline.io.nearby import BATCH, Boxes, Nearby
+from pipeline.io.nearby import BATCH, POLYGONS, Boxes, Nearby, Shape
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -65,7 +65,7 @@ def geometry_column(path: Path, schema: pa.Schema, column: str | None = None) ->
 
 
 def read_geoparquet(
-    path: Path, column: str | None, boxes: Boxes | None = None
+    path: Path, column: str | None, boxes: Boxes | None = None, shape: Shape = POLYGONS
 ) -> tuple[str | None, npt.NDArray[np.int64], npt.NDArray[np.object_], dict[str, Sequence[Any]], int]:
     """CRS, row numbers, geometries and attributes of a file, and how many of its polygons were passed over.
 
@@ -83,7 +83,7 @@ def read_geoparquet(
     dict
         All other columns as plain Python values; other geometries and columns that only cover one are left out.
     int
-        Polygons off the boxes.
+        Polygons, or what `shape` says, off the boxes.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -92,7 +92,7 @@ def read_geoparquet(
         with pq.ParquetFile(path) as file:
             about = geometry_column(path, file.schema_arrow, column)
             name = about.name
-            nearby = Nearby(None if boxes is None else boxes(about.crs))
+            nearby = Nearby(None if boxes is None else boxes(about.crs), shape)
             rows, batches, geometries = [np.empty(0, np.int64)], [], [np.empty(0, object)]
             first = 0
             for batch in file.iter_batches(BATCH, columns=about.wanted):

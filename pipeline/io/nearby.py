@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,21 @@ Boxes = Callable[[str | None], npt.NDArray[np.float64] | None]
 they cannot be computed there."""
 
 
+class Shape(NamedTuple):
+    """What the features of a layer are."""
+
+    word: str
+    """As in GDAL's names of kinds of geometries."""
+    kinds: tuple[shapely.GeometryType, ...]
+    """The single one and the multiple one."""
+    named: str
+    """What they are to the reader of a message."""
+
+
+POLYGONS = Shape("Polygon", (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON), "footprints")
+"""The default."""
+
+
 class Nearby:
     """Which features of a layer lie near some boxes; counts the others.
 
@@ -23,12 +39,15 @@ class Nearby:
     ----------
     boxes : array, optional
         (k, 4) float64: xmin, ymin, xmax, ymax in the layer's CRS; None takes all features for near.
+    shape : Shape
+        What is counted of those that are passed over.
     """
 
-    def __init__(self, boxes: npt.NDArray[np.float64] | None) -> None:
+    def __init__(self, boxes: npt.NDArray[np.float64] | None, shape: Shape = POLYGONS) -> None:
+        self._kinds = shape.kinds
         self._tree = None if boxes is None else shapely.STRtree(shapely.box(*np.reshape(boxes, (-1, 4)).T))
         self.elsewhere = 0
-        """Polygons that were passed over."""
+        """Polygons, or what the shape says, that were passed over."""
 
     @property
     def all(self) -> bool:
@@ -45,5 +64,5 @@ class Nearby:
         near[placed] = False
         near[np.flatnonzero(placed)[np.unique(self._tree.query(geometries[placed])[0])]] = True
         kinds = shapely.get_type_id(geometries[~near])
-        self.elsewhere += int(np.isin(kinds, (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON)).sum())
+        self.elsewhere += int(np.isin(kinds, self._kinds).sum())
         return near

@@ -17,7 +17,7 @@ import shapely
 
 from pipeline.errors import InputError, UnreadableInputError
 from pipeline.io.formats import first_bytes
-from pipeline.io.nearby import BATCH, Boxes, Nearby
+from pipeline.io.nearby import BATCH, POLYGONS, Boxes, Nearby, Shape
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.urls import is_url, shown
 
@@ -46,11 +46,11 @@ class VectorLayer:
     columns: Mapping[str, Sequence[Any]]
     """All columns but the geometry, by name."""
     elsewhere: int = 0
-    """Polygons of the file that were passed over, since they lie off the boxes."""
+    """Features of the wanted shape that were passed over, since they lie off the boxes."""
 
 
-def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None) -> VectorLayer:
-    """The one layer of a file that can hold polygons, or the named one.
+def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None, shape: Shape = POLYGONS) -> VectorLayer:
+    """The one layer of a file that can hold polygons, or features of another shape, or the named one.
 
     Raises UnreadableInputError if the file cannot be read as vector data, or the layer is not there.
 
@@ -62,26 +62,30 @@ def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None) 
         The layer; of GeoParquet the geometry column.
     boxes : callable, optional
         Where features are wanted; those whose bounds meet none of its boxes are passed over. None reads all.
+    shape : Shape
+        What the features are.
     """
     label = shown(str(path))
     if is_url(path) and label.lower().endswith(".shp"):
         raise UnreadableInputError(label, "a Shapefile is several files", "Give a GeoPackage, or fetch its files first")
     with on_this_machine(path) as file:
         try:
-            return _read(file, layer, boxes)
+            return _read(file, layer, boxes, shape)
         except InputError as fault:
             raise fault.of(label, str(file)) from fault
 
 
-def _read(path: Path, layer: str | None, boxes: Boxes | None) -> VectorLayer:
+def _read(path: Path, layer: str | None, boxes: Boxes | None, shape: Shape) -> VectorLayer:
     """The layer of a file of this machine."""
     head = first_bytes(path)
     if head.startswith(PARQUET_MAGIC):
         from pipeline.io.geoparquet import read_geoparquet
 
-        crs, feature_ids, geometry_bytes, columns, elsewhere = read_geoparquet(path, layer, boxes)
+        crs, feature_ids, geometry_bytes, columns, elsewhere = read_geoparquet(path, layer, boxes, shape)
     else:
-        crs, feature_ids, geometry_bytes, columns, elsewhere = _by_gdal(path, _driver_of(path, head), layer, boxes)
+        crs, feature_ids, geometry_bytes, columns, elsewhere = _by_gdal(
+            path, _driver_of(path, head), layer, boxes, shape
+        )
     geometries: npt.NDArray[np.object_] = np.asarray(shapely.from_wkb(geometry_bytes, on_invalid="ignore"), object)
     there = np.array([data is not None for data in geometry_bytes], np.bool_)
     return VectorLayer(
@@ -106,7 +110,7 @@ def _driver_of(path: Path, head: bytes) -> str:
 
 
 def _by_gdal(
-    path: Path, source: str, layer: str | None, boxes: Boxes | None
+    path: Path, source: str, layer: str | None, boxes: Boxes | None, shape: Shape
 ) -> tuple[str | None, npt.NDArray[np.int64], npt.NDArray[np.object_], dict[str, Sequence[Any]], int]:
     """CRS, feature ids, WKB and columns of a layer, and how many of its polygons were passed over."""
     import pyogrio
@@ -116,17 +120,17 @@ def _by_gdal(
         layers = {str(name): kind for name, kind in pyogrio.list_layers(source)}
         if layer is None:
             # The kind is None for tables without geometry and "Unknown" where a layer does not say.
-            found = [name for name, kind in layers.items() if kind and ("Polygon" in kind or "Unknown" in kind)]
+            found = [name for name, kind in layers.items() if kind and (shape.word in kind or "Unknown" in kind)]
             found = found or [name for name, kind in layers.items() if kind]
         else:
             found = [name for name in layers if name == layer]
         if len(found) != 1:
             raise UnreadableInputError(
                 str(path),
-                f"layer {layer!r} is not there" if layer else f"{len(found)} layers could be the footprints",
+                f"layer {layer!r} is not there" if layer else f"{len(found)} layers could be the {shape.named}",
                 f"Name one of the layers {', '.join(sorted(layers)) or '(there are none)'}",
             )
-        near, elsewhere = (None, 0) if boxes is None else _near(source, found[0], boxes)
+        near, elsewhere = (None, 0) if boxes is None else _near(source, found[0], boxes, shape)
         none = near is not None and len(near) == 0
         meta, feature_ids, geometry_bytes, columns = pyogrio.raw.read(
             source,
@@ -142,14 +146,14 @@ def _by_gdal(
     return meta["crs"], feature_ids[kept].astype(np.int64), geometry_bytes[kept], named, elsewhere
 
 
-def _near(source: str, layer: str, boxes: Boxes) -> tuple[npt.NDArray[np.int64] | None, int]:
+def _near(source: str, layer: str, boxes: Boxes, shape: Shape) -> tuple[npt.NDArray[np.int64] | None, int]:
     """The ids of the features near the boxes, None where all are; and how many polygons are not."""
     import pyogrio
 
     with pyogrio.raw.open_arrow(
         source, layer=layer, columns=[], batch_size=BATCH, return_fids=True, use_pyarrow=True
     ) as (meta, reader):
-        nearby = Nearby(boxes(meta["crs"]))
+        nearby = Nearby(boxes(meta["crs"]), shape)
         if nearby.all:
             return None, 0
         geometry = meta["geometry_name"] or "wkb_geometry"

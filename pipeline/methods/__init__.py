@@ -15,7 +15,7 @@ from pipeline.methods.settings import (
     RoofFaceSettings,
 )
 from pipeline.parameters import Parameters
-from pipeline.roof.settings import ArrangementSettings, RoofSettings, RoofTypeSettings
+from pipeline.roof.settings import ArrangementSettings, GuideSettings, RoofSettings, RoofTypeSettings
 from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
 
 if TYPE_CHECKING:
@@ -135,6 +135,8 @@ class ReconstructSettings:
     """Costs of roof faces, where they are arranged."""
     roof_type: RoofTypeSettings = dataclasses.field(default_factory=RoofTypeSettings)
     """Thresholds of the roof types."""
+    guides: GuideSettings = dataclasses.field(default_factory=GuideSettings)
+    """Given lines of the roof."""
     lods: tuple[str, ...] = LODS[-1:]
     """Levels of detail to be modelled, of `LODS` and in their order."""
 

@@ -19,6 +19,7 @@ from pipeline.model import (
     BoolArray,
     Decision,
     FloatArray,
+    Guide,
     IntArray,
     LabelArray,
     Plane,
@@ -27,11 +28,15 @@ from pipeline.model import (
     WallOutline,
 )
 from pipeline.roof.arrangement.arranging import arrange
+from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides
 from pipeline.roof.borders import straighten_borders
 from pipeline.roof.eaves import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
+from pipeline.roof.enclosed_planes import with_enclosed_planes
 from pipeline.roof.facades import FacadePoints, walls_beneath
 from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, outline, polygons_of
+from pipeline.roof.guided_faces import guided_faces
+from pipeline.roof.guides import inner_pieces
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels, nearest_points
 from pipeline.roof.named_form import TRACED, NamedForm
 from pipeline.roof.partition import (
@@ -73,6 +78,10 @@ class RoofPoints:
     """The given footprint in integer millimetres."""
     outline_mm: MultiPolygon | None = None
     """The outline that was drawn together with touching units; integer millimetres."""
+    guides: tuple[Guide, ...] = ()
+    """Given lines, local metres."""
+    guide_distance_m: float = 0.0
+    """How far lines and edges may lie from a guide that takes their place."""
     facades: FacadePoints | None = None
     """Points that show the walls beneath; None where no wall is asked for."""
 
@@ -266,12 +275,25 @@ def arranged_faces(
     costs: ArrangementSettings,
     clearance: float = 1.0,
 ) -> RoofPartition:
-    """The plan as an arrangement of the lines in which planes meet.
+    """The plan as an arrangement of the lines in which planes meet, and of guides that the points bear out.
 
     Raises BuildingError `no_partition` where the outline cannot be filled.
     """
     coefficients = np.array([plane.coefficients for plane in planes], np.float64).reshape(len(planes), 3)
-    return arrange(roof.points, roof.labels, coefficients, outline_mm, roof.spacing_m, costs, clearance)
+
+    labels = roof.labels
+
+    def arranged(guides: Guides) -> RoofPartition:
+        return arrange(roof.points, labels, coefficients, outline_mm, roof.spacing_m, costs, clearance, guides)
+
+    free = arranged(NO_GUIDES)
+    if not roof.guides:
+        return free
+    pieces, may_step = inner_pieces(roof.guides, outline_mm)
+    guides = Guides(pieces, roof.guide_distance_m)
+    coefficients, labels = with_enclosed_planes(roof.points, labels, coefficients, pieces, outline_mm, costs)
+    beside_m = max(guides.distance_m, roof.spacing_m)
+    return guided_faces(arranged, free, roof.points, guides, may_step, beside_m, costs.residual_cap_m)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

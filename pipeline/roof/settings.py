@@ -5,6 +5,9 @@ from __future__ import annotations
 from pipeline.parameters import Parameters, parameter
 
 _CELL_SPACINGS = 1.2
+_GUIDE_SPACINGS = 0.4
+GUIDE_REACH_M = 2.0
+"""Guides within this distance of the box of a building's points concern it: no line moves farther to a guide."""
 """A cell of dense points then holds one or two of them."""
 _MIN_CELL_M = 0.25
 """A superstructure of a metre has four such cells per side."""
@@ -284,6 +287,30 @@ class ArrangementSettings(Parameters):
         """
         by_area = max(self.face_cost, self.face_area_m2 * points_per_m2)
         return max(self.face_cost, min(by_area, self.face_points)), by_area
+
+
+class GuideSettings(Parameters):
+    """Given lines of roofs."""
+
+    kind_column: str = parameter("kind", "Column of the file with the kinds of the lines.")
+    distance_m: float = parameter(
+        0.4,
+        "How far a line of the points, or an edge of the outline, may lie from a guide that takes its place; at least "
+        "0.4 point spacings.",
+        unit="m",
+        minimum=0.0,
+        maximum=GUIDE_REACH_M,
+    )
+
+    def distance_of(self, spacing_m: float) -> float:
+        """The distance for a spacing, metres.
+
+        Examples
+        --------
+        >>> [GuideSettings().distance_of(spacing_m) for spacing_m in (0.5, 2.0)]
+        [0.4, 0.8]
+        """
+        return max(self.distance_m, _GUIDE_SPACINGS * spacing_m)
 
 
 class RoofTypeSettings(Parameters):

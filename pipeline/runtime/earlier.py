@@ -133,6 +133,7 @@ def request_of(manifest: RunManifest) -> RunRequest:
         out="",
         settings=settings,
         footprints=asked["footprints"],
+        guides=asked.get("guides"),
         crs=asked["crs"],
         vertical_unit=asked["vertical_unit"],
         allow_outside_area_of_use=True,  # decided by the run itself
@@ -151,8 +152,8 @@ def check_points(manifest: RunManifest, paths: Sequence[str], ingested: Sequence
 
 
 def check_outlines(manifest: RunManifest, request: RunRequest) -> None:
-    """Refuse footprints, or an area of interest, that the run did not have."""
+    """Refuse footprints, guides, or an area of interest, that the run did not have."""
     known = {entry.path: entry.sha256 for entry in manifest.inputs if entry.n_points is None}
-    for path in (request.footprints, request.aoi):
+    for path in (request.footprints, request.guides, request.aoi):
         if path is not None and known.get(shown(path)) != input_file(path).sha256:
             raise RunError(f"{shown(path)} is not the file that the run read. {_AGAIN}")

@@ -37,6 +37,8 @@ class RunRequest:
     """What the run runs with."""
     footprints: str | None = None
     """A vector file of the building outlines to model."""
+    guides: str | None = None
+    """A vector file of lines of roofs."""
     overrides: str | None = None
     """A TOML file of corrections to single buildings; `pipeline.runtime.overrides.overrides_file`."""
     crs: str | None = None
@@ -117,6 +119,7 @@ def request_record(request: RunRequest) -> dict[str, object]:
     """The part of the request stored in `run.json`, from which single buildings of the run can be modelled again."""
     files = {
         "footprints": request.footprints,
+        "guides": request.guides,
         "overrides": request.overrides,
         "aoi": request.aoi,
         "work": request.resources.work,

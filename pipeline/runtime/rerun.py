@@ -54,6 +54,7 @@ from pipeline.runtime.stages.apply_overrides import WARNING, EntryOutcome, apply
 from pipeline.runtime.stages.batch_figures import REJECTED, Modelled
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints_of_run
+from pipeline.runtime.stages.given_guides import given_guides
 from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested, points_by_tile
@@ -154,6 +155,9 @@ def _rerun(
         raise RunError(f"{', '.join(unknown)}: no building of {earlier.run_dir}. Give ids of its buildings table")
     plan, paths = plan_inputs(dataclasses.replace(wanted, resources=request.resources), progress, cancelled, executor)
     footprints = footprints_of_run(wanted.footprints, plan, wanted.settings.footprints)
+    guides = None
+    if wanted.guides is not None:
+        guides = given_guides(wanted.guides, plan, wanted.settings.building.guides.kind_column)
     overrides = () if wanted.overrides is None else read_overrides(wanted.overrides, plan.reference, wanted.settings)
     check_outlines(earlier.manifest, wanted)
     with run_context(
@@ -187,7 +191,7 @@ def _rerun(
         if wanted.settings.general.terrain != "none":
             progress.warn("publish", _TERRAIN_GONE)
         again = joined_of(store_sites(context, "again", found.again), 0, found.splits.keys)
-        models = reconstruct(context, wanted.settings, again)
+        models = reconstruct(context, wanted.settings, again, guides)
         modelled = list(models.each())
         new = LocalStorage(root=Path(context.scratch.root, _NEW))
         prepared = _prepared(search, found, models, new)

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline import __version__
-from pipeline.errors import RunCancelledError, RunError
+from pipeline.errors import InputError, RunCancelledError, RunError
 from pipeline.export.point_files import FOLDER as POINTS_FOLDER
 from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
 from pipeline.io import SpatialReference, Storage, is_url, shown, storage_at
-from pipeline.methods import ReconstructSettings
+from pipeline.methods import ReconstructSettings, method_named
 from pipeline.runtime.cluster.serial_executor import Executor, run_alone
 from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.preloading import loads_of
@@ -48,6 +48,7 @@ from pipeline.runtime.stages.content_digest import STAGE as DIGEST
 from pipeline.runtime.stages.content_digest import content_digest
 from pipeline.runtime.stages.counts import run_counts
 from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints_of_run
+from pipeline.runtime.stages.given_guides import GivenGuides, given_guides
 from pipeline.runtime.stages.ground import Ground, find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested
@@ -65,6 +66,8 @@ if TYPE_CHECKING:  # loads kernels, which few drivers need
 
 FOOTPRINTS = "footprints.json"
 """File of the run directory with the faults of the given footprints, one by one."""
+GUIDES = "guides.json"
+"""The same of the given guides."""
 OVERRIDES = "overrides.json"
 """File of the run directory with the outcome of each entry of the overrides."""
 
@@ -210,6 +213,11 @@ def run_variants(
     footprints = footprints_of_run(request.footprints, plan, request.settings.footprints)
     for warning in () if footprints is None else footprints.warnings:
         progress.warn("plan", warning)
+    guides = None
+    if request.guides is not None:
+        guides = _given_guides(request, plan, variants)
+        for warning in guides.warnings:
+            progress.warn("plan", warning)
     overrides = () if request.overrides is None else read_overrides(request.overrides, plan.reference, settings)
     runs = [_VariantRun.of(variant, request, plan, progress, started_at) for variant in variants]
     progress.timings["plan"] = time.perf_counter() - began
@@ -232,14 +240,16 @@ def run_variants(
         )
         # all checks passed: only now are results of an earlier run removed
         for one in runs:
-            one.begin(footprints, resources.work, points=request.points, terrain=settings.general.terrain != "none")
+            one.begin(
+                footprints, guides, resources.work, points=request.points, terrain=settings.general.terrain != "none"
+            )
         for path in outdated:
             path.unlink(missing_ok=True)
         try:
             found = _find_candidates(context, settings, paths, footprints)
             if request.overrides is not None:
                 found = _override(context, settings, found, overrides, runs)
-            _model(context, request, found, runs)
+            _model(context, request, found, guides, runs)
             for one in runs:
                 one.find_digest(context, found.joined)
         except BaseException as error:
@@ -302,7 +312,26 @@ def _override(
     return dataclasses.replace(found, joined=joined)
 
 
-def _model(context: RunContext, request: RunRequest, found: _Candidates, runs: Sequence[_VariantRun]) -> None:
+def _given_guides(request: RunRequest, plan: Plan, variants: Sequence[RunVariant]) -> GivenGuides:
+    """The guides of a run; raises InputError if they cannot be used, also by a method that takes none."""
+    settings = [variant.settings_in(request.settings) for variant in variants]
+    for one in settings:
+        if not one.building.arranges(method_named(one.general.method)):
+            raise InputError(
+                shown(str(request.guides)),
+                f"{one.general.method} traces roof faces from labelled points and takes no guides",
+                'Use faces = "arranged" or the method arrangement, or leave --guides out',
+            )
+    return given_guides(str(request.guides), plan, settings[0].building.guides.kind_column)
+
+
+def _model(
+    context: RunContext,
+    request: RunRequest,
+    found: _Candidates,
+    guides: GivenGuides | None,
+    runs: Sequence[_VariantRun],
+) -> None:
     """The stages of each variant: models, then publishing."""
     several = len(runs) > 1
     for number, one in enumerate(runs):
@@ -312,7 +341,7 @@ def _model(context: RunContext, request: RunRequest, found: _Candidates, runs: S
         for one in runs
     ]
     for one, part, settings in own:
-        one.models = reconstruct(part, settings, found.joined, compared=several)
+        one.models = reconstruct(part, settings, found.joined, guides, compared=several)
     for one, part, settings in own:
         output = RunOutput(run_dir=one.run_dir, meshes=request.meshes)
         one.published = publish(part, settings, found.splits, found.joined, one.models, output)
@@ -396,11 +425,19 @@ class _VariantRun:
         """The run directory's storage."""
         return storage_at(self.run_dir)
 
-    def begin(self, footprints: GivenFootprints | None, work: str | None, *, points: bool, terrain: bool) -> None:
+    def begin(
+        self,
+        footprints: GivenFootprints | None,
+        guides: GivenGuides | None,
+        work: str | None,
+        *,
+        points: bool,
+        terrain: bool,
+    ) -> None:
         """Remove an earlier run, except what the work folder knows; readers see that the directory changes."""
         known = work is not None and _is_of_work(self.run_dir, work)
         write_manifest(self.run_dir, self.manifest, self.storage.put)
-        outdated = [FOOTPRINTS, OVERRIDES, PAGE]
+        outdated = [FOOTPRINTS, GUIDES, OVERRIDES, PAGE]
         if not (known and points):
             outdated.append(POINTS_FOLDER)
         if not (known and terrain):
@@ -408,6 +445,8 @@ class _VariantRun:
         self.storage.clear(outdated if known else [*outdated, *_RESULTS])
         if footprints is not None:
             put_json(self.run_dir, FOOTPRINTS, footprints.report)
+        if guides is not None:
+            put_json(self.run_dir, GUIDES, guides.report)
 
     def fail(self, error: BaseException) -> None:
         """Write how the run ended."""
@@ -504,7 +543,8 @@ def _input_files(
         )
         for path, found in zip(paths, ingested, strict=True)
     ]
-    inputs.extend(input_file(name) for name in (request.footprints, request.aoi, request.overrides) if name is not None)
+    others = (request.footprints, request.guides, request.aoi, request.overrides)
+    inputs.extend(input_file(name) for name in others if name is not None)
     return tuple(inputs)
 
 

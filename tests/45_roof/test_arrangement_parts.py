@@ -196,7 +196,7 @@ def edge_through(plan: Subdivision, x: int, y: int) -> int:
 
 def united(plan: Subdivision, misfits: IntArray, labels: LabelArray, limits: Limits) -> int:
     """The number of faces that stay, of one cell each with a hundred points."""
-    pairs, weights = cell_borders(plan, 0.01)
+    pairs, weights = cell_borders(plan, 0.01, np.empty((0, 4)))
     unite_faces(plan, misfits, np.full(len(labels), 100, np.int32), pairs, weights, labels, limits)
     return connected_faces(labels, pairs)[1]
 

@@ -19,9 +19,9 @@ from pipeline.errors import SettingsError, UnreadableInputError
 from pipeline.io.crs import SpatialReference
 from pipeline.methods import ReconstructSettings
 from pipeline.methods.settings import FuzzySartSettings
-from pipeline.model import Candidate, Status
+from pipeline.model import Candidate, Guide, GuideKind, Status
 from pipeline.reconstruct import reconstruct_building
-from pipeline.roof.settings import ArrangementSettings, RoofSettings
+from pipeline.roof.settings import ArrangementSettings, GuideSettings, RoofSettings
 from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.isolation.replay_bundle import Bundle, Incident, read_bundle, write_bundle
 from pipeline.runtime.replay import replay
@@ -50,6 +50,7 @@ def bundle() -> Bundle:
         outline=shapely.MultiPolygon([shapely.box(0.0, 0.0, 10.0, 9.9)]),
         touches_data_edge=True,
         strip_offset_m=0.25,
+        guides=(Guide(kind=GuideKind.HIP, line=shapely.LineString([(0.5, 0.25), (3.0, 4.0)])),),
     )
     return Bundle(
         candidate=candidate,
@@ -58,6 +59,7 @@ def bundle() -> Bundle:
             method=FuzzySartSettings(vigilance=0.9),
             roof=RoofSettings(min_roof_height_m=1.0),
             plan=ArrangementSettings(line_reach_m=0.7),
+            guides=GuideSettings(distance_m=0.9),
             lods=("1.2", "2.2"),
         ),
         incident=Incident(reason="crashed", detail="by signal 11", seconds=1.5, memory_bytes=7, stderr="Fatal: ä\n"),

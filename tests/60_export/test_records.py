@@ -31,7 +31,8 @@ footprint_area_m2, footprint_share, roof_area_m2, volume_m3, n_points, density_p
 detection_confidence, n_planes, rmse_m, p95_m, coverage, point_spacing_m, noise_m, share_within_0_2m, unexplained_m2,
 largest_hole_m, ridge_z_sigma_m, bic_margin,
 is_curved, valid, validity_codes, touches_data_edge, strip_offset_m, wall_outline, overhang_m, overhang_sigma_m,
-acquired_from, acquired_to, mesh_path, input_hash, settings_hash, engine_version"""
+guides_followed, guides_not_followed, acquired_from, acquired_to, mesh_path, input_hash, settings_hash,
+engine_version"""
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
 
 
@@ -99,6 +100,7 @@ def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts: Contexts) 
         *("point_spacing_m", "noise_m", "share_within_0_2m", "unexplained_m2", "largest_hole_m", "ridge_z_sigma_m"),
         *("strip_offset_m", "wall_outline", "overhang_m", "overhang_sigma_m"),
         *("through_share", "detection_confidence", "ground_source", "height_source"),
+        *("guides_followed", "guides_not_followed"),
         *("bic_margin", "source_attributes", "overridden", "mesh_path", "input_hash"),
         *("solid", "solid_parts", "solid_surfaces", "solid_planes"),
         *("solid_lod12", "solid_lod12_parts", "solid_lod12_surfaces"),

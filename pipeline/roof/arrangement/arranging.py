@@ -23,6 +23,7 @@ from pipeline.roof.arrangement.far_corners import (
     heights_raster,
     with_level_planes,
 )
+from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides, mark_edges_on_guides, with_guides
 from pipeline.roof.arrangement.joined_planes import joined_planes
 from pipeline.roof.arrangement.limits import Limits, limits_at
 from pipeline.roof.arrangement.merged_vertices import merge_vertices, rings_with_merged
@@ -79,9 +80,9 @@ def _outline_edges(outline: _Outline) -> FloatArray:
 
 @kernel(inline="always")
 def _planes_and_lines(
-    points: FloatArray, planes: FloatArray, edges: FloatArray, limits: Limits
+    points: FloatArray, planes: FloatArray, edges: FloatArray, guides: Guides, limits: Limits
 ) -> tuple[FloatArray, CandidateLines]:
-    """The planes refitted to the points of their coarse labels, (k, 3), and lines along the borders of those."""
+    """The planes refitted to the points of their coarse labels, (k, 3); guides and lines along the borders of those."""
     k, cap_m = len(planes), limits.cap_m
     if k == 1:
         nowhere = np.empty(0, np.int32)
@@ -91,11 +92,11 @@ def _planes_and_lines(
     planes = refitted_planes(points, labels_of_points(points, labels, raster), planes, cap_m)
     places, pairs = border_places(labels, raster, k)
     lines = candidate_lines(places, pairs, points, planes, edges, raster.cell_m, cap_m, limits.line_length_m)
-    return planes, lines
+    return planes, with_guides(lines, guides, raster.cell_m, limits.line_length_m)
 
 
 @kernel(inline="always")
-def _label_cells(
+def _label_cells(  # noqa: PLR0913 - the parts of one arrangement
     plan: Subdivision,
     points: FloatArray,
     labels: LabelArray,
@@ -103,18 +104,20 @@ def _label_cells(
     limits: Limits,
     around: HeightsAround,
     is_again: bool,
+    guides: FloatArray,
     chosen: LabelArray,
 ) -> IntArray:
     """Give every cell its plane, in place of those `chosen` before, -1 for none; the cell of each point, (n,).
 
-    `labels` are the planes of the points. From the second time on planes that are far from the points cost more.
+    `labels` are the planes of the points. From the second time on planes that are far from the points cost more. The
+    pieces of guides (g, 4) lie on the first lines.
     """
     n_cells = plan.counts[CELLS]
     cells = cells_of_points(plan, points)
     costs, misfits = cell_costs(plan, points, labels, planes, cells, limits)
     if is_again:
         add_costs_of_far_planes(plan, planes, around, limits.overshoot_m, costs, misfits)
-    borders, weights = cell_borders(plan, limits.cost_per_m)
+    borders, weights = cell_borders(plan, limits.cost_per_m, guides)
     for i in range(n_cells):
         if chosen[i] < 0:
             chosen[i] = np.argmin(costs[i])
@@ -149,10 +152,10 @@ def clean_borders(
 
 @kernel
 def _arranged(
-    points: FloatArray, labels: LabelArray, planes: FloatArray, outline: _Outline, limits: Limits
+    points: FloatArray, labels: LabelArray, planes: FloatArray, outline: _Outline, guides: Guides, limits: Limits
 ) -> _Arranged:
     """Kernel of `arrange`."""
-    planes, lines = _planes_and_lines(points, planes, _outline_edges(outline), limits)
+    planes, lines = _planes_and_lines(points, planes, _outline_edges(outline), guides, limits)
     n_lines = len(lines.lines)
     plan = subdivision_of(outline.xy, outline.starts, outline.polygons, _SPARE_EDGES + _EDGES_PER_LINE * n_lines)
     counts = plan.counts
@@ -170,7 +173,7 @@ def _arranged(
         known = n_cells
         chosen = cell_labels[:n_cells]
         around = heights_around(plan, raster_of_heights)
-        cells = _label_cells(plan, points, labels, planes, limits, around, attempt > 0, chosen)
+        cells = _label_cells(plan, points, labels, planes, limits, around, attempt > 0, guides.pieces, chosen)
         for i in range(len(points)):
             label_of_point[i] = chosen[cells[i]] if cells[i] >= 0 else -1
         if attempt == _CUTS:
@@ -190,6 +193,7 @@ def _arranged(
     xy = np.concatenate((plan.xy, np.zeros((1, 2), np.int64)))
     if n_faces > 1 and limits.clearance == 1.0:
         edges = edges_of_rings(xy, vertices, ring_starts, owner)
+        mark_edges_on_guides(xy, edges, guides.pieces)
         borders = Borders(xy, edges, plane_of_face, np.arange(len(xy)) < len(outline.xy))
         rings = vertices, ring_starts
         vertices, ring_starts, planes = clean_borders(borders, rings, points, label_of_point, planes, limits)
@@ -227,6 +231,7 @@ def arrange(
     spacing_m: float,
     settings: ArrangementSettings,
     clearance: float = 1.0,
+    guides: Guides = NO_GUIDES,
 ) -> RoofPartition:
     """Fill an outline with the roof faces that explain the points best for their number and their borders' length.
 
@@ -250,6 +255,8 @@ def arrange(
     clearance : float
         Times the usual distances that vertices keep from each other; more where planes nearly meet in one point and no
         solid is valid.
+    guides : Guides
+        Given lines, local metres, along which faces may part at no cost.
 
     Returns
     -------
@@ -274,7 +281,9 @@ def arrange(
     moved = np.ascontiguousarray(planes, dtype=np.float64).copy()
     moved[:, 2] += moved[:, 0] * shift[0] + moved[:, 1] * shift[1]
     limits = limits_at(spacing_m, settings, clearance)
-    found = _arranged(points - shift, labels, moved, _Outline(ring_xy - low, ring_starts, polygon_of_ring), limits)
+    near = Guides(guides.pieces - np.array([*shift[:2], *shift[:2]]), guides.distance_m)
+    outline = _Outline(ring_xy - low, ring_starts, polygon_of_ring)
+    found = _arranged(points - shift, labels, moved, outline, near, limits)
     nodes, ring_of, owner, is_sound = found.rings
     polygons = _polygons(nodes + low, ring_of, owner) if is_sound else None
     if polygons is None:

@@ -18,9 +18,10 @@ from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.merge_sort import ascending_order
 from pipeline.kernels.union_find import numbered_sets, unite
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
+from pipeline.roof.arrangement.guide_lines import length_on_guide
 from pipeline.roof.arrangement.limits import Limits
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
-from pipeline.roof.arrangement.subdivision import CELLS, EDGES, FACE, ORIGIN, Subdivision, between_vertices
+from pipeline.roof.arrangement.subdivision import CELLS, EDGES, FACE, LINE, ORIGIN, Subdivision, between_vertices
 
 _MIN_BEYOND = 3.0
 """Points that a cell counts for at least where a plane leaves the heights of its own: splinters hold none."""
@@ -174,8 +175,11 @@ def cell_costs(
 
 
 @kernel
-def cell_borders(plan: Subdivision, cost_per_m: float) -> tuple[IntArray, IntArray]:
-    """Pairs of cells that share an edge, (m, 2), and what a border there costs, (m,), thousandths of points."""
+def cell_borders(plan: Subdivision, cost_per_m: float, guides: FloatArray) -> tuple[IntArray, IntArray]:
+    """Pairs of cells that share an edge, (m, 2), and what a border there costs, (m,), thousandths of points.
+
+    The pieces of guides (g, 4), metres, lie on the first lines. Borders on them cost nothing.
+    """
     xy, graph, n_edges = plan.xy, plan.graph, plan.counts[EDGES]
     pairs = np.empty((n_edges // 2, 2), np.int64)
     weights = np.empty(n_edges // 2, np.int64)
@@ -187,6 +191,8 @@ def cell_borders(plan: Subdivision, cost_per_m: float) -> tuple[IntArray, IntArr
         p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
         length = math.hypot(float(xy[q, 0] - xy[p, 0]), float(xy[q, 1] - xy[p, 1])) * 1e-3
         pairs[m, 0], pairs[m, 1] = f, g
+        if 0 <= graph[h, LINE] < len(guides):
+            length -= length_on_guide(xy, p, q, guides[graph[h, LINE]])
         weights[m] = int(COST_SCALE * cost_per_m * length)
         m += 1
     return pairs[:m], weights[:m]

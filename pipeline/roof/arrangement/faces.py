@@ -201,7 +201,7 @@ def part_crossings(
         np.empty(2 * _MAX_BORDERS, np.bool_),
     )
     borders = star.borders
-    pairs, _ = cell_borders(plan, 0.0)
+    pairs, _ = cell_borders(plan, 0.0, np.empty((0, 4)))
     faces, n_faces = connected_faces(labels[: counts[CELLS]], pairs)
     leaving = np.full(len(xy), -1, np.int64)
     for h in range(counts[EDGES]):
@@ -232,7 +232,7 @@ def part_crossings(
                 label = labels[graph[borders[giver], FACE]]
                 given = _give_corner(plan, labels, borders[corner], borders[(corner + 1) % m], label, corner_mm)
                 star.refused[choice] = not given
-            pairs, _ = cell_borders(plan, 0.0)
+            pairs, _ = cell_borders(plan, 0.0, np.empty((0, 4)))
             faces, n_faces = connected_faces(labels[: counts[CELLS]], pairs)
             if not given:
                 break

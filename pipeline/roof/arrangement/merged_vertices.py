@@ -16,6 +16,7 @@ from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import FloatArray, IntArray
 from pipeline.roof.arrangement.limits import Limits
 from pipeline.roof.arrangement.movable_borders import (
+    KEEPS,
     MAX_DEGREE,
     Borders,
     Buckets,
@@ -27,6 +28,8 @@ from pipeline.roof.arrangement.movable_borders import (
     star_is_sound,
 )
 
+_ONE_WAY = 0.1
+"""Sine of the angle below which edges have one direction."""
 _ROUNDS = 8
 """Most turns through all edges: bounds the work; it ends as soon as nothing changes."""
 
@@ -76,13 +79,24 @@ def _corners_saved(
 
 
 @kernel(inline="always")
+def _are_parallel(xy: IntArray, edges: IntArray, one: int, other: int) -> bool:
+    """Whether two edges have one direction, but for what rounding to 1 mm and passing through vertices turn them."""
+    ax, ay = xy[edges[one, 1], 0] - xy[edges[one, 0], 0], xy[edges[one, 1], 1] - xy[edges[one, 0], 1]
+    bx, by = xy[edges[other, 1], 0] - xy[edges[other, 0], 0], xy[edges[other, 1], 1] - xy[edges[other, 0], 1]
+    turned = abs(float(ax * by - ay * bx))
+    return turned <= _ONE_WAY * math.hypot(float(ax), float(ay)) * math.hypot(float(bx), float(by))
+
+
+@kernel(inline="always")
 def _may_move(borders: Borders, edge: int, found: IntArray, m: int, reach_m: float) -> bool:
-    """Whether the vertex with the m found edges may move along one of them: on the outline, and not too far."""
+    """Whether the vertex with the m found edges may move along one of them: on outline or guide, and not too far."""
     xy, edges = borders.xy, borders.edges
     a, b = edges[edge, 0], edges[edge, 1]
     on_outline = False
     for s in range(m):
         on_outline = on_outline or edges[found[s], 3] < 0
+        if edges[found[s], KEEPS] != 0 and not _are_parallel(xy, edges, edge, found[s]):
+            return False
     is_far = math.hypot(float(xy[a, 0] - xy[b, 0]), float(xy[a, 1] - xy[b, 1])) > reach_m * 1e3
     return not (is_far and m > 2) and not (on_outline and edges[edge, 3] >= 0)
 

@@ -26,13 +26,17 @@ MAX_DEGREE = 16
 """Vertices with more edges stay."""
 
 
+KEEPS = 4
+"""Column of the edges: 1 where an edge lies on a guide, whose line it keeps."""
+
+
 class Borders(NamedTuple):
-    """Edges of the faces, one each, (e, 4) int64: ends, face to the left of first to second and to the right or -1."""
+    """Edges of the faces, one each: ends, face to the left of first to second, face to the right or -1, and `KEEPS`."""
 
     xy: IntArray
     """(v, 2) int64, millimetres."""
     edges: IntArray
-    """(e, 4) int64; -1 as first end of an edge that is gone."""
+    """(e, 5) int64; -1 as first end of an edge that is gone."""
     plane_of_face: LabelArray
     """(f,) int32."""
     is_fixed: BoolArray
@@ -125,7 +129,7 @@ def edges_of_rings(xy: IntArray, vertices: IntArray, starts: IntArray, owner: La
             a, b = vertices[s], vertices[after]
             ends[s, 0], ends[s, 1], ends[s, 2] = a, b, owner[r]
             keys[s] = min(a, b) * len(xy) + max(a, b)
-    edges = np.empty((n, 4), np.int64)
+    edges = np.zeros((n, 5), np.int64)
     m = 0
     before = np.int64(-1)
     for s in ascending_order(keys):

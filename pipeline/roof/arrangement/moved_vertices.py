@@ -15,6 +15,7 @@ from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray
 from pipeline.roof.arrangement.limits import Limits
 from pipeline.roof.arrangement.movable_borders import (
+    KEEPS,
     MAX_DEGREE,
     Borders,
     buckets_of,
@@ -38,13 +39,14 @@ def _line_to_keep(
 ) -> tuple[bool, float, float]:
     """Whether v may move, and the direction of the line that it stays on; zero without one.
 
-    The outline and steps, the found edges with a wider gap, keep their line: a corner or an end of them stays.
+    The outline, edges on guides, and steps, the found edges with a wider gap, keep their line: a corner or an end of
+    them stays.
     """
     xy, edges = borders.xy, borders.edges
     n = 0
     ends = np.empty(2, np.int64)
     for s in range(len(found)):
-        if edges[found[s], 3] < 0 or abs(gaps[s]) > gap_m:
+        if edges[found[s], 3] < 0 or abs(gaps[s]) > gap_m or edges[found[s], KEEPS] != 0:
             if n == 2:
                 return False, 0.0, 0.0
             ends[n] = edges[found[s], 0] + edges[found[s], 1] - v

@@ -20,14 +20,14 @@ from typing import Any
 
 import numpy as np
 import shapely
-from shapely import MultiPolygon, Polygon
+from shapely import LineString, MultiPolygon, Polygon
 
 from pipeline import __version__
 from pipeline.errors import UnreadableInputError
 from pipeline.io import place_below, storage_at
 from pipeline.io.crs import SpatialReference
 from pipeline.methods import ReconstructSettings, method_named
-from pipeline.model import Candidate, FloatArray, GivenHeights
+from pipeline.model import Candidate, FloatArray, GivenHeights, Guide, GuideKind
 from pipeline.settings import RunSettings
 
 SUFFIX = ".bundle"
@@ -106,6 +106,7 @@ def write_bundle(folder: str, bundle: Bundle) -> str:
         "footprint": None if footprint is None else shapely.to_wkb(footprint, hex=True),
         "given": None if candidate.given is None else _known(candidate.given),
         "outline": None if candidate.outline is None else shapely.to_wkb(candidate.outline, hex=True),
+        "guides": [[guide.kind.value, shapely.to_wkb(guide.line, hex=True)] for guide in candidate.guides],
         "touches_data_edge": candidate.touches_data_edge,
         "strip_offset_m": None if math.isnan(candidate.strip_offset_m) else candidate.strip_offset_m,
         "method": bundle.method,
@@ -115,6 +116,7 @@ def write_bundle(folder: str, bundle: Bundle) -> str:
             "roof": dataclasses.asdict(bundle.settings.roof),
             "plan": dataclasses.asdict(bundle.settings.plan),
             "roof-type": dataclasses.asdict(bundle.settings.roof_type),
+            "guides": dataclasses.asdict(bundle.settings.guides),
         },
         "incident": incident,
         "reference": dataclasses.asdict(bundle.reference),
@@ -224,6 +226,7 @@ def _bundle(
         outline=outline,
         touches_data_edge=bool(document["touches_data_edge"]),
         strip_offset_m=math.nan if document.get("strip_offset_m") is None else float(document["strip_offset_m"]),
+        guides=tuple(_guide(kind, line) for kind, line in document.get("guides", ())),
     )
     return Bundle(
         candidate=candidate,
@@ -232,6 +235,14 @@ def _bundle(
         incident=_incident(document["incident"], stderr),
         reference=SpatialReference(**document["reference"]),
     )
+
+
+def _guide(kind: str, wkb: str) -> Guide:
+    """A guide of the document."""
+    line = shapely.from_wkb(wkb)
+    if not isinstance(line, LineString):
+        raise TypeError(f"a guide is a {line.geom_type}")
+    return Guide(kind=GuideKind(kind), line=line)
 
 
 def _incident(document: Mapping[str, Any], stderr: str) -> Incident:

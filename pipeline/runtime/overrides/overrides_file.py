@@ -33,7 +33,7 @@ TABLE = "building"
 _PLACES = ("building_id", "source_id", "point")
 _EFFECTS = ("action", "footprint", "method", "preset", "settings")
 _KEYS = (*_PLACES, *_EFFECTS, "note")
-_SHARED_TABLES = ("roof", "plan", "roof-type")
+_SHARED_TABLES = ("roof", "plan", "roof-type", "guides")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

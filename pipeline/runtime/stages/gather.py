@@ -17,8 +17,8 @@ from shapely import MultiPolygon, Polygon
 from pipeline.compiler import kernel
 from pipeline.export.facts import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
-from pipeline.model import BoolArray, Candidate, GivenHeights, GroundSource, IntArray
-from pipeline.roof.settings import RoofSettings
+from pipeline.model import BoolArray, Candidate, GivenHeights, GroundSource, Guide, IntArray
+from pipeline.roof.settings import GUIDE_REACH_M, RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.sites import CandidateSite, PointRange
 from pipeline.runtime.stages.surroundings import Surroundings, surroundings_of
@@ -166,8 +166,9 @@ def gather(
     site: CandidateSite,
     gps_kind: GpsTimeKind,
     roof: RoofSettings | None = None,
+    guides: Sequence[Guide] = (),
 ) -> tuple[Candidate, CandidateFacts]:
-    """One candidate with the terrain around it.
+    """One candidate with the terrain around it, and with those of the guides, in metres of the CRS, that are near.
 
     `gps_kind` says whether GPS times can be converted to dates, `roof` whether to align strips and whether to add the
     points around and beneath it.
@@ -218,6 +219,7 @@ def gather(
         beside_later=(later_mm - origin_mm) / MM,
         touches_data_edge=touches_data_edge,
         strip_offset_m=strip_offset_m,
+        guides=_near(guides, low, high, origin_mm) if len(xyz) else (),
     )
     first, last = _acquired(points, gps_kind)
     goes_on = int((points["return_number"] < points["return_count"]).sum())
@@ -301,6 +303,17 @@ def _beside(
             single.append(xyz[near["return_count"] <= 1])
             later.append(xyz[(near["return_count"] > 1) & (near["return_number"] >= near["return_count"])])
     return _others(single, len(own_mm)), _others(later, len(own_mm))
+
+
+def _near(guides: Sequence[Guide], low_mm: IntArray, high_mm: IntArray, origin_mm: IntArray) -> tuple[Guide, ...]:
+    """The guides within reach of the box of a candidate's points, in its frame."""
+    reach_mm = round(GUIDE_REACH_M * MM)
+    box = shapely.box(*((low_mm[:2] - reach_mm) / MM), *((high_mm[:2] + reach_mm) / MM))
+    return tuple(
+        Guide(kind=guide.kind, line=shapely.transform(guide.line, lambda xy: np.rint(xy * MM - origin_mm[:2]) / MM))
+        for guide in guides
+        if box.intersects(guide.line)
+    )
 
 
 def _others(pieces: Sequence[IntArray], own: int) -> IntArray:

@@ -44,6 +44,17 @@ class GivenFootprints:
     """The content of `footprints.json`: how many were read, used, repaired and left out, and every single fault."""
 
 
+def data_area(plan: Plan) -> shapely.Geometry:
+    """The bounds of a run's inputs, cut by --bbox and --aoi, in metres of its CRS."""
+    area = shapely.union_all([shapely.box(*i.bounds_m[:2], *i.bounds_m[3:5]) for i in plan.sources])
+    unit = plan.reference.horizontal_unit_m
+    if plan.options.bbox is not None:
+        area &= shapely.box(*(v * unit for v in plan.options.bbox))
+    if plan.options.aoi is not None:
+        area &= shapely.transform(plan.options.aoi, lambda xy: xy * unit)
+    return area
+
+
 def footprints_of_run(path: str | None, plan: Plan, settings: FootprintSettings) -> GivenFootprints | None:
     """The footprints of a run with the heights that its settings name; None without a file.
 
@@ -63,12 +74,7 @@ def given_footprints(path: str, plan: Plan, settings: FootprintSettings | None =
     `settings` name the columns of heights; None reads none. Raises InputError if the file cannot be used, or does not
     have these columns.
     """
-    area = shapely.union_all([shapely.box(*i.bounds_m[:2], *i.bounds_m[3:5]) for i in plan.sources])
-    unit = plan.reference.horizontal_unit_m
-    if plan.options.bbox is not None:
-        area &= shapely.box(*(v * unit for v in plan.options.bbox))
-    if plan.options.aoi is not None:
-        area &= shapely.transform(plan.options.aoi, lambda xy: xy * unit)
+    area = data_area(plan)
     found = read_footprints(path, plan.reference, area=area)
     settings = settings or FootprintSettings()
     _check_columns(path, found, settings)

@@ -18,7 +18,7 @@ from pipeline.export.facts import CandidateFacts
 from pipeline.io.crs import SpatialReference
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.methods import METHODS, ReconstructSettings
-from pipeline.model import BuildingResult, Candidate, Reason, Status
+from pipeline.model import BuildingResult, Candidate, Guide, Reason, Status
 from pipeline.runtime.cluster.memory_needs import building_bytes
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
 from pipeline.runtime.isolation.replay_bundle import SUFFIX, Bundle, Incident, is_whole, write_bundle
@@ -58,6 +58,8 @@ class BatchTask:
     """CRS of the run, for its bundles."""
     own: Mapping[str, OwnModelling] = dataclasses.field(default_factory=dict)
     """Method and settings of the buildings that have their own, by building_id."""
+    guides: tuple[Guide, ...] = ()
+    """Given lines of roofs near the candidates, in metres of the CRS."""
     earlier: tuple[Place, ...] = ()
     """Outcomes of earlier batches of these candidates' tile: models of the same input are taken from them."""
     compared: bool = False
@@ -275,7 +277,7 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     made_from = ""
     reused = False
     try:
-        candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, task.settings.roof)
+        candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, task.settings.roof, task.guides)
         made_from = key_of(candidate, task.method, _settings_key(task.settings))
         earlier = _modelled_before(task, site.building_id, made_from)
         reused = earlier is not None
@@ -341,7 +343,7 @@ def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
     from pipeline.reconstruct import failed_building  # as above
 
     task = task.way_of(site)
-    candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, task.settings.roof)
+    candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, task.settings.roof, task.guides)
     result = failed_building(candidate, task.method, loss.reason, loss.detail)
     incident = Incident(
         reason=loss.reason.value,

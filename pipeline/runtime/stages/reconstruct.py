@@ -15,6 +15,7 @@ from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, keys_of, result_of
 from pipeline.runtime.stages.batch_figures import LOST, BatchFigures, Counted, Modelled
+from pipeline.runtime.stages.given_guides import GivenGuides
 from pipeline.runtime.stages.model_batch import (
     Batch,
     BatchTask,
@@ -69,7 +70,14 @@ def stage_of_models(settings_hash: str) -> str:
     return f"models-{settings_hash[:16]}"
 
 
-def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, compared: bool = False) -> Models:
+def reconstruct(
+    context: RunContext,
+    settings: RunSettings,
+    joined: Joined,
+    guides: GivenGuides | None = None,
+    *,
+    compared: bool = False,
+) -> Models:
     """Model all candidates, the batches of most points first; seconds may be compared with those of other methods."""
     scratch, plan = context.scratch, context.plan
     stage, method = models_stage(settings), settings.general.method
@@ -83,7 +91,9 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
         if owner not in earlier:
             earlier[owner] = tuple(Place(stage, owner.key, key) for key in keys_of(scratch, stage, owner.key))
         own = {building_id: own_modelling(override, settings) for building_id, override in figures.overridden}
-        place = Place(stage, owner.key, key_of(alike, figures.digest, joined.around(figures.tiles), own))
+        near = () if guides is None else guides.near(figures.tiles, plan.grid)
+        key = key_of(alike, figures.digest, joined.around(figures.tiles), own, *near)
+        place = Place(stage, owner.key, key)
         places.setdefault(owner, []).append(place)
         tasks[place] = BatchTask(
             group=group,
@@ -96,6 +106,7 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
             quarantine=str(Path(scratch.root, QUARANTINE)),
             reference=plan.reference,
             own=own,
+            guides=near,
             earlier=earlier[owner],
             compared=compared,
             slow_s=slow_building_s(),
