@@ -2,8 +2,10 @@
 
 Content is all columns of buildings, planes and rejected except `NOT_CONTENT`, in the order of the rows' keys. Of
 `reason_detail` only the figures count, so a better wording changes no digest. Every row is hashed by itself in a
-canonical form (columns by name; integers, floats and times as eight bytes, texts as UTF-8, null unlike any value). The
-row hashes are then hashed in the order of the keys, so only the keys and 32 bytes per row are held in memory.
+canonical form (columns by name; integers, floats and times as eight bytes, texts as UTF-8, null unlike any value). A
+column of `ADDED` that is null in a row is left out of it: a run without overhangs has the digest that it had before
+there were columns for them. The row hashes are then hashed in the order of the keys, so only the keys and 32 bytes per
+row are held in memory.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import pyarrow.fs as pafs
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import stored_schema, table_batches
 from pipeline.export.records import KEYS
+from pipeline.export.solid_geometry import OVERHANG_COLUMNS
 from pipeline.io import arrow_at
 
 NOT_CONTENT = frozenset(
@@ -31,6 +34,8 @@ NOT_CONTENT = frozenset(
 )
 """Columns that may differ between runs with equal results (by tiling, names of settings, or the version), and those
 that say where figures come from: the figures themselves and the reasons count."""
+ADDED = frozenset({*OVERHANG_COLUMNS, "overhang_source", "lod23_reason"})
+"""Columns that are there only for levels of detail which a run may ask for since they were added."""
 FIGURES_ONLY = "reason_detail"
 """The column whose figures count and whose words do not."""
 ROWS_A_BATCH = 8192
@@ -151,10 +156,15 @@ def _check_unique(name: str, key: tuple[str, ...], keys: list[npt.NDArray[Any]],
 
 def canonical_rows(batch: pa.RecordBatch) -> Iterator[bytes]:
     """Every row of a batch as bytes that depend only on names and values, not on Arrow's representation."""
-    names = sorted(batch.schema.names)
+    names = sorted(set(batch.schema.names) - ADDED)
     cells = [_cells(batch.column(name), name) for name in names]
+    added = sorted(ADDED.intersection(batch.schema.names))
+    further = [[b""] * batch.num_rows]
+    for name in added:
+        heading = _sized(name.encode())
+        further.append([b"" if cell == _NULL else heading + cell for cell in _cells(batch.column(name), name)])
     heading = "\x1f".join(names).encode()
-    for row in zip(*cells, strict=True):
+    for row in zip(*cells, *further, strict=True):
         yield heading + b"".join(row)
 
 
