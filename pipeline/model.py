@@ -119,6 +119,8 @@ class FaceKind(StrEnum):
     ROOF = "roof"
     WALL = "wall"
     GROUND = "ground"
+    CEILING = "ceiling"
+    """The underside of an overhang."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -447,6 +449,40 @@ class LodModel:
     """Closed solids, one for each solid of the record's model, in the same order."""
 
 
+class OverhangSource(StrEnum):
+    """Where the overhangs of a model in LoD2.3 come from."""
+
+    SEEN = "seen"
+    USUAL = "usual"
+    GIVEN = "given"
+
+
+class NoOverhang(StrEnum):
+    """Why a building has no model in LoD2.3: a closed list."""
+
+    NO_LOD22 = "no_lod22"
+    FOOTPRINT_GIVEN = "footprint_given"
+    NO_WALL_SEEN = "no_wall_seen"
+    NO_OPEN_GROUND = "no_open_ground"
+    OVERHANG_TOO_SMALL = "overhang_too_small"
+    WALLS_BREAK = "walls_break"
+    TOO_LOW = "too_low"
+    INVALID_SOLID = "invalid_solid"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Overhangs:
+    """A building's model in LoD2.3, or why there is none."""
+
+    solids: tuple[Solid, ...] = ()
+    """Closed solids, one for each solid of the record's model, in the same order; their roofs number its planes. Empty
+    where there are none."""
+    source: OverhangSource | None = None
+    """Where the overhangs come from; None where there are no solids."""
+    reason: NoOverhang | None = None
+    """Why there are no solids; None where there are."""
+
+
 class DecisionKind(StrEnum):
     """What was decided while a building was modelled."""
 
@@ -568,3 +604,5 @@ class BuildingResult:
     """What was checked and tried, in this order; empty where the building ended its process."""
     coarser: tuple[LodModel, ...] = ()
     """Models at the coarser requested levels of detail, the finest first; none beside a fallback block."""
+    overhangs: Overhangs | None = None
+    """The model in LoD2.3 beside that of the record; None where it is not asked for, or where there is no model."""

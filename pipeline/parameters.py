@@ -64,6 +64,7 @@ def parameter(
     maximum: float | None = None,
     choices: tuple[str, ...] | None = None,
     changes_geometry: bool = True,
+    added: bool = False,
 ) -> Any:
     """Describe one field of a settings class: default, one sentence for the reference docs, unit, and what is valid.
 
@@ -77,6 +78,8 @@ def parameter(
         The valid words of a string.
     changes_geometry : bool
         Whether the value can change results and belongs to the settings hash.
+    added : bool
+        Whether its default leaves the settings hash as it was before there was this setting.
     """
     metadata = {
         "doc": doc,
@@ -85,6 +88,7 @@ def parameter(
         "maximum": maximum,
         "choices": choices,
         "changes_geometry": changes_geometry,
+        "added": added,
     }
     return dataclasses.field(default=default, metadata=metadata)
 

@@ -18,7 +18,7 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import BuildingError
-from pipeline.methods import ReconstructSettings, method_named
+from pipeline.methods import OVERHANGS, ReconstructSettings, method_named
 from pipeline.model import (
     BuildingResult,
     Candidate,
@@ -26,7 +26,10 @@ from pipeline.model import (
     DecisionKind,
     HeightSource,
     LodModel,
+    NoOverhang,
     Outcome,
+    Overhangs,
+    OverhangSource,
     Plane,
     PreparedCloud,
     Reason,
@@ -41,21 +44,32 @@ from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, model_quality
 from pipeline.quality.residuals import vertical_residuals
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_forms, block_plane
+from pipeline.roof.facades import Walls
 from pipeline.roof.floor_cut import cut_at_floor
 from pipeline.roof.flush_walls import unite_flush_walls
-from pipeline.roof.footprint import hull_of_points, outline
+from pipeline.roof.footprint import footprint_in_mm, hull_of_points, outline
 from pipeline.roof.forms import UNDRAWABLE, FaceForm, arranged_forms, template_forms, traced_forms, undrawable
 from pipeline.roof.given_heights import given_block
 from pipeline.roof.guides import followed
 from pipeline.roof.lower_lods import LodParts, lower_lods
 from pipeline.roof.named_form import BLOCK, PRIMITIVE, NamedForm
+from pipeline.roof.overhangs import UndrawableError, floor_m2, overhanging_solids
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.plan import RoofPlan, RoofPoints, level_unsupported_faces, partition_roof, roof_points, walls_of
+from pipeline.roof.plan import (
+    RoofPlan,
+    RoofPoints,
+    level_unsupported_faces,
+    partition_roof,
+    roof_points,
+    wall_outline,
+    walls_of,
+)
 from pipeline.roof.primitives import primitive_partition
 from pipeline.roof.roof_type import roof_type
 from pipeline.roof.shaded_points import with_shaded_points
 from pipeline.roof.solid import SolidPart, solid_parts
 from pipeline.roof.templates.fitting import RankedFaces
+from pipeline.roof.wider_eaves import wider_parts
 
 __all__ = ["ReconstructSettings", "failed_building", "reconstruct_building"]
 
@@ -64,6 +78,8 @@ _MUCH_LEVELLED = 0.05
 _AROUND_M, _FAR_M = 1.0, 1.0
 """Points this near to a face in plan bound its height, within this tolerance: a few point spacings, less than a
 storey."""
+_LEAST_BEYOND_M2 = 0.05
+"""Less is what rounding adds to a footprint."""
 _FEW_EXPLAINED = 0.75
 """Share of its roof points that a model has to explain where they are fewer than usual, or show no plane though they
 are dense: a tree would make a roof, too."""
@@ -198,7 +214,7 @@ def _reconstruct(
     block, _ = _first_valid(_blocks(building, plan), building)
     if block is None:
         raise BuildingError(Reason.NO_FOOTPRINT, f"no valid block over {len(building.roof.points)} roof points")
-    if settings.lods == ("1.2",):  # the settings ask for a block
+    if settings.record_lods == ("1.2",):  # the settings ask for a block
         return _record(building, block)
     return _record(building, block, fallback, codes)
 
@@ -405,15 +421,15 @@ def _explained_share(building: _Building, model: _Model) -> float:
 
 def _delivered(building: _Building, model: _Model) -> BuildingResult | None:
     """The record of a model at the levels of detail that the settings ask for; None where the finest is not valid."""
-    settings = building.settings
-    if settings.lods == (model.lod,):
+    settings, lods = building.settings, building.settings.record_lods
+    if lods == (model.lod,):
         return _record(building, model)
     models = lower_lods(
-        model, building.roof.points, building.candidate.ground_z_m, settings.roof, settings.lods,
+        model, building.roof.points, building.candidate.ground_z_m, settings.roof, lods,
         lambda solid: not check_solid(solid),
     )  # fmt: skip
-    building.decisions.extend(_levels(settings.lods, models))
-    if not models or models[0].lod != settings.lods[-1]:
+    building.decisions.extend(_levels(lods, models))
+    if not models or models[0].lod != lods[-1]:
         return None
     finest, *coarser = models
     if finest is not model:  # level parts say nothing about the roof's type, and nothing competed with them
@@ -521,6 +537,8 @@ def _record(
         outline_sigma_m=0.0 if candidate.footprint is not None else roof.spacing_m * DRAWN_OUTLINE_SPACINGS,
         is_planar=model.lod == "2.2",
     )
+    walls = walls_of(footprint, roof, building.settings.roof)
+    overhangs = _overhangs(building, model, walls) if OVERHANGS in building.settings.lods else None
     return BuildingResult(
         building_id=candidate.building_id,
         origin=candidate.origin,
@@ -548,9 +566,74 @@ def _record(
         quality=dataclasses.replace(quality, bic_margin=model.bic_margin),
         touches_data_edge=candidate.touches_data_edge,
         strip_offset_m=candidate.strip_offset_m,
-        walls=walls_of(footprint, roof, building.settings.roof),
+        walls=wall_outline(walls),
+        overhangs=overhangs,
         guides=guides,
     )
+
+
+def _overhangs(building: _Building, model: _Model, walls: Walls | None) -> Overhangs:
+    """The model in LoD2.3 beside a valid one, or why there is none; how it ended is added to the decisions."""
+    solids: tuple[Solid, ...] = ()
+    source = reason = None
+    detail = ""
+    try:
+        source, drawn = _with_overhangs(building, model, walls)
+    except UndrawableError as error:
+        reason, detail = error.reason, f"{error.reason}: {error}"
+    else:
+        used = sorted({face.plane for part in model.parts for face in part.faces})
+        number = {plane: k for k, plane in enumerate(used)}
+        solids = tuple(_renumbered(solid, number) for solid in drawn)
+    planes = [face.plane for solid in solids for face in solid.faces if face.plane >= 0]
+    building.decisions.append(
+        Decision(
+            kind=DecisionKind.LEVEL,
+            name=OVERHANGS,
+            outcome=Outcome.CHOSEN if solids else Outcome.UNDRAWABLE,
+            detail=detail,
+            n_faces=len(planes) if solids else None,
+            n_planes=len(set(planes)) if solids else None,
+        )
+    )
+    return Overhangs(solids=solids, source=source, reason=reason)
+
+
+def _with_overhangs(building: _Building, model: _Model, walls: Walls | None) -> tuple[OverhangSource, Sequence[Solid]]:
+    """Solids with overhangs for the parts of a model, and where the overhangs come from.
+
+    Raises UndrawableError where there are none or they cannot be drawn.
+    """
+    settings, ground_z_m, facades = building.settings.roof, building.candidate.ground_z_m, building.roof.facades
+    if model.lod != "2.2":
+        raise UndrawableError(NoOverhang.NO_LOD22, "the model is a block")
+    parts, least_m = model.parts, settings.min_overhang_m
+    if walls is None:
+        source, given_m = OverhangSource.GIVEN, settings.beyond_footprint_m
+        if facades is None or given_m <= 0.0:
+            raise UndrawableError(NoOverhang.FOOTPRINT_GIVEN, "beyond_footprint_m is 0")
+        if given_m < least_m:
+            raise UndrawableError(NoOverhang.OVERHANG_TOO_SMALL, f"{given_m:.3f} m, less than {least_m:g} m")
+        walls_mm = footprint_in_mm(_united([part.footprint for part in parts]))
+        parts = wider_parts(parts, model.planes, facades, given_m, ground_z_m)
+    else:
+        source = OverhangSource.USUAL if math.isnan(walls.overhang_m) else OverhangSource.SEEN
+        if source is OverhangSource.USUAL and settings.usual_overhang_m <= 0.0:
+            raise UndrawableError(NoOverhang.NO_WALL_SEEN, "usual_overhang_m is 0")
+        if source is OverhangSource.USUAL and walls.widest_m <= 0.0:
+            raise UndrawableError(NoOverhang.NO_OPEN_GROUND, "no line has open ground before it")
+        if walls.counted_m <= 0.0:
+            raise UndrawableError(NoOverhang.OVERHANG_TOO_SMALL, f"{walls.widest_m:.3f} m, less than {least_m:g} m")
+        walls_mm = walls.overhung_mm
+    solids = overhanging_solids(
+        parts, model.planes, walls_mm, settings.overhang_thickness_m, ground_z_m + settings.min_clearance_m,
+        lambda solid: not check_solid(solid),
+    )  # fmt: skip
+    if source is OverhangSource.GIVEN:
+        beyond_m2 = math.fsum(map(floor_m2, solids)) - math.fsum(floor_m2(part.solid) for part in model.parts)
+        if beyond_m2 > _LEAST_BEYOND_M2:
+            raise UndrawableError(NoOverhang.TOO_LOW, f"{beyond_m2:.2f} m2 of walls would be beyond the footprint")
+    return source, solids
 
 
 def _lod_model(model: LodParts) -> LodModel:

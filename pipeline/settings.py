@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import SettingsError
-from pipeline.methods import LODS, METHODS, PRESETS, ReconstructSettings, method_named
+from pipeline.methods import LODS, METHODS, OVERHANGS, PRESETS, ReconstructSettings, method_named
 from pipeline.parameters import Parameters, build, parameter
 from pipeline.roof.settings import ArrangementSettings, FootprintSettings, GuideSettings, RoofSettings, RoofTypeSettings
 from pipeline.terrain.class_codes import ClassCodeSettings
@@ -39,8 +39,12 @@ class GeneralSettings(Parameters):
     )
     lods: str = parameter(
         LODS[-1],
-        "Levels of detail of the models; records describe the finest.",
-        choices=tuple(",".join(chosen) for n in range(1, len(LODS) + 1) for chosen in itertools.combinations(LODS, n)),
+        "Levels of detail of the models; records describe the finest up to 2.2, which 2.3 brings with it.",
+        choices=tuple(
+            ",".join(chosen)
+            for n in range(1, len(LODS) + 2)
+            for chosen in itertools.combinations((*LODS, OVERHANGS), n)
+        ),
     )
     classes: str = parameter(
         "trust",
@@ -172,6 +176,7 @@ class RunSettings:
                 field.name: getattr(section, field.name)
                 for field in dataclasses.fields(section)
                 if field.metadata.get("changes_geometry", True)
+                and not (field.metadata.get("added") and getattr(section, field.name) == field.default)
             }
             for name, section in self.sections().items()
             if name not in _OPTIONAL or section != type(section)()

@@ -64,7 +64,7 @@ Method = Annotated[
 Lods = Annotated[
     str | None,
     typer.Option(
-        metavar="L1,L2,…", help="Levels of detail to write: 1.2, 1.3, 2.2, or several; default from the settings."
+        metavar="L1,L2,…", help="Levels of detail to write: 1.2, 1.3, 2.2, 2.3, or several; default from the settings."
     ),
 ]
 Footprints = Annotated[

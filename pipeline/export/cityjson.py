@@ -1,6 +1,6 @@
 """CityJSONSeq 2.0: a line of metadata, then one CityJSONFeature per building, with one BuildingPart per solid.
 
-Coarser levels of detail are further geometries of the same parts, each with its `lod`.
+Other levels of detail are further geometries of the same parts, each with its `lod`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.export.coordinates import SpatialReference, crs_coordinates, decimals, epsg_code
 from pipeline.export.obj import part_id
-from pipeline.export.solid_geometry import SHAPE_COLUMNS, SURFACES
+from pipeline.export.solid_geometry import SHAPE_COLUMNS, SURFACES, models_beside
 from pipeline.model import BuildingResult, FaceKind, FloatArray, Plane, Solid
 
 VERSION = "2.0"
@@ -114,8 +114,8 @@ def json_line(value: Mapping[str, Any]) -> str:
 
 
 def _solids(result: BuildingResult) -> list[Solid]:
-    """The solids of all levels of detail, the finest level first."""
-    return [*result.solids, *(solid for model in result.coarser for solid in model.solids)]
+    """The solids of all levels of detail, those of the record first."""
+    return [*result.solids, *(solid for model in models_beside(result) for solid in model.solids)]
 
 
 def _feature(
@@ -135,9 +135,10 @@ def _feature(
             "geometry": [_solid(solid, result.planes, result.lod, first)],
         }
         first += len(solid.vertices)
-    for model in result.coarser:
+    for model in models_beside(result):
+        planes = result.planes if model.lod > result.lod else ()
         for name, solid in zip(parts, model.solids, strict=True):
-            objects[name]["geometry"].append(_solid(solid, (), model.lod, first))
+            objects[name]["geometry"].append(_solid(solid, planes, model.lod, first))
             first += len(solid.vertices)
     return {
         "type": "CityJSONFeature",
@@ -164,7 +165,7 @@ def _attributes(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _solid(solid: Solid, planes: Sequence[Plane], lod: str, first: int) -> dict[str, Any]:
-    """The geometry of one part: one semantic surface per roof plane, one for the walls, one for the ground.
+    """The geometry of one part: one semantic surface per roof plane, one each for walls, ground and undersides.
 
     Without planes, roof surfaces are level and have no `plane_id`.
     """

@@ -117,6 +117,22 @@ BUILDINGS = (
     Column("solid_lod13", WKB, HORIZONTAL, "the solids in LoD1.3, like `solid_lod12`"),
     Column("solid_lod13_parts", INT32S, NONE, "like `solid_parts`, for LoD1.3"),
     Column("solid_lod13_surfaces", TEXTS, NONE, "like `solid_surfaces`, for LoD1.3"),
+    Column(
+        "solid_lod23",
+        WKB,
+        HORIZONTAL,
+        "the solids with overhangs (LoD2.3), like `solid`; null if not requested, and where `lod23_reason` says why "
+        "there are none",
+        page="../methods/overhangs.md",
+    ),
+    Column("solid_lod23_parts", INT32S, NONE, "like `solid_parts`, for LoD2.3"),
+    Column(
+        "solid_lod23_surfaces",
+        TEXTS,
+        NONE,
+        "like `solid_surfaces`, for LoD2.3, and `OuterCeilingSurface` for the undersides of overhangs",
+    ),
+    Column("solid_lod23_planes", INT32S, NONE, "like `solid_planes`, for LoD2.3; -1 on undersides too"),
     Column("ground_z", FLOAT64, VERTICAL, "elevation of the floor: the lowest terrain at the outline"),
     Column(
         "ground_source",
@@ -263,6 +279,21 @@ BUILDINGS = (
         FLOAT64,
         "m",
         "standard error of `overhang_m`, from the thickness of the walls' points and the differences between walls",
+    ),
+    Column(
+        "overhang_source",
+        TEXT,
+        NONE,
+        "where the overhangs of `solid_lod23` come from: `seen` if points show a wall of the building; `usual` and "
+        "`given` if they are `usual_overhang_m` and `beyond_footprint_m` of the settings; null without such solids",
+        page="../methods/overhangs.md#where-overhangs-come-from",
+    ),
+    Column(
+        "lod23_reason",
+        TEXT,
+        NONE,
+        "why a model has no solids in LoD2.3, from a closed list; null if it has, and if they are not requested",
+        page="../methods/overhangs.md#buildings-without-lod23",
     ),
     Column(
         "guides_followed",

@@ -49,7 +49,7 @@ class RecordContext:
     """Latest acquisition of the whole run's input."""
     facts: Mapping[str, CandidateFacts] = dataclasses.field(default_factory=dict)
     """Facts by building_id."""
-    coarser_lods: tuple[str, ...] = ()
+    further_lods: tuple[str, ...] = ()
     """Levels of detail that were asked for beside the finest one: each has mesh files of its own."""
 
 

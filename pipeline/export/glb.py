@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,8 +28,11 @@ MATERIALS: Mapping[str, tuple[float, float, float]] = {
     "RoofSurface": (0.50, 0.09, 0.06),
     "WallSurface": (0.71, 0.66, 0.58),
     "GroundSurface": (0.25, 0.25, 0.25),
+    "OuterCeilingSurface": (0.55, 0.50, 0.42),
 }
 """One material per semantic surface of CityJSON, by its name, with its colour in linear RGB."""
+_ONLY_IF_USED = "OuterCeilingSurface"
+"""The last material: only models with overhangs have this surface."""
 PLANE_ID = "_PLANE_ID"
 """Vertex attribute: `plane_id` of the roof plane, -1 on walls and ground."""
 
@@ -66,9 +69,9 @@ def glb_bytes(
     """The buildings of a CityJSONSeq text (`cityjson_lines`) as a GLB file; the same text gives the same bytes.
 
     Units are metres in one unit of easting and northing, and of elevation. `lod` is the finest level of detail that is
-    taken; None for the finest of each building. Buildings without a solid are left out; without any the file is empty,
-    since glTF has no empty scene of meshes. Raises ValueError if a face cannot be cut into triangles: it crosses or
-    touches itself.
+    taken; None for that of each building's record. Buildings without a solid are left out; without any the file is
+    empty, since glTF has no empty scene of meshes. Raises ValueError if a face cannot be cut into triangles: it crosses
+    or touches itself.
     """
     heading, *features = (json.loads(line) for line in lines)
     frame = Frame.of(heading["transform"], (horizontal_unit_m, horizontal_unit_m, vertical_unit_m))
@@ -117,12 +120,12 @@ class Frame:
 
 
 def solid_mesh(feature: Mapping[str, Any], frame: Frame, lod: str | None) -> SolidMesh | None:
-    """The triangles of a feature's solids at the finest level up to `lod`; None where it has none."""
+    """The triangles of a feature's solids at the finest level up to `lod`, or its record's; None where it has none."""
     corners, ring_starts, face_starts = [], [0], [0]
     face_keys: list[tuple[str, str]] = []
     planes: list[int] = []
     levels = {g["lod"] for entry in feature["CityObjects"].values() for g in entry.get("geometry", ())}
-    level = max((name for name in levels if lod is None or name <= lod), default="")
+    level = record_level(feature) if lod is None else max((name for name in levels if name <= lod), default="")
     for part, entry in feature["CityObjects"].items():
         for geometry in entry.get("geometry", ()):
             if geometry["lod"] != level:
@@ -159,6 +162,15 @@ def solid_mesh(feature: Mapping[str, Any], frame: Frame, lod: str | None) -> Sol
         planes=np.array(planes, np.int64),
         triangles=tuple((*key, triangles[np.isin(of_face, groups[key])]) for key in wanted),
     )
+
+
+def record_level(feature: Mapping[str, Any]) -> str:
+    """The level of detail of a building's record; without a record the finest there is, empty without a model."""
+    objects = feature["CityObjects"].values()
+    stated = (entry["attributes"]["lod"] for entry in objects if "lod" in entry.get("attributes", ()))
+    finest = max((geometry["lod"] for entry in objects for geometry in entry.get("geometry", ())), default="")
+    level: str = next(stated, finest)
+    return level
 
 
 def gltf_axes(xyz: FloatArray) -> FloatArray:
@@ -263,7 +275,9 @@ class _Scene:
             "scenes": [{"name": title, "nodes": [0]}],
             "nodes": [root, *self._nodes],
             "meshes": self._meshes,
-            "materials": [material(name, colour) for name, colour in MATERIALS.items()],
+            "materials": materials(
+                {primitive["material"] for mesh in self._meshes for primitive in mesh["primitives"]}
+            ),
             "accessors": self._accessors,
             "bufferViews": views,
             "buffers": [{"byteLength": start}],
@@ -282,6 +296,15 @@ class _View:
     def append(self, data: bytes) -> None:
         self.pieces.append(data)
         self.size += len(data)
+
+
+def materials(used: Container[int]) -> list[dict[str, Any]]:
+    """All materials in their order; that of undersides only if its number is among those that are used."""
+    return [
+        material(name, colour)
+        for number, (name, colour) in enumerate(MATERIALS.items())
+        if name != _ONLY_IF_USED or number in used
+    ]
 
 
 def material(name: str, colour: Sequence[float]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from shapely import Polygon
 from shapely.geometry.polygon import orient
 
-from pipeline.export.glb import MATERIALS, Frame, SolidMesh, gltf_axes, material
+from pipeline.export.glb import MATERIALS, Frame, SolidMesh, gltf_axes, materials, record_level
 from pipeline.export.glb_container import INDICES, QUANTIZATION, VERSION, VERTICES, container
 from pipeline.export.property_table import StoredColumn
 from pipeline.model import FloatArray, IntArray
@@ -83,7 +83,7 @@ def block_feature(feature: Mapping[str, Any], frame: Frame, top: float) -> dict[
     """
     objects: dict[str, Any] = {}
     vertices: list[list[int]] = []
-    level = max((g["lod"] for entry in feature["CityObjects"].values() for g in entry.get("geometry", ())), default="")
+    level = record_level(feature)
     for part, entry in feature["CityObjects"].items():
         geometry = next((g for g in entry.get("geometry", ()) if g["lod"] == level), None)
         if geometry is None:
@@ -298,7 +298,7 @@ class _File:
             "scenes": [{"nodes": [0]}],
             "nodes": [node],
             "meshes": [{"primitives": primitives}],
-            "materials": [material(name, colour) for name, colour in MATERIALS.items()],
+            "materials": materials(()),
             "accessors": self.accessors,
             "bufferViews": self.views,
             "buffers": [{"byteLength": self.size}],

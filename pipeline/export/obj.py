@@ -1,7 +1,8 @@
-"""Wavefront OBJ: full coordinates, one `o` per closed solid, groups roof, wall and ground, one material per roof plane.
+"""Wavefront OBJ: full coordinates, one `o` per closed solid, groups by the kind of face, one material per roof plane.
 
-There is no `mtllib`: a material's name says which roof plane a face belongs to (`roof_3` is plane_id 3), and
-the viewer chooses its colour. Programs make a default material of each name.
+The groups are roof, wall, ground, and ceiling for the undersides of overhangs. There is no `mtllib`: a material's name
+says which roof plane a face belongs to (`roof_3` is plane_id 3), and the viewer chooses its colour. Programs make a
+default material of each name.
 """
 
 from __future__ import annotations
@@ -13,14 +14,14 @@ from pipeline.export.solid_geometry import model_at
 from pipeline.model import BuildingResult, FaceKind, FloatArray, Solid, SolidFace
 from pipeline.triangulation import triangulate_face
 
-_KINDS = (FaceKind.ROOF, FaceKind.WALL, FaceKind.GROUND)
+_KINDS = (FaceKind.ROOF, FaceKind.WALL, FaceKind.GROUND, FaceKind.CEILING)
 
 
 def obj_text(results: Iterable[BuildingResult], reference: SpatialReference, lod: str | None = None) -> str:
     """The solids of one or more buildings as one OBJ file; buildings without a solid are left out.
 
     Every solid has its own vertices, so it is closed. Faces without holes stay polygons, those with holes become
-    triangles on the same vertices. `lod` is a coarser level of detail in place of the records' own (`model_at`).
+    triangles on the same vertices. `lod` is another level of detail in place of the records' own (`model_at`).
     """
     unit = f"{reference.horizontal_unit_m:.12g} m horizontally, {reference.vertical_unit_m:.12g} m vertically"
     lines = [f"# coordinates are easting, northing, elevation; one unit is {unit}"]

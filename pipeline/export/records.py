@@ -137,13 +137,15 @@ def _quality(quality: ModelQuality) -> dict[str, float | bool | None]:
     }
 
 
-def _walls(result: BuildingResult, reference: SpatialReference) -> dict[str, bytes | float | None]:
-    """The walls beneath the footprint; None where they are not known."""
-    walls = result.walls
+def _walls(result: BuildingResult, reference: SpatialReference) -> dict[str, bytes | float | str | None]:
+    """The walls beneath the footprint and the overhangs over them; None where they are not known."""
+    walls, overhangs = result.walls, result.overhangs
     return {
         WALL_OUTLINE: None if walls is None else _geometry(walls.outline, result.origin, reference),
         "overhang_m": None if walls is None else _or_none(walls.overhang_m),
         "overhang_sigma_m": None if walls is None else _or_none(walls.overhang_sigma_m),
+        "overhang_source": None if overhangs is None or overhangs.source is None else overhangs.source.value,
+        "lod23_reason": None if overhangs is None or overhangs.reason is None else overhangs.reason.value,
     }
 
 

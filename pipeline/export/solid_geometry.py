@@ -14,6 +14,8 @@ from typing import Any
 from pipeline.export.coordinates import SpatialReference, crs_coordinates
 from pipeline.model import BuildingResult, FaceKind, LodModel, Solid
 
+OVERHANGS = "2.3"
+"""The level of detail with overhangs, beside the record's model."""
 COARSER_LODS = ("1.2", "1.3")
 """Levels of detail that have columns and files of their own where a finer one is modelled too."""
 
@@ -30,8 +32,10 @@ def lod_suffix(lod: str) -> str:
 _COARSER_COLUMNS = {
     lod: tuple(f"solid_{lod_suffix(lod)}{end}" for end in ("", "_parts", "_surfaces")) for lod in COARSER_LODS
 }
+OVERHANG_COLUMNS = tuple(f"solid_{lod_suffix(OVERHANGS)}{end}" for end in ("", "_parts", "_surfaces", "_planes"))
+"""The columns of the solids with overhangs."""
 
-SOLIDS = ("solid", *(names[0] for names in _COARSER_COLUMNS.values()))
+SOLIDS = ("solid", *(names[0] for names in _COARSER_COLUMNS.values()), OVERHANG_COLUMNS[0])
 """The columns of geometry among `SOLID_COLUMNS`."""
 SOLID_COLUMNS = (
     "solid",
@@ -39,13 +43,19 @@ SOLID_COLUMNS = (
     "solid_surfaces",
     "solid_planes",
     *(name for names in _COARSER_COLUMNS.values() for name in names),
+    *OVERHANG_COLUMNS,
 )
 """The columns that tell a building's solids."""
 WALL_OUTLINE = "wall_outline"
 """The column of the walls beneath a footprint at the eaves."""
 SHAPE_COLUMNS = (*SOLID_COLUMNS, WALL_OUTLINE)
 """The columns that hold a building's shape beside its footprint."""
-SURFACES = {FaceKind.ROOF: "RoofSurface", FaceKind.WALL: "WallSurface", FaceKind.GROUND: "GroundSurface"}
+SURFACES = {
+    FaceKind.ROOF: "RoofSurface",
+    FaceKind.WALL: "WallSurface",
+    FaceKind.GROUND: "GroundSurface",
+    FaceKind.CEILING: "OuterCeilingSurface",
+}
 """CityGML's names of the kinds of faces."""
 
 _LITTLE_ENDIAN = 1
@@ -60,7 +70,7 @@ def solid_columns(result: BuildingResult, reference: SpatialReference) -> dict[s
     `solid` is ISO WKB in CRS units: the faces of all parts, part by part. The other three are lists with one value a
     polygon: the number of the part, the semantic surface, and the `plane_id` of a roof plane (-1 on walls and ground).
     `solid_lod12` and `solid_lod13` tell coarser models beside the record's own in the same way, but for the planes:
-    level parts are none of the table `planes`.
+    level parts are none of the table `planes`. `solid_lod23` has the planes of the record.
     """
     columns: dict[str, Any] = dict.fromkeys(SOLID_COLUMNS)
     if result.solids:
@@ -69,6 +79,9 @@ def solid_columns(result: BuildingResult, reference: SpatialReference) -> dict[s
         columns.update(
             zip(_COARSER_COLUMNS[model.lod], _columns_of(model.solids, result.origin, reference), strict=False)
         )
+    if result.overhangs is not None and result.overhangs.solids:
+        values = _columns_of(result.overhangs.solids, result.origin, reference)
+        columns.update(zip(OVERHANG_COLUMNS, values, strict=True))
     return columns
 
 
@@ -77,9 +90,20 @@ def model_at(result: BuildingResult, lod: str | None) -> LodModel | None:
 
     A building that fell back to a block has that at every level.
     """
-    own = (LodModel(lod=result.lod, planes=result.planes, solids=result.solids),) if result.solids else ()
-    known = [model for model in (*own, *result.coarser) if lod is None or model.lod <= lod]
+    if not result.solids:
+        return None
+    own = LodModel(lod=result.lod, planes=result.planes, solids=result.solids)
+    if lod is None:
+        return own
+    known = [model for model in (own, *models_beside(result)) if model.lod <= lod]
     return max(known, key=lambda model: model.lod, default=None)
+
+
+def models_beside(result: BuildingResult) -> tuple[LodModel, ...]:
+    """The models of a building beside that of its record: with overhangs, then the coarser ones, the finest first."""
+    overhangs = result.overhangs.solids if result.overhangs is not None else ()
+    finer = (LodModel(lod=OVERHANGS, planes=result.planes, solids=overhangs),) if overhangs else ()
+    return (*finer, *result.coarser)
 
 
 def _columns_of(

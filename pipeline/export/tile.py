@@ -73,7 +73,7 @@ def mesh_files(
     GLB files are made of the lines of the tile's CityJSONSeq. `meshes` is one of `pipeline.export.mesh_kinds.MESHES`.
     """
     units_m = context.reference.horizontal_unit_m, context.reference.vertical_unit_m
-    for lod in (None, *context.coarser_lods):
+    for lod in (None, *context.further_lods):
         modelled = [result for result in results if model_at(result, lod) is not None]
         groups = [[result] for result in modelled] if meshes == "building" else [modelled] if modelled else []
         if meshes == "glb":

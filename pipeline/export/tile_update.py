@@ -65,7 +65,7 @@ def updated_tile(
     text = _merged_cityjson(_text(root / path), names, fresh)
     files = {path: text.encode(), **dict(mesh_files(tile_key, results, lines_of(text), context, meshes))}
     gone: list[str] = []
-    for lod in (None, *context.coarser_lods):
+    for lod in (None, *context.further_lods):
         there = {name: mesh_path(tile_key, name, meshes, lod) for name in sorted(names)}
         whole = mesh_path(tile_key, "", meshes, lod)
         if meshes == "tile" and whole is not None:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 LODS = ("1.2", "1.3", "2.2")
 """Levels of detail (Biljecki, Ledoux and Stoter 2016): one block, level parts, the roof faces themselves."""
+OVERHANGS = "2.3"
+"""The level of detail with overhangs, always beside 2.2: where there are none, or they cannot be drawn, it is empty."""
 PRESETS = ("robust", "faithful")
 """Named settings: those that measured better, the default, which every method has, and those that keep to its paper."""
 
@@ -138,7 +140,34 @@ class ReconstructSettings:
     guides: GuideSettings = dataclasses.field(default_factory=GuideSettings)
     """Given lines of the roof."""
     lods: tuple[str, ...] = LODS[-1:]
-    """Levels of detail to be modelled, of `LODS` and in their order."""
+    """Levels of detail to be modelled, of `LODS` and in their order, then `OVERHANGS` if it is asked for."""
+
+    def __post_init__(self) -> None:
+        """Overhangs take LoD2.2 and the walls beneath the eaves; raises SettingsError if no walls are looked for."""
+        if OVERHANGS not in self.lods:
+            return
+        faults = [
+            f"lods has {OVERHANGS}, and {name} is {value}: use {wanted}, or leave {OVERHANGS} out"
+            for name, value, wanted in (
+                ("outline", repr(self.roof.outline), "'eaves'"),
+                ("straight_eaves", str(self.roof.straight_eaves).lower(), "true"),
+            )
+            if str(value).strip("'") != wanted.strip("'")
+        ]
+        if faults:
+            raise SettingsError(faults)
+        object.__setattr__(self, "lods", (*sorted({*self.lods, LODS[-1]} - {OVERHANGS}), OVERHANGS))
+        object.__setattr__(self, "roof", dataclasses.replace(self.roof, wall_outline=True))
+
+    @property
+    def record_lods(self) -> tuple[str, ...]:
+        """The levels of which the finest is that of the record."""
+        return tuple(lod for lod in self.lods if lod != OVERHANGS)
+
+    @property
+    def further_lods(self) -> tuple[str, ...]:
+        """The levels beside that of the record."""
+        return tuple(lod for lod in self.lods if lod != self.record_lods[-1])
 
     def segmentation(self, method: Method) -> Callable[[PreparedCloud], Segmentation]:
         """The method with its settings bound; raises SettingsError where the settings belong to another method."""

@@ -20,6 +20,7 @@ from matplotlib.patches import Patch, Rectangle
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
+from pipeline.export.glb import record_level
 from pipeline.io import arrow_at
 from pipeline.model import RoofType, Status
 from pipeline.report.maps import round_length
@@ -235,10 +236,11 @@ def _solids(
 
 
 def _viewed_faces(feature: dict[str, Any], xyz: Any, roof_colour: str) -> list[ViewedFace]:
-    """Roofs and walls of a CityJSONFeature, each part at its finest level of detail."""
+    """Roofs and walls of a CityJSONFeature, at the level of detail of its record."""
     faces = []
+    level = record_level(feature)
     for entry in feature["CityObjects"].values():
-        for solid in sorted(entry.get("geometry", ()), key=lambda geometry: str(geometry["lod"]))[-1:]:
+        for solid in (geometry for geometry in entry.get("geometry", ()) if geometry["lod"] == level):
             surfaces = [surface["type"] for surface in solid["semantics"]["surfaces"]]
             for shell, values in zip(solid["boundaries"], solid["semantics"]["values"], strict=True):
                 for rings, value in zip(shell, values, strict=True):

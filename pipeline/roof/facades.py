@@ -42,6 +42,8 @@ _OUTSIDE_M = 0.5
 """Points as far outside the eave are looked at too: where most are there, they are plants, not a wall."""
 _SHEET_M = 0.3
 """Thickness of a facade with its reliefs, as several strips of a survey show it."""
+_OWN_SIGMA_M = _SHEET_M / math.sqrt(12.0)
+"""Standard error of one wall: that of a uniform distribution as wide as its sheet."""
 _UNDER_EAVE_M = 0.5
 """Gutters and soffits hang no lower."""
 _ABOVE_GROUND_M = 1.0
@@ -209,7 +211,7 @@ def mean_overhang(eaves: Sequence[Eave]) -> tuple[float, float]:
         return math.nan, math.nan
     whole = math.fsum(length for length, _ in known)
     mean = math.fsum(length * over for length, over in known) / whole
-    own = _SHEET_M**2 / 12.0  # the variance of a uniform distribution
+    own = _SHEET_M**2 / 12.0
     variance = math.fsum(length**2 * (own + (over - mean) ** 2) for length, over in known) / whole**2
     return max(0.0, mean), math.sqrt(variance)
 
@@ -224,28 +226,100 @@ class Walls:
     """Mean overhang of the lines whose wall is known; nan where no wall is."""
     overhang_sigma_m: float
     """Its standard error."""
+    overhung_mm: MultiPolygon
+    """The same with the least overhang that counts: where it is less, or not above its standard error, at the eaves."""
+    widest_m: float
+    """The widest overhang of a line, seen or taken over."""
+    counted_m: float
+    """The widest that counts."""
 
 
-def walls_beneath(outline_mm: MultiPolygon, points: FacadePoints, reach_m: float, usual_m: float) -> Walls:
+def walls_beneath(
+    outline_mm: MultiPolygon, points: FacadePoints, reach_m: float, usual_m: float, least_m: float = 0.0
+) -> Walls:
     """Find the walls beneath an outline at the eaves, with straight lines, in integer millimetres; it stays valid.
 
-    `usual_m` is the overhang where no wall of the whole outline is known; see `mixed_pulse_reach_mm` for the reach.
+    `usual_m` is the overhang where no wall of the whole outline is known, `least_m` the least that counts; see
+    `mixed_pulse_reach_mm` for the reach.
     """
     polygons = [orient(polygon) for polygon in outline_mm.geoms]
-    rings = [
+    rings = rings_of(polygons)
+    eaves_of = [_eaves(ring, points, reach_m) for _, ring in rings]
+    known_m, sigma_m = mean_overhang([eave for eaves in eaves_of for eave in eaves])
+    mean_m, mean_sigma_m = (usual_m, 0.0) if math.isnan(known_m) else (known_m, sigma_m)
+    ways_m, counted_m = [], []
+    for eaves in eaves_of:
+        ways = [e.overhang_m if e.overhang_m is not None else mean_m if e.is_open else 0.0 for e in eaves]
+        least = [max(least_m, mean_sigma_m if e.overhang_m is None else _OWN_SIGMA_M) for e in eaves]
+        ways_m.append(ways)
+        counted_m.append([way if way >= enough else 0.0 for way, enough in zip(ways, least, strict=True)])
+
+    moved: list[list[FloatArray]] = [[] for _ in polygons]
+    for (k, ring), ways in zip(rings, ways_m, strict=True):
+        moved[k].append(moved_line_by_line(ring, ways))
+    drawn = MultiPolygon([Polygon(outer, holes) for outer, *holes in moved])
+    walls = drawn if drawn.is_valid else outline_mm
+    return Walls(
+        outline_mm=walls,
+        overhang_m=known_m,
+        overhang_sigma_m=sigma_m,
+        overhung_mm=_overhung(polygons, rings, counted_m),
+        widest_m=max(way for ways in ways_m for way in ways),
+        counted_m=max(way for ways in counted_m for way in ways),
+    )
+
+
+def rings_of(polygons: Sequence[Polygon]) -> list[tuple[int, FloatArray]]:
+    """The vertices of all rings, (n, 2) each, and the numbers of their polygons; the outer ring of each comes first."""
+    return [
         (k, shapely.get_coordinates(ring)[:-1])
         for k, polygon in enumerate(polygons)
         for ring in (polygon.exterior, *polygon.interiors)
     ]
-    eaves_of = [_eaves(ring, points, reach_m) for _, ring in rings]
-    known_m, sigma_m = mean_overhang([eave for eaves in eaves_of for eave in eaves])
-    mean_m = usual_m if math.isnan(known_m) else known_m
-    moved: list[list[FloatArray]] = [[] for _ in polygons]
-    for (k, ring), eaves in zip(rings, eaves_of, strict=True):
-        ways_m = [e.overhang_m if e.overhang_m is not None else mean_m if e.is_open else 0.0 for e in eaves]
-        moved[k].append(_moved(ring, ways_m))
-    drawn = MultiPolygon([Polygon(outer, holes) for outer, *holes in moved])
-    return Walls(outline_mm=drawn if drawn.is_valid else outline_mm, overhang_m=known_m, overhang_sigma_m=sigma_m)
+
+
+def _overhung(
+    polygons: Sequence[Polygon], rings: Sequence[tuple[int, FloatArray]], ways_m: Sequence[Sequence[float]]
+) -> MultiPolygon:
+    """Polygons without what hangs over the lines of their rings, in integer millimetres.
+
+    The lines of a ring are moved, as those of an outline at the walls. Where the ring would break, for example at a
+    notch that is narrower than its overhangs, the strips along its lines are taken away.
+    """
+    walls: list[list[FloatArray]] = [[] for _ in polygons]
+    strips: list[list[Polygon]] = [[] for _ in polygons]
+    for (k, ring), ways in zip(rings, ways_m, strict=True):
+        walls[k].append(moved_line_by_line(ring, ways))
+        if any(ways) and walls[k][-1] is ring:
+            strips[k] += _strips(ring, ways)
+    parts: list[Polygon] = []
+    for k, (polygon, (outer, *holes)) in enumerate(zip(polygons, walls, strict=True)):
+        whole = Polygon(outer, holes)
+        if not whole.is_valid:  # its rings are sound and cross one another
+            whole = polygon
+            strips[k] = [
+                s for (j, ring), ways in zip(rings, ways_m, strict=True) if j == k for s in _strips(ring, ways)
+            ]
+        hidden = shapely.union_all(strips[k])
+        parts += polygons_of(shapely.difference(whole, hidden, grid_size=1.0) if strips[k] else whole)
+    return MultiPolygon(parts)
+
+
+def _strips(ring: FloatArray, ways_m: Sequence[float]) -> list[Polygon]:
+    """The strips to the left of the lines of a ring, (n, 2) in millimetres, as wide as their overhangs.
+
+    Where two of them meet at a corner that points inwards, what the moved lines cut off beside both is added.
+    """
+    ends = np.roll(ring, -1, axis=0)
+    along = (ends - ring) / np.maximum(np.hypot(*(ends - ring).T), 1.0)[:, None]
+    inwards = 1e3 * np.array(ways_m)[:, None] * np.column_stack((-along[:, 1], along[:, 0]))
+    strips = [Polygon([a, b, b + way, a + way]) for a, b, way in zip(ring, ends, inwards, strict=True) if way.any()]
+    before, before_along = np.roll(inwards, 1, axis=0), np.roll(along, 1, axis=0)
+    turns = before_along[:, 0] * along[:, 1] - before_along[:, 1] * along[:, 0]
+    for corner, one, other, turn in zip(ring, before, inwards, turns, strict=True):
+        if turn < 0.0 and one.any() and other.any():
+            strips.append(Polygon([corner, corner + other, corner + one + other, corner + one]))
+    return [strip for strip in strips if strip.is_valid]
 
 
 def _eaves(ring: FloatArray, points: FacadePoints, reach_m: float) -> list[Eave]:
@@ -255,7 +329,7 @@ def _eaves(ring: FloatArray, points: FacadePoints, reach_m: float) -> list[Eave]
     return [eave_of(start, end, points, reach_m) for start, end in zip(starts, ends, strict=True)]
 
 
-def _moved(ring: FloatArray, ways_m: Sequence[float]) -> FloatArray:
+def moved_line_by_line(ring: FloatArray, ways_m: Sequence[float]) -> FloatArray:
     """A ring, (n, 2) in millimetres, with every line moved to its left; as it was where it would break."""
     runs = []
     for k, ((x0, y0), (x1, y1), way_m) in enumerate(zip(ring, np.roll(ring, -1, axis=0), ways_m, strict=True)):

@@ -33,7 +33,7 @@ from pipeline.roof.borders import straighten_borders
 from pipeline.roof.eaves import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
 from pipeline.roof.enclosed_planes import with_enclosed_planes
-from pipeline.roof.facades import FacadePoints, walls_beneath
+from pipeline.roof.facades import FacadePoints, Walls, walls_beneath
 from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, outline, polygons_of
 from pipeline.roof.guided_faces import guided_faces
 from pipeline.roof.guides import inner_pieces
@@ -249,14 +249,18 @@ def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:
     return _traced_plan(unlabelled, [level], settings, continued=False).outline_mm
 
 
-def walls_of(footprint: Polygon | MultiPolygon, roof: RoofPoints, settings: RoofSettings) -> WallOutline | None:
-    """The walls beneath a footprint at the eaves, local metres; None where they are not asked for or none is seen."""
+def walls_of(footprint: Polygon | MultiPolygon, roof: RoofPoints, settings: RoofSettings) -> Walls | None:
+    """The walls beneath a footprint at the eaves, local metres; None where they are not asked for."""
     if roof.facades is None or roof.footprint_mm is not None or not settings.finds_walls:
         return None
     eaves_mm = footprint_in_mm(footprint)
     reach_mm = mixed_pulse_reach_mm(eaves_mm, EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m))
-    walls = walls_beneath(eaves_mm, roof.facades, 1e-3 * reach_mm, settings.usual_overhang_m)
-    if math.isnan(walls.overhang_m):
+    return walls_beneath(eaves_mm, roof.facades, 1e-3 * reach_mm, settings.usual_overhang_m, settings.min_overhang_m)
+
+
+def wall_outline(walls: Walls | None) -> WallOutline | None:
+    """Walls as they are recorded; None where none is seen."""
+    if walls is None or math.isnan(walls.overhang_m):
         return None
     drawn = shapely.transform(walls.outline_mm, lambda xy: xy * 1e-3)
     return WallOutline(outline=drawn, overhang_m=walls.overhang_m, overhang_sigma_m=walls.overhang_sigma_m)

@@ -63,14 +63,39 @@ class RoofSettings(Parameters):
     )
     usual_overhang_m: float = parameter(
         0.0,
-        "With outline = walls: overhang of the eaves where no points show a wall of the building.",
+        "With outline = walls, and in LoD2.3: overhang of the eaves where no points show a wall of the building.",
         unit="m",
         minimum=0.0,
         maximum=1.0,
     )
     wall_outline: bool = parameter(
         False,
-        "With outline = eaves: find the walls beneath as well, for the columns wall_outline and overhang_m.",
+        "With outline = eaves: find the walls beneath as well, for the columns wall_outline and overhang_m; LoD2.3 does"
+        " so, too.",
+    )
+    min_overhang_m: float = parameter(
+        0.2,
+        "LoD2.3: where the roof hangs over less, the wall goes up to the eaves.",
+        unit="m",
+        minimum=0.05,
+        maximum=1.0,
+        added=True,
+    )
+    beyond_footprint_m: float = parameter(
+        0.0,
+        "LoD2.3: overhang beyond given footprints, which are taken as the walls, where open ground lies before them.",
+        unit="m",
+        minimum=0.0,
+        maximum=1.0,
+        added=True,
+    )
+    overhang_thickness_m: float = parameter(
+        0.2,
+        "LoD2.3: vertical distance from the roof to the underside of an overhang; assumed, not measured.",
+        unit="m",
+        minimum=0.05,
+        maximum=1.0,
+        added=True,
     )
     templates_spacing_m: float = parameter(
         0.6,
@@ -178,8 +203,13 @@ class RoofSettings(Parameters):
         """Whether the walls beneath outlines at the eaves are found for the records."""
         return self.wall_outline and self.straight_eaves and not self.at_walls
 
-    def needs_facades(self, *, is_drawn: bool) -> bool:
-        """Whether a candidate needs the points around and beneath it; `is_drawn` if it has an outline already."""
+    def needs_facades(self, *, is_drawn: bool, is_given: bool = False) -> bool:
+        """Whether a candidate needs the points around and beneath it.
+
+        `is_drawn` if it has an outline already, `is_given` if its footprint is given.
+        """
+        if is_given:
+            return self.finds_walls and self.beyond_footprint_m > 0.0
         return self.finds_walls or (self.at_walls and not is_drawn)
 
 

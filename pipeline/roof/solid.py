@@ -101,7 +101,8 @@ def _edges(mesh: _Mesh, members: Sequence[int]) -> dict[tuple[int, int], int]:
     return edges
 
 
-def _height_mm(plane: Plane, xy: tuple[int, int]) -> float:
+def height_mm(plane: Plane, xy: tuple[int, int]) -> float:
+    """Height of a plane over a plan vertex; all in millimetres."""
     return (plane.a * (xy[0] * 1e-3) + plane.b * (xy[1] * 1e-3) + plane.c) * 1e3
 
 
@@ -114,8 +115,8 @@ def _insert_crossings(mesh: _Mesh, planes: Sequence[Plane]) -> dict[tuple[int, i
         if a > b or right < 0:
             continue
         p, q = planes[mesh.planes[left]], planes[mesh.planes[right]]
-        at_a = _height_mm(p, mesh.xy[a]) - _height_mm(q, mesh.xy[a])
-        at_b = _height_mm(p, mesh.xy[b]) - _height_mm(q, mesh.xy[b])
+        at_a = height_mm(p, mesh.xy[a]) - height_mm(q, mesh.xy[a])
+        at_b = height_mm(p, mesh.xy[b]) - height_mm(q, mesh.xy[b])
         if at_a * at_b >= 0.0 or min(abs(at_a), abs(at_b)) <= SAME_HEIGHT_MM:
             continue
         (xa, ya), (xb, yb) = mesh.xy[a], mesh.xy[b]
@@ -162,7 +163,7 @@ class _Levels:
         for (a, b), face in edges.items():
             plane = planes[mesh.planes[face]]
             # every vertex of a ring is the start of one of its edges
-            touching.setdefault(a, {})[face] = _height_mm(plane, mesh.xy[a])
+            touching.setdefault(a, {})[face] = height_mm(plane, mesh.xy[a])
             other = edges.get((b, a), -1)
             if other < 0:
                 outline.update((a, b))
@@ -229,7 +230,7 @@ def _wall(levels: _Levels, a: int, b: int, left: int, right: int) -> Ring | None
     return up + down[::-1]
 
 
-def _trace(following: dict[int, int], xy: Sequence[tuple[int, int]]) -> list[Ring]:
+def trace(following: dict[int, int], xy: Sequence[tuple[int, int]]) -> list[Ring]:
     """Closed rings of a successor table, the outer one (clockwise: a floor is seen from below) first."""
     rings: list[Ring] = []
     left = dict(following)
@@ -277,7 +278,7 @@ def _extrude(
         wall = _wall(levels, a, b, face, other)
         if wall is not None:
             faces.append(SolidFace(rings=(tuple(wall),), kind=FaceKind.WALL))
-    floor = _trace(below, mesh.xy)
+    floor = trace(below, mesh.xy)
     faces.append(SolidFace(rings=tuple(tuple(levels.at(v, -1) for v in ring) for ring in floor), kind=FaceKind.GROUND))
     vertices = np.array(levels.points, np.float64) / 1e3
     plan = np.array(mesh.xy, np.float64) / 1e3

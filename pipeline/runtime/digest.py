@@ -2,9 +2,10 @@
 
 Content is all columns of buildings, planes and rejected except `NOT_CONTENT`, in the order of the rows' keys. Of
 `reason_detail` only the figures count, so a better wording changes no digest. Every row is hashed by itself in a
-canonical form (columns by name; integers, floats and times as eight bytes, texts as UTF-8, null unlike any value;
-columns of `LATER` only where they have one). The row hashes are then hashed in the order of the keys, so only the keys
-and 32 bytes per row are held in memory.
+canonical form (columns by name; integers, floats and times as eight bytes, texts as UTF-8, null unlike any value). A
+column of `ADDED` that is null in a row is left out of it: a run without overhangs or guides has the digest that it had
+before there were columns for them. The row hashes are then hashed in the order of the keys, so only the keys and 32
+bytes per row are held in memory.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import pyarrow.fs as pafs
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import stored_schema, table_batches
 from pipeline.export.records import KEYS
+from pipeline.export.solid_geometry import OVERHANG_COLUMNS
 from pipeline.io import arrow_at
 
 NOT_CONTENT = frozenset(
@@ -32,8 +34,8 @@ NOT_CONTENT = frozenset(
 )
 """Columns that may differ between runs with equal results (by tiling, names of settings, or the version), and those
 that say where figures come from: the figures themselves and the reasons count."""
-LATER = frozenset({"guides_followed", "guides_not_followed"})
-"""Columns that count in rows that have a value there: digests without the options that fill them stay as they were."""
+ADDED = frozenset({*OVERHANG_COLUMNS, "overhang_source", "lod23_reason", "guides_followed", "guides_not_followed"})
+"""Columns that only options fill which were added later: they count in rows that have a value there."""
 FIGURES_ONLY = "reason_detail"
 """The column whose figures count and whose words do not."""
 ROWS_A_BATCH = 8192
@@ -154,14 +156,15 @@ def _check_unique(name: str, key: tuple[str, ...], keys: list[npt.NDArray[Any]],
 
 def canonical_rows(batch: pa.RecordBatch) -> Iterator[bytes]:
     """Every row of a batch as bytes that depend only on names and values, not on Arrow's representation."""
-    names = sorted(name for name in batch.schema.names if name not in LATER)
-    later = sorted(name for name in batch.schema.names if name in LATER)
+    names = sorted(set(batch.schema.names) - ADDED)
     cells = [_cells(batch.column(name), name) for name in names]
-    added = [
-        [b"" if cell == _NULL else name.encode() + cell for cell in _cells(batch.column(name), name)] for name in later
-    ]
+    added = sorted(ADDED.intersection(batch.schema.names))
+    further = [[b""] * batch.num_rows]
+    for name in added:
+        heading = _sized(name.encode())
+        further.append([b"" if cell == _NULL else heading + cell for cell in _cells(batch.column(name), name)])
     heading = "\x1f".join(names).encode()
-    for row in zip(*cells, *added, strict=True):
+    for row in zip(*cells, *further, strict=True):
         yield heading + b"".join(row)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from pipeline.export.building_points import building_points
 from pipeline.export.point_files import FOLDER, TILESET
+from pipeline.export.solid_geometry import OVERHANGS
 from service.errors import NoSuchBuildingError, NoSuchOutputError
 from service.outputs.building_index import FEATURES_NAME
 from service.outputs.building_pages import GONE, opened_index
@@ -148,10 +149,11 @@ def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str, lod: str | 
     NoSuchBuildingError
         There is none of this kind or level.
     """
-    name, own_lod = building.building_id, building.feature["properties"]["lod"]
+    name, properties = building.building_id, building.feature["properties"]
+    own_lod = properties["lod"]
     if building.mesh_path is None:
         if own_lod is None:
-            why = building.feature["properties"]["reason"]
+            why = properties["reason"]
             raise NoSuchBuildingError(f"building {name} has no model ({why}), so it has no mesh")
         raise NoSuchBuildingError(f"the request left out the meshes: use CityJSON for building {name}")
     kind = building.mesh_path.rpartition(".")[2]
@@ -161,10 +163,12 @@ def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str, lod: str | 
     path = run_dir / building.mesh_path
     if lod not in {None, own_lod}:
         # named by pipeline.export.tile.mesh_path
-        coarser = path.with_stem(f"{path.stem}-lod{str(lod).replace('.', '')}")
-        if not coarser.is_file() or str(lod) > own_lod:
+        other = path.with_stem(f"{path.stem}-lod{str(lod).replace('.', '')}")
+        # the file of a level has the next coarser model of buildings that are not modelled in it
+        finest = own_lod if properties.get("overhang_source") is None else OVERHANGS
+        if not other.is_file() or str(lod) > finest:
             raise NoSuchBuildingError(f"building {name} has no mesh in LoD{lod}; its own is in LoD{own_lod}")
-        return coarser
+        return other
     if not path.is_file():
         raise NoSuchBuildingError(f"the mesh of building {name} is no longer in the state folder: submit the job again")
     return path

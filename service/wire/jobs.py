@@ -120,7 +120,7 @@ class JobForm(Answer):
     bbox: str | None = Field(None, description="x_min,y_min,x_max,y_max in the tiles' CRS.")
     method: str | None = None
     preset: str | None = Field(None, description="Starting point of the method's settings.")
-    lods: str | None = Field(None, description="Levels of detail with commas between them: 1.2, 1.3, 2.2.")
+    lods: str | None = Field(None, description="Levels of detail with commas between them: 1.2, 1.3, 2.2, 2.3.")
     methods: list[str] | None = Field(
         None,
         description="Makes the job a comparison of these, each METHOD or METHOD:PRESET, instead of method and preset: "

@@ -235,3 +235,29 @@ def test_scanned_buildings_without_overhangs_keep_their_true_area() -> None:
     assert walls > 0.3 * len(areas)
     assert abs(np.median(drawn_m2 / true_m2) - 1.0) < 0.01
     assert abs(drawn_m2.sum() / true_m2.sum() - 1.0) < 0.01
+
+
+def test_overhangs_under_the_least_one_and_within_their_error_do_not_count() -> None:
+    points = facades(street(), wall(0, 0.15), wall(1, 0.4))
+    eaves_mm = shapely.MultiPolygon([shapely.transform(EAVES, lambda xy: xy * 1e3)])
+    walls = walls_beneath(eaves_mm, points, 0.0, 0.0, 0.2)
+    assert np.allclose(shapely.bounds(walls.overhung_mm) / 1e3, (0.25, 0.0, 11.6, 7.75), atol=0.03)
+    assert walls.outline_mm.bounds[1] == pytest.approx(150.0, abs=30.0)
+    assert walls.counted_m == walls.widest_m == pytest.approx(0.4, abs=0.03)
+    # the walls of a line are known to 0.087 m
+    assert walls_beneath(eaves_mm, facades(street(), wall(0, 0.07)), 0.0, 0.0, 0.05).counted_m == 0.0
+
+
+def test_a_ring_that_would_break_loses_the_strips_along_its_lines() -> None:
+    # a bridge of 0.6 m between two wings, narrower than its overhangs of 0.4 m on either side
+    bridged = shapely.union_all([shapely.box(0, 0, 5, 8), shapely.box(5, 3, 7, 3.6), shapely.box(7, 0, 12, 8)])
+    ground = np.random.default_rng(2).uniform((5, 0, 0), (7, 8, 0), (400, 3))
+    points = facades(street(), ground)
+    eaves_mm = shapely.MultiPolygon([shapely.transform(bridged, lambda xy: xy * 1e3)])
+    walls = walls_beneath(eaves_mm, points, 0.0, 0.4, 0.2)
+    assert walls.outline_mm.equals(eaves_mm)
+    drawn = shapely.transform(walls.overhung_mm, lambda xy: xy / 1e3)
+    assert drawn.is_valid
+    wanted = shapely.buffer(bridged, -0.4, join_style="mitre")
+    assert len(drawn.geoms) == len(wanted.geoms) == 2
+    assert shapely.symmetric_difference(drawn, wanted).area < 0.4

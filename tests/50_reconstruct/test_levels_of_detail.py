@@ -97,5 +97,5 @@ def test_settings_name_the_levels_and_change_the_hash() -> None:
     some = RunSettings.from_mapping({"lods": "1.2,2.2"})
     assert some.building.lods == ("1.2", "2.2")
     assert some.settings_hash != RunSettings.from_mapping({}).settings_hash
-    with pytest.raises(SettingsError, match=r"lods is '2\.2,1\.2': use one of 1\.2, 1\.3, 2\.2, 1\.2,1\.3"):
+    with pytest.raises(SettingsError, match=r"lods is '2\.2,1\.2': use one of 1\.2, 1\.3, 2\.2, 2\.3, 1\.2,1\.3"):
         RunSettings.from_mapping({"lods": "2.2,1.2"})

@@ -21,7 +21,8 @@ def _object(optional: dict[str, Schema] | None = None, **required: Schema) -> Sc
 _TEXT, _NUMBER, _INTEGER = ({"type": name} for name in ("string", "number", "integer"))
 _NUMBERS = _array(_NUMBER, 3, 3)
 _RINGS = _array(_array({"type": "integer", "minimum": 0}, 3), 1)
-_SURFACE = _object(type={"enum": ["RoofSurface", "WallSurface", "GroundSurface"]}) | {"additionalProperties": True}
+_SURFACES = ["RoofSurface", "WallSurface", "GroundSurface", "OuterCeilingSurface"]
+_SURFACE = _object(type={"enum": _SURFACES}) | {"additionalProperties": True}
 _SOLID = _object(
     type={"const": "Solid"},
     lod=_TEXT | {"pattern": r"^[0-3](\.[0-3])?$"},

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+import shapely
 from shapely import Polygon, unary_union
 
 from pipeline.export.records import RecordContext, RejectedObject
@@ -13,6 +14,8 @@ from pipeline.model import (
     FaceKind,
     LodModel,
     ModelQuality,
+    Overhangs,
+    OverhangSource,
     Plane,
     Reason,
     RoofFace,
@@ -21,6 +24,9 @@ from pipeline.model import (
     SolidFace,
     Status,
 )
+from pipeline.quality.validity import check_solid
+from pipeline.roof.overhangs import overhanging_solids
+from pipeline.roof.solid import SolidPart
 
 ORIGIN = (85_000.0, 447_000.0, 2.0)
 
@@ -172,6 +178,16 @@ def courtyard(building_id: str = "courtyard") -> BuildingResult:
 def two_parts(building_id: str = "two_parts") -> BuildingResult:
     """Two touching gables, a solid each."""
     return building(building_id, gable_solid(), gable_solid(10.0, 2))
+
+
+def overhung(building_id: str = "overhung") -> BuildingResult:
+    """The gable with its walls 0.5 m inside the eaves: LoD2.3 beside LoD2.2."""
+    result = building(building_id, gable_solid())
+    plan = shapely.box(0.0, 0.0, 10.0, 8.0)
+    part = SolidPart(solid=result.solids[0], faces=result.faces, footprint=plan)
+    walls_mm = shapely.MultiPolygon([shapely.box(500, 500, 9500, 7500)])
+    solids = overhanging_solids([part], result.planes, walls_mm, 0.2, 0.1, lambda solid: not check_solid(solid))
+    return dataclasses.replace(result, overhangs=Overhangs(solids=tuple(solids), source=OverhangSource.SEEN))
 
 
 def levelled(building_id: str = "levelled") -> BuildingResult:

@@ -134,6 +134,19 @@ def test_levels_of_detail_are_geometries_of_the_same_parts(contexts: Contexts) -
             assert roofs == [{"type": "RoofSurface", "slope_deg": 0.0, "aspect_deg": 0.0}]
 
 
+def test_overhangs_are_a_further_geometry_with_undersides_and_the_planes_of_the_record(contexts: Contexts) -> None:
+    feature = sequence(contexts["compound"], [small.overhung])[1]
+    detailed, finer = feature["CityObjects"]["overhung-0"]["geometry"]
+    assert (detailed["lod"], finer["lod"]) == ("2.2", "2.3")
+    (shell,), semantics = finer["boundaries"], finer["semantics"]
+    assert_closed(ring for surface in shell for ring in surface)
+    kinds = Counter(semantics["surfaces"][value]["type"] for value in semantics["values"][0])
+    assert kinds == {"RoofSurface": 2, "WallSurface": 12, "GroundSurface": 1, "OuterCeilingSurface": 2}
+    roofs = [surface for surface in semantics["surfaces"] if surface["type"] == "RoofSurface"]
+    assert [roof["plane_id"] for roof in roofs] == [0, 1]
+    assert feature["CityObjects"]["overhung"]["attributes"]["overhang_source"] == "seen"
+
+
 def test_semantic_surfaces_tell_slope_and_aspect_of_each_roof_plane(contexts: Contexts) -> None:
     feature = sequence(contexts["compound"], [small.two_parts])[1]
     (solid,) = feature["CityObjects"]["two_parts-1"]["geometry"]

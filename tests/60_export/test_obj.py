@@ -105,6 +105,14 @@ def test_buildings_without_a_solid_leave_no_object(contexts: Contexts) -> None:
     assert (len(vertices), objects) == (0, [])
 
 
+def test_undersides_are_a_group_of_their_own(contexts: Contexts) -> None:
+    reference = contexts["compound"].reference
+    _, (one,) = read_obj(obj_text([small.overhung()], reference, "2.3"))
+    assert Counter(group for group, _, _ in one.faces) == {"roof": 2, "wall": 12, "ground": 1, "ceiling": 2}
+    own = obj_text([small.overhung("gable")], reference)
+    assert own == obj_text([small.gable()], reference)
+
+
 def test_a_coarser_level_takes_the_place_of_the_records_own_and_a_fallback_block_stays(contexts: Contexts) -> None:
     results = [small.levelled(), small.courtyard(), small.gable()]
     tops = {}

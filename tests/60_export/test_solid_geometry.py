@@ -24,7 +24,12 @@ from pipeline.quality.validity import check_solid
 
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
 BUILT = (small.gable, small.courtyard, small.two_parts, small.pent)
-KINDS = {"RoofSurface": FaceKind.ROOF, "WallSurface": FaceKind.WALL, "GroundSurface": FaceKind.GROUND}
+KINDS = {
+    "RoofSurface": FaceKind.ROOF,
+    "WallSurface": FaceKind.WALL,
+    "GroundSurface": FaceKind.GROUND,
+    "OuterCeilingSurface": FaceKind.CEILING,
+}
 
 
 def table_of(context: RecordContext, *builders: Builder) -> bytes:
@@ -146,6 +151,19 @@ def test_coarser_solids_have_columns_of_their_own(contexts: Contexts) -> None:
     assert solid_columns(small.gable(), reference)["solid_lod13"] is None
 
 
+def test_solids_with_overhangs_have_columns_of_their_own(contexts: Contexts) -> None:
+    result, reference = small.overhung(), contexts["compound"].reference
+    assert result.overhangs is not None
+    columns = solid_columns(result, reference)
+    named = {f"solid{end}": columns[f"solid_lod23{end}"] for end in ("", "_parts", "_surfaces", "_planes")}
+    (again,) = solids_again(named, (1.0, 1.0))
+    assert check_solid(again) == ()
+    assert volume(again) == pytest.approx(volume(result.overhangs.solids[0]))
+    assert columns["solid_lod23_surfaces"].count("OuterCeilingSurface") == 2
+    assert columns["solid"] == solid_columns(small.gable("overhung"), reference)["solid"]
+    assert solid_columns(small.gable(), reference)["solid_lod23"] is None
+
+
 def test_geopandas_reads_coarser_solids_where_there_are_any(tmp_path: Path, contexts: Contexts) -> None:
     path = tmp_path / "buildings.parquet"
     path.write_bytes(table_of(contexts["compound"], *BUILT, small.levelled))
@@ -163,5 +181,8 @@ def test_the_finest_model_up_to_a_level_is_found() -> None:
     levelled, block = small.levelled(), small.courtyard()
     assert [model_at(levelled, lod).lod for lod in (None, "2.2", "1.3", "1.2")] == ["2.2", "2.2", "1.3", "1.2"]
     assert [model_at(block, lod).lod for lod in (None, "1.3", "1.2")] == ["1.2", "1.2", "1.2"]
+    overhung = small.overhung()
+    assert [model_at(overhung, lod).lod for lod in (None, "2.2", "2.3")] == ["2.2", "2.2", "2.3"]
+    assert model_at(small.gable(), "2.3").lod == "2.2"
     assert model_at(small.gable(), "1.3") is None
     assert model_at(small.failed(), None) is None

@@ -128,7 +128,7 @@ def test_the_command_line_and_the_service_offer_the_meshes_that_are_written() ->
 def test_every_level_of_detail_has_mesh_files_of_its_own(
     tmp_path: Path, contexts: Contexts, meshes: str, stems: tuple[str, ...], ending: str
 ) -> None:
-    context = dataclasses.replace(contexts["compound"], coarser_lods=("1.2", "1.3"))
+    context = dataclasses.replace(contexts["compound"], further_lods=("1.2", "1.3"))
     reported = write_tile(tmp_path, "t1", [small.levelled(), small.courtyard(), small.failed()], [], context, meshes)
     wanted = {f"meshes/t1/{stem}{suffix}.{ending}" for stem in stems for suffix in ("", "-lod12", "-lod13")}
     assert {path for path in reported.digests if path.startswith("meshes/")} == wanted

@@ -43,7 +43,7 @@ def test_an_updated_tile_is_the_tile_written_whole(
     before, fresh, replaced = CASES[case]
     if case == "one that moves the origin":
         before = [*[b for b in before if b.building_id != "gable"], MOVED]
-    context = dataclasses.replace(contexts[crs], coarser_lods=("1.3",))
+    context = dataclasses.replace(contexts[crs], further_lods=("1.3",))
     write_tile(tmp_path / "old", KEY, before, rejected_objects[:1], context, meshes)
     after = [*[b for b in before if b.building_id not in replaced], *fresh]
     gone = dataclasses.replace(rejected_objects[1], object_id="gable" if "gable" in replaced else "pole")

@@ -104,7 +104,7 @@ def write_run(
     meshes: str = "building",
     failed_tile: str | None = None,
     status: RunStatus = RunStatus.FINISHED,
-    coarser_lods: tuple[str, ...] = (),
+    further_lods: tuple[str, ...] = (),
     points: bool = True,
     tiles_without_points: tuple[str, ...] = (),
 ) -> Path:
@@ -116,7 +116,7 @@ def write_run(
         engine_version="0.1.0",
         acquired_from=dt.datetime(2014, 3, 1, 10, tzinfo=dt.UTC),
         acquired_to=dt.datetime(2014, 3, 1, 11, tzinfo=dt.UTC),
-        coarser_lods=coarser_lods,
+        further_lods=further_lods,
     )
     (run_dir / "state").mkdir(parents=True)
     for key, buildings in tiles.items():

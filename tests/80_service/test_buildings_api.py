@@ -448,7 +448,7 @@ def test_a_building_is_had_in_each_level_of_detail_that_was_made(
     levelled, block = runs.placed(small.levelled(), "levelled", 0.0, 0.0), runs.placed(small.courtyard(), "c", 0, 50.0)
     tiles = {"x850_y4470": [levelled, block]}
     job = service.finished(
-        lambda run_dir: runs.write_run(run_dir, tiles, meshes=meshes, coarser_lods=("1.2", "1.3")), meshes=meshes
+        lambda run_dir: runs.write_run(run_dir, tiles, meshes=meshes, further_lods=("1.2", "1.3")), meshes=meshes
     )
     form = "glb" if meshes == "glb" else "obj"
 

@@ -193,7 +193,8 @@ def gather(
     digest = hashlib.sha256(points.tobytes())
     digest.update(ground_mm.tobytes())
     beside_mm = later_mm = np.empty((0, 3), np.int64)
-    if roof is not None and footprint is None and roof.needs_facades(is_drawn=site.outline is not None):
+    is_drawn, is_given = site.outline is not None, footprint is not None
+    if roof is not None and roof.needs_facades(is_drawn=is_drawn, is_given=is_given):
         beside_mm, later_mm = _beside(scratch, grid, xyz, _grown(own, _BESIDE_CELLS), around)
         digest.update(beside_mm.tobytes())
         digest.update(later_mm.tobytes())

@@ -126,7 +126,7 @@ def record_context(plan: Plan, settings: RunSettings) -> RecordContext:
         engine_version=__version__,
         acquired_from=min((a for a, _ in known), default=None),
         acquired_to=max((b for _, b in known), default=None),
-        coarser_lods=settings.building.lods[:-1],
+        further_lods=settings.building.further_lods,
     )
 
 

@@ -1,6 +1,11 @@
 /** Levels of detail of the models, numbered as in Biljecki et al. (2016). */
 
-const WORDS: Record<string, string> = { "1.2": "one block", "1.3": "level parts", "2.2": "roof faces" };
+const WORDS: Record<string, string> = {
+  "1.2": "one block",
+  "1.3": "level parts",
+  "2.2": "roof faces",
+  "2.3": "roof faces with overhangs",
+};
 
 /** The parts of a model of this level; empty for an unknown level. */
 export function levelWords(lod: string): string {
