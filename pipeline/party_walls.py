@@ -21,7 +21,7 @@ from pipeline.parameters import Parameters, parameter
 Shapes = npt.NDArray[np.object_]
 """(n,) shapely geometries."""
 
-_ROUNDED_M = 1e-6
+ROUNDED_M = 1e-6
 """Distances that differ by less are equal: coordinates are multiples of 1 mm, or of a part of a foot."""
 
 
@@ -148,9 +148,9 @@ def contacts(walls: Walls, own: BoolArray, settings: PartyWallSettings) -> Conta
     shared = _areas_only(shared)
     ahead = [_ahead(planes, index, origin, along, normal) for index in (first, second)]
     gap = ahead[1] - ahead[0]
-    shared = _areas_only(_within(shared, gap, settings.max_distance_m + _ROUNDED_M))
+    shared = _areas_only(_within(shared, gap, settings.max_distance_m + ROUNDED_M))
     area = shapely.area(shared)
-    kept = area >= max(settings.min_area_m2, _ROUNDED_M)
+    kept = area >= max(settings.min_area_m2, ROUNDED_M)
     order = np.flatnonzero(kept)
     first, second, shared, gap = first[order], second[order], shared[order], gap[order]
     middle = ((ahead[0] + ahead[1]) / 2.0)[order]
@@ -176,7 +176,7 @@ def _pairs(walls: Walls, planes: _Planes, own: BoolArray, settings: PartyWallSet
     mine = np.flatnonzero(own)
     # the planes of two walls may turn towards each other between their traces' ends
     asked, found = shapely.STRtree(traces).query(
-        traces[mine], predicate="dwithin", distance=settings.max_distance_m + _ROUNDED_M
+        traces[mine], predicate="dwithin", distance=settings.max_distance_m + ROUNDED_M
     )
     first, second = mine[asked], found
     rank = np.empty(len(walls), np.int64)

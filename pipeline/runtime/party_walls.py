@@ -19,7 +19,7 @@ from pipeline.export.result_file import SUFFIX
 from pipeline.export.solid_geometry import SURFACES
 from pipeline.io import LocalStorage
 from pipeline.model import BoolArray, FaceKind
-from pipeline.party_walls import Contacts, PartyWallSettings, Walls, contacts, wall_areas
+from pipeline.party_walls import ROUNDED_M, Contacts, PartyWallSettings, Walls, contacts, wall_areas
 from pipeline.runtime.manifest import RunManifest
 from pipeline.runtime.monitoring.events import Event, Listener, ignore
 from pipeline.runtime.publishing import (
@@ -158,7 +158,7 @@ def _write_tile(files: list[Any], run: _Run, tile: str, settings: PartyWallSetti
     if not len(own.ids):
         return
     walls = own.walls
-    for other in run.near(tile, settings.max_distance_m):
+    for other in run.near(tile, settings.max_distance_m + 2.0 * ROUNDED_M):
         if other != tile:
             walls = walls.with_others(run.tile(other).walls)
     is_own = np.arange(len(walls)) < len(own.walls)

@@ -118,6 +118,17 @@ def test_one_tile_or_two_give_the_same_rows(tmp_path: Path) -> None:
     assert found[0] == found[1] == found[2]
 
 
+def test_walls_exactly_at_the_limit_touch_also_across_tiles(tmp_path: Path) -> None:
+    context = RecordContext(reference=small.Reference(), settings_hash="ab", engine_version="0")
+    found = []
+    for name, cuts in (("whole", [ROW]), ("single", range(1, ROW + 1))):
+        folder = write_run(tmp_path / name, [])
+        for first, last in zip([0, *cuts], cuts, strict=False):
+            write_tile(folder, f"n{last}", row(pitch_m=10.1)[first:last], [], context)
+        found.append(tables(folder, tmp_path)[0].num_rows)
+    assert found == 2 * [HALVES * (ROW - 1)]
+
+
 def test_files_are_geoparquet_with_their_tolerances_and_the_same_bytes_each_time(run_dir: Path, tmp_path: Path) -> None:
     for name in ("one", "two"):
         tables(run_dir, tmp_path / name, settings=PartyWallSettings(max_distance_m=0.2))
