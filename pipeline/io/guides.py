@@ -14,7 +14,7 @@ import shapely
 from shapely import LineString
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
-from pipeline.io.crs import SpatialReference
+from pipeline.io.crs import LARGEST_COORDINATE, SpatialReference
 from pipeline.io.nearby import Shape
 from pipeline.io.placed_features import boxes_around, in_metres
 from pipeline.io.urls import shown
@@ -99,9 +99,9 @@ def read_guides(
     kinds = _kinds(found, kind_column, problems)
     kept = np.array([row for row in range(len(geometries)) if row not in problems], np.int64)
     lines = in_metres(name, "guides", shapely.force_2d(geometries[kept]), found.crs, reference, warnings)
-    whole = np.isfinite(shapely.bounds(lines)).all(axis=1)
+    whole = (np.abs(shapely.bounds(lines)) <= LARGEST_COORDINATE).all(axis=1)
     for row in kept[~whole].tolist():
-        problems[row] = ("outside_crs", "it cannot be reprojected to the run's CRS")
+        problems[row] = ("outside_crs", "it has no place in the run's CRS")
     if not whole.any() and not found.elsewhere:
         raise EmptyInputError(name, f"none of the {len(geometries)} features is a line that can be used", "Give lines")
     guides = tuple(

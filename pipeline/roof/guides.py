@@ -19,6 +19,8 @@ OF_OUTLINES = frozenset({GuideKind.EAVE, GuideKind.ANY})
 _STEPS = frozenset({GuideKind.EAVE, GuideKind.STEP})
 _MIN_PIECE_M = 0.5
 """Shorter pieces are not looked at: the ends of lines that lie beside a building."""
+_MOST_PIECES = 100
+"""Most pieces within one roof, the longest ones: the faces may be arranged once for each."""
 _ON_EDGE_M = 0.1
 """A guide is followed where an edge is this near: chords pass through vertices within 6 cm."""
 _FOLLOWED_SHARE = 0.5
@@ -52,13 +54,16 @@ def lines_within(guides: Iterable[Guide], area: shapely.Geometry) -> list[list[L
 def inner_pieces(guides: Sequence[Guide], outline_mm: MultiPolygon) -> tuple[FloatArray, BoolArray]:
     """The straight pieces (g, 4) of guides within an outline, local metres; what runs along the outline is left out.
 
-    Also returns which of them are known as steps, (g,): eaves over a lower part are.
+    Of more than 100 the longest ones. Also returns which of them are known as steps, (g,): eaves over a lower part are.
     """
     outline = shapely.transform(outline_mm, lambda xy: xy * 1e-3)
     inside = shapely.difference(outline, shapely.buffer(outline.boundary, _ON_EDGE_M))
     found = [pieces_of(lines) for lines in lines_within(guides, inside)]
     may_step = [np.full(len(pieces), guide.kind in _STEPS) for guide, pieces in zip(guides, found, strict=True)]
-    return np.concatenate([np.empty((0, 4)), *found]), np.concatenate([np.empty(0, np.bool_), *may_step])
+    pieces, steps = np.concatenate([np.empty((0, 4)), *found]), np.concatenate([np.empty(0, np.bool_), *may_step])
+    lengths_mm = np.rint(1e3 * np.hypot(pieces[:, 2] - pieces[:, 0], pieces[:, 3] - pieces[:, 1]))
+    longest = np.sort(np.argsort(-lengths_mm, kind="stable")[:_MOST_PIECES])
+    return pieces[longest], steps[longest]
 
 
 def guided_outline(

@@ -45,6 +45,12 @@ def test_four_formats_give_the_same_lines_in_plan(tmp_path: Path, suffix: str) -
     assert (found.issues, found.elsewhere) == ((), 0)
 
 
+def test_a_line_to_the_end_of_all_numbers_has_no_place_in_the_crs(tmp_path: Path) -> None:
+    found = read(write(tmp_path / "a.parquet", [LineString([(85_000.0, 447_004.0), (1e300, 447_004.0)]), RIDGE]))
+    assert [issue.problem for issue in found.issues] == ["outside_crs"]
+    assert len(found.guides) == 1
+
+
 def test_a_line_without_a_kind_is_of_any_kind(tmp_path: Path) -> None:
     found = read(write(tmp_path / "a.gpkg", kind=[None, " "]))
     assert [guide.kind for guide in found.guides] == [GuideKind.ANY] * 2

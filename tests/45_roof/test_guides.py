@@ -254,6 +254,15 @@ def test_pieces_along_the_outline_are_not_inner_ones() -> None:
     assert pieces_of([LineString([(0, 0), (0.3, 0), (2, 0)])]).tolist() == [[0.3, 0.0, 2.0, 0.0]]
 
 
+def test_of_very_many_pieces_the_longest_take_part() -> None:
+    short = guides(*([(1.0, y), (2.0, y)] for y in np.linspace(1.0, 7.0, 60)))
+    long = guides(*([(3.0, y), (6.0, y)] for y in np.linspace(1.0, 7.0, 60)))
+    found, may_step = inner_pieces([*short, *long], BOX_MM)
+    assert len(found) == len(may_step) == 100
+    assert (found[:40, 2] == 2.0).all()
+    assert (found[40:, 2] == 6.0).all()
+
+
 def test_guides_are_counted_where_edges_run_along_half_of_them() -> None:
     faces = [shapely.box(0, 0, 5, 8), shapely.box(5, 0, 10, 8)]
     along, across = [(5.0, 1.0), (5.0, 7.0)], [(1.0, 4.0), (9.0, 4.0)]
