@@ -258,7 +258,7 @@ def test_a_job_that_the_disk_never_has_room_for_fails_with_the_reason(bench: Ben
 
 def test_the_end_of_a_job_is_written_on_a_full_disk(small_disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(small_disk / "state", monkeypatch)
-    monkeypatch.setattr("service.driver.attempt.outcome", lambda _: "x" * MIB)
+    monkeypatch.setattr("service.driver.attempt.outcome", lambda *_: "x" * MIB)
     plain = bench.script.write_outputs
 
     def write_outputs(run_dir: Path, out_dir: Path, *others: Any) -> None:
