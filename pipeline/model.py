@@ -478,9 +478,9 @@ class Overhangs:
     """Closed solids, one for each solid of the record's model, in the same order; their roofs number its planes. Empty
     where there are none."""
     source: OverhangSource | None = None
-    """Where the overhangs come from; None where there are no solids."""
+    """Where the overhangs come from; None without solids."""
     reason: NoOverhang | None = None
-    """Why there are no solids; None where there are."""
+    """Why no solid was made; None if one was."""
 
 
 class DecisionKind(StrEnum):
@@ -605,4 +605,4 @@ class BuildingResult:
     coarser: tuple[LodModel, ...] = ()
     """Models at the coarser requested levels of detail, the finest first; none beside a fallback block."""
     overhangs: Overhangs | None = None
-    """The model in LoD2.3 beside that of the record; None where it is not asked for, or where there is no model."""
+    """The model in LoD2.3 beside that of the record; None unless the settings request it, and without a model."""

@@ -161,8 +161,8 @@ def _with_shared_vertices(polygons: Sequence[Polygon], own: Sequence[XY]) -> tup
     found: list[Polygon] = []
     for polygon in polygons:
         shapely.prepare(polygon)
-        own = [cell for cell in cells if shapely.contains(polygon, shapely.point_on_surface(cell))]
-        if len(own) != 1:
+        within = [cell for cell in cells if shapely.contains(polygon, shapely.point_on_surface(cell))]
+        if len(within) != 1:
             raise BuildingError(Reason.NO_PARTITION, "roof faces overlap where they are continued")
-        found.append(own[0])
+        found.append(within[0])
     return tuple(found)

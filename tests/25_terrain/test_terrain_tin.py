@@ -263,6 +263,6 @@ def test_the_step_to_a_lower_floor_is_closed_on_a_border_too(houses: list[Outlin
     free = [(a, b) for a, b in found if (b, a) not in found]
     inside = [(a, b) for a, b in free if not any(a[d] == b[d] and a[d] in (0, 2 * SIDE) for d in (0, 1))]
     upright = [(a, b) for a, b in inside if a[:2] == b[:2]]
-    # the ends of a common wall are free: there is no terrain between the floors
+    # no terrain lies between the floors: the ends of a common wall are free
     assert {(a[2], b[2]) for a, b in inside if (a, b) not in upright} == {(3000, 3000), (3400, 3400)}
     assert max(found.values()) == 1
