@@ -12,7 +12,9 @@ import hashlib
 import os
 import shutil
 import uuid
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path, PurePosixPath
 from typing import Protocol
@@ -20,6 +22,7 @@ from typing import Protocol
 from pipeline.errors import RunError
 
 BLOCK_BYTES = 1 << 20
+_SYNCED_AT_ONCE = 8
 TEMPORARY_SUFFIX = ".part"
 """Ending of unfinished files; `keys` does not list them."""
 
@@ -112,6 +115,18 @@ class LocalStorage:
         """Where a thing is or would be."""
         return self.root.joinpath(*parts_of_key(key))
 
+    def paths(self, key: str) -> tuple[Path, Path]:
+        """Where a thing is or would be, and a temporary path beside it in a folder that is there.
+
+        Raises RunError if the folder cannot be made.
+        """
+        final = self.path(key)
+        try:
+            final.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as fault:
+            raise RunError(f"{final.parent}: the folder cannot be made ({fault.strerror or fault})") from fault
+        return final, final.with_name(f".{final.name}.{uuid.uuid4().hex}{TEMPORARY_SUFFIX}")
+
     @property
     def place(self) -> str:
         """The folder."""
@@ -122,30 +137,22 @@ class LocalStorage:
         self.root.mkdir(parents=True, exist_ok=True)
 
     @contextlib.contextmanager
-    def putting(self, key: str, *, sync_folder: bool = True) -> Iterator[Path]:
+    def putting(self, key: str) -> Iterator[Path]:
         """A temporary path beside the final one, for the caller to write; renamed when the block ends.
 
-        When the block raises, the temporary file is removed and what was under the key stays. Without `sync_folder` a
-        power loss can undo the rename until the caller syncs the folder. Raises RunError if the folder cannot be made,
-        or the block wrote nothing to the path.
+        When the block raises, the temporary file is removed and what was under the key stays. Raises RunError if the
+        folder cannot be made, or the block wrote nothing to the path.
         """
-        final = self.path(key)
-        try:
-            final.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as fault:
-            raise RunError(f"{final.parent}: the folder cannot be made ({fault.strerror or fault})") from fault
-        temporary = final.with_name(f".{final.name}.{uuid.uuid4().hex}{TEMPORARY_SUFFIX}")
+        final, temporary = self.paths(key)
         try:
             yield temporary
             if not temporary.is_file():
                 raise RunError(f"{key!r} was not written")
-            with temporary.open("rb+") as stream:
-                os.fsync(stream.fileno())
+            _sync(temporary)
             temporary.replace(final)
         finally:
             temporary.unlink(missing_ok=True)
-        if sync_folder:
-            _sync_folder(final.parent)
+        _sync_folder(final.parent)
 
     def put(self, key: str, content: bytes) -> None:
         """Put bytes under a key and replace what was there."""
@@ -154,10 +161,14 @@ class LocalStorage:
 
     @contextlib.contextmanager
     def several(self, check: Callable[[], None]) -> Iterator[Puts]:
-        """Puts one after the other; their folders reach the disk together."""
-        puts = _OneByOne(self, check)
-        yield puts
-        puts.wait()
+        """Puts that reach the disk together; none has its name before."""
+        with ThreadPoolExecutor(_SYNCED_AT_ONCE, thread_name_prefix="gablework-sync") as threads:
+            puts = _Together(self, check, threads)
+            try:
+                yield puts
+                puts.wait()
+            finally:
+                puts.drop()
 
     def get(self, key: str) -> bytes:
         """The bytes under a key; raises RunError if there is nothing."""
@@ -208,28 +219,45 @@ class LocalStorage:
 
 
 @dataclasses.dataclass(frozen=True)
-class _OneByOne:
-    """Puts that are there when they return, and survive a power loss from the next wait on.
+class _Together:
+    """Puts that reach the disk together, from the next wait on: most of each is waiting for the disk.
 
     To sync a folder takes far longer than to sync a small file in it.
     """
 
     storage: LocalStorage
     check: Callable[[], None]
-    folders: set[Path] = dataclasses.field(default_factory=set)
-    """Folders that have new names since the last wait."""
+    threads: ThreadPoolExecutor
+    written: dict[Path, Path] = dataclasses.field(default_factory=dict)
+    """The final path of each temporary file since the last wait."""
 
     def put(self, key: str, content: bytes) -> None:
-        """Put at once."""
+        """Write a file, without its name."""
         self.check()
-        self.folders.add(self.storage.path(key).parent)
-        with self.storage.putting(key, sync_folder=False) as temporary:
-            temporary.write_bytes(content)
+        final, temporary = self.storage.paths(key)
+        self.written[temporary] = final
+        temporary.write_bytes(content)
 
     def wait(self) -> None:
-        """Bring the new names to the disk."""
-        while self.folders:
-            _sync_folder(self.folders.pop())
+        """Bring all files to the disk, then give them their names and bring these to the disk."""
+        deque(self.threads.map(_sync, self.written), maxlen=0)
+        folders = {final.parent for final in self.written.values()}
+        for temporary, final in self.written.items():
+            temporary.replace(final)
+        self.written.clear()
+        for folder in folders:
+            _sync_folder(folder)
+
+    def drop(self) -> None:
+        """Remove what has no name yet."""
+        for temporary in self.written:
+            temporary.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    """Bring a file's content to the disk."""
+    with path.open("rb+") as stream:
+        os.fsync(stream.fileno())
 
 
 def _sync_folder(folder: Path) -> None:

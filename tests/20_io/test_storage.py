@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import stat
 import threading
 from pathlib import Path
 
@@ -119,7 +120,7 @@ def test_several_puts_are_all_there_when_the_block_ends(storage):
 
 
 def test_several_names_survive_a_power_loss_from_the_next_wait_on(tmp_path, monkeypatch):
-    """A folder is synced after its last new name, once for all of them; a file before it gets its name."""
+    """Files get their names when all of them are on the disk; then their folder is synced, once."""
     synced = []
 
     def sync(handle: int) -> None:
@@ -131,13 +132,38 @@ def test_several_names_survive_a_power_loss_from_the_next_wait_on(tmp_path, monk
     with storage.several(lambda: None) as puts:
         for name in ("a", "b", "c"):
             puts.put(f"meshes/{name}", b"x")
-        assert [path.suffix for path, _ in synced] == [TEMPORARY_SUFFIX] * 3
-        assert all(path.name in names for path, names in synced)
         puts.wait()
+        assert len({path for path, _ in synced[:3]}) == 3
+        assert {Path(name).suffix for _, names in synced[:3] for name in names} == {TEMPORARY_SUFFIX}
         assert synced[3:] == [(tmp_path / "meshes", ["a", "b", "c"])]
         puts.put("buildings", b"x")
     assert [path.parent for path, _ in synced[4:5]] == [tmp_path]
     assert [path for path, _ in synced[5:]] == [tmp_path]
+
+
+def test_several_things_wait_for_the_disk_at_the_same_time(tmp_path, monkeypatch):
+    together = threading.Barrier(3, timeout=60)
+    monkeypatch.setattr(os, "fsync", lambda handle: stat.S_ISREG(os.fstat(handle).st_mode) and together.wait())
+    storage = LocalStorage(root=tmp_path)
+    with storage.several(lambda: None) as puts:
+        for name in ("a", "b", "c"):
+            puts.put(name, b"x")
+    assert storage.keys() == ["a", "b", "c"]
+
+
+def test_what_has_no_name_yet_goes_with_an_error(tmp_path):
+    storage = LocalStorage(root=tmp_path)
+    storage.put("a", b"old")
+
+    def put_two() -> None:
+        with storage.several(lambda: None) as puts:
+            puts.put("a", b"new")
+            raise ValueError("out of paper")
+
+    with pytest.raises(ValueError, match="out of paper"):
+        put_two()
+    assert storage.get("a") == b"old"
+    assert storage.names() == ["a"]
 
 
 def test_what_the_check_raises_ends_several_puts(storage):

@@ -224,7 +224,7 @@ def publish_tile(task: PublishTask) -> InParts[Published]:
     try:
         if task.batches or task.rejected or task.empty_tables:
             with storage.several(task.scratch.check_cancelled) as puts:
-                written = _write(task, _tables_last(puts))
+                written = _write(task, _records_last(puts))
             files, rows = dict(written.digests), _rows(written.tables)
     except RunCancelledError:
         raise
@@ -267,11 +267,11 @@ def _rows(tables: Mapping[str, Any]) -> tuple[Rows, ...]:
     return tuple(rows_of(tables[name], name) for name in TABLES)
 
 
-def _tables_last(puts: Puts) -> Put:
-    """Concurrent puts, except that tables wait for all meshes, which their rows name."""
+def _records_last(puts: Puts) -> Put:
+    """Concurrent puts, except that the records wait for the meshes, which they name, and all else."""
 
     def put(key: str, content: bytes) -> None:
-        if not key.startswith("meshes/"):
+        if key.startswith("buildings/"):
             puts.wait()
         puts.put(key, content)
 
