@@ -10,11 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.radix_sort import radix_order
 from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.spatial_hash import slot_of_key
-
-_BITS = 31
-"""Bits per column or row in one key: a lattice of millimetres fits."""
 
 
 @kernel
@@ -113,8 +111,9 @@ def highest_per_cell(
     if len(found) == 0:
         return found, cell
     x, y = x_mm[found], y_mm[found]
-    # one sort of one whole number in place of two; all are different
-    order = np.argsort(((x - x.min()) << _BITS) | (y - y.min()))
+    y -= y.min()
+    # one whole number in place of two; all are different
+    order = radix_order(((x - x.min()) << int(y.max()).bit_length()) | y)
     place = np.full(len(found) + 1, -1, np.int64)
     place[order] = np.arange(len(found))
     chosen: IntArray = found[order]

@@ -8,10 +8,10 @@ the order of the points, and facets whose circumcircles lie in a shared part of 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.compiler import kernel
 from pipeline.kernels.bounds import bounds_of
+from pipeline.kernels.radix_sort import radix_order
 from pipeline.model import FloatArray, IntArray, LabelArray, Tin
 from pipeline.tin.half_edges import canonical_facets, locate, restore_delaunay, split_facet, start_sphere
 from pipeline.tin.predicates import orientation
@@ -19,29 +19,30 @@ from pipeline.tin.predicates import orientation
 MAX_WINDOW_MM = 2_000_000
 """The largest width or depth of one triangulation."""
 
-_HILBERT_BITS = 16  # of each coordinate on the curve: order only, no geometry
+_HILBERT_BITS = 11  # of each coordinate on the curve: order only, no geometry
 _ROUND_FACTOR = 8  # points of a round over those of the round before
 
 
 @kernel
-def _hilbert_keys(xy_mm: IntArray, x_min: int, y_min: int, shift: int) -> npt.NDArray[np.uint64]:
-    """Position on the Hilbert curve in the upper, index in the lower 32 bits."""
+def _hilbert_keys(xy_mm: IntArray, x_min: int, y_min: int, shift: int) -> IntArray:
+    """Position of each point (n, 2) on the Hilbert curve, (n,)."""
     n = len(xy_mm)
-    keys = np.empty(n, np.uint64)
+    right_of, above = np.empty(n, np.uint32), np.empty(n, np.uint32)
     for i in range(n):
-        a = (xy_mm[i, 0] - x_min) >> shift
-        b = (xy_mm[i, 1] - y_min) >> shift
-        key = np.int64(0)
-        # without branches, several points at a time are worked on
+        right_of[i], above[i] = (xy_mm[i, 0] - x_min) >> shift, (xy_mm[i, 1] - y_min) >> shift
+    keys = np.empty(n, np.int64)
+    # without branches and in 32 bits, several points at a time are worked on
+    for i in range(n):
+        a, b, key = right_of[i], above[i], np.uint32(0)
         for bit in range(_HILBERT_BITS - 1, -1, -1):
             right = (a >> bit) & 1
             upper = (b >> bit) & 1
-            key = (key << 2) | ((3 * right) ^ upper)
+            key = np.uint32((key << 2) | ((3 * right) ^ upper))
             mirrored = -(right & (1 - upper))
-            a, b = a ^ mirrored, b ^ mirrored
+            a, b = np.uint32(a ^ mirrored), np.uint32(b ^ mirrored)
             swapped = (a ^ b) & (upper - 1)
-            a, b = a ^ swapped, b ^ swapped
-        keys[i] = (np.uint64(key) << np.uint64(32)) | np.uint64(i)
+            a, b = np.uint32(a ^ swapped), np.uint32(b ^ swapped)
+        keys[i] = key
     return keys
 
 
@@ -81,14 +82,13 @@ def insert_all(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelArra
 def hilbert_order(xy_mm: IntArray) -> LabelArray:
     """Indices of points, (n,) int32, in the order in which a Hilbert curve passes them; at least one point.
 
-    The cells of the curve are the 2^16th part of the extent; points of one cell are ordered by index.
+    The cells of the curve are the 2^11th part of the extent; points of one cell are ordered by index.
     """
     xy_mm = np.ascontiguousarray(xy_mm)
     low, high = bounds_of(xy_mm)
     extent = int((high - low).max())
     keys = _hilbert_keys(xy_mm, int(low[0]), int(low[1]), max(0, extent.bit_length() - _HILBERT_BITS))
-    keys.sort()
-    return (keys & np.uint64(0xFFFFFFFF)).astype(np.int32)
+    return radix_order(keys)
 
 
 def triangulate(xy_mm: IntArray) -> Tin:
@@ -169,15 +169,15 @@ def unique_xy_ranked(xy_mm: IntArray, z_mm: IntArray) -> tuple[IntArray, LabelAr
     extent = high - low
     if extent.max() >= 1 << 31:
         raise ValueError(f"points extend over {extent.max() / 1000:.3f} m: use coordinates of at most 2^31 mm extent")
-    position = ((xy_mm[:, 0] - low[0]) << 31) + (xy_mm[:, 1] - low[1])
+    position = ((xy_mm[:, 0] - low[0]) << int(extent[1]).bit_length()) + (xy_mm[:, 1] - low[1])
     if (position[1:] > position[:-1]).all():  # points in canonical order, each position once: they mostly are
         each = np.arange(len(position))
         return each, each.astype(np.int32), each.astype(np.int32)
-    return _keep_highest(position, np.ascontiguousarray(z_mm, dtype=np.int64), np.argsort(position))
+    return _keep_highest(position, np.ascontiguousarray(z_mm, dtype=np.int64), radix_order(position))
 
 
 @kernel
-def _keep_highest(position: IntArray, z_mm: IntArray, order: IntArray) -> tuple[IntArray, LabelArray, LabelArray]:
+def _keep_highest(position: IntArray, z_mm: IntArray, order: LabelArray) -> tuple[IntArray, LabelArray, LabelArray]:
     """The kernel of `unique_xy_ranked`; `order` sorts the positions, in whatever way where they are equal."""
     n = len(position)
     stands_for = np.empty(n, np.int32)

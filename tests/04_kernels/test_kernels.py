@@ -24,6 +24,7 @@ from pipeline.kernels.orientation import (
     segments_meet,
     turn_of,
 )
+from pipeline.kernels.radix_sort import radix_order
 from pipeline.kernels.union_find import numbered_sets, root_of, unite, united
 
 PAIRS = st.lists(st.tuples(st.integers(0, 11), st.integers(0, 11)), max_size=20)
@@ -53,6 +54,14 @@ def test_whole_numbers_are_sorted_and_ties_keep_their_order(values: list[int]) -
     keys = np.array(values, np.int64)
     assert ascending_order(keys).tolist() == sorted(range(len(values)), key=values.__getitem__)
     assert in_order(keys).tolist() == sorted(values)
+
+
+@given(st.lists(st.integers(0, 2**63 - 1) | st.integers(0, 3) | st.integers(2000, 5000), max_size=60))
+@settings(deadline=None)
+def test_radix_sort_keeps_the_order_of_ties(values: list[int]) -> None:
+    keys = np.array(values, np.int64)
+    assert radix_order(keys).tolist() == sorted(range(len(values)), key=values.__getitem__)
+    assert keys.tolist() == values
 
 
 @given(st.lists(st.tuples(st.integers(-(2**62), 2**62), st.integers(-3, 3)), min_size=1, max_size=20))

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon, Polygon
 
+from pipeline.kernels.radix_sort import radix_order
 from pipeline.model import BoolArray, IntArray
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import key_of
@@ -181,14 +182,14 @@ def _order_by_owner(records: npt.NDArray[np.void], owner: IntArray) -> IntArray:
     if max(int(x.max()), int(y.max())) >> _PLACE_BITS or int(owner.max()) >> (63 - 2 * _PLACE_BITS):
         return np.lexsort((records["z"], y, x, owner)).astype(np.int64)
     key = (owner << 2 * _PLACE_BITS) | (x << _PLACE_BITS) | y
-    order = np.argsort(key)
+    order = radix_order(key).astype(np.int64)
     key = key[order]
     tied = np.flatnonzero(key[1:] == key[:-1])
     if len(tied):
         rows = np.unique(np.concatenate((tied, tied + 1)))
         points = order[rows]
         order[rows] = points[np.lexsort((points, records["z"][points], key[rows]))]
-    return order.astype(np.int64)
+    return order
 
 
 def _above_ground(
