@@ -33,7 +33,7 @@ from numba.core.typing import templates
 
 from pipeline.compiler import store
 from pipeline.compiler.frame_room import with_room_for_frames
-from pipeline.compiler.processor import GENERIC, processor
+from pipeline.compiler.processor import PORTABLE, processor
 from pipeline.compiler.store import Stored
 
 types: Any = numba.types
@@ -43,7 +43,7 @@ COMMON_OPTIONS = {"nopython": True, "nogil": True}
 """Options of all kernels."""
 # set before numba makes its code generator, which reads them once
 config.CPU_NAME = processor()
-if config.CPU_NAME == GENERIC:
+if config.CPU_NAME == PORTABLE:
     config.CPU_FEATURES = ""
 _ENVIRONMENTS = "_ZN08NumbaEnv"
 _PLAIN = "GABLEWORK_PLAIN_NUMBA"
