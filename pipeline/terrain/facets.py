@@ -216,9 +216,12 @@ def marks(
     return near, shared
 
 
+@kernel
 def with_vertex(facets: LabelArray, marked: BoolArray) -> BoolArray:
     """Mask of the facets with at least one marked vertex."""
-    found: BoolArray = marked[facets[:, 0]] | marked[facets[:, 1]] | marked[facets[:, 2]]
+    found = np.empty(facets.shape[0], np.bool_)
+    for f in range(facets.shape[0]):
+        found[f] = marked[facets[f, 0]] or marked[facets[f, 1]] or marked[facets[f, 2]]
     return found
 
 
