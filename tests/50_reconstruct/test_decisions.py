@@ -165,7 +165,7 @@ def test_every_level_of_detail_that_was_asked_for_is_listed() -> None:
 
 
 GUIDED = {
-    "roof.forms.guided_outline": lambda outline, guides, *_: guides,
+    "roof.forms.guided_outline": lambda _, guides, *__: guides,
     "roof.plan.inner_pieces": lambda guides, *_: guides,
     "roof.plan.with_enclosed_planes": lambda *_: True,
     "roof.plan.arrange": lambda *given: len(given[-1].pieces),
