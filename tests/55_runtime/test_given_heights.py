@@ -194,6 +194,16 @@ def test_a_column_that_is_not_there_ends_the_run_before_it_begins(
         reconstruct(holes, settings={"footprints": {"height": "h"}}, out=str(tmp_path / "never"))
 
 
+def test_classify_refuses_the_columns_that_a_run_refuses(
+    holes: Path, houses: list[Polygon], run_classify: Any, tmp_path: Path
+) -> None:
+    settings = {"footprints": {"height": "hoehe"}}
+    with pytest.raises(UnreadableInputError, match="no column 'hoehe'"):
+        run_classify(holes, footprints=write_outlines(tmp_path, houses), settings=settings)
+    with pytest.raises(SettingsError, match="none are given"):
+        run_classify(holes, settings=settings)
+
+
 def test_a_district_is_no_block(tmp_path: Path) -> None:
     def heights(side_m: float) -> GivenHeights | None:
         known = GivenHeights(height_m=7.0)
