@@ -133,6 +133,28 @@ def test_nothing_else_is_served(client: TestClient, job_id: str, path: str) -> N
     assert (answer.status_code, answer.headers["content-type"]) == (404, "application/problem+json")
 
 
+@pytest.mark.parametrize(
+    "path",
+    [*(f"/jobs/JOB/results/{name}" for name in OUTPUTS if name != "solar"),
+     "/jobs/JOB/results/3dtiles/tileset.json", "/jobs/JOB/results/3dtiles/models/x850_y4470.glb",
+     "/jobs/JOB/results/stac/collection.json", "/jobs/JOB/results/stac/x850_y4470/x850_y4470.json",
+     "/jobs/JOB/run/buildings/tile=x850_y4470/part-0.parquet", "/jobs/JOB/results/3dtiles/nothing.json",
+     "/jobs/JOB/run/state/x1_y1/x1_y1.json", "/collections", "/collections/JOB.buildings",
+     "/collections/JOB.buildings/queryables", "/collections/JOB.buildings/schema", "/collections/JOB.buildings/items",
+     "/collections/JOB.buildings/items?limit=2&filter=height_m%20%3E%201", "/collections/JOB.buildings/items/nothing",
+     "/collections/JOB.nothing/items"],
+)  # fmt: skip
+def test_the_head_of_an_answer_is_that_of_get_without_its_body(client: TestClient, job_id: str, path: str) -> None:
+    place = path.replace("JOB", job_id)
+    for headers in ({}, {"Accept": "text/csv"}, {"Range": "bytes=0-3"}):
+        whole, head = (client.request(method, place, headers=headers) for method in ("GET", "HEAD"))
+        assert head.content == b""
+        assert head.status_code == whole.status_code
+        assert head.headers == whole.headers
+    refused = client.put(place)
+    assert (refused.status_code, refused.headers["allow"]) == (405, "GET, HEAD, OPTIONS")
+
+
 def test_a_job_without_further_formats_says_so(client: TestClient, bare: str) -> None:
     for path in ("results/3dtiles/tileset.json", "results/geopackage"):
         assert "the request left out" in runs.problem(client.get(f"/jobs/{bare}/{path}"), 404, "no-such-output")
