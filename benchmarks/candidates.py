@@ -16,7 +16,7 @@ from pipeline.runtime.plan import make_plan
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.gather import gather
-from pipeline.runtime.stages.given_footprints import given_footprints
+from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.join import join
@@ -46,7 +46,7 @@ def found_scene(
 ) -> FoundScene:
     """The stages of point files up to the join, serially in this process, with given footprints if there are any."""
     plan = make_plan(tiles, ReadOptions(crs=crs), settings)
-    given = None if footprints is None else given_footprints(footprints, plan)
+    given = footprints_of_run(footprints, plan, settings.footprints)
     progress = Progress(ignore)
     with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
         scratch = Scratch(str(Path(folder, "scratch")))

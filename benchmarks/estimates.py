@@ -41,7 +41,7 @@ from pipeline.runtime.request import plan_inputs
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
 from pipeline.runtime.sample import sample_tasks, sample_window, sampled
-from pipeline.runtime.stages.given_footprints import given_footprints
+from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.runtime.stages.model_batch import load
 
 COMMAND = [sys.executable, "-m", "service.cli"]
@@ -163,7 +163,8 @@ def measured_by_cpu(job: Job, out: Path) -> dict[str, Any]:
     (out / "job.toml").write_text(dataclasses.replace(job, workers=0).batch(out / "models"))
     request = dataclasses.replace(read_batch(str(out / "job.toml")).request(), overwrite=True, resources=SERIAL)
     plan, paths = plan_inputs(request, Progress(ignore))
-    known = None if request.footprints is None else len(given_footprints(request.footprints, plan).polygons)
+    given = footprints_of_run(request.footprints, plan, request.settings.footprints)
+    known = None if given is None else len(given.polygons)
     by_rates = expected(plan, known)
     load(request.settings.general.method)
     # libraries and kernels are loaded before the clock starts, as children load them

@@ -50,7 +50,7 @@ from pipeline.roof.flush_walls import unite_flush_walls
 from pipeline.roof.footprint import footprint_in_mm, hull_of_points, outline
 from pipeline.roof.forms import UNDRAWABLE, FaceForm, arranged_forms, template_forms, traced_forms, undrawable
 from pipeline.roof.given_heights import given_block
-from pipeline.roof.guides import followed
+from pipeline.roof.guides import followed, guide_steps
 from pipeline.roof.lower_lods import LodParts, lower_lods
 from pipeline.roof.named_form import BLOCK, PRIMITIVE, NamedForm
 from pipeline.roof.overhangs import UndrawableError, floor_m2, overhanging_solids
@@ -121,7 +121,8 @@ def reconstruct_building(candidate: Candidate, method: str, settings: Reconstruc
 
     The method finds planes; the plan is cut into roof faces and extruded. The first form whose solids are valid is
     delivered, and a block where none is. There is always a result for a known method: a building's own faults are its
-    status and reason, also unexpected ones (`internal_error`). Only a lack of memory is passed on: it says nothing
+    status and reason, also unexpected ones (`internal_error`). A building whose guides may be at fault is modelled
+    without them, and its decisions say so. Only a lack of memory is passed on: it says nothing
     about the building, and a record of it would differ between machines.
 
     Raises
@@ -148,6 +149,10 @@ def reconstruct_building(candidate: Candidate, method: str, settings: Reconstruc
         raise
     except Exception as error:  # noqa: BLE001 - the record holds it, with its place
         result = failed_building(candidate, method, Reason.INTERNAL_ERROR, _describe(error))
+    if candidate.guides and result.reason is Reason.INTERNAL_ERROR:
+        without_guides = reconstruct_building(dataclasses.replace(candidate, guides=()), method, settings)
+        fault = undrawable("guides", RuntimeError(result.reason_detail))
+        return dataclasses.replace(without_guides, decisions=(fault, *without_guides.decisions))
     if result.status is Status.FAILED and result.reason is not Reason.INTERNAL_ERROR and candidate.given is not None:
         without = dataclasses.replace(candidate, points=np.zeros((0, 3)))
         blind = _Building(
@@ -527,7 +532,8 @@ def _record(
     )
     solids = tuple(_renumbered(part.solid, number) for part in model.parts)
     footprint = _united([part.footprint for part in model.parts])
-    guides = followed(candidate.guides, [face.polygon for face in faces], roof.guide_distance_m)
+    with guide_steps():
+        guides = followed(candidate.guides, [face.polygon for face in faces], roof.guide_distance_m)
     residuals, quality = model_quality(
         candidate.points,
         faces,

@@ -33,7 +33,7 @@ from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import check_out
 from pipeline.runtime.scratch.folder import POINT
 from pipeline.runtime.scratch.work_folder import refuse_foreign
-from pipeline.runtime.stages.given_footprints import given_footprints
+from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.tiling import MM
 
 # Constants of the estimate, measured; they decide nothing in a run, so they are not settings.
@@ -126,8 +126,8 @@ def _estimated(batch: Batch, worth_s: float, known: tuple[int, int]) -> Estimate
             shown(paths[0]), f"all {len(paths)} inputs lie off --bbox and --aoi", "Check them, and their CRS"
         )
     buildings, known_from = None, None
-    if request.footprints is not None:
-        given = given_footprints(request.footprints, plan, request.settings.footprints)
+    given = footprints_of_run(request.footprints, plan, request.settings.footprints)
+    if given is not None:
         buildings, known_from = len(given.polygons), "the given footprints"
         work = dataclasses.replace(work, buildings=buildings)
     elif known[0] and known[1] == work.points:

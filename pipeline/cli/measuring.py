@@ -20,6 +20,7 @@ from pipeline.cli.options import (
     VerticalUnit,
 )
 from pipeline.console import Console
+from pipeline.errors import SettingsError
 
 if TYPE_CHECKING:
     from pipeline.ruler.evaluation.evaluate import Evaluation
@@ -47,6 +48,10 @@ def inspect(
         if _is_run(tile):
             from pipeline.report.statistics import run_statistics
 
+            given = {"--crs": crs, "--vertical-unit": vertical_unit, "--settings": settings}
+            unused = [f"{name} {value}" for name, value in given.items() if value is not None]
+            if unused:
+                raise SettingsError([f"{', '.join(unused)}: {tile} is a run, which has its own. Leave them out"])
             statistics = run_statistics(tile)
             show_statistics(console, statistics)
             console.document({"run": tile, "statistics": statistics})

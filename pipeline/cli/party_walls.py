@@ -9,6 +9,9 @@ import typer
 
 from pipeline.cli.options import AsJson, Quiet
 from pipeline.console import Console
+from pipeline.party_walls.settings import PartyWallSettings
+
+_DEFAULTS = PartyWallSettings()
 
 
 def party_walls(
@@ -19,16 +22,19 @@ def party_walls(
     ] = None,
     max_distance: Annotated[
         float, typer.Option(metavar="M", help="Walls touch where they are at most this far apart.")
-    ] = 0.1,
-    max_angle: Annotated[float, typer.Option(metavar="DEG", help="Largest angle between their planes.")] = 5.0,
-    min_area: Annotated[float, typer.Option(metavar="M2", help="Smaller contacts do not count.")] = 0.1,
+    ] = _DEFAULTS.max_distance_m,
+    max_angle: Annotated[
+        float, typer.Option(metavar="DEG", help="Largest angle between their planes.")
+    ] = _DEFAULTS.max_angle_deg,
+    min_area: Annotated[
+        float, typer.Option(metavar="M2", help="Smaller contacts do not count.")
+    ] = _DEFAULTS.min_area_m2,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Find the walls that neighbouring buildings share, with their area. The run stays as it is."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.party_walls import PartyWallSettings
         from pipeline.runtime.party_walls import party_walls as write_party_walls
 
         settings = PartyWallSettings(max_distance_m=max_distance, max_angle_deg=max_angle, min_area_m2=min_area)

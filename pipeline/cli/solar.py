@@ -9,6 +9,9 @@ import typer
 
 from pipeline.cli.options import AsJson, Quiet
 from pipeline.console import Console
+from pipeline.solar.settings import SolarSettings
+
+_DEFAULTS = SolarSettings()
 
 
 def solar(
@@ -24,9 +27,13 @@ def solar(
         float | None,
         typer.Option(metavar="X", help="Linke turbidity of the clear sky, 1 to 10; default pvlib's map by month."),
     ] = None,
-    albedo: Annotated[float, typer.Option(metavar="SHARE", help="Share of the light that the ground reflects.")] = 0.2,
-    reach: Annotated[float, typer.Option(metavar="M", help="Buildings within this distance shade a plane.")] = 100.0,
-    samples: Annotated[int, typer.Option(metavar="N", help="About so many points of each plane.")] = 16,
+    albedo: Annotated[
+        float, typer.Option(metavar="SHARE", help="Share of the light that the ground reflects.")
+    ] = _DEFAULTS.albedo,
+    reach: Annotated[
+        float, typer.Option(metavar="M", help="Buildings within this distance shade a plane.")
+    ] = _DEFAULTS.reach_m,
+    samples: Annotated[int, typer.Option(metavar="N", help="About so many points of each plane.")] = _DEFAULTS.samples,
     sky_only: Annotated[
         bool, typer.Option("--sky-only", help="Only the view of the sky, without pvlib and without a CRS.")
     ] = False,
@@ -38,7 +45,6 @@ def solar(
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.errors import SettingsError
         from pipeline.runtime.solar import solar as write_solar
-        from pipeline.solar.settings import SolarSettings
 
         if weather is not None and (sky_only or turbidity is not None):
             other = "--sky-only" if sky_only else "--turbidity"

@@ -300,7 +300,7 @@ BUILDINGS = (
         INT32,
         COUNT,
         "given guides that edges of the roof faces follow over at least half of their length here; null without a "
-        "model or without any guide near",
+        "model, without any guide near, or where they failed and were left out",
         page="../how_to/guides.md",
     ),
     Column(

@@ -16,7 +16,7 @@ from shapely import MultiPolygon
 from pipeline.errors import BuildingError
 from pipeline.model import Decision, DecisionKind, Outcome, Plane
 from pipeline.roof.footprint import simpler_outlines
-from pipeline.roof.guides import guided_outline
+from pipeline.roof.guides import guide_steps, guided_outline
 from pipeline.roof.named_form import ARRANGEMENT, TEMPLATES, NamedForm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPlan, RoofPoints, arranged_faces, drawn_outline, partition_roof, plan_forms
@@ -54,7 +54,8 @@ def arranged_forms(
     if roof.footprint_mm is not None:
         outline_mm = without_voids(outline_mm, roof.points, roof.spacing_m, settings)
     else:
-        outline_mm = guided_outline(outline_mm, roof.guides, roof.xy_mm, roof.guide_distance_m)
+        with guide_steps():
+            outline_mm = guided_outline(outline_mm, roof.guides, roof.xy_mm, roof.guide_distance_m)
     first, last = _competing_forms(roof, planes, outline_mm, settings, costs, decisions)
     yield from first
     # many planes that meet nearly in one point: with more room between its vertices the solid is valid

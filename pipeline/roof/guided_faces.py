@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import shapely
 
-from pipeline.errors import BuildingError
 from pipeline.model import BoolArray, FloatArray, Plane
 from pipeline.roof.arrangement.guide_lines import Guides, line_through
 from pipeline.roof.partition import RoofPartition
@@ -47,10 +46,7 @@ def guided_faces(
     before = misfits_of(points, free, cap_m)
     kept = np.arange(len(guides.pieces))
     while len(kept):
-        try:
-            drawn = arranged(Guides(guides.pieces[kept], guides.distance_m))
-        except (BuildingError, shapely.errors.GEOSException):
-            return free
+        drawn = arranged(Guides(guides.pieces[kept], guides.distance_m))
         more = misfits_of(points, drawn, cap_m) - before
         worse = np.array(
             [

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import shapely
 from shapely import LineString, MultiPolygon, Polygon
 
+from pipeline.errors import BuildingError
 from pipeline.model import BoolArray, FloatArray, Guide, GuideKind, IntArray
 from pipeline.roof.arrangement.guide_lines import MAX_TURN, line_through
 from pipeline.roof.footprint import polygons_of
@@ -28,6 +30,19 @@ _FOLLOWED_SHARE = 0.5
 _BEYOND_M = 0.15
 """A roof point this far beyond an eave speaks against it; nearer ones are pulses that met it with a part of their beam.
 Chosen on development scenes."""
+
+
+class GuideError(Exception):
+    """A step that needs guides failed. It is not a fault of the building, which is modelled without them."""
+
+
+@contextlib.contextmanager
+def guide_steps() -> Iterator[None]:
+    """Turn the faults of a form within into a GuideError, so that no other form is tried with these guides."""
+    try:
+        yield
+    except (BuildingError, shapely.errors.GEOSException) as error:
+        raise GuideError(str(error)) from error
 
 
 def pieces_of(lines: Iterable[LineString]) -> FloatArray:

@@ -36,7 +36,7 @@ from pipeline.roof.enclosed_planes import with_enclosed_planes
 from pipeline.roof.facades import FacadePoints, Walls, walls_beneath
 from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, outline, polygons_of
 from pipeline.roof.guided_faces import guided_faces
-from pipeline.roof.guides import inner_pieces
+from pipeline.roof.guides import guide_steps, inner_pieces
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels, nearest_points
 from pipeline.roof.named_form import TRACED, NamedForm
 from pipeline.roof.partition import (
@@ -281,7 +281,7 @@ def arranged_faces(
 ) -> RoofPartition:
     """The plan as an arrangement of the lines in which planes meet, and of guides that the points bear out.
 
-    Raises BuildingError `no_partition` where the outline cannot be filled.
+    Raises BuildingError `no_partition` where the outline cannot be filled, GuideError where only guides prevent it.
     """
     coefficients = np.array([plane.coefficients for plane in planes], np.float64).reshape(len(planes), 3)
 
@@ -293,11 +293,12 @@ def arranged_faces(
     free = arranged(NO_GUIDES)
     if not roof.guides:
         return free
-    pieces, may_step = inner_pieces(roof.guides, outline_mm)
-    guides = Guides(pieces, roof.guide_distance_m)
-    coefficients, labels = with_enclosed_planes(roof.points, labels, coefficients, pieces, outline_mm, costs)
-    beside_m = max(guides.distance_m, roof.spacing_m)
-    return guided_faces(arranged, free, roof.points, guides, may_step, beside_m, costs.residual_cap_m)
+    with guide_steps():
+        pieces, may_step = inner_pieces(roof.guides, outline_mm)
+        guides = Guides(pieces, roof.guide_distance_m)
+        coefficients, labels = with_enclosed_planes(roof.points, labels, coefficients, pieces, outline_mm, costs)
+        beside_m = max(guides.distance_m, roof.spacing_m)
+        return guided_faces(arranged, free, roof.points, guides, may_step, beside_m, costs.residual_cap_m)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

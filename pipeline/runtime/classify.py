@@ -24,7 +24,7 @@ from pipeline.runtime.resources import Resources
 from pipeline.runtime.run_context import RunContext, run_context
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
-from pipeline.runtime.stages.given_footprints import given_footprints
+from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use
@@ -152,7 +152,7 @@ def classify(
             raise InputError(shown(path), "classify reads files of this machine only", "Fetch it first")
     for info in plan.sources:
         check_writable(info)
-    footprints = None if request.footprints is None else given_footprints(request.footprints, plan)
+    footprints = footprints_of_run(request.footprints, plan, request.settings.footprints)
     for warning in () if footprints is None else footprints.warnings:
         progress.warn("plan", warning)
     unit_m = plan.reference.horizontal_unit_m

@@ -19,7 +19,8 @@ from pipeline.export.result_file import SUFFIX
 from pipeline.export.solid_geometry import SURFACES
 from pipeline.io import LocalStorage
 from pipeline.model import BoolArray, FaceKind
-from pipeline.party_walls import ROUNDED_M, Contacts, PartyWallSettings, Walls, contacts, wall_areas
+from pipeline.party_walls.contacts import ROUNDED_M, Contacts, Walls, contacts, wall_areas
+from pipeline.party_walls.settings import PartyWallSettings
 from pipeline.runtime.manifest import RunManifest
 from pipeline.runtime.monitoring.events import Event, Listener, ignore
 from pipeline.runtime.publishing import (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import secrets
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from types import MappingProxyType
 from typing import Any, Protocol
 
 from pipeline import __version__
-from pipeline.errors import RunCancelledError
+from pipeline.errors import GableworkError, RunCancelledError
 from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables, parse_variants
@@ -19,7 +20,8 @@ from pipeline.runtime.monitoring.events import Event, Listener
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.run import RunSummary, run
 from pipeline.settings import RunSettings
-from service.driver.leased_job import LeasedJob
+from service.driver.failures import failure_of, has_no_space
+from service.driver.leased_job import LOG, LeasedJob
 from service.driver.messages import (
     classification_digest,
     classification_outcome,
@@ -108,8 +110,8 @@ class Publish(Protocol):
         name: str,
         geoid_height_m: float | None,
         on_progress: Callable[[int, int], None],
-    ) -> dict[str, str]:
-        """Write further formats."""
+    ) -> Mapping[str, Exception]:
+        """Write further formats; returns why some could not be made."""
 
 
 class WriteComparison(Protocol):
@@ -280,9 +282,17 @@ def _published(held: LeasedJob, shop: DriverParts, run_dir: Path, out_dir: Path)
             geoid_height_m=request.geoid_height,
             on_progress=on_progress,
         )
-    problems = {form: held.scrub(problem) for form, problem in found.items()}
-    for form, problem in problems.items():
-        held.record(Event(kind="warning", stage="formats", message=f"{form} could not be published: {problem}"))
+    problems = {}
+    for form, error in found.items():
+        if has_no_space(error):
+            raise error
+        problems[form] = held.scrub(str(error))
+        if not isinstance(error, GableworkError):
+            reference = secrets.token_hex(4)
+            facts = {**held.facts, "reference": reference}
+            LOG.error("%s could not be published: %s", form, error, extra=facts, exc_info=error)
+            problems[form] = failure_of(error, scrub=held.scrub, reference=reference, attempts=1).detail
+        held.record(Event(kind="warning", stage="formats", message=f"{form} could not be published: {problems[form]}"))
     return problems
 
 

@@ -74,8 +74,10 @@ def publish(
     name: str,
     geoid_height_m: float | None = None,
     on_progress: Callable[[int, int], None] = _nothing,
-) -> dict[str, str]:
+) -> dict[str, Exception]:
     """Write a finished run in some formats, beside its outputs; returns why those that are missing could not be made.
+
+    A format that fails leaves nothing behind. The caller must report its error, which may be unexpected.
 
     Parameters
     ----------
@@ -90,16 +92,17 @@ def publish(
     geoid_height_m : float, optional
         Height of the geoid above the ellipsoid, for 3D Tiles.
     on_progress : callable
-        Gets the number of finished formats and of all, after each tile, too. An exception from it ends the work.
+        Gets the number of finished formats and of all, after each tile, too. RunCancelledError from it
+        ends the work.
 
     Raises
     ------
     OSError
-        The folder cannot be written.
+        The folder cannot be made.
     """
-    from pipeline.errors import RunError
+    from pipeline.errors import RunCancelledError
 
-    problems = {}
+    problems: dict[str, Exception] = {}
     out_dir.mkdir(parents=True, exist_ok=True)
     for done, form in enumerate(formats):
 
@@ -109,10 +112,13 @@ def publish(
         on_progress(done, len(formats))
         try:
             _WRITERS[form](run_dir, out_dir, {"name": name, "geoid_height_m": geoid_height_m}, heard)
-        except RunError as error:
-            if isinstance(error.__cause__, OSError):
-                raise error.__cause__ from error
-            problems[form] = str(error)
+        except RunCancelledError:
+            raise
+        except Exception as error:  # noqa: BLE001 - the caller reports it
+            problems[form] = error
+            shutil.rmtree(out_dir / form, ignore_errors=True)
+            for output_id in FORMATS[form]:
+                (out_dir / OUTPUTS[output_id].filename).unlink(missing_ok=True)
     on_progress(len(formats), len(formats))
     return problems
 

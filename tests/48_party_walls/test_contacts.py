@@ -11,7 +11,8 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.party_walls import Contacts, PartyWallSettings, Walls, contacts, wall_areas
+from pipeline.party_walls.contacts import Contacts, Walls, contacts, wall_areas
+from pipeline.party_walls.settings import PartyWallSettings
 
 Wall = shapely.Polygon
 Ring = Sequence[tuple[float, float]]
@@ -146,6 +147,30 @@ def test_of_a_wedge_the_part_within_the_distance_counts(angle_deg: float) -> Non
     assert pairs.distance_m[0] == pytest.approx(0.05, abs=1e-5)
     assert pairs.angle_deg[0] == pytest.approx(angle_deg)
     assert len(found(of, max_angle_deg=angle_deg - 0.01).first) == 0
+
+
+HALF = math.radians(14.99)
+"""Half the angle of a wedge, of nearly the largest angle that settings allow."""
+
+
+@pytest.mark.parametrize("names", ["ab", "ba"])
+@pytest.mark.parametrize(("limit_m", "exposed_m"), [(1.0, 9.0 - 1.0 / (2.0 * math.sin(HALF))), (5.0, 0.0)])
+def test_walls_share_their_own_area_where_a_wide_wedge_is_between_them(
+    names: str, limit_m: float, exposed_m: float
+) -> None:
+    half = HALF
+    left = [(0.0, 0.0), (-9.0 * math.sin(half), 9.0 * math.cos(half)), (-20.0, 20.0)]
+    right = [(-x, y) for x, y in reversed(left)]
+    of = turned(walls((names[0], upright(left, 0, 5)), (names[1], upright(right, 0, 5))), 0.7, (1e5, 4e6))
+    pairs = found(of, max_distance_m=limit_m, max_angle_deg=30.0)
+    areas = wall_areas(of, pairs)
+    exposed_m2 = areas.whole_m2 - areas.shared_m2
+    facing = [int(pairs.first[0]), int(pairs.second[0])]
+    assert len(pairs.first) == 1
+    assert exposed_m2[facing] == pytest.approx([5.0 * exposed_m] * 2, abs=1e-4)
+    assert areas.shared_m2[facing[0]] == pytest.approx(areas.shared_m2[facing[1]], abs=1e-6)
+    # half-way between them it is smaller
+    assert areas.shared_m2[facing[0]] * math.cos(half) == pytest.approx(pairs.area_m2[0], abs=1e-4)
 
 
 def test_a_gable_shares_what_the_lower_neighbour_covers() -> None:

@@ -1,19 +1,26 @@
 """What a result says about the way to it: figures with their limits, and the forms that were tried."""
 
+import dataclasses
+import operator
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 import shapely
 from candidates_by_hand import candidate
 
+import pipeline
 from pipeline import reconstruct
+from pipeline.errors import BuildingError
 from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.model import (
     BuildingResult,
     Candidate,
     Decision,
     DecisionKind,
+    Guide,
+    GuideKind,
     Outcome,
     Plane,
     PreparedCloud,
@@ -155,3 +162,49 @@ def test_every_level_of_detail_that_was_asked_for_is_listed() -> None:
         ("1.3", "chosen", 1),
         ("1.2", "chosen", 1),
     ]
+
+
+GUIDED = {
+    "roof.forms.guided_outline": lambda _, guides, *__: guides,
+    "roof.plan.inner_pieces": lambda guides, *_: guides,
+    "roof.plan.with_enclosed_planes": lambda *_: True,
+    "roof.plan.arrange": lambda *given: len(given[-1].pieces),
+    "roof.guided_faces.misfits_of": lambda *_: True,
+    "reconstruct.followed": lambda guides, *_: guides,
+}
+"""The steps that need guides, and whether they get any."""
+
+
+@pytest.mark.parametrize("step", list(GUIDED))
+@pytest.mark.parametrize("kind", [BuildingError, shapely.errors.GEOSException, IndexError])
+def test_a_building_whose_guides_fail_in_any_step_is_modelled_without_them_and_says_so(
+    step: str, kind: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = dataclasses.replace(gable(), footprint=None)
+    ridge = Guide(kind=GuideKind.RIDGE, line=shapely.LineString([(1.0, 4.0), (11.0, 4.0)]))
+    eave = Guide(kind=GuideKind.EAVE, line=shapely.LineString([(0.0, -0.1), (12.0, -0.1)]))
+    guided = dataclasses.replace(free, guides=(ridge, eave))
+    known = reconstruct_building(free, "arrangement", ReconstructSettings())
+    usual = operator.attrgetter(step)(pipeline)
+
+    def failing(*given: Any) -> Any:
+        if GUIDED[step](*given):
+            raise BuildingError(Reason.NO_PARTITION, "a fault") if kind is BuildingError else kind("a fault")
+        return usual(*given)
+
+    assert reconstruct_building(guided, "arrangement", ReconstructSettings()).guides == (2, 0)
+    monkeypatch.setattr(f"pipeline.{step}", failing)
+    found = reconstruct_building(guided, "arrangement", ReconstructSettings())
+    first, *others = found.decisions
+    assert (first.name, first.outcome) == ("guides", Outcome.UNDRAWABLE)
+    assert "a fault" in first.detail
+    assert tuple(map(repr, others)) == tuple(map(repr, known.decisions))
+    assert repr(dataclasses.replace(found, decisions=())) == repr(dataclasses.replace(known, decisions=()))
+
+
+def test_a_building_that_fails_without_its_guides_too_keeps_its_own_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    ridge = Guide(kind=GuideKind.RIDGE, line=shapely.LineString([(1.0, 4.0), (11.0, 4.0)]))
+    monkeypatch.setattr(reconstruct, "model_quality", lambda *_, **__: 1 // 0)
+    result = reconstruct_building(dataclasses.replace(gable(), guides=(ridge,)), "arrangement", ReconstructSettings())
+    assert (result.status, result.reason) == (Status.FAILED, Reason.INTERNAL_ERROR)
+    assert "ZeroDivisionError" in result.reason_detail

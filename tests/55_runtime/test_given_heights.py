@@ -26,8 +26,9 @@ from pipeline.runtime.run import run
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.sites import CandidateSite
+from pipeline.runtime.stages.surroundings import Surroundings, surroundings_of
 from pipeline.settings import RunSettings
-from pipeline.tiling import Tile, TileGrid
+from pipeline.tiling import Tile, TileGrid, Window
 
 HEIGHTS = {"footprints": {"height": "h", "roof_elevation": "roof", "storeys": "n", "ground_elevation": "ground"}}
 
@@ -192,6 +193,33 @@ def test_a_column_that_is_not_there_ends_the_run_before_it_begins(
     assert not (tmp_path / "never").exists()
     with pytest.raises(SettingsError, match=r"\[footprints\] height name.*none are given"):
         reconstruct(holes, settings={"footprints": {"height": "h"}}, out=str(tmp_path / "never"))
+
+
+def test_classify_refuses_the_columns_that_a_run_refuses(
+    holes: Path, houses: list[Polygon], run_classify: Any, tmp_path: Path
+) -> None:
+    settings = {"footprints": {"height": "hoehe"}}
+    with pytest.raises(UnreadableInputError, match="no column 'hoehe'"):
+        run_classify(holes, footprints=write_outlines(tmp_path, houses), settings=settings)
+    with pytest.raises(SettingsError, match="none are given"):
+        run_classify(holes, settings=settings)
+
+
+def test_the_surroundings_of_a_building_with_heights_are_read_once(
+    holes: Path, houses: list[Polygon], reconstruct: Any, candidates: list[Candidate], monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    views: list[Window] = []
+
+    def watched(scratch: Scratch, grid: TileGrid, view: Window) -> Surroundings:
+        views.append(view)
+        return surroundings_of(scratch, grid, view)
+
+    monkeypatch.setattr("pipeline.runtime.stages.gather.surroundings_of", watched)
+    outlines = [house.buffer(3.0) for house in houses]
+    reconstruct(holes, footprints=write_outlines(tmp_path, outlines), settings=HEIGHTS)
+    assert len(views) == len(candidates) == 3
+    assert [candidate.given is not None for candidate in candidates] == [True] * 3
 
 
 def test_a_district_is_no_block(tmp_path: Path) -> None:

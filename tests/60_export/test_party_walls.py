@@ -23,7 +23,7 @@ from pipeline.export.party_wall_tables import BUILDINGS, FACTS, WALLS, PartyWall
 from pipeline.export.records import RecordContext
 from pipeline.export.tile import write_tile
 from pipeline.model import BuildingResult, Reason, Status
-from pipeline.party_walls import PartyWallSettings
+from pipeline.party_walls.settings import PartyWallSettings
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus
 from pipeline.runtime.party_walls import party_walls

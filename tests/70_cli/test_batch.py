@@ -316,6 +316,14 @@ def test_faults_name_keys_of_the_batch_file(folder: Path, tmp_path: Path) -> Non
     assert "give another [output] path" in " ".join(call("run", file)[2].split())
 
 
+@pytest.mark.parametrize("command", ["plan", "run"])
+def test_columns_of_heights_without_footprints_are_refused(text: str, tmp_path: Path, command: str) -> None:
+    (tmp_path / "city.toml").write_text(f'{text}[settings.footprints]\nheight = "h"\n')
+    code, _, error = call(command, tmp_path / "city.toml")
+    assert code == 2
+    assert "height name columns of given footprints, and none are given" in " ".join(error.split())
+
+
 @pytest.mark.parametrize("words", [["plan"], ["run"], ["status"]])
 def test_a_batch_file_with_faults_is_a_usage_error(tmp_path: Path, words: Sequence[str]) -> None:
     file = tmp_path / "city.toml"

@@ -1,9 +1,11 @@
 """The commands as a user meets them: help, usage errors, input errors, machine output, options that they share."""
 
+import inspect
 import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -12,6 +14,11 @@ from command_line import invoke
 from pipeline import __version__
 from pipeline.cli import app
 from pipeline.cli.options import worker_count
+from pipeline.cli.party_walls import party_walls
+from pipeline.cli.solar import solar
+from pipeline.parameters import Parameters
+from pipeline.party_walls.settings import PartyWallSettings
+from pipeline.solar.settings import SolarSettings
 
 COMMANDS = (
     *("reconstruct", "rerun", "compare", "classify", "inspect", "simulate", "digest"),
@@ -186,3 +193,16 @@ def test_every_command_with_workers_refuses_what_is_no_number(words: tuple[str, 
     code, _, error = invoke(*words, "--workers", "many")
     assert code == 2
     assert "'many': use auto, or a whole number from 0 to 1024" in " ".join(error.split())
+
+
+@pytest.mark.parametrize(
+    ("command", "settings", "options"),
+    [
+        (party_walls, PartyWallSettings(), {"max_distance": "max_distance_m", "max_angle": "max_angle_deg",
+                                            "min_area": "min_area_m2"}),
+        (solar, SolarSettings(), {"albedo": "albedo", "reach": "reach_m", "samples": "samples"}),
+    ],
+)  # fmt: skip
+def test_options_default_to_the_settings(command: Any, settings: Parameters, options: dict[str, str]) -> None:
+    for option, name in options.items():
+        assert inspect.signature(command).parameters[option].default == getattr(settings, name)

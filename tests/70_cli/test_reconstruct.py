@@ -62,6 +62,16 @@ def test_inspect_adds_up_the_figures_and_reasons_of_a_run(run: Run) -> None:
     assert "Candidates" in said
 
 
+def test_inspect_refuses_for_a_run_what_only_tiles_need(run: Run, tmp_path: Path) -> None:
+    settings = tmp_path / "fine.toml"
+    settings.write_text("[settings]\n")
+    for option, value in (("--settings", str(settings)), ("--crs", "EPSG:25832"), ("--vertical-unit", "m")):
+        code, said, error = invoke("inspect", str(run[0]), option, value)
+        assert (code, said) == (2, "")
+        assert f"{option} {value}" in " ".join(error.split())
+        assert "Leave them out" in " ".join(error.split())
+
+
 def test_levels_of_detail_are_written_side_by_side(scene: Path, run: Run, tmp_path: Path) -> None:
     words = ("reconstruct", str(scene / "gable.laz"), "--out", str(tmp_path / "run"), "--workers", "0", "--json")
     code, said, _ = invoke(*words, "--lods", "2.2, 1.2,1.3")

@@ -253,7 +253,7 @@ class Service:
         write(run_dir)
         found = publish(run_dir, out_dir, job.request.publish, name=job.job_id)
         assert problems is not None or not found, found
-        (problems if problems is not None else {}).update(found)
+        (problems if problems is not None else {}).update({form: str(error) for form, error in found.items()})
         write_outputs(run_dir, out_dir, job.request.outputs)
         self.store.succeed(job, message="done", summary={})
         return job.job_id

@@ -1,6 +1,7 @@
 """The driver with a scripted run in place of the science: what becomes of a job, whatever happens."""
 
 import contextlib
+import errno
 import os
 import socket
 import threading
@@ -13,7 +14,7 @@ import pytest
 from driver_bench import Bench, Engine
 from processes import LONG_S, wait_for
 
-from pipeline.errors import ClusterError, UnreadableInputError
+from pipeline.errors import ClusterError, RunError, UnreadableInputError
 from pipeline.runtime.monitoring.events import Event
 from service.driver import attempts, process
 from service.driver.shared_cluster import SharedCluster, answers
@@ -111,10 +112,10 @@ def test_a_dismissal_is_seen_while_outputs_are_assembled(bench: Bench) -> None:
 def test_further_formats_are_written_before_the_outputs_and_may_fail(bench: Bench) -> None:
     seen: list[Any] = []
 
-    def publish(run_dir: Path, out_dir: Path, formats: Any, *, on_progress: Any, **options: Any) -> dict[str, str]:
+    def publish(run_dir: Path, out_dir: Path, formats: Any, *, on_progress: Any, **options: Any) -> dict[str, Any]:
         seen.append((out_dir.exists(), formats, options))
         on_progress(1, 2)
-        return {"pmtiles": f"the CRS of the run in {run_dir} is unknown: run it again with --crs"}
+        return {"pmtiles": RunError(f"the CRS of the run in {run_dir} is unknown: run it again with --crs")}
 
     bench.tools["publish"] = publish
     job = bench.submit({"publish": ("3dtiles", "pmtiles"), "geoid_height": 43.2})
@@ -132,10 +133,45 @@ def test_further_formats_are_written_before_the_outputs_and_may_fail(bench: Benc
     assert [event.progress for event in events if event.kind == "progress" and event.stage == "formats"] == [91]
 
 
+def test_an_unexpected_fault_of_a_format_is_logged_and_leaves_the_rest(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench.tools["publish"] = lambda *_, **__: {"stac": ZeroDivisionError("secret detail")}
+    job = bench.submit({"publish": ("geopackage", "stac")})
+    bench.driver()
+    done = bench.over(job)
+    assert done.status is JobStatus.SUCCESSFUL
+    assert "stac could not be published" in done.message
+    (record,) = [record for record in caplog.records if record.exc_info]
+    problem = done.summary["unpublished"]["stac"]
+    assert f"ZeroDivisionError (reference {record.reference})" in problem
+    assert "secret detail" in caplog.text
+    assert "secret detail" not in problem
+    (warning,) = [
+        event.message
+        for event in bench.store.events(done.job_id)
+        if event.stage == "formats" and event.kind == "warning"
+    ]
+    assert warning == f"stac could not be published: {problem}"
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_job_whose_formats_fill_the_disk_is_tried_again(bench: Bench, wrapped: bool) -> None:
+    full: Exception = OSError(errno.ENOSPC, "No space left on device")
+    if wrapped:
+        full, full.__cause__ = RunError("models.gpkg: No space left on device"), full
+    bench.tools["publish"] = lambda *_, **__: {"stac": full}
+    job = bench.submit({"publish": ("stac",)})
+    bench.driver(max_attempts=1)
+    failure = bench.over(job).failure
+    assert failure is not None
+    assert failure.fault is Fault.NO_SPACE
+
+
 def test_a_dismissal_is_seen_while_formats_are_written(bench: Bench) -> None:
     began = threading.Event()
 
-    def endless(*_: Any, on_progress: Callable[[int, int], None], **_options: Any) -> dict[str, str]:
+    def endless(*_: Any, on_progress: Callable[[int, int], None], **_options: Any) -> dict[str, Any]:
         began.set()
         while True:
             on_progress(0, 1)

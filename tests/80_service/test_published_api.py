@@ -16,9 +16,11 @@ import pyogrio
 import pytest
 from starlette.testclient import TestClient
 
+from pipeline.errors import RunCancelledError
 from pipeline.export.glb_container import read_document
 from pipeline.runtime.manifest import RunStatus
 from service.keys import Scope, new_key
+from service.outputs import published
 from service.outputs.kinds import FORMATS, ON_REQUEST, OUTPUTS
 
 WITHOUT_SOLAR = tuple(form for form in FORMATS if form != "solar")
@@ -131,6 +133,28 @@ def test_nothing_else_is_served(client: TestClient, job_id: str, path: str) -> N
     assert (answer.status_code, answer.headers["content-type"]) == (404, "application/problem+json")
 
 
+@pytest.mark.parametrize(
+    "path",
+    [*(f"/jobs/JOB/results/{name}" for name in OUTPUTS if name != "solar"),
+     "/jobs/JOB/results/3dtiles/tileset.json", "/jobs/JOB/results/3dtiles/models/x850_y4470.glb",
+     "/jobs/JOB/results/stac/collection.json", "/jobs/JOB/results/stac/x850_y4470/x850_y4470.json",
+     "/jobs/JOB/run/buildings/tile=x850_y4470/part-0.parquet", "/jobs/JOB/results/3dtiles/nothing.json",
+     "/jobs/JOB/run/state/x1_y1/x1_y1.json", "/collections", "/collections/JOB.buildings",
+     "/collections/JOB.buildings/queryables", "/collections/JOB.buildings/schema", "/collections/JOB.buildings/items",
+     "/collections/JOB.buildings/items?limit=2&filter=height_m%20%3E%201", "/collections/JOB.buildings/items/nothing",
+     "/collections/JOB.nothing/items"],
+)  # fmt: skip
+def test_the_head_of_an_answer_is_that_of_get_without_its_body(client: TestClient, job_id: str, path: str) -> None:
+    place = path.replace("JOB", job_id)
+    for headers in ({}, {"Accept": "text/csv"}, {"Range": "bytes=0-3"}):
+        whole, head = (client.request(method, place, headers=headers) for method in ("GET", "HEAD"))
+        assert head.content == b""
+        assert head.status_code == whole.status_code
+        assert head.headers == whole.headers
+    refused = client.put(place)
+    assert (refused.status_code, refused.headers["allow"]) == (405, "GET, HEAD, OPTIONS")
+
+
 def test_a_job_without_further_formats_says_so(client: TestClient, bare: str) -> None:
     for path in ("results/3dtiles/tileset.json", "results/geopackage"):
         assert "the request left out" in runs.problem(client.get(f"/jobs/{bare}/{path}"), 404, "no-such-output")
@@ -165,6 +189,41 @@ def test_what_cannot_be_made_leaves_the_rest(service: runs.Service, client: Test
     problems.clear()
     service.finished(holes, publish=("geopackage",), problems=problems)
     assert "would have holes" in problems["geopackage"]
+
+
+@pytest.mark.parametrize("form", WITHOUT_SOLAR)
+def test_an_unexpected_fault_leaves_out_that_format_whole(
+    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs.write_run(tmp_path / "run")
+    plain = dict(published._WRITERS)
+
+    def broken(*given: Any) -> None:
+        plain[form](*given)
+        (tmp_path / "out" / form).mkdir(exist_ok=True)
+        raise IndexError("list index out of range")
+
+    monkeypatch.setattr(published, "_WRITERS", plain | {form: broken})
+    found = published.publish(tmp_path / "run", tmp_path / "out", WITHOUT_SOLAR, name="some run")
+    assert {name: type(error) for name, error in found.items()} == {form: IndexError}
+    files = {path.name for path in (tmp_path / "out").iterdir()}
+    assert not files & {form, *(OUTPUTS[name].filename for name in FORMATS[form])}
+    assert files >= {OUTPUTS[name].filename for other in set(WITHOUT_SOLAR) - {form} for name in FORMATS[other]}
+    if form != "stac":
+        collection = json.loads((tmp_path / "out" / "stac.json").read_text(encoding="utf-8"))
+        assert collection["id"] == "some run"
+
+
+def test_a_cancellation_within_a_format_ends_the_work(tmp_path: Path) -> None:
+    runs.write_run(tmp_path / "run")
+    calls = iter([None, RunCancelledError("the job was cancelled")])
+
+    def cancelled_once(*_: int) -> None:
+        if error := next(calls, None):
+            raise error
+
+    with pytest.raises(RunCancelledError):
+        published.publish(tmp_path / "run", tmp_path / "out", ("pmtiles",), name="a", on_progress=cancelled_once)
 
 
 @pytest.mark.slow

@@ -97,20 +97,26 @@ def _crosses(star: _Star, m: int) -> bool:
 
 
 @kernel
-def _give_corner(plan: Subdivision, labels: LabelArray, first: int, last: int, label: int, corner_mm: float) -> bool:
-    """Give the corner from half-edge `first` to the left up to `last` another label; whether there was room for it."""
+def _give_corner(
+    plan: Subdivision, labels: LabelArray, first: int, last: int, label: int, corner_mm: float, known: int
+) -> bool:
+    """Give the corner from half-edge `first` to the left up to `last` another label; whether there was room for it.
+
+    Earlier tries at this vertex left the vertices from `known` on, which serve again.
+    """
     xy, graph, counts = plan.xy, plan.graph, plan.counts
     g = first
     while True:
         v, w = graph[g, ORIGIN], graph[g ^ 1, ORIGIN]
-        dx, dy = float(xy[w, 0] - xy[v, 0]), float(xy[w, 1] - xy[v, 1])
-        length = math.hypot(dx, dy)
-        size = min(corner_mm, 0.4 * length)
-        if size < _MIN_CORNER_MM or counts[VERTICES] >= len(xy) or counts[EDGES] + 4 > len(graph):
+        if counts[VERTICES] >= len(xy) or counts[EDGES] + 4 > len(graph):
             return False
-        x, y = int(np.rint(xy[v, 0] + size / length * dx)), int(np.rint(xy[v, 1] + size / length * dy))
-        if not insert_vertex(plan, g, x, y):
-            return False
+        if w < known:
+            dx, dy = float(xy[w, 0] - xy[v, 0]), float(xy[w, 1] - xy[v, 1])
+            length = math.hypot(dx, dy)
+            size = min(corner_mm, 0.4 * length)
+            x, y = int(np.rint(xy[v, 0] + size / length * dx)), int(np.rint(xy[v, 1] + size / length * dy))
+            if size < _MIN_CORNER_MM or not insert_vertex(plan, g, x, y):
+                return False
         if g == last:
             break
         g = graph[g, PREVIOUS] ^ 1
@@ -222,6 +228,7 @@ def part_crossings(
             if not _crosses(star, m):
                 break
             star.refused[:] = False
+            known = counts[VERTICES]
             given = False
             while not given:
                 choice = _cheapest_corner(plan, planes, star, m, corner_mm)
@@ -230,7 +237,7 @@ def part_crossings(
                 corner = choice // 2
                 giver = (corner + 1) % m if choice % 2 == 0 else (corner - 1) % m
                 label = labels[graph[borders[giver], FACE]]
-                given = _give_corner(plan, labels, borders[corner], borders[(corner + 1) % m], label, corner_mm)
+                given = _give_corner(plan, labels, borders[corner], borders[(corner + 1) % m], label, corner_mm, known)
                 star.refused[choice] = not given
             pairs, _ = cell_borders(plan, 0.0, np.empty((0, 4)))
             faces, n_faces = connected_faces(labels[: counts[CELLS]], pairs)

@@ -177,17 +177,23 @@ def gather(
     footprint = site.footprint
     columns_mm = [points[name].astype(np.int64) for name in "xyz"]
     xyz = np.column_stack(columns_mm)
+    x0, y0, x1, y1 = (round(value * MM) for value in (footprint.bounds if footprint is not None else (0, 0, 0, 0)))
     if len(xyz):
         # by columns: numpy takes many times longer along the first axis of an (n, 3) array
         low, high = (np.array([extreme(column) for column in columns_mm]) for extreme in (np.min, np.max))
     else:
-        x0, y0, x1, y1 = footprint.bounds if footprint is not None else (0.0, 0.0, 0.0, 0.0)
-        low = np.array([round(x0 * MM), round(y0 * MM), 0], np.int64)
-        high = np.array([round(x1 * MM), round(y1 * MM), 0], np.int64)
+        low, high = np.array([x0, y0, 0], np.int64), np.array([x1, y1, 0], np.int64)
     origin_mm = low // MM * MM
-    margin = _VIEW_M * MM
-    view = Window(x0_mm=int(low[0]), y0_mm=int(low[1]), x1_mm=int(high[0]) + 1, y1_mm=int(high[1]) + 1).grown(margin)
-    around = surroundings_of(scratch, grid, view)
+    view = Window(x0_mm=int(low[0]), y0_mm=int(low[1]), x1_mm=int(high[0]) + 1, y1_mm=int(high[1]) + 1)
+    given = site.given if footprint is not None and max(x1 - x0, y1 - y0) <= _LARGEST_M * MM else None
+    if given is not None:
+        view = Window(
+            x0_mm=min(view.x0_mm, x0),
+            y0_mm=min(view.y0_mm, y0),
+            x1_mm=max(view.x1_mm, x1 + 1),
+            y1_mm=max(view.y1_mm, y1 + 1),
+        )
+    around = surroundings_of(scratch, grid, view.grown(_VIEW_M * MM))
     ground_mm, lowest_mm, own, touches_data_edge = _terrain_by(columns_mm[0], columns_mm[1], around)
     ground_z, ground_source = _ground_mm(lowest_mm, ground_mm[:, 2], xyz[:, 2], site.given)
     digest = hashlib.sha256(points.tobytes())
@@ -214,7 +220,7 @@ def gather(
         ground_source=ground_source,
         footprint=None if footprint is None else _moved(footprint, origin_mm),
         source_id=site.source_id,
-        given=_given(site, scratch, grid, int(origin_mm[2])),
+        given=None if given is None else _local(given, footprint, around, int(origin_mm[2])),
         outline=None if site.outline is None else _moved(site.outline, origin_mm),
         beside=(beside_mm - origin_mm) / MM,
         beside_later=(later_mm - origin_mm) / MM,
@@ -250,30 +256,22 @@ def _ground_mm(
     return None, None
 
 
-def _given(site: CandidateSite, scratch: Scratch, grid: TileGrid, origin_z_mm: int) -> GivenHeights | None:
-    """The heights of a site by attributes, in local elevations, with the terrain at the outline of its footprint.
-
-    None without any, and for a footprint that is too large for a building.
-    """
-    if site.given is None or site.footprint is None:
-        return None
-    x0, y0, x1, y1 = (round(value * MM) for value in site.footprint.bounds)
-    if max(x1 - x0, y1 - y0) > _LARGEST_M * MM:
-        return None
-    view = Window(x0_mm=x0, y0_mm=y0, x1_mm=x1 + 1, y1_mm=y1 + 1).grown(_VIEW_M * MM)
-    around = surroundings_of(scratch, grid, view)
+def _local(
+    given: GivenHeights, footprint: Polygon | MultiPolygon | None, around: Surroundings, origin_z_mm: int
+) -> GivenHeights:
+    """Heights by attributes in local elevations, with the terrain at the outline of their footprint."""
     rows, columns = around.occupied.shape
     x = (np.arange(columns, dtype=np.int64) + around.column0) * CELL_MM + CELL_MM // 2
     y = (np.arange(rows, dtype=np.int64) + around.row0) * CELL_MM + CELL_MM // 2
     x, y = (axis.ravel() for axis in np.meshgrid(x, y))
-    touched = shapely.buffer(site.footprint, _HALF_DIAGONAL_M)
+    touched = shapely.buffer(footprint, _HALF_DIAGONAL_M)
     inside = shapely.intersects_xy(touched, x / MM, y / MM)
     ground_mm, lowest_mm, _, _ = _terrain_by(x[inside], y[inside], around)
     terrain_mm, _ = _ground_mm(lowest_mm, ground_mm[:, 2], np.empty(0, np.int64), None)
     return dataclasses.replace(
-        site.given,
-        roof_z_m=site.given.roof_z_m - origin_z_mm / MM,
-        ground_z_m=site.given.ground_z_m - origin_z_mm / MM,
+        given,
+        roof_z_m=given.roof_z_m - origin_z_mm / MM,
+        ground_z_m=given.ground_z_m - origin_z_mm / MM,
         terrain_z_m=math.nan if terrain_mm is None else (terrain_mm - origin_z_mm) / MM,
     )
 

@@ -56,27 +56,23 @@ def data_area(plan: Plan) -> shapely.Geometry:
 
 
 def footprints_of_run(path: str | None, plan: Plan, settings: FootprintSettings) -> GivenFootprints | None:
-    """The footprints of a run with the heights that its settings name; None without a file.
+    """The footprints within the bounds of a run's inputs, cut by --bbox and --aoi; None without a file.
 
-    Raises InputError as `given_footprints`, and SettingsError if columns are named, but no file.
+    `settings` name the columns of heights. Raises InputError if the file cannot be used or lacks one of these columns,
+    and SettingsError if columns are named, but no file.
     """
     if path is not None:
-        return given_footprints(path, plan, settings)
+        return _given_footprints(path, plan, settings)
     if settings.columns:
         names = ", ".join(settings.columns)
         raise SettingsError([f"[footprints] {names} name columns of given footprints, and none are given: give them"])
     return None
 
 
-def given_footprints(path: str, plan: Plan, settings: FootprintSettings | None = None) -> GivenFootprints:
-    """Read the footprints of a run, within the bounds of its inputs, cut by --bbox and --aoi.
-
-    `settings` name the columns of heights; None reads none. Raises InputError if the file cannot be used, or does not
-    have these columns.
-    """
+def _given_footprints(path: str, plan: Plan, settings: FootprintSettings) -> GivenFootprints:
+    """The footprints of a file."""
     area = data_area(plan)
     found = read_footprints(path, plan.reference, area=area)
-    settings = settings or FootprintSettings()
     _check_columns(path, found, settings)
     shapely.prepare(area)  # many inputs give it many corners, and every footprint is tested against it
     inside = [k for k, polygon in enumerate(found.polygons) if area.intersects(polygon)]

@@ -172,6 +172,7 @@ const FORMS: Record<string, string> = {
   primitive: "The method's whole form",
   block: "Level block",
   further: "Further forms",
+  guides: "Guides, which were left out",
 };
 
 const OUTCOMES: Record<string, string> = {

@@ -16,26 +16,13 @@ import shapely
 from shapely import MultiPolygon
 
 from pipeline.model import BoolArray, FloatArray, IntArray
-from pipeline.parameters import Parameters, parameter
+from pipeline.party_walls.settings import PartyWallSettings
 
 Shapes = npt.NDArray[np.object_]
 """(n,) shapely geometries."""
 
 ROUNDED_M = 1e-6
 """Distances that differ by less are equal: coordinates are multiples of 1 mm, or of a part of a foot."""
-
-
-class PartyWallSettings(Parameters):
-    """When two walls touch."""
-
-    max_distance_m: float = parameter(
-        0.1, "Walls touch where they are at most this far apart, or overlap by as much.", unit="m", minimum=0.0,
-        maximum=5.0,
-    )  # fmt: skip
-    max_angle_deg: float = parameter(
-        5.0, "Largest angle between the planes of two walls that touch.", unit="deg", minimum=0.0, maximum=30.0
-    )
-    min_area_m2: float = parameter(0.1, "Smaller contacts do not count.", unit="m2", minimum=0.0, maximum=100.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -242,7 +229,9 @@ def _upright(shared: Shapes, origin: FloatArray, along: FloatArray, normal: Floa
 def wall_areas(walls: Walls, found: Contacts) -> WallAreas:
     """The area of each wall, and what of it touches another building, or another solid of its own."""
     planes = _Planes(walls.polygons)
-    whole = shapely.area(_flat(walls.polygons, planes.origin, planes.along()))
+    along, ahead = planes.along(), planes.origin + planes.normal * planes.offset[:, None]
+    whole = shapely.area(_flat(walls.polygons, planes.origin, along))
+    across = planes.normal[found.first] - planes.normal[found.second]
     shared, touched = np.zeros(len(walls)), np.zeros(len(walls))
     other = walls.building[found.first] != walls.building[found.second]
     wall = np.concatenate((found.first, found.second))
@@ -251,8 +240,9 @@ def wall_areas(walls: Walls, found: Contacts) -> WallAreas:
     begins = np.flatnonzero(np.diff(wall[order], prepend=-1))
     for some in np.split(order, begins[1:]) if len(order) else ():
         k, at = int(wall[some[0]]), contact[some]
-        outline = np.repeat(k, len(at))
-        flat = _flat(found.polygons[at], planes.origin[outline], planes.along()[outline])
+        # a contact lies between both walls: each of its corners goes along its normal to this one
+        turn = (across[at] @ along[k]) / (across[at] @ planes.normal[k])
+        flat = _flat(found.polygons[at], np.tile(ahead[k], (len(at), 1)), along[k] - turn[:, None] * planes.normal[k])
         touched[k] = _united_m2(flat)
         shared[k] = _united_m2(flat[other[at]])
     touched, shared = np.minimum(touched, whole), np.minimum(shared, whole)

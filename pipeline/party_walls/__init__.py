@@ -1,0 +1,1 @@
+"""Party walls: where walls of two buildings touch, and what is left of each wall."""
