@@ -19,6 +19,7 @@ from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
 from pipeline.io import SpatialReference, Storage, is_url, shown, storage_at
 from pipeline.methods import ReconstructSettings, method_named
 from pipeline.runtime.cluster.serial_executor import Executor, run_alone
+from pipeline.runtime.cluster.worker_fork_server import start_early
 from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.manifest import (
@@ -207,6 +208,8 @@ def run_variants(
         check_scratch(request.out, resources.scratch, resources.scheduler)
     for variant in variants:
         storage_at(variant.out)  # refuses a URL of no storage before anything is read
+    if resources.workers and executor is None:
+        start_early()
     progress = Progress(on_event)
     progress.tell("run", "plan", f"run into {request.out}")
     plan, paths = plan_inputs(request, progress, cancelled, executor)

@@ -28,6 +28,13 @@ _users = 0
 _environment: Mapping[str, str] | None = None
 
 
+def start_early() -> None:
+    """Start a fork server if there is none: it imports while this process still plans."""
+    if can_fork():
+        with _changing:
+            run_in_starter_thread(_start)
+
+
 @contextlib.contextmanager
 def forked_workers() -> Iterator[Mapping[str, Any]]:
     """Start a fork server; yields Dask's settings for forking workers from it. A context manager.
@@ -39,6 +46,8 @@ def forked_workers() -> Iterator[Mapping[str, Any]]:
     if not can_fork():
         yield {}
         return
+    # Dask would otherwise import all optional packages and replace the server's list by its own
+    vars(sys.modules["distributed.utils"])["_forkserver_preload_set"] = True
     with _changing:
         run_in_starter_thread(_start)
         _users += 1
@@ -57,8 +66,6 @@ def _start() -> None:
         _stop()
         _environment = now
     multiprocessing.set_forkserver_preload(list(_PRELOADED))
-    # Dask would otherwise import all optional packages and replace this list by its own
-    vars(sys.modules["distributed.utils"])["_forkserver_preload_set"] = True
     before = dict(os.environ)
     special = {"PYTHONPATH": environment_with_this_package()["PYTHONPATH"], **WITHOUT_THREADS, **_SAFE_PATH}
     # the server inherits the environment of this process: there is no other way to set it
