@@ -58,6 +58,8 @@ def cut_at_ridge_steps(
     for number in np.unique(roof[borders.first[rows.ridges]]):
         slopes = _slopes(grown, np.flatnonzero(roof[grown.label] == number), strip)
         passed[slopes.vertex] = np.searchsorted(ridge_steps(slopes, min_step_m), slopes.way_m, side="right")
+    if not passed.any():
+        return grown, roof, np.zeros(len(roof), np.int64)
     keys, label = np.unique(grown.label * (passed.max() + 1) + passed, return_inverse=True)
     origin = keys // (passed.max() + 1)
     planes = grown.planes[origin]
@@ -100,7 +102,9 @@ def _slopes(grown: GrownPatches, vertex: IntArray, strip: IntArray) -> Slopes:
     by one degree, steep slopes seem to step by 5 cm within 3 m, one up and the other one down.
     """
     patch = grown.label[vertex]
-    number, inverse, size = np.unique(patch, return_inverse=True, return_counts=True)
+    counts = np.bincount(patch, minlength=len(grown.planes))
+    number = np.flatnonzero(counts)
+    inverse, size = (np.cumsum(counts > 0) - 1)[patch], counts[number]
     slope_x, slope_y = grown.planes[number, :2].T
     # doubled angles, since the slopes fall to both sides
     turn = 0.5 * np.angle(-np.sum(size * (slope_x + 1j * slope_y) ** 2))

@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.normal_equations import add_to_sums, solve_plane_moments
+from pipeline.kernels.radix_sort import radix_order
 from pipeline.kernels.smallest_eigenvalue import smallest_eigenvalue
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Tin
 from pipeline.terrain.binning import points_by_cell
@@ -429,8 +430,8 @@ def grown_patches(x: IntArray, y: IntArray, z: IntArray, tin: Tin) -> GrownPatch
     settle_patches(vertices, label, planes)
     count = int(fill_patches(vertices, label, planes))
     planes = np.concatenate((planes, np.full((count - len(planes), 3), np.nan)))
-    kept, own = np.unique(label, return_inverse=True)  # some patches lost all their vertices
-    label = own.reshape(-1).astype(np.int32)
+    kept = np.bincount(label, minlength=count) > 0  # some patches lost all their vertices
+    label = (np.cumsum(kept, dtype=np.int32) - 1)[label]
     return GrownPatches(vertices=vertices, tin=tin, is_sound=is_sound, label=label, planes=planes[kept])
 
 
@@ -440,10 +441,8 @@ def measured_patches(grown: GrownPatches, min_step_m: float) -> tuple[Patches, B
     facets, neighbours = grown.tin.facets, grown.tin.neighbours
     sound, across = (np.flatnonzero(part).astype(np.int32) for part in (grown.is_sound, ~grown.is_sound))
     pairs, ends, area, outline = border_pieces(x, y, facets, neighbours, sound, label, count)
-    centres = np.zeros((count, 3))
-    for k, values in enumerate((x, y, z)):
-        np.add.at(centres[:, k], label, values / 1000.0)
-    centres /= np.maximum(np.bincount(label, minlength=count), 1)[:, None]
+    sums = [np.bincount(label, values / 1000.0, minlength=count) for values in (x, y, z)]
+    centres = np.column_stack(sums) / np.maximum(np.bincount(label, minlength=count), 1)[:, None]
     gaps, sights, _, _ = border_pieces(x, y, facets, neighbours, across, label, count)
     edges = facets[grown.is_sound]
     half_edge_mm = (
@@ -468,8 +467,8 @@ def measured_patches(grown: GrownPatches, min_step_m: float) -> tuple[Patches, B
 
 
 def _tops(z: IntArray, label: LabelArray, count: int) -> FloatArray:
-    """Elevation in metres below which nine tenths of the vertices of each patch lie, (k,)."""
-    order = np.lexsort((z, label))
+    """Elevation in metres below which nine tenths of the vertices of each patch lie, (k,); none of (n,) is below 0."""
+    order = radix_order((label.astype(np.int64) << int(z.max()).bit_length()) | z)
     ends = np.cumsum(np.bincount(label, minlength=count))
     starts = np.concatenate(([0], ends[:-1]))
     return z[order[starts + (9 * (ends - 1 - starts)) // 10]] / 1000.0
@@ -478,8 +477,7 @@ def _tops(z: IntArray, label: LabelArray, count: int) -> FloatArray:
 def _longest_first(pairs: LabelArray, ends: FloatArray, count: int) -> IntArray:
     """Different pairs of patches, the greatest summed length first; equal ones by their numbers."""
     keys, row = np.unique(pairs[:, 0].astype(np.int64) * count + pairs[:, 1], return_inverse=True)
-    lengths = np.zeros(len(keys))
-    np.add.at(lengths, row, np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]))
+    lengths = np.bincount(row, np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]), len(keys))
     keys = keys[np.argsort(-lengths, kind="stable")]
     return np.column_stack((keys // count, keys % count))
 
