@@ -26,7 +26,7 @@ from pipeline.compiler import kernel
 from pipeline.kernels.bounds import bounds_of
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.merge_sort import ascending_order
-from pipeline.model import BoolArray, FloatArray, IntArray
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.lines import Run
 
 _STRIP_SPACINGS = 2.0
@@ -56,7 +56,7 @@ class _Cells(NamedTuple):
 
     xy_mm: IntArray
     split: BoolArray
-    starts: IntArray
+    starts: LabelArray
     low_x: int
     low_y: int
     columns: int
@@ -85,7 +85,7 @@ class EdgePoints:
     """(n, 2) int64, cell after cell."""
     split: BoolArray
     """(n,) bool, True where the pulse went on to a lower return."""
-    starts: IntArray
+    starts: LabelArray
     """(columns * rows + 1,) where each cell's points start, row after row."""
     low_mm: tuple[int, int]
     """Lower left corner of the first cell."""
@@ -106,8 +106,7 @@ class EdgePoints:
         low, high = bounds_of(np.ascontiguousarray(xy_mm, dtype=np.int64))
         columns, rows = ((high - low) // cell + 1).tolist()
         place = (xy_mm[:, 1] - low[1]) // cell * columns + (xy_mm[:, 0] - low[0]) // cell
-        order = np.argsort(place, kind="stable")
-        starts = np.concatenate(([0], np.cumsum(np.bincount(place, minlength=columns * rows)))).astype(np.int64)
+        starts, order = counting_sort(place.astype(np.int32), columns * rows)
         return cls(
             xy_mm=xy_mm[order],
             split=split[order],

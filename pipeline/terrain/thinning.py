@@ -40,8 +40,8 @@ def _highest_per_cell(
     # where the lattice is no larger than a hash table it takes its place: neighbours in space are then near in memory
     is_lattice = columns * rows <= size
     mask = size - 1
-    keys = np.full(columns * rows if is_lattice else size, -1, np.int64)
-    numbers = np.empty(keys.size, np.int64)
+    keys = np.empty(0 if is_lattice else size, np.int64)
+    numbers = np.full(columns * rows if is_lattice else size, -1, np.int32)
     chosen = np.empty(n, np.int64)
     cell = np.full(n, -1, np.int64)
     count = 0
@@ -50,10 +50,12 @@ def _highest_per_cell(
             continue
         key = (x_mm[i] // cell_mm - column0) * rows + y_mm[i] // cell_mm - row0
         s = key if is_lattice else slot_of_key(key, mask)
-        while keys[s] != -1 and keys[s] != key:
+        while not is_lattice and numbers[s] >= 0 and keys[s] != key:
             s = (s + 1) & mask
-        if keys[s] == -1:
-            keys[s], numbers[s] = key, count
+        if numbers[s] < 0:
+            numbers[s] = count
+            if not is_lattice:
+                keys[s] = key
             chosen[count], cell[i] = i, count
             count += 1
             continue

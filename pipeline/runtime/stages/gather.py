@@ -17,6 +17,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.compiler import kernel
 from pipeline.export.facts import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
+from pipeline.kernels.radix_sort import radix_order
 from pipeline.model import BoolArray, Candidate, GivenHeights, GroundSource, Guide, IntArray
 from pipeline.roof.settings import GUIDE_REACH_M, RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
@@ -141,15 +142,15 @@ def stored_bytes(scratch: Scratch, part: PointRange) -> npt.NDArray[np.uint8]:
 
 def canonical_order(points: npt.NDArray[np.void]) -> IntArray:
     """Order of points by X, Y, Z, return, GPS time, source, independent of files and tiles; (n,) int64."""
-    x, y = (np.ascontiguousarray(points[name]) for name in "xy")
-    steps = np.diff(x), np.diff(y)
+    if len(points) == 0:
+        return np.empty(0, np.int64)
+    x, y = (points[name].astype(np.int64) - int(points[name].min()) for name in "xy")
+    place = (x << int(y.max()).bit_length()) | y
     # the split sorted one tile's points by x and y: a stable sort would not move them
-    if bool(((steps[0] > 0) | ((steps[0] == 0) & (steps[1] >= 0))).all()):
-        order = np.arange(len(points))
-    else:
-        order = np.lexsort((y, x))
-        steps = np.diff(x[order]), np.diff(y[order])
-    tied = np.flatnonzero((steps[0] == 0) & (steps[1] == 0))
+    is_sorted = bool((place[1:] >= place[:-1]).all())
+    order = np.arange(len(points)) if is_sorted else radix_order(place).astype(np.int64)
+    ordered = place[order]
+    tied = np.flatnonzero(ordered[1:] == ordered[:-1])
     if len(tied):
         rows = np.unique(np.concatenate((tied, tied + 1)))
         among = np.sort(order[rows])
