@@ -29,6 +29,7 @@ from pipeline.roof.arrangement.minimum_cut import (
 )
 from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, Raster, _settle
 from pipeline.roof.arrangement.subdivision import (
+    EDGES,
     FACE,
     NEXT,
     ORIGIN,
@@ -280,6 +281,13 @@ def test_a_chord_between_corners_makes_two_cells() -> None:
     assert len(loops(plan)) == 3
     assert {cell_at(plan, 9000.0, 1000.0), cell_at(plan, 1000.0, 9000.0)} == {0, 1}
     assert cell_at(plan, -5.0, 5000.0) == -1
+
+
+def test_a_chord_without_room_for_its_edge_is_not_drawn() -> None:
+    plan = square()
+    full = plan._replace(graph=plan.graph[: plan.counts[EDGES] + 1].copy())
+    assert insert_chord(full, 0, 2, 0, 7) == -1
+    assert full.counts.tolist() == [4, 8, 1]
 
 
 def test_a_chord_to_a_hole_makes_one_loop_of_two_and_the_next_parts_the_cell() -> None:

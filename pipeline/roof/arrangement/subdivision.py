@@ -209,9 +209,12 @@ def _set_face(graph: IntArray, start: int, face: int) -> None:
 def insert_chord(plan: Subdivision, u: int, v: int, face: int, line: int) -> int:
     """Join two vertices of a cell by an edge, which is the last one then, unless it would touch anything.
 
-    Returns the cells made: 1, or 0 where two loops of the cell became one; -1 if the chord does not fit.
+    Returns the cells made: 1, or 0 where two loops of the cell became one; -1 if the chord does not fit, or no
+    edge is left.
     """
     graph, counts = plan.graph, plan.counts
+    if counts[EDGES] + 2 > len(graph):
+        return -1
     at_u, at_v = _corner(plan, u, v, face), _corner(plan, v, u, face)
     if at_u < 0 or at_v < 0 or not _has_clearance(plan, u, v, face) or not _is_clear(plan, u, v, -1):
         return -1
