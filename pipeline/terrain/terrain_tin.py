@@ -186,7 +186,9 @@ class _Drawn:
     _low: IntArray = dataclasses.field(init=False)
     _side: int = dataclasses.field(init=False)
     _lines: npt.NDArray[np.object_] = dataclasses.field(init=False)
-    """The rings of the outlines."""
+    """The rings of the outlines. What is decided on the border by distances needs them: neighbours have the same."""
+    _noded_lines: npt.NDArray[np.object_] = dataclasses.field(init=False)
+    """The rings as they lead through the nodes."""
     _floor_of_line: IntArray = dataclasses.field(init=False)
     nodes: IntArray = dataclasses.field(init=False)
     """(n, 2): where outlines, the border and the edge of the data in the tile meet or turn."""
@@ -203,12 +205,13 @@ class _Drawn:
             if (outline.rings[0].max(axis=0) - low >= -BESIDE_MM).all()
             and (outline.rings[0].min(axis=0) - low <= side + BESIDE_MM).all()
         ]
-        rings = [shapely.linearrings(ring - low) for outline in near for ring in outline.rings]
+        rings = np.array([shapely.linearrings(ring - low) for outline in near for ring in outline.rings], dtype=object)
         object.__setattr__(self, "outlines", near)
         object.__setattr__(self, "_low", low)
         object.__setattr__(self, "_side", side)
-        found = noded(side, BESIDE_MM, self._data_edges(), np.array(rings, dtype=object))
-        object.__setattr__(self, "_lines", found.outlines)
+        found = noded(side, BESIDE_MM, self._data_edges(), rings)
+        object.__setattr__(self, "_lines", rings)
+        object.__setattr__(self, "_noded_lines", found.outlines)
         object.__setattr__(self, "nodes", found.nodes)
         object.__setattr__(self, "edges", found.edges)
         floors = [outline.z_mm for outline in near for _ in outline.rings]
@@ -251,7 +254,7 @@ class _Drawn:
     def floors_at_nodes(self) -> IntArray:
         """The nodes on outlines and the floor of each outline there: (k, 2)."""
         points = shapely.points(self.nodes.astype(np.float64))
-        node, line = shapely.STRtree(self._lines).query(points, predicate="dwithin", distance=ON_LINE_MM)
+        node, line = shapely.STRtree(self._noded_lines).query(points, predicate="dwithin", distance=ON_LINE_MM)
         return np.column_stack((node, self._floor_of_line[line]))
 
     def _samples(self) -> tuple[IntArray, IntArray]:
@@ -303,7 +306,7 @@ class _Drawn:
         """
         floor = np.full(len(places), NO_DATA, np.int64)
         if self.outlines:
-            ring = iter(self._lines)
+            ring = iter(self._noded_lines)
             polygons = [shapely.Polygon(next(ring), [next(ring) for _ in one.rings[1:]]) for one in self.outlines]
             place, polygon = shapely.STRtree(polygons).query(shapely.points(places), predicate="intersects")
             np.minimum.at(floor, place, np.array([one.z_mm for one in self.outlines], np.int64)[polygon])
