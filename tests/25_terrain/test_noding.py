@@ -80,3 +80,12 @@ def test_the_corner_of_the_tile_stays_then_the_border_then_data_edges(ring: Ring
 def test_outlines_without_close_nodes_stay_as_they_are() -> None:
     rings = rings_of([(20, 20), (60, 21), (59, 61)], [(60, 21), (90, 30), (59, 61)], [(-20, 70), (30, 75), (-20, 80)])
     assert shapely.equals_exact(noded(SIDE, BEYOND, NO_DATA_EDGES, rings).outlines, rings).all()
+
+
+def test_tiles_around_a_corner_agree_on_an_outline_beside_it() -> None:
+    ring = [(90, 67), (110, 127), (150, 67)]  # crosses the border a millimetre beside the corner
+    for shift in itertools.product((0, SIDE), repeat=2):
+        found = noded(SIDE, BEYOND, NO_DATA_EDGES, rings_of(moved(ring, shift)))
+        assert (SIDE - shift[0], SIDE - shift[1]) in {
+            tuple(place) for place in shapely.get_coordinates(found.outlines).tolist()
+        }
