@@ -89,3 +89,10 @@ def test_tiles_around_a_corner_agree_on_an_outline_beside_it() -> None:
         assert (SIDE - shift[0], SIDE - shift[1]) in {
             tuple(place) for place in shapely.get_coordinates(found.outlines).tolist()
         }
+
+
+def test_a_corner_of_an_outline_stays_rather_than_a_crossing() -> None:
+    over_a_wall: Ring = [(50, 50), (40, 10), (60, 10)]
+    found = noded(SIDE, BEYOND, NO_DATA_EDGES, rings_of(over_a_wall, [(5, 49), (90, 49), (90, 80), (5, 80)]))
+    near = found.nodes[np.hypot(*(found.nodes - (50, 50)).T) < 4]
+    assert near.tolist() == [[50, 50]]

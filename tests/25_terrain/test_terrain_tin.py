@@ -316,6 +316,11 @@ def test_floors_a_millimetre_apart_are_one_level() -> None:
     assert {3000, 3001, 3400} <= set(mesh.vertices_mm[:, 2].tolist())
 
 
+def test_no_vertex_on_a_border_is_close_to_the_corner_of_the_tile() -> None:
+    # the middles of the first cells lie a millimetre from the corner, and all beside a house become vertices
+    assert faults_of(tile_at((499, 499), [box_at(1500, 1500, 9000, 9000, 3000)])) == []
+
+
 def test_upright_triangles_on_both_sides_of_a_slit_share_whole_edges() -> None:
     low = box_at(2000, 2000, 16_000, 8000, 3000)
     west = box_at(2000, 8000, 8000, 14_000, 3200)
