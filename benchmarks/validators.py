@@ -32,6 +32,7 @@ from benchmarks.results_page import filled
 from pipeline.ruler.simulation.suites import SUITES
 
 SIMULATED = [name for name in SUITES if name != "sweep"]
+SWEEP = {f"sweep-{cell.key}": cell for cell in SUITES["sweep"].cells}
 """The sweep is one scene that is surveyed many times."""
 LODS = "1.2,1.3,2.2"
 CITIES = {f"city-{split}{draw}": (split, draw) for split in ("dev", "test") for draw in range(2)}
@@ -84,7 +85,7 @@ class Figures:
     triangles: int
     """Triangles of the terrain."""
     surfaces: int
-    """Terrains that val3dity judged, one per tile."""
+    """Surfaces of the terrain that val3dity judged."""
     files: int
     """Published CityJSON files that val3dity judged."""
     documents: int
@@ -98,7 +99,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--entries", nargs="*", default=[*SIMULATED, *REAL, *CITIES])
+    parser.add_argument("--entries", nargs="*", default=[*SIMULATED, *SWEEP, *REAL, *CITIES])
     parser.add_argument("--page", type=Path)
     arguments = parser.parse_args()
     val3dity, check = os.environ["GABLEWORK_VAL3DITY"], schema_faults(Path(os.environ["GABLEWORK_CITYJSON_SCHEMAS"]))
@@ -131,16 +132,25 @@ def made(name: str, folder: Path, data: Path) -> None:
     if name in REAL:
         words = [str(data / word) if "/" in word else word for word in REAL[name]]
     else:
-        split, draw = CITIES.get(name, (None, 0))
-        asked = [name] if split is None else ["city", "--split", split, "--draw", str(draw), "--size", "500", "500"]
         if not (folder / "scene").exists():
-            _gablework("simulate", *asked, "--out", str(folder / "scene"))
+            _gablework("simulate", *_scene(name), "--out", str(folder / "scene"))
         words = sorted(map(str, (folder / "scene").rglob("*.laz")))
     run = folder / "run"
     _gablework(
         "reconstruct", *words, "--out", str(run), "--lods", LODS, "--terrain", "tin", "--meshes", "tile", "--overwrite"
     )
     _gablework("publish", str(run), "--as", "cityjson", "--out", str(folder / "cityjson"), "--overwrite")
+
+
+def _scene(name: str) -> list[str]:
+    """What to simulate for an entry."""
+    if name in SWEEP:
+        cell = SWEEP[name]
+        return ["sweep", "--density", f"{cell.density_per_m2:g}", "--noise", f"{cell.noise_m:g}"]
+    if name in CITIES:
+        split, draw = CITIES[name]
+        return ["city", "--split", split, "--draw", str(draw), "--size", "500", "500"]
+    return [name]
 
 
 def _gablework(*words: str) -> None:
@@ -231,11 +241,12 @@ def schema_faults(folder: Path) -> Callable[[Mapping[str, Any]], list[str]]:
 
 
 def table(found: Mapping[str, Figures]) -> str:
-    """The figures as a Markdown table; single roof shapes are one row."""
+    """The figures as a Markdown table; single roof shapes are one row, and so are the surveys of the sweep."""
     rows: dict[str, list[Figures]] = {}
     for name, figures in found.items():
         is_shape = name in SUITES and SUITES[name].size_m == (40.0, 40.0)
-        rows.setdefault("single roof shapes" if is_shape else name, []).append(figures)
+        row = f"sweep, {len(SWEEP)} surveys" if name in SWEEP else "single roof shapes" if is_shape else name
+        rows.setdefault(row, []).append(figures)
     lines = [[name, *_summed(parts)] for name, parts in rows.items()]
     lines.append(["**all**", *_summed(list(found.values()))])
     return markdown_table(["data", *COUNTED.values(), *JUDGED.values()], lines)

@@ -62,7 +62,7 @@ def terrain_lines(
     name = f"terrain-{tile_key}"
     surfaces = [
         {"type": "CompositeSurface", "lod": "2", "boundaries": [[face] for face in part.tolist()]}
-        for part in connected_parts(terrain.triangles)
+        for part in surfaces_of(terrain.triangles)
     ]
     yield json_line(
         {
@@ -74,18 +74,52 @@ def terrain_lines(
     )
 
 
-def connected_parts(triangles: LabelArray) -> list[LabelArray]:
-    """The triangles (t, 3) in parts that are connected over edges, each in their order.
+def surfaces_of(triangles: LabelArray) -> list[LabelArray]:
+    """The triangles (t, 3) as surfaces, each in their order: connected over edges, and touching itself nowhere.
 
-    >>> [part.tolist() for part in connected_parts(np.array([[0, 1, 2], [3, 4, 5], [0, 2, 6]], np.int32))]
+    Where a surface would meet itself at a vertex, the triangles of one side of it become a surface of their own.
+
+    >>> [part.tolist() for part in surfaces_of(np.array([[0, 1, 2], [3, 4, 5], [0, 2, 6]], np.int32))]
     [[[0, 1, 2], [0, 2, 6]], [[3, 4, 5]]]
     """
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).astype(np.int64)
-    keys = edges[:, 0] << 32 | edges[:, 1]
+    found: list[LabelArray] = []
+    waiting = [triangles]
+    while waiting:
+        part = waiting.pop()
+        surface, fan = _surfaces_and_fans(part)
+        for number in np.unique(surface):
+            own = surface == number
+            fans, sizes = np.unique(np.column_stack((part[own].ravel(), fan[own].ravel())), axis=0, return_counts=True)
+            again = np.flatnonzero(fans[1:, 0] == fans[:-1, 0])
+            if len(again):
+                smaller = again[0] + (sizes[again[0]] > sizes[again[0] + 1])
+                cut = (fan[own] == fans[smaller, 1]).any(axis=1)
+                waiting += [part[own][cut], part[own][~cut]]
+            else:
+                found.append(part[own])
+    return sorted(found, key=lambda surface: surface[0].tolist())
+
+
+def _surfaces_and_fans(triangles: LabelArray) -> tuple[LabelArray, LabelArray]:
+    """The number of the surface of each triangle, (t,), and of the fan around each of its corners, (t, 3).
+
+    Neighbours share an edge that no third has, and run along it in opposite directions. A fan is the neighbours around
+    a vertex.
+    """
+    start, end = triangles.ravel().astype(np.int64), np.roll(triangles, -1, axis=1).ravel()
+    keys = np.minimum(start, end) << 32 | np.maximum(start, end)
     order = np.argsort(keys, kind="stable")
-    shared = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
-    part, count = numbered_sets(united(len(triangles), order[shared] // 3, order[shared + 1] // 3))
-    return [triangles[part == number] for number in range(count)]
+    same = np.pad(keys[order[1:]] == keys[order[:-1]], 1)
+    first = np.flatnonzero(same[1:-1] & ~same[:-2] & ~same[2:])
+    one, other = order[first], order[first + 1]
+    opposite = start[one] == end[other]
+    one, other = one[opposite], other[opposite]
+    surface, _ = numbered_sets(united(len(triangles), one // 3, other // 3))
+    # an edge starts at the corner of its number and ends at the next one of its triangle
+    after_one, after_other = (edge - edge % 3 + (edge + 1) % 3 for edge in (one, other))
+    corners = np.concatenate((one, other)), np.concatenate((after_other, after_one))
+    fan, _ = numbered_sets(united(triangles.size, *corners))
+    return surface, fan.reshape(-1, 3)
 
 
 def terrain_obj(terrain: TerrainTriangles, tile_key: str, reference: SpatialReference) -> str:

@@ -8,6 +8,7 @@ border alone. So both tiles have the same vertices there, whatever lies inside.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,6 +18,7 @@ import shapely
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, height_above
+from pipeline.terrain.noding import APART_MM, ON_LINE_MM, noded
 from pipeline.tiling import Window
 from pipeline.tin.constrained import LatticePoints, RefinedTin, refine, triangulate_constrained
 
@@ -31,8 +33,6 @@ up to so far from a tile matter to it."""
 REACH_M = 2 * GAP_CELLS + 3
 """How far beyond a tile terrain is looked at."""
 
-_ON_OUTLINE_MM = 0.75
-"""Noding moves an outline by at most 0.71 mm, half the diagonal of a millimetre."""
 _BORDER_MM = 250
 """Cells whose middle is nearer than this to the border of a tile are left to the vertices on it."""
 
@@ -90,14 +90,13 @@ def terrain_mesh(
         Vertical distance between the middle of a cell and the triangle there, at most.
     """
     drawn = _Drawn(core=core, terrain=terrain, corner=corner, known=_known(terrain, occupied), outlines=outlines)
-    nodes, edges = drawn.nodes_and_edges()
-    nodes, z_mm = drawn.with_more(nodes, edges, tolerance_mm)
-    tin = triangulate_constrained(nodes, edges)
+    nodes, z_mm = drawn.with_more(tolerance_mm)
+    tin = triangulate_constrained(nodes, drawn.edges)
     floor_of_region, is_terrain = drawn.judged(nodes[tin.inside].mean(axis=1))
     if not is_terrain.any():
         return _no_mesh()
     found = refine(tin, z_mm, is_terrain, drawn.lattice_points(), tolerance_mm)
-    return _mesh(found, drawn.floors_beyond(found, floor_of_region), core)
+    return _mesh(found, drawn.floors_beyond(found, floor_of_region), drawn.floors_at_nodes(), core)
 
 
 def _no_mesh() -> TerrainMesh:
@@ -187,46 +186,36 @@ class _Drawn:
     _low: IntArray = dataclasses.field(init=False)
     _side: int = dataclasses.field(init=False)
     _lines: npt.NDArray[np.object_] = dataclasses.field(init=False)
-    """The rings of the outlines."""
+    """The rings of the outlines. What is decided on the border by distances needs them: neighbours have the same."""
+    _noded_lines: npt.NDArray[np.object_] = dataclasses.field(init=False)
+    """The rings as they lead through the nodes."""
     _floor_of_line: IntArray = dataclasses.field(init=False)
+    nodes: IntArray = dataclasses.field(init=False)
+    """(n, 2): where outlines, the border and the edge of the data in the tile meet or turn."""
+    edges: IntArray = dataclasses.field(init=False)
+    """(s, 2): the nodes at the ends of each edge."""
 
     def __post_init__(self) -> None:
-        """Move the outlines near the tile to its corner."""
+        """Move the outlines near the tile to its corner, and cut all lines at their crossings."""
         low = np.array([self.core.x0_mm, self.core.y0_mm])
         side = self.core.x1_mm - self.core.x0_mm
-        rings: list[shapely.LinearRing] = []
-        floors: list[int] = []
-        near: list[Outline] = []
-        for outline in self.outlines:
-            moved = [ring - low for ring in outline.rings]
-            outer = moved[0]
-            if (outer.max(axis=0) < -BESIDE_MM).any() or (outer.min(axis=0) > side + BESIDE_MM).any():
-                continue
-            near.append(dataclasses.replace(outline, rings=tuple(moved)))
-            rings.extend(shapely.linearrings(ring) for ring in moved)
-            floors.extend([outline.z_mm] * len(moved))
-        object.__setattr__(self, "outlines", tuple(near))
+        near = [
+            outline
+            for outline in self.outlines
+            if (outline.rings[0].max(axis=0) - low >= -BESIDE_MM).all()
+            and (outline.rings[0].min(axis=0) - low <= side + BESIDE_MM).all()
+        ]
+        rings = np.array([shapely.linearrings(ring - low) for outline in near for ring in outline.rings], dtype=object)
+        object.__setattr__(self, "outlines", near)
         object.__setattr__(self, "_low", low)
         object.__setattr__(self, "_side", side)
-        object.__setattr__(self, "_lines", np.array(rings, dtype=object))
+        found = noded(side, BESIDE_MM, self._data_edges(), rings)
+        object.__setattr__(self, "_lines", rings)
+        object.__setattr__(self, "_noded_lines", found.outlines)
+        object.__setattr__(self, "nodes", found.nodes)
+        object.__setattr__(self, "edges", found.edges)
+        floors = [outline.z_mm for outline in near for _ in outline.rings]
         object.__setattr__(self, "_floor_of_line", np.array(floors, dtype=np.int64))
-
-    def nodes_and_edges(self) -> tuple[IntArray, IntArray]:
-        """The nodes (n, 2) of outlines, of the border and of the edge of the data in the tile; edges (s, 2) in it.
-
-        They meet at nodes only, on whole millimetres (snap rounding: Hobby 1999). A node depends only on lines within a
-        millimetre of it.
-        """
-        side = self._side
-        border = shapely.linearrings([(0, 0), (side, 0), (side, side), (0, side)])
-        noded = shapely.union_all([border, *self._lines, *self._data_edges()], grid_size=1.0)
-        xy, line = shapely.get_coordinates(shapely.get_parts(noded), return_index=True)
-        xy = np.rint(xy).astype(np.int64)
-        ends = np.column_stack((xy[:-1], xy[1:]))[line[:-1] == line[1:]]
-        inside = ((ends >= 0) & (ends <= side)).all(axis=1)
-        corners = np.array([(0, 0), (side, 0), (side, side), (0, side)], np.int64)
-        nodes, number = np.unique(np.concatenate((ends[inside].reshape(-1, 2), corners)), axis=0, return_inverse=True)
-        return nodes, number.reshape(-1)[: -len(corners)].reshape(-1, 2).astype(np.int64)
 
     def _data_edges(self) -> npt.NDArray[np.object_]:
         """The sides between cells with and without terrain, in runs as long as they are straight."""
@@ -249,30 +238,30 @@ class _Drawn:
         below = height_above(x, y, np.zeros(len(xy), np.int64), self.terrain, *self.corner)
         return np.where(below == NO_DATA, np.int64(NO_DATA), -below)
 
-    def with_more(self, nodes: IntArray, edges: IntArray, tolerance_mm: float) -> tuple[IntArray, IntArray]:
+    def with_more(self, tolerance_mm: float) -> tuple[IntArray, IntArray]:
         """The nodes and further ones along the border and the edge of the data, and the elevation of each.
 
         On an outline it is that of the floor, of the lowest where several touch there.
         """
-        z_mm = self._elevations_of_nodes(nodes)
-        added = self._between(nodes, z_mm, edges, tolerance_mm)
-        return np.concatenate((nodes, added)), np.concatenate((z_mm, self.elevations(added)))
+        z_mm = self.elevations(self.nodes)
+        node, floor = self.floors_at_nodes().T
+        lowest = np.full(len(self.nodes), np.iinfo(np.int64).max)
+        np.minimum.at(lowest, node, floor)
+        z_mm[node] = lowest[node]
+        added = self._between(z_mm, tolerance_mm)
+        return np.concatenate((self.nodes, added)), np.concatenate((z_mm, self.elevations(added)))
 
-    def _elevations_of_nodes(self, nodes: IntArray) -> IntArray:
-        z_mm = self.elevations(nodes)
-        if len(self._lines):
-            points = shapely.points(nodes.astype(np.float64))
-            node, line = shapely.STRtree(self._lines).query(points, predicate="dwithin", distance=_ON_OUTLINE_MM)
-            floor = np.full(len(nodes), np.iinfo(np.int64).max)
-            np.minimum.at(floor, node, self._floor_of_line[line])
-            z_mm[node] = floor[node]
-        return z_mm
+    def floors_at_nodes(self) -> IntArray:
+        """The nodes on outlines and the floor of each outline there: (k, 2)."""
+        points = shapely.points(self.nodes.astype(np.float64))
+        node, line = shapely.STRtree(self._noded_lines).query(points, predicate="dwithin", distance=ON_LINE_MM)
+        return np.column_stack((node, self._floor_of_line[line]))
 
-    def _samples(self, nodes: IntArray, edges: IntArray) -> tuple[IntArray, IntArray]:
+    def _samples(self) -> tuple[IntArray, IntArray]:
         """The middles of cells along those edges that run along rows or columns, (k, 2), and the edge of each."""
         found, of_edge = [np.empty((0, 2), np.int64)], [np.empty(0, np.int64)]
         for axis in (0, 1):
-            along, ends = 1 - axis, nodes[edges]
+            along, ends = 1 - axis, self.nodes[self.edges]
             straight = np.flatnonzero(ends[:, 0, axis] == ends[:, 1, axis])
             low, high = (edge(ends[straight][:, :, along], axis=1) for edge in (np.min, np.max))
             half, shift = CELL_MM // 2, int(self._low[along])
@@ -286,11 +275,12 @@ class _Drawn:
             of_edge.append(np.repeat(straight, counts))
         return np.concatenate(found), np.concatenate(of_edge)
 
-    def _between(self, nodes: IntArray, z_mm: IntArray, edges: IntArray, tolerance_mm: float) -> IntArray:
+    def _between(self, z_mm: IntArray, tolerance_mm: float) -> IntArray:
         """Points (k, 2) on edges along rows or columns that the terrain needs between their ends."""
-        xy, of_edge = self._samples(nodes, edges)
+        xy, of_edge = self._samples()
         z = self.elevations(xy)
-        usable, beside = z != NO_DATA, np.zeros(len(z), np.bool_)
+        too_close = ((xy > 0) & (xy < APART_MM)) | ((xy < self._side) & (xy > self._side - APART_MM))
+        usable, beside = (z != NO_DATA) & ~too_close.any(axis=1), np.zeros(len(z), np.bool_)
         if len(self._lines):
             tree, points = shapely.STRtree(self._lines), shapely.points(xy.astype(np.float64))
             beside[tree.query(points, predicate="dwithin", distance=float(BESIDE_MM))[0]] = True
@@ -298,12 +288,12 @@ class _Drawn:
         xy, z, beside, of_edge = xy[usable], z[usable], beside[usable], of_edge[usable]
         chosen = [np.empty((0, 2), np.int64)]
         for own in np.split(np.arange(len(xy)), np.flatnonzero(np.diff(of_edge)) + 1) if len(xy) else ():
-            a, b = edges[of_edge[own[0]]]
+            a, b = self.edges[of_edge[own[0]]]
             if NO_DATA in (z_mm[a], z_mm[b]):
                 continue
-            if nodes[a].sum() > nodes[b].sum():
+            if self.nodes[a].sum() > self.nodes[b].sum():
                 a, b = b, a
-            place = np.concatenate(([nodes[a]], xy[own], [nodes[b]])).sum(axis=1)
+            place = np.concatenate(([self.nodes[a]], xy[own], [self.nodes[b]])).sum(axis=1)
             profile = np.concatenate(([z_mm[a]], z[own], [z_mm[b]]))
             stays = _thinned(place, profile, np.concatenate(([True], beside[own], [True])), tolerance_mm)
             chosen.append(xy[own][stays[1:-1]])
@@ -316,7 +306,8 @@ class _Drawn:
         """
         floor = np.full(len(places), NO_DATA, np.int64)
         if self.outlines:
-            polygons = [shapely.Polygon(one.rings[0], one.rings[1:]) for one in self.outlines]
+            ring = iter(self._noded_lines)
+            polygons = [shapely.Polygon(next(ring), [next(ring) for _ in one.rings[1:]]) for one in self.outlines]
             place, polygon = shapely.STRtree(polygons).query(shapely.points(places), predicate="intersects")
             np.minimum.at(floor, place, np.array([one.z_mm for one in self.outlines], np.int64)[polygon])
         cells = np.floor((places + self._low) / CELL_MM).astype(np.int64) - np.array(self.corner)
@@ -325,14 +316,15 @@ class _Drawn:
     def floors_beyond(self, found: RefinedTin, floor_of_region: IntArray) -> IntArray:
         """The floor of the building beyond each edge of the facets, (t, 3); NO_DATA where there is none.
 
-        Beyond the border of the tile it is that of the outlines 1 mm from there.
+        Beyond the border of the tile it is that of the outlines 0.5 mm from there: noding moves those that are nearer
+        onto the border.
         """
         floor: IntArray = np.concatenate((floor_of_region, np.full(1, NO_DATA, np.int64)))[found.beyond]
         t, k = np.nonzero(found.beyond < 0)
         ends = found.vertices_mm[np.stack((found.facets[t, k], found.facets[t, (k + 1) % 3]), axis=1), :2]
         places, is_on_border = ends.mean(axis=1), np.zeros(len(t), np.bool_)
         for axis in (0, 1):
-            for border, step in ((0, -1.0), (self._side, 1.0)):
+            for border, step in ((0, -0.5), (self._side, 0.5)):
                 on = (ends[:, :, axis] == border).all(axis=1)
                 places[on, axis] += step
                 is_on_border |= on
@@ -358,25 +350,37 @@ class _Drawn:
         )
 
 
-def _mesh(found: RefinedTin, floor: IntArray, core: Window) -> TerrainMesh:
+def _upright(vertices: IntArray, walls: IntArray, floors_at: IntArray) -> IntArray:
+    """The triangles (k, 3, 3) that close steps beneath walls (w, 3): from vertex u to v, at the level of a floor.
+
+    Each level of another floor at a vertex is a corner of theirs, too, so that those of two walls share whole edges.
+    Levels less than `APART_MM` above another are left out.
+    """
+    levels: dict[int, list[int]] = {}
+    for vertex, z in np.unique(np.concatenate((floors_at, walls[:, [0, 2]], walls[:, [1, 2]])), axis=0).tolist():
+        at = levels.setdefault(vertex, [])
+        if not at or z >= at[-1] + APART_MM:
+            at.append(z)
+    found: list[tuple[tuple[int, ...], ...]] = []
+    is_step = (vertices[walls[:, :2], 2] != walls[:, 2:]).any(axis=1)
+    for u, v, floor in walls[is_step].tolist():
+        on_u, on_v = ([(*vertices[e, :2].tolist(), z) for z in levels[e] if z <= floor] for e in (u, v))
+        found += [(on_v[0], lower, upper) for lower, upper in itertools.pairwise(on_u)]
+        found += [(lower, on_u[-1], upper) for lower, upper in itertools.pairwise(on_v)]
+    return np.array(found, dtype=np.int64).reshape(-1, 3, 3)
+
+
+def _mesh(found: RefinedTin, floor: IntArray, floors_at: IntArray, core: Window) -> TerrainMesh:
     """The facets and the upright triangles between them and floors, in canonical order and absolute coordinates.
 
-    `floor` (t, 3) is that of the building beyond each edge, NO_DATA without one.
+    `floor` (t, 3) is that of the building beyond each edge, NO_DATA without one; `floors_at` (k, 2) are vertices and
+    the floors that touch there.
     """
     vertices, facets = found.vertices_mm, found.facets
     t, k = np.nonzero(floor != NO_DATA)
-    u, v, z_floor = facets[t, k], facets[t, (k + 1) % 3], floor[t, k]
-    raised_u, raised_v = vertices[u].copy(), vertices[v].copy()
-    raised_u[:, 2] = raised_v[:, 2] = z_floor
-    low_u, low_v = vertices[u], vertices[v]
-    first, second = low_u[:, 2] != z_floor, low_v[:, 2] != z_floor
-    corners = np.concatenate(
-        (
-            vertices[facets],
-            np.stack((low_v, low_u, raised_u), axis=1)[first],
-            np.stack((low_v, raised_u, raised_v), axis=1)[second],
-        )
-    )
+    walls = np.column_stack((facets[t, k], facets[t, (k + 1) % 3], floor[t, k])).astype(np.int64)
+    upright = _upright(vertices, walls, floors_at)
+    corners = np.concatenate((vertices[facets], upright))
     places, number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     triangles = number.reshape(-1, 3)
     start = np.argmin(triangles, axis=1)

@@ -1,6 +1,8 @@
 """The terrain of tiles as triangles: seamless, with floors cut out, within its tolerance."""
 
+import dataclasses
 import itertools
+import math
 from collections import Counter
 from collections.abc import Sequence
 
@@ -10,7 +12,9 @@ import shapely
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from surface_rules import surface_faults
 
+from pipeline.export.terrain import surfaces_of
 from pipeline.model import IntArray
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.terrain_tin import (
@@ -266,3 +270,120 @@ def test_the_step_to_a_lower_floor_is_closed_on_a_border_too(houses: list[Outlin
     # no terrain lies between the floors: the ends of a common wall are free
     assert {(a[2], b[2]) for a, b in inside if (a, b) not in upright} == {(3000, 3000), (3400, 3400)}
     assert max(found.values()) == 1
+
+
+def facets_of(mesh: TerrainMesh) -> TerrainMesh:
+    """The mesh without its upright triangles."""
+    a, b, c = (mesh.vertices_mm[mesh.triangles[:, k], :2] for k in range(3))
+    u, v = b - a, c - a
+    return dataclasses.replace(mesh, triangles=mesh.triangles[u[:, 0] * v[:, 1] != u[:, 1] * v[:, 0]])
+
+
+def faults_of(mesh: TerrainMesh) -> list[str]:
+    """Vertices closer than 2 mm, upright edges with a vertex in the middle, and faults of the surfaces."""
+    vertices = mesh.vertices_mm.tolist()
+    pairs = shapely.STRtree(shapely.points(mesh.vertices_mm)).query(shapely.points(mesh.vertices_mm), "dwithin", 1.9)
+    found = [f"{a}, {b} are close" for a, b in pairs.T.tolist() if a < b and math.dist(vertices[a], vertices[b]) < 2]
+    levels: dict[tuple[int, int], list[int]] = {}
+    for x, y, z in vertices:
+        levels.setdefault((x, y), []).append(z)
+    for a, b in edges_of([mesh]):
+        if a[:2] == b[:2] and any(a[2] < z < b[2] for z in levels[a[:2]]):
+            found.append(f"{a}, {b} has a vertex within")
+    return [*found, *(fault for one in surfaces_of(mesh.triangles) for fault in surface_faults(one.tolist()))]
+
+
+@pytest.mark.parametrize("at", [8000, SIDE - 1, SIDE], ids=["inside", "beside a border", "on a border"])
+@pytest.mark.parametrize("along", [0, 1])
+def test_corners_a_millimetre_apart_become_one_in_all_tiles(at: int, along: int) -> None:
+    one, other = box_at(4000, 5000, at, 12_000, 3000), box_at(at + 1, 5000, 30_000, 14_000, 3000)
+    houses = [dataclasses.replace(house, rings=(house.rings[0][:, :: 1 - 2 * along],)) for house in (one, other)]
+    meshes = [tile_at((SIDE * i, SIDE * k), houses) for i in (0, 1) for k in (0, 1)]
+    assert [fault for mesh in meshes for fault in faults_of(mesh)] == []
+    edges = edges_of(meshes)
+    assert max(edges.values()) == 1
+    built = shapely.union_all([polygon(house) for house in houses])
+    free = [(a[:2], b[:2]) for a, b in edges if (b, a) not in edges]
+    inside = [line for line in free if not any(a in (0, 2 * SIDE) and a == b for a, b in zip(*line, strict=True))]
+    # no terrain is left between the houses, and elsewhere an outline is left by at most the diagonal of a millimetre
+    assert shapely.hausdorff_distance(shapely.union_all(shapely.linestrings(inside)), built.buffer(1).exterior) < 3
+    assert sum(map(area_mm2, meshes)) == pytest.approx(4 * SIDE**2 - built.area, abs=20_000)
+
+
+def test_floors_a_millimetre_apart_are_one_level() -> None:
+    mesh = tile_at((0, 0), row_of_houses(2500, 8000, 0.0, [3000, 3001, 3400]))
+    assert faults_of(mesh) == []
+    assert {3000, 3001, 3400} <= set(mesh.vertices_mm[:, 2].tolist())
+
+
+def test_no_vertex_on_a_border_is_close_to_the_corner_of_the_tile() -> None:
+    # the middles of the first cells lie a millimetre from the corner, and all beside a house become vertices
+    assert faults_of(tile_at((499, 499), [box_at(1500, 1500, 9000, 9000, 3000)])) == []
+
+
+def test_upright_triangles_on_both_sides_of_a_slit_share_whole_edges() -> None:
+    low = box_at(2000, 2000, 16_000, 8000, 3000)
+    west = box_at(2000, 8000, 8000, 14_000, 3200)
+    east = Outline(rings=(np.array([(8000, 8000), (14_000, 8000), (14_000, 14_000), (9000, 14_000)]),), z_mm=3400)
+    mesh = tile_at((0, 0), [low, west, east])
+    assert faults_of(mesh) == []
+    edges = edges_of([mesh])
+    step = ((8000, 8000, 3000), (8000, 8000, 3200))
+    assert edges[step] == edges[step[::-1]] == 1
+    assert ((8000, 8000, 3200), (8000, 8000, 3400)) in edges or ((8000, 8000, 3400), (8000, 8000, 3200)) in edges
+
+
+def test_terrain_around_a_house_with_a_corner_on_the_border_is_two_surfaces() -> None:
+    house = Outline(rings=(np.array([(0, 12_000), (6000, 6000), (12_000, 12_000), (6000, 18_000)]),), z_mm=3000)
+    mesh = tile_at((0, 0), [house])
+    surfaces = surfaces_of(mesh.triangles)
+    assert len(surfaces) == 2
+    assert faults_of(mesh) == []
+
+
+def sectors(x: int, y: int, turn: float, parts: Sequence[tuple[float, int, tuple[int, int]]]) -> list[Outline]:
+    """Houses around a corner, each up to a sixth of the circle: its share, level, and how far its corner is off."""
+    found = []
+    for number, (share, level, shift) in enumerate(parts):
+        angles = turn + np.pi / 3 * np.array((number, number + share))
+        corner = np.array((x, y)) + shift
+        ends = np.rint(corner + 9000 * np.column_stack((np.cos(angles), np.sin(angles)))).astype(np.int64)
+        if share:
+            found.append(Outline(rings=(np.concatenate((corner[None], ends)),), z_mm=level))
+    return found
+
+
+NEAR_A_BORDER = st.one_of(st.integers(SIDE - 3, SIDE + 3), st.integers(9000, 39_000))
+
+
+@settings(max_examples=examples(40), deadline=None)
+@given(
+    st.builds(
+        sectors,
+        NEAR_A_BORDER,
+        NEAR_A_BORDER,
+        st.sampled_from([0.0, 0.3, 1.1]),
+        st.lists(
+            st.tuples(
+                st.sampled_from([0.0, 0.5, 1.0]),
+                st.sampled_from([3000, 3001, 3002, 3400, 3800]),
+                st.tuples(st.integers(-1, 1), st.integers(-1, 1)),
+            ),
+            min_size=6,
+            max_size=6,
+        ),
+    )
+)
+def test_houses_that_nearly_meet_at_a_corner_leave_valid_terrain_in_all_tiles(houses: list[Outline]) -> None:
+    meshes = [tile_at((SIDE * i, SIDE * k), houses) for i in (0, 1) for k in (0, 1)]
+    assert [fault for mesh in meshes for fault in faults_of(mesh)] == []
+    edges = edges_of([facets_of(mesh) for mesh in meshes])
+    assert max(edges.values()) == 1
+    built = shapely.union_all([polygon(house) for house in houses])
+    square = shapely.box(0, 0, 2 * SIDE, 2 * SIDE)
+    assert sum(map(area_mm2, meshes)) == pytest.approx(square.area - built.area, abs=2000 + 4 * built.length)
+    walls = shapely.union_all([polygon(house).exterior for house in houses])
+    for a, b in edges:
+        line = shapely.LineString((a[:2], b[:2]))
+        if (b, a) not in edges and not square.exterior.contains(line):
+            assert shapely.hausdorff_distance(line, walls & line.buffer(3)) < 4

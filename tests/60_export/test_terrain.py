@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import small_buildings as small
 from cityjson_rules import faults
+from surface_rules import surface_faults
 
-from pipeline.export.terrain import in_crs, read_terrain, terrain_lines, terrain_obj
+from pipeline.export.terrain import in_crs, read_terrain, surfaces_of, terrain_lines, terrain_obj
 
 NAMES = ("compound", "feet and metres", "US feet", "unknown")
 ORIGIN = (84_750.0, 447_500.0, 0.0)
@@ -65,3 +66,37 @@ def test_a_file_of_buildings_holds_no_terrain() -> None:
     building = {"CityObjects": {"a": {"type": "Building"}}, "vertices": []}
     with pytest.raises(ValueError, match="the lines hold no TINRelief"):
         read_terrain([json.dumps(first), json.dumps(building)])
+
+
+RING = [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4], [4, 5, 6], [5, 7, 6], [6, 7, 8], [7, 9, 8]]
+"""A strip."""
+
+
+@pytest.mark.parametrize(
+    ("triangles", "sizes"),
+    [
+        ([*RING, [8, 9, 0]], [8, 1]),
+        ([*RING, [8, 9, 0], [9, 1, 0]], [10]),
+        ([[0, 1, 2], [0, 3, 4]], [1, 1]),
+        ([[0, 1, 2], [1, 0, 3], [0, 1, 4], [1, 0, 5]], [1, 1, 1, 1]),
+        ([[0, 1, 2], [0, 1, 3]], [1, 1]),
+        ([[0, 1, 2], [1, 0, 3], [0, 2, 4], [4, 2, 3], [0, 1, 5]], [3, 1, 1]),
+    ],
+    ids=[
+        "a ring closed at a vertex",
+        "a ring",
+        "a vertex",
+        "four at an edge",
+        "against each other",
+        "a third at an edge",
+    ],
+)
+def test_surfaces_touch_themselves_nowhere(triangles: list[list[int]], sizes: list[int]) -> None:
+    found = surfaces_of(np.array(triangles, np.int32))
+    assert sorted(map(len, found), reverse=True) == sizes
+    assert [fault for surface in found for fault in surface_faults(surface.tolist())] == []
+    assert sorted(face for surface in found for face in surface.tolist()) == sorted(triangles)
+
+
+def test_there_is_no_surface_without_triangles() -> None:
+    assert surfaces_of(np.empty((0, 3), np.int32)) == []
