@@ -108,7 +108,11 @@ def test_the_catalogue_leads_to_every_file_it_lists(client: TestClient, job_id: 
         answer = client.get(place)
         assert answer.headers["content-type"] == "application/geo+json"
         for link in answer.json()["links"]:
-            assert client.get(urljoin(place, link["href"])).json()["id"] == job_id
+            document = client.get(urljoin(place, link["href"])).json()
+            assert document["id"] == job_id or (link["rel"], document["properties"]["pc:count"]) == (
+                "derived_from",
+                700,
+            )
         assets = answer.json()["assets"]
         assert {"buildings", "planes", "rejected", "cityjson"} <= set(assets)
         for asset in assets.values():
@@ -116,6 +120,19 @@ def test_the_catalogue_leads_to_every_file_it_lists(client: TestClient, job_id: 
             assert f"1220{hashlib.sha256(file.content).hexdigest()}" == asset["file:checksum"]
             assert file.headers["content-type"] == asset["type"]
     assert "/srv/" not in client.get(address).text
+
+
+def test_the_catalogue_leads_to_the_points_and_names_no_folder(client: TestClient, job_id: str) -> None:
+    address = f"http://127.0.0.1/jobs/{job_id}/results/stac"
+    (child,) = (link["href"] for link in client.get(address).json()["links"] if link["rel"] == "child")
+    place = urljoin(address, child)
+    points = client.get(place)
+    assert (points.json()["id"], points.headers["content-type"]) == (f"{job_id}-points", "application/json")
+    (item,) = (link["href"] for link in points.json()["links"] if link["rel"] == "item")
+    answer = client.get(urljoin(place, item))
+    assert answer.headers["content-type"] == "application/geo+json"
+    assert (answer.json()["properties"]["title"], answer.json()["assets"]) == ("Points of tile.laz", {})
+    assert "/srv/" not in points.text + answer.text
 
 
 @pytest.mark.parametrize(
