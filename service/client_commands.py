@@ -194,7 +194,7 @@ def submit(
         typer.Option(
             "--publish",
             metavar="FORMAT",
-            help="Also 3dtiles, geopackage, pmtiles, cityjson, stac or solar; repeat --publish for several.",
+            help="Also 3dtiles, geopackage, pmtiles, cityjson, stac, solar or party-walls; repeat for several.",
         ),
     ] = None,
     geoid_height: Annotated[

@@ -182,6 +182,13 @@ def _solar(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> Non
     solar(str(run_dir), str(out_dir / OUTPUTS["solar"].filename), on_event=on_event)
 
 
+def _party_walls(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
+    from pipeline.runtime.party_walls import party_walls
+
+    walls, areas = (str(out_dir / OUTPUTS[name].filename) for name in FORMATS["party-walls"])
+    party_walls(str(run_dir), walls, buildings=areas, on_event=on_event)
+
+
 _WRITERS: Mapping[str, Callable[[Path, Path, _Options, Listener], None]] = MappingProxyType(
     {
         "3dtiles": _tiles,
@@ -190,6 +197,7 @@ _WRITERS: Mapping[str, Callable[[Path, Path, _Options, Listener], None]] = Mappi
         "cityjson": _cityjson,
         "stac": _stac,
         "solar": _solar,
+        "party-walls": _party_walls,
     }
 )
 

@@ -306,7 +306,7 @@ class ReconstructInputs(BuildingInputs):
             default_factory=list,
             title="Publish",
             description="Also deliver the models in these formats: 3D Tiles, GeoPackage, PMTiles, CityJSON files, a "
-            "STAC catalogue, solar energy per roof plane. Naming one of their outputs does the same.",
+            "STAC catalogue, solar energy per roof plane, party walls. Naming one of their outputs does the same.",
             json_schema_extra={"uniqueItems": True},
         )
     )

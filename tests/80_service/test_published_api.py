@@ -18,6 +18,7 @@ from starlette.testclient import TestClient
 
 from pipeline.export.glb_container import read_document
 from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.party_walls import party_walls
 from service.keys import Scope, new_key
 from service.outputs.kinds import FORMATS, ON_REQUEST, OUTPUTS
 
@@ -177,11 +178,24 @@ def test_what_cannot_be_made_leaves_the_rest(service: runs.Service, client: Test
     job = service.finished(unknown, publish=WITHOUT_SOLAR, problems=problems)
     assert set(problems) == {"3dtiles", "pmtiles", "stac"}
     assert all("CRS" in problem for problem in problems.values())
-    assert {"geopackage", "cityjson-zip"} == set(client.get(f"/jobs/{job}/results").json()) & set(ON_REQUEST)
+    there = set(client.get(f"/jobs/{job}/results").json()) & set(ON_REQUEST)
+    assert there == {"geopackage", "cityjson-zip", "party-walls", "wall-areas"}
     holes = functools.partial(runs.write_run, failed_tile="x9_y9", status=RunStatus.INCOMPLETE)
     problems.clear()
     service.finished(holes, publish=("geopackage",), problems=problems)
     assert "would have holes" in problems["geopackage"]
+
+
+def test_party_walls_are_two_outputs_with_the_tables_of_the_command(
+    service: runs.Service, client: TestClient, tmp_path: Path
+) -> None:
+    run_dir = runs.write_run(tmp_path / "run")
+    party_walls(str(run_dir), str(tmp_path / "walls.parquet"), buildings=str(tmp_path / "areas.parquet"))
+    job = service.finished(publish=("party-walls",))
+    for name, file in (("party-walls", "walls.parquet"), ("wall-areas", "areas.parquet")):
+        found = pq.read_table(io.BytesIO(client.get(f"/jobs/{job}/results/{name}").content))
+        assert found.equals(pq.read_table(tmp_path / file)), name
+    assert found.num_rows > 0
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ export const FORMATS: Record<string, string> = {
   cityjson: "CityJSON files",
   stac: "STAC catalogue",
   solar: "Solar energy of the roofs",
+  "party-walls": "Party walls",
 };
 
 /** A message that names fields in place of inputs, and no settings of the operator. */
