@@ -9,6 +9,7 @@ export const LABELS = {
   preset: "Preset",
   classes: "Classes of the file",
   footprints: "Footprints",
+  guides: "Guides",
   points: "Keep the points",
   publish: "Publish as",
   title: "Title",
