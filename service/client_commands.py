@@ -168,6 +168,9 @@ def submit(
     footprints: Annotated[
         str | None, typer.Option(metavar="FILE", help="Building outlines (GeoPackage, GeoJSON, GeoParquet) to model.")
     ] = None,
+    guides: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Lines of roofs (GeoPackage, GeoJSON, GeoParquet) to follow.")
+    ] = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
     allow_outside_area_of_use: AllowOutside = False,
@@ -194,7 +197,7 @@ def submit(
         typer.Option(
             "--publish",
             metavar="FORMAT",
-            help="Also 3dtiles, geopackage, pmtiles, cityjson, stac or solar; repeat --publish for several.",
+            help="Also 3dtiles, geopackage, pmtiles, cityjson, stac, solar or party-walls; repeat for several.",
         ),
     ] = None,
     geoid_height: Annotated[
@@ -247,6 +250,7 @@ def submit(
         process=process or ("reconstruct" if methods is None else "compare"),
         inputs=inputs | {"settings": None if settings is None else _settings(settings)},
         footprints=footprints,
+        guides=guides,
         outputs=outputs or None,
         new=new,
         on_transfer=_shown(remote.console, "upload"),

@@ -32,6 +32,8 @@ class Draft:
     """Point clouds."""
     footprints: InputReference | Inline | None
     """Outlines."""
+    guides: InputReference | Inline | None = None
+    """Lines of roofs."""
     priority: int
     """Higher runs first."""
     values: Mapping[str, Any]
@@ -43,13 +45,14 @@ class Draft:
         def placed(source: InputReference | Inline) -> InputReference:
             return stored[source] if isinstance(source, Inline) else source
 
-        footprints = None if self.footprints is None else placed(self.footprints)
-        return JobRequest(tiles=tuple(placed(tile) for tile in self.tiles), footprints=footprints, **self.values)
+        footprints, guides = (None if one is None else placed(one) for one in (self.footprints, self.guides))
+        tiles = tuple(placed(tile) for tile in self.tiles)
+        return JobRequest(tiles=tiles, footprints=footprints, guides=guides, **self.values)
 
     @property
     def inline(self) -> tuple[Inline, ...]:
         """The files that must be stored."""
-        sources = (*self.tiles, *(() if self.footprints is None else (self.footprints,)))
+        sources = (*self.tiles, self.footprints, self.guides)
         return tuple(dict.fromkeys(source for source in sources if isinstance(source, Inline)))
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 from pipeline.errors import InputError
 from pipeline.io.area_of_use import location_of
@@ -23,7 +24,7 @@ from service.input_policy import checked_crs, checked_path, checked_url
 from service.jobs import InputReference, JobRequest, Upload
 from service.preflight import outside_area, preflight, promised_points
 from service.settings import ServiceSettings
-from service.vectors import VECTOR_SUFFIXES
+from service.vectors import LINES, POLYGONS, VECTOR_SUFFIXES
 
 
 class UploadTable(Protocol):
@@ -42,9 +43,37 @@ class Fetched:
     path: Path
     """Its path on disk."""
     points: int
-    """Points of a point cloud, by its header; 0 for footprints."""
+    """Points of a point cloud, by its header; 0 for footprints and guides."""
     sha256: str | None
     """Hexadecimal; None for files that were read in place."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class JobFiles:
+    """The inputs of a job on this machine's disk."""
+
+    tiles: Sequence[Fetched]
+    """Point clouds."""
+    footprints: Fetched | None = None
+    """Building outlines."""
+    guides: Fetched | None = None
+    """Lines of roofs."""
+
+    @property
+    def all(self) -> list[Fetched]:
+        """All of them."""
+        return [*self.tiles, *(one for one in (self.footprints, self.guides) if one is not None)]
+
+
+_Kind = Literal["point cloud", "file of footprints", "file of guides"]
+"""What an input must be."""
+_SUFFIXES: Mapping[_Kind, tuple[str, ...]] = {
+    "point cloud": POINT_SUFFIXES,
+    "file of footprints": VECTOR_SUFFIXES,
+    "file of guides": VECTOR_SUFFIXES,
+}
+_SHAPES: Mapping[_Kind, str] = {"file of footprints": POLYGONS, "file of guides": LINES}
+"""What a vector file must hold."""
 
 
 def resolve_inputs(
@@ -66,23 +95,25 @@ def resolve_inputs(
     TooLargeError
         Too many inputs or points.
     """
-    sources: list[tuple[InputReference, tuple[str, ...]]] = [(tile, POINT_SUFFIXES) for tile in request.tiles]
+    sources: list[tuple[InputReference, _Kind]] = [(tile, "point cloud") for tile in request.tiles]
     if request.footprints is not None:
-        sources.append((request.footprints, VECTOR_SUFFIXES))
+        sources.append((request.footprints, "file of footprints"))
+    if request.guides is not None:
+        sources.append((request.guides, "file of guides"))
     if len(sources) > settings.max_inputs:
         raise TooLargeError(f"the job names {len(sources)} inputs, this service takes {settings.max_inputs}")
     faults: list[str] = []
     refusals, outside, points = 0, 0, 0
-    for source, suffixes in dict.fromkeys(sources):
+    for source, kind in dict.fromkeys(sources):
         try:
             if source.kind == "upload":
-                points += _check_upload(source, suffixes, request, store, folder, owner)
+                points += _check_upload(source, kind, request, store, folder, owner)
             elif source.kind == "path":
                 path = checked_path(source.value, settings)
-                _check_suffix(source, path.name, suffixes)
-                points += (promised_points(path) or 0) if suffixes is POINT_SUFFIXES else 0
+                _check_suffix(source, path.name, kind)
+                points += (promised_points(path) or 0) if kind == "point cloud" else 0
             else:
-                _check_suffix(source, name_of(checked_url(source.value, settings)), suffixes)
+                _check_suffix(source, name_of(checked_url(source.value, settings)), kind)
         except TooLargeError:
             raise
         except (ServiceError, InputError) as fault:
@@ -98,7 +129,7 @@ def resolve_inputs(
 
 def _check_upload(
     source: InputReference,
-    suffixes: tuple[str, ...],
+    kind: _Kind,
     request: JobRequest,
     store: UploadTable,
     folder: StateFolder,
@@ -107,7 +138,8 @@ def _check_upload(
     """The number of points of an upload; refuses one that does not fit."""
     upload = store.upload(source.value, owner=owner)
     _upload_path(upload, folder)
-    _check_suffix(source, upload.filename, suffixes)
+    _check_suffix(source, upload.filename, kind)
+    _check_shape(upload, kind)
     far = _outside_area(upload, request.crs)
     problems = [str(problem) for problem in upload.preflight.get("problems", ()) if problem != far]
     if problems and request.crs is None:
@@ -141,11 +173,19 @@ def _upload_path(upload: Upload, folder: StateFolder) -> Path:
     return path
 
 
-def _check_suffix(source: InputReference, name: str, suffixes: tuple[str, ...]) -> None:
+def _check_suffix(source: InputReference, name: str, kind: _Kind) -> None:
     """Refuse points as footprints and vice versa, by the ending that decides how a file is read."""
+    suffixes = _SUFFIXES[kind]
     if not name.lower().endswith(suffixes):
-        what = "point cloud" if suffixes is POINT_SUFFIXES else "file of footprints"
-        raise RequestError([f"{source.kind} {name[:80]!r} is not a {what}: its name must end in {', '.join(suffixes)}"])
+        raise RequestError([f"{source.kind} {name[:80]!r} is not a {kind}: its name must end in {', '.join(suffixes)}"])
+
+
+def _check_shape(upload: Upload, kind: _Kind) -> None:
+    """Refuse lines as footprints and vice versa, by what was found when the file came."""
+    held = upload.preflight.get("shapes", [POLYGONS])
+    if kind in _SHAPES and _SHAPES[kind] not in held:
+        what = f"holds {' and '.join(held)}, not {_SHAPES[kind]}"
+        raise RequestError([f"upload {upload.filename[:80]!r} is not a {kind}: it {what}. Upload a file that does"])
 
 
 def _check_sum(points: int, settings: ServiceSettings) -> None:
@@ -164,21 +204,19 @@ def gather(
     settings: ServiceSettings,
     target: Path,
     cancelled: Cancel,
-) -> tuple[list[Fetched], Fetched | None]:
-    """Tiles and footprints of a job on this machine's disk, within the limits; raises as `materialise`."""
+) -> JobFiles:
+    """The inputs of a job on this machine's disk, within the limits; raises as `materialise`."""
+
+    def fetched(source: InputReference) -> Fetched:
+        return materialise(source, store=store, folder=folder, settings=settings, target=target, cancelled=cancelled)
+
     tiles, points = [], 0
     for tile in dict.fromkeys(request.tiles):
-        tiles.append(
-            materialise(tile, store=store, folder=folder, settings=settings, target=target, cancelled=cancelled)
-        )
+        tiles.append(fetched(tile))
         points += tiles[-1].points
         _check_sum(points, settings)
-    if request.footprints is None:
-        return tiles, None
-    outlines = materialise(
-        request.footprints, store=store, folder=folder, settings=settings, target=target, cancelled=cancelled
-    )
-    return tiles, outlines
+    footprints, guides = (None if one is None else fetched(one) for one in (request.footprints, request.guides))
+    return JobFiles(tiles=tiles, footprints=footprints, guides=guides)
 
 
 def materialise(

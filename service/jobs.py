@@ -106,6 +106,8 @@ class JobRequest:
     """Point clouds."""
     footprints: InputReference | None = None
     """A vector file of building outlines."""
+    guides: InputReference | None = None
+    """A vector file of lines of roofs; not for `classify`."""
     crs: str | None = None
     """Overrides the CRS in the headers."""
     vertical_unit: str | None = None
@@ -149,7 +151,7 @@ class JobRequest:
     @property
     def upload_ids(self) -> list[str]:
         """Ids of the uploads among its inputs, each once, in order."""
-        references = [*self.tiles, *([] if self.footprints is None else [self.footprints])]
+        references = [*self.tiles, *(one for one in (self.footprints, self.guides) if one is not None)]
         return sorted({reference.value for reference in references if reference.kind == "upload"})
 
     def as_dict(self) -> dict[str, Any]:
@@ -166,8 +168,9 @@ class JobRequest:
         """
         values = dict(stored)
         values["tiles"] = tuple(InputReference(**tile) for tile in stored["tiles"])
-        if stored.get("footprints") is not None:
-            values["footprints"] = InputReference(**stored["footprints"])
+        for name in ("footprints", "guides"):
+            if stored.get(name) is not None:
+                values[name] = InputReference(**stored[name])
         if stored.get("subscriber") is not None:
             values["subscriber"] = Subscriber(**stored["subscriber"])
         for name in ("bbox", "outputs", "methods", "publish"):

@@ -32,8 +32,8 @@ FIX = "Write it again as GeoParquet with WKB, as GDAL, DuckDB or geopandas do"
 CODE = re.compile(r"(?:urn:ogc:def:crs:)?EPSG:(?:[\d.]*:)?(\d{4,6})")
 
 
-def parquet_facts(path: Path) -> tuple[int, str, dict[str, Any] | None]:
-    """Rows, geometry column and CRS (name and EPSG code; None if the file says that it is unknown).
+def parquet_facts(path: Path) -> tuple[int, str, dict[str, Any] | None, tuple[str, ...]]:
+    """Rows, geometry column, CRS (name and EPSG code; None if the file says that it is unknown), types of geometries.
 
     Raises
     ------
@@ -58,9 +58,11 @@ def parquet_facts(path: Path) -> tuple[int, str, dict[str, Any] | None]:
             crs = None if about.crs is None else _crs_of(path, about.crs)
             rows = file.metadata.num_rows
             if rows == 0:
-                raise EmptyInputError(str(path), "it has no rows", "Give polygons of buildings")
+                raise EmptyInputError(str(path), "it has no rows", "Give polygons of buildings, or lines of roofs")
             if rows > ROWS_LIMIT:
-                raise TooLargeError(f"{path.name} has {rows} rows, footprints may have {ROWS_LIMIT}: cut out the area")
+                raise TooLargeError(
+                    f"{path.name} has {rows} rows, footprints or guides may have {ROWS_LIMIT}: cut out the area"
+                )
             decoded, found = 0, 0
             for batch in file.iter_batches(ROWS_AT_ONCE, columns=about.wanted, use_threads=False):
                 found += batch.num_rows
@@ -74,7 +76,7 @@ def parquet_facts(path: Path) -> tuple[int, str, dict[str, Any] | None]:
         raise UnreadableInputError(str(path), f"cannot be read as Parquet ({str(fault)[:160]})", FIX) from fault
     if found != rows:
         raise UnreadableInputError(str(path), f"its footer promises {rows} rows, it holds {found}", FIX)
-    return rows, about.name, crs
+    return rows, about.name, crs, about.types
 
 
 def _check_footer(path: Path) -> None:

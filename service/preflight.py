@@ -50,11 +50,11 @@ def examine(path: Path, *, max_points: int) -> dict[str, Any]:
     Returns
     -------
     dict
-        Plain JSON values. `kind` points or footprints, `format`, `usable`, `problems` that `crs` or other inputs of a
-        job may still fix, `warnings`, `crs` (name and EPSG code); for points `pointCount`, `horizontalUnitM`,
+        Plain JSON values. `kind` points, footprints or guides, `format`, `usable`, `problems` that `crs` or other
+        inputs may still fix, `warnings`, `crs` (name and EPSG code); for points `pointCount`, `horizontalUnitM`,
         `verticalUnitM`, `bounds` (x_min, y_min, z_min, x_max, y_max, z_max in the CRS's units), `place` (longitude and
         latitude of their middle), `areaOfUse`, `outsideAreaOfUse` (a sentence), `densityPerM2`, `hasReturns`,
-        `hasClasses`, `acquiredFrom`, `acquiredTo`; for footprints `featureCount`, `layers`. Unknown values are None.
+        `hasClasses`, `acquiredFrom`, `acquiredTo`; else `featureCount`, `layers`, `shapes`. Unknown values are None.
 
     Raises
     ------

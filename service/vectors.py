@@ -1,4 +1,4 @@
-"""Checks a client's file of footprints without the library that will read it.
+"""Checks a client's file of footprints or guides without the library that will read it.
 
 A GeoPackage is a database, which can hold endless views and computed columns; GeoJSON can be nested without limit;
 GeoParquet can hold far more than its size suggests. All of these are refused here. Shapefiles are several files and
@@ -24,7 +24,7 @@ from service.errors import TooLargeError
 from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES, PARQUET_SUFFIXES
 
 VECTOR_SUFFIXES = (*FOOTPRINT_SUFFIXES, ".shp")
-"""Endings of footprints."""
+"""Endings of footprints and guides."""
 GEOPACKAGE_LIMIT = 2**30
 """Maximum number of bytes of a GeoPackage or GeoParquet; if all of it overlaps the points, all is held in memory."""
 GEOJSON_LIMIT = 2**28
@@ -40,28 +40,37 @@ PARSED_BYTES = 2**25
 HEAD_BYTES = 65_536
 BLOCK_BYTES = 1 << 20
 
-FIX = "Give a GeoPackage (.gpkg), GeoJSON (.geojson, .json) or GeoParquet (.parquet) with polygons of buildings"
+FIX = (
+    "Give a GeoPackage (.gpkg), GeoJSON (.geojson, .json) or GeoParquet (.parquet) with polygons of buildings, "
+    "or with lines of roofs"
+)
 SQLITE_MAGIC = b"SQLite format 3\0"
 SHAPE_MAGIC = b"\0\0\x27\x0a"
 APPLICATION_IDS = (b"GPKG", b"GP10", b"GP11")
 POLYGONAL = ("POLYGON", "MULTIPOLYGON", "CURVEPOLYGON", "GEOMETRY", "GEOMETRYCOLLECTION", "SURFACE", "MULTISURFACE")
 """Types of geometry columns that can hold polygons."""
+LINEAR = ("LINESTRING", "MULTILINESTRING", "GEOMETRY")
+"""Types of geometry columns that can hold lines."""
+POLYGONS, LINES = "polygons", "lines"
+"""Words for what a file can hold: footprints, guides."""
 HARMLESS_MODULES = ("rtree", "fts3", "fts4", "fts5")
 """Virtual tables that only index."""
 MODULE = re.compile(r"\bUSING\s+[\"'\[`]?(\w+)", re.IGNORECASE)
 CRS_NAME = re.compile(rb'"crs"\s*:.{0,100}?"name"\s*:\s*"((?:urn:ogc:def:crs:|EPSG:)[\w:.]{1,80})"', re.DOTALL)
-MEMBER = re.compile(rb'"type"\s*:\s*"(FeatureCollection|Feature|Polygon|MultiPolygon|GeometryCollection)"')
+MEMBER = re.compile(
+    rb'"type"\s*:\s*"(FeatureCollection|Feature|(?:Multi)?Polygon|(?:Multi)?LineString|GeometryCollection)"'
+)
 
 
 def examine_vector(path: Path) -> dict[str, Any]:
-    """The facts of a file of footprints; see `service.preflight.examine`.
+    """The facts of a file of footprints or guides; see `service.preflight.examine`.
 
     Raises
     ------
     UnreadableInputError, CrsError
         Not the format that its name says, damaged, or built to harm.
     EmptyInputError
-        No features, or no polygons.
+        No features, or neither polygons nor lines.
     TooLargeError
         More bytes than allowed.
     """
@@ -70,14 +79,15 @@ def examine_vector(path: Path) -> dict[str, Any]:
     size = path.stat().st_size
     if size > limit:
         raise TooLargeError(
-            f"{path.name} has {size} bytes, footprints in {suffix} may have {limit}: cut out the area of the points"
+            f"{path.name} has {size} bytes, footprints or guides in {suffix} may have {limit}: "
+            "cut out the area of the points"
         )
     with path.open("rb") as stream:
         head = stream.read(HEAD_BYTES)
     if suffix == ".shp":
         if not head.startswith(SHAPE_MAGIC):
             raise UnreadableInputError(str(path), f"not a Shapefile: it begins with {head[:4]!r}", FIX)
-        return _facts("shapefile", None, None, None, [])
+        return _facts("shapefile", None, None, None, [], (POLYGONS, LINES))
     if suffix == ".gpkg":
         if not head.startswith(SQLITE_MAGIC) or head[68:72] not in APPLICATION_IDS:
             raise UnreadableInputError(str(path), f"not a GeoPackage: it begins with {head[:16]!r}", FIX)
@@ -85,16 +95,29 @@ def examine_vector(path: Path) -> dict[str, Any]:
     if suffix in PARQUET_SUFFIXES:
         from service.parquet import parquet_facts
 
-        rows, column, crs = parquet_facts(path)
-        return _facts("geoparquet", rows, [column], crs, [])
+        rows, column, crs, types = parquet_facts(path)
+        linear = ["LineString" in one for one in types]
+        shapes = _shapes(not all(linear) or not types, any(linear) or not types)
+        return _facts("geoparquet", rows, [column], crs, [], shapes)
     return _geojson(path, head)
 
 
+def _shapes(has_polygons: bool, has_lines: bool) -> tuple[str, ...]:
+    """The words for what a file can hold."""
+    return (*((POLYGONS,) if has_polygons else ()), *((LINES,) if has_lines else ()))
+
+
 def _facts(
-    kind: str, count: int | None, layers: list[str] | None, crs: dict[str, Any] | None, problems: list[str]
+    kind: str,
+    count: int | None,
+    layers: list[str] | None,
+    crs: dict[str, Any] | None,
+    problems: list[str],
+    shapes: tuple[str, ...],
 ) -> dict[str, Any]:
     return {
-        "kind": "footprints",
+        "kind": "footprints" if POLYGONS in shapes else "guides",
+        "shapes": list(shapes),
         "format": kind,
         "featureCount": count,
         "layers": layers,
@@ -144,28 +167,30 @@ def _refuse_programs(path: Path, database: sqlite3.Connection) -> None:
 
 
 def _contents(path: Path, database: sqlite3.Connection) -> dict[str, Any]:
-    """Layers with polygons, their features and CRS."""
+    """Layers with polygons, or with lines if there are none, their features and CRS."""
     rows = database.execute(
         "SELECT c.table_name, upper(g.geometry_type_name), s.srs_name, upper(s.organization), "
         "s.organization_coordsys_id "
         "FROM gpkg_contents c JOIN gpkg_geometry_columns g ON lower(g.table_name) = lower(c.table_name) "
         "LEFT JOIN gpkg_spatial_ref_sys s ON s.srs_id = g.srs_id WHERE c.data_type = 'features' LIMIT 1000"
     ).fetchall()
-    found = [row for row in rows if row[1] in POLYGONAL]
+    polygons, lines = ([row for row in rows if row[1] in types] for types in (POLYGONAL, LINEAR))
+    found, shapes = polygons or lines, _shapes(bool(polygons), bool(lines))
     if not found:
-        raise EmptyInputError(str(path), f"none of its {len(rows)} layers can hold polygons", FIX)
-    for row in found:
+        raise EmptyInputError(str(path), f"none of its {len(rows)} layers can hold polygons or lines", FIX)
+    for row in {*polygons, *lines}:
         _check_table(path, database, str(row[0]))
     layers = [str(row[0]) for row in found]
     if len(found) != 1:
-        return _facts("geopackage", None, layers, None, [f"{len(found)} layers could be the footprints: give one"])
+        named = "footprints" if polygons else "guides"
+        return _facts("geopackage", None, layers, None, [f"{len(found)} layers could be the {named}: give one"], shapes)
     table = layers[0].replace('"', '""')
     count = int(database.execute(f'SELECT count(*) FROM "{table}"').fetchone()[0])  # noqa: S608 - quoted; SQLite takes no names as parameters
     if count == 0:
         raise EmptyInputError(str(path), f"layer {layers[0][:60]!r} has no features", FIX)
     _, _, name, organization, code = found[0]
     crs = None if name is None else {"name": str(name)[:200], "epsg": int(code) if organization == "EPSG" else None}
-    return _facts("geopackage", count, layers, crs, [])
+    return _facts("geopackage", count, layers, crs, [], shapes)
 
 
 def _check_table(path: Path, database: sqlite3.Connection, name: str) -> None:
@@ -199,19 +224,18 @@ def _geojson(path: Path, head: bytes) -> dict[str, Any]:
         raise UnreadableInputError(str(path), f"truncated: {depth} brackets are not closed", FIX)
     if member[1] == b"FeatureCollection" and count == 0:
         raise EmptyInputError(str(path), "the collection has no features", FIX)
-    if path.stat().st_size <= PARSED_BYTES:
-        _check_polygons(path)
+    shapes = _shapes_within(path) if path.stat().st_size <= PARSED_BYTES else (POLYGONS, LINES)
     named = CRS_NAME.search(text)
     name = named[1].decode() if named else "WGS 84 (CRS84)"
     code = re.search(r"EPSG:(?:[\d.]*:)?(\d{4,6})$", name)
     crs = {"name": name, "epsg": int(code[1]) if code else None}
     if code:
         parse_crs(f"EPSG:{code[1]}", path=str(path))
-    return _facts("geojson", max(count, 1), None, crs, [])
+    return _facts("geojson", max(count, 1), None, crs, [], shapes)
 
 
-def _check_polygons(path: Path) -> None:
-    """Refuse GeoJSON that is not JSON, or has no polygon with a ring; its depth is known to be small."""
+def _shapes_within(path: Path) -> tuple[str, ...]:
+    """What GeoJSON holds; refuses what is not JSON, or has neither. Its depth is known to be small."""
 
     def refuse(word: str) -> None:
         raise ValueError(f"{word} is not a number of JSON")
@@ -221,36 +245,41 @@ def _check_polygons(path: Path) -> None:
     except ValueError as fault:
         raise UnreadableInputError(str(path), f"cannot be read as JSON ({str(fault)[:160]})", FIX) from fault
     found = document["features"] if isinstance(document.get("features"), list) else [document]
-    if not any(_has_ring(one) for one in found):
-        raise EmptyInputError(str(path), f"none of its {len(found)} features is a polygon with a ring", FIX)
+    shapes = _shapes(*(any(_holds(one, shape) for one in found) for shape in ("Polygon", "LineString")))
+    if not shapes:
+        problem = f"none of its {len(found)} features is a polygon with a ring or a line"
+        raise EmptyInputError(str(path), problem, FIX)
+    return shapes
 
 
-def _has_ring(found: Any) -> bool:
-    """Whether a feature or a geometry has a ring of at least four positions."""
+def _holds(found: Any, shape: str) -> bool:
+    """Whether a feature or a geometry has a polygon with a ring of at least four positions, or a line of two."""
     if not isinstance(found, dict):
         return False
-    parts: Any = found.get("coordinates")
-    match found.get("type"):
-        case "Feature":
-            return _has_ring(found.get("geometry"))
-        case "GeometryCollection":
-            members = found.get("geometries")
-            return isinstance(members, list) and any(map(_has_ring, members))
-        case "Polygon":
-            return _is_ringed(parts)
-        case "MultiPolygon":
-            return isinstance(parts, list) and any(map(_is_ringed, parts))
-        case _:
-            return False
+    parts, kind = found.get("coordinates"), found.get("type")
+    is_whole = _is_ringed if shape == "Polygon" else _is_line
+    if kind == "Feature":
+        return _holds(found.get("geometry"), shape)
+    if kind == "GeometryCollection":
+        members = found.get("geometries")
+        return isinstance(members, list) and any(_holds(one, shape) for one in members)
+    if kind == f"Multi{shape}":
+        return isinstance(parts, list) and any(map(is_whole, parts))
+    return bool(kind == shape) and is_whole(parts)
 
 
 def _is_ringed(rings: Any) -> bool:
     """Whether the first of a polygon's rings has four positions or more, all of numbers."""
-    if not isinstance(rings, list) or not rings or not isinstance(rings[0], list):
+    return isinstance(rings, list) and bool(rings) and _is_line(rings[0], 4)
+
+
+def _is_line(places: Any, fewest: int = 2) -> bool:
+    """Whether there are so many positions or more, all of numbers."""
+    if not isinstance(places, list) or len(places) < fewest:
         return False
-    return len(rings[0]) >= 4 and all(
+    return all(
         isinstance(place, list) and len(place) >= 2 and all(type(value) in {int, float} for value in place)
-        for place in rings[0]
+        for place in places
     )
 
 

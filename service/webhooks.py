@@ -309,7 +309,7 @@ def verdict(delivery: Delivery, result: Result, now: dt.datetime, policy: RetryP
 
 def snapshot_of(job: Job) -> dict[str, Any]:
     """All that a message says of a job, as plain JSON values; without its inputs, settings and lease."""
-    small = dataclasses.replace(job.request, tiles=(), footprints=None, settings={}, subscriber=None)
+    small = dataclasses.replace(job.request, tiles=(), footprints=None, guides=None, settings={}, subscriber=None)
     values = {field.name: getattr(job, field.name) for field in dataclasses.fields(job)}
     values |= {"request": small.as_dict(), "status": job.status.value, "lease_owner": None, "lease_until": None}
     if job.failure is not None:

@@ -17,7 +17,7 @@ from pipeline.runtime.run import RunSummary
 from service.driver.attempt import Tools
 from service.driver.process import Driver
 from service.driver.shared_cluster import SharedCluster
-from service.fetching import Fetched
+from service.fetching import Fetched, JobFiles
 from service.files import StateFolder
 from service.jobs import InputReference, Job, JobFailure, JobRequest, JobStatus
 from service.settings import ServiceSettings
@@ -63,14 +63,14 @@ class Script:
         self.steps: list[Callable[[Any, Callable[[Event], None], Callable[[], bool]], None]] = []
         self.go_on = threading.Event()
 
-    def gather(self, request: JobRequest, *, target: Path, **_others: Any) -> tuple[list[Fetched], None]:
+    def gather(self, request: JobRequest, *, target: Path, **_others: Any) -> JobFiles:
         target.mkdir(parents=True)
         tiles = []
         for number, tile in enumerate(request.tiles):
             path = target / f"tile {number}.laz"
             path.write_bytes(b"points")
             tiles.append(Fetched(reference=tile, path=path, points=1, sha256=None))
-        return tiles, None
+        return JobFiles(tiles=tiles)
 
     def run(self, request: Any, on_event: Callable[[Event], None], executor: Any, cancelled: Any) -> RunSummary:
         self.runs += 1

@@ -1,6 +1,7 @@
 """A STAC catalogue of a run: a Collection for the run and an Item per tile, since a run's files are per tile.
 
-STAC 1.1 with the extensions projection, processing, file and table. Places are in longitude and latitude.
+Below it is a Collection of the points that the models were made from, with an Item per input file. STAC 1.1 with the
+extensions projection, processing, file, table and pointcloud. Places are in longitude and latitude.
 """
 
 from __future__ import annotations
@@ -24,12 +25,16 @@ CRS = "OGC:CRS84"
 """The CRS of places in STAC."""
 COLLECTION = "collection.json"
 """File name of the Collection."""
+POINTS = "points"
+"""Folder of the Collection of points and its Items."""
 _EXTENSIONS = "https://stac-extensions.github.io"
 PROJECTION = f"{_EXTENSIONS}/projection/v2.0.0/schema.json"
 PROCESSING = f"{_EXTENSIONS}/processing/v1.2.0/schema.json"
 FILE = f"{_EXTENSIONS}/file/v2.1.0/schema.json"
 TABLE = f"{_EXTENSIONS}/table/v1.2.0/schema.json"
+POINTCLOUD = f"{_EXTENSIONS}/pointcloud/v1.0.0/schema.json"
 
+_GEOJSON = "application/geo+json"
 _PARQUET = "application/vnd.apache.parquet"
 ASSETS: Mapping[str, tuple[str, str, str]] = {
     "buildings": (_PARQUET, "data", "GeoParquet: one row per candidate, footprint and solids"),
@@ -50,8 +55,19 @@ DOCUMENTS: Mapping[str, tuple[str, str, str, str]] = {
     "points/tileset.json": ("points", "application/json", "visual", "3D Tiles: the points over the models"),
 }
 """Name, media type, role and title of the assets of a Collection, by their files in the run directory."""
+ENCODINGS: Mapping[str, tuple[str, str]] = {
+    "las": ("LAS", "application/vnd.las"),
+    "laz": ("LASzip", "application/vnd.laszip"),
+    "copc": ("COPC", "application/vnd.laszip+copc"),
+    "ply": ("PLY", "application/octet-stream"),
+    "ascii": ("text", "text/plain"),
+}
+"""`pc:encoding` and media type of the formats of points."""
+_KINDS = {"i": "signed", "u": "unsigned", "f": "floating"}
 _DEGREE_DIGITS = 7
 """Decimals of degrees: about a centimetre."""
+_STEM = 64
+"""Longest beginning of a file's name in an id."""
 _SPDX = re.compile(r"[A-Za-z0-9.+-]+")
 """What an SPDX identifier may be."""
 
@@ -93,6 +109,53 @@ class TileFacts:
     """First and last acquisition of its buildings; None if unknown."""
     rows: Mapping[str, int]
     """Rows of its tables."""
+    points: Sequence[str] = ()
+    """Keys of the input files that gave points where it is."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PointFacts:
+    """What an Item says about an input file of points: the whole file, whichever of its points the run took."""
+
+    name: str
+    """Name of the file, without its folder."""
+    address: str | None
+    """Its URL; None for a file of the machine that made the run."""
+    size_bytes: int
+    """Its size."""
+    sha256: str
+    """Digest of the file; of what was read of it, if that was less."""
+    is_digest_of_file: bool
+    """Whether `sha256` is that of the file."""
+    format: str
+    """A key of `ENCODINGS`."""
+    count: int
+    """Points in the file."""
+    bounds: tuple[float, float, float, float]
+    """Smallest x and y, largest x and y of its points, in CRS units."""
+    taken: tuple[float, float, float, float]
+    """The same of those points that the run took."""
+    density_per_m2: float | None
+    """Points per square metre of the bounds; None if these have no area."""
+    acquired: tuple[dt.datetime, dt.datetime] | None
+    """First and last acquisition of a sample of its points; None if unknown."""
+    dimensions: Mapping[str, str]
+    """What it has of each point: names, and types as numpy writes them, such as i4."""
+
+    @property
+    def key(self) -> str:
+        """The id of the Item: the name of the file, and the beginning of its digest."""
+        stem = re.sub(r"[^A-Za-z0-9]+", "_", PurePosixPath(self.name).stem)[:_STEM]
+        return f"{stem}-{self.sha256[:8]}"
+
+
+def points_name(key: str) -> str:
+    """The file of an input's Item in the catalogue.
+
+    >>> points_name("tile-ab12cd34")
+    'points/tile-ab12cd34.json'
+    """
+    return f"{POINTS}/{key}.json"
 
 
 def item_name(tile: str) -> str:
@@ -160,16 +223,17 @@ def item(tile: TileFacts, run: Run, project: Project, href: str) -> dict[str, An
         "geometry": shapely.geometry.mapping(geometry),
         "properties": {
             "title": f"Buildings of tile {tile.key}",
-            **_times(tile, run),
-            "proj:code": None if run.crs.get("epsg") is None else f"EPSG:{run.crs['epsg']}",
-            "proj:wkt2": run.crs["wkt"],
-            "proj:bbox": list(tile.bounds),
+            **_times(tile.acquired, run),
+            **_projection(tile.bounds, run),
             "processing:software": {"gablework": run.version},
             "processing:datetime": _zulu(run.finished_at),
             "processing:lineage": run.lineage,
             "license": _licence(run),
         },
-        "links": [_link(rel, f"../{COLLECTION}") for rel in ("root", "parent", "collection")],
+        "links": [
+            *(_link(rel, f"../{COLLECTION}") for rel in ("root", "parent", "collection")),
+            *(_link("derived_from", f"../{points_name(key)}", _GEOJSON) for key in tile.points),
+        ],
         "assets": {
             name: _asset(name, path, digest, href) | _row_count(tile.rows.get(name))
             for path, digest in sorted(tile.files.items())
@@ -178,7 +242,83 @@ def item(tile: TileFacts, run: Run, project: Project, href: str) -> dict[str, An
     }
 
 
-def collection(run: Run, items: Sequence[Mapping[str, Any]], documents: Sequence[str], href: str) -> dict[str, Any]:
+def points_item(points: PointFacts, run: Run, project: Project) -> dict[str, Any]:
+    """The Item of an input file of points; the file is an asset only if it has an address.
+
+    Parameters
+    ----------
+    points : PointFacts
+        The file.
+    run : Run
+        The run that read it.
+    project : callable
+        From the run's horizontal CRS to `CRS`.
+    """
+    geometry, bbox = _place(points.bounds, project)
+    encoding, kind = ENCODINGS[points.format]
+    digest = f", sha256 {points.sha256}" if points.is_digest_of_file else ""
+    return {
+        "type": "Feature",
+        "stac_version": VERSION,
+        "stac_extensions": [PROJECTION, POINTCLOUD, *([] if points.address is None else [FILE])],
+        "id": points.key,
+        "collection": _points_id(run),
+        "bbox": bbox,
+        "geometry": shapely.geometry.mapping(geometry),
+        "properties": {
+            "title": f"Points of {points.name}",
+            "description": f"The file {points.name}, {points.size_bytes} bytes{digest}",
+            **_times(points.acquired, run),
+            **_projection(points.bounds, run),
+            "license": _licence(run),
+            "pc:count": points.count,
+            "pc:type": "lidar",
+            "pc:encoding": encoding,
+            "pc:schemas": [
+                {"name": name, "size": int(code[1:]), "type": _KINDS[code[0]]}
+                for name, code in points.dimensions.items()
+            ],
+            **({} if points.density_per_m2 is None else {"pc:density": round(points.density_per_m2, 3)}),
+        },
+        "links": [
+            _link("root", f"../{COLLECTION}"),
+            *(_link(rel, f"./{COLLECTION}") for rel in ("parent", "collection")),
+        ],
+        "assets": {}
+        if points.address is None
+        else {
+            "points": {
+                "href": points.address,
+                **_described((kind, "data", f"the points, {encoding}")),
+                "file:size": points.size_bytes,
+                **({"file:checksum": f"1220{points.sha256}"} if points.is_digest_of_file else {}),
+            }
+        },
+    }
+
+
+def points_collection(run: Run, items: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The Collection of the points that a run read, of at least one Item; `items` as in `collection`."""
+    return {
+        "type": "Collection",
+        "stac_version": VERSION,
+        "stac_extensions": [],
+        "id": _points_id(run),
+        "title": f"Points of the building models {run.name}",
+        "description": "The files of points from which the models were made, as they were before the run left out any "
+        f"point. Licence: {run.licence or 'unknown'}.",
+        "license": _licence(run),
+        "extent": _extent(items),
+        "links": [
+            *(_link(rel, f"../{COLLECTION}") for rel in ("root", "parent")),
+            *(_link("item", f"./{one['id']}.json", _GEOJSON) for one in items),
+        ],
+    }
+
+
+def collection(
+    run: Run, items: Sequence[Mapping[str, Any]], documents: Sequence[str], href: str, *, has_points: bool = False
+) -> dict[str, Any]:
     """The Collection of a run.
 
     Parameters
@@ -191,14 +331,9 @@ def collection(run: Run, items: Sequence[Mapping[str, Any]], documents: Sequence
         Files of the run as a whole that exist, by their paths in it.
     href : str
         The run directory as seen from the Collection, ending in a slash.
+    has_points : bool
+        Whether there is a Collection of its points, too.
     """
-    first, last = (
-        order(
-            (one["properties"].get(name) or one["properties"]["datetime"] for one in items),
-            key=dt.datetime.fromisoformat,
-        )
-        for order, name in ((min, "start_datetime"), (max, "end_datetime"))
-    )
     return {
         "type": "Collection",
         "stac_version": VERSION,
@@ -207,17 +342,15 @@ def collection(run: Run, items: Sequence[Mapping[str, Any]], documents: Sequence
         "title": f"Building models {run.name}",
         "description": f"{run.lineage}. Licence of the source data: {run.licence or 'unknown'}.",
         "license": _licence(run),
-        "extent": {
-            "spatial": {"bbox": [_around([one["bbox"] for one in items])]},
-            "temporal": {"interval": [[first, last]]},
-        },
+        "extent": _extent(items),
         "item_assets": {
             name: {**_described(ASSETS[name]), "table:columns": _columns(name)} for name in ASSETS if name in COLUMNS
         },
         "links": [
             _link("root", f"./{COLLECTION}"),
             *([_link("license", run.licence, "text/html")] if _is_url(run.licence) else []),
-            *(_link("item", f"./{item_name(one['id'])}", "application/geo+json") for one in items),
+            *([_link("child", f"./{POINTS}/{COLLECTION}")] if has_points else []),
+            *(_link("item", f"./{item_name(one['id'])}", _GEOJSON) for one in items),
         ],
         "assets": {
             name: {"href": href + path, **_described(words)}
@@ -227,11 +360,40 @@ def collection(run: Run, items: Sequence[Mapping[str, Any]], documents: Sequence
     }
 
 
-def _times(tile: TileFacts, run: Run) -> dict[str, str | None]:
+def _points_id(run: Run) -> str:
+    """The id of the Collection of points."""
+    return f"{run.name}-{POINTS}"
+
+
+def _extent(items: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The extent of the Items of a Collection in space and time."""
+    first, last = (
+        order(
+            (one["properties"].get(name) or one["properties"]["datetime"] for one in items),
+            key=dt.datetime.fromisoformat,
+        )
+        for order, name in ((min, "start_datetime"), (max, "end_datetime"))
+    )
+    return {
+        "spatial": {"bbox": [_around([one["bbox"] for one in items])]},
+        "temporal": {"interval": [[first, last]]},
+    }
+
+
+def _projection(bounds: Sequence[float], run: Run) -> dict[str, Any]:
+    """The CRS and a place in it."""
+    return {
+        "proj:code": None if run.crs.get("epsg") is None else f"EPSG:{run.crs['epsg']}",
+        "proj:wkt2": run.crs["wkt"],
+        "proj:bbox": list(bounds),
+    }
+
+
+def _times(acquired: tuple[dt.datetime, dt.datetime] | None, run: Run) -> dict[str, str | None]:
     """When the points were measured; if that is unknown, when the models were made."""
-    if tile.acquired is None:
+    if acquired is None:
         return {"datetime": _zulu(run.finished_at)}
-    return {"datetime": None, "start_datetime": _zulu(tile.acquired[0]), "end_datetime": _zulu(tile.acquired[1])}
+    return {"datetime": None, "start_datetime": _zulu(acquired[0]), "end_datetime": _zulu(acquired[1])}
 
 
 def _zulu(at: dt.datetime) -> str:

@@ -259,6 +259,7 @@ class AsciiFile:
             gps_time_kind=kind,
             gps_time_range=None if kind is GpsTimeKind.NONE else times,
             typical_bounds=typical_bounds(places),
+            dimensions=tuple((name, "f8") for name in sorted(at, key=at.__getitem__) if name not in {"x2", "y2", "z2"}),
             warnings=warnings,
         )
 

@@ -40,6 +40,8 @@ class GeometryColumn:
     """`WKB`, or one of `DEPTHS`; others are not read."""
     wanted: list[str]
     """This column and those of attributes: all but other geometries and what only covers one."""
+    types: tuple[str, ...] = ()
+    """Types of the geometries, as the file states them; empty where they are unknown."""
 
 
 def geometry_column(path: Path, schema: pa.Schema, column: str | None = None) -> GeometryColumn:
@@ -60,6 +62,7 @@ def geometry_column(path: Path, schema: pa.Schema, column: str | None = None) ->
         name=name,
         crs=crs if crs is None or isinstance(crs, str) else json.dumps(crs),
         encoding=str(columns[name].get("encoding")),
+        types=tuple(map(str, columns[name].get("geometry_types") or ())),
         wanted=[field for field in schema.names if field == name or field not in idle],
     )
 

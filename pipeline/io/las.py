@@ -345,6 +345,7 @@ class LasFile:
             gps_time_range=None if kind is GpsTimeKind.NONE else time_range,
             typical_bounds=typical_bounds([sample.xyz]),
             created=header.creation_date,
+            dimensions=_dimensions_of(header.point_format),
             warnings=tuple(self._warnings),
         )
 
@@ -371,3 +372,14 @@ def read_exactly(stream: io.BufferedReader, into: npt.NDArray[np.uint8]) -> None
     """Fill an array from a stream; EOFError if the stream ends before."""
     if stream.readinto(into.data) != len(into):
         raise EOFError("the file ends")
+
+
+def _dimensions_of(point_format: laspy.PointFormat) -> tuple[tuple[str, str], ...]:
+    """Names and types of the fields of a point, extra bytes included; fields of single bits are u1."""
+    letters = {
+        laspy.DimensionKind.SignedInteger: "i",
+        laspy.DimensionKind.UnsignedInteger: "u",
+        laspy.DimensionKind.FloatingPoint: "f",
+        laspy.DimensionKind.BitField: "u",
+    }
+    return tuple((one.name, f"{letters[one.kind]}{-(-one.num_bits // 8)}") for one in point_format.dimensions)

@@ -243,6 +243,7 @@ class PlyFile:
             gps_time_kind=kind,
             gps_time_range=None if kind is GpsTimeKind.NONE else times,
             typical_bounds=typical_bounds(sample),
+            dimensions=tuple((name, SCALARS[kind]) for name, kind in self._vertex.properties),
             warnings=self._precision_warnings(np.maximum(np.abs(low), np.abs(high))),
         )
 

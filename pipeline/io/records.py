@@ -112,6 +112,9 @@ class FileFacts:
     """Smallest and largest sampled GPS time, seconds as in the file."""
     created: dt.date | None = None
     """Day on which the file was made, which is not the day of the flight."""
+    dimensions: tuple[tuple[str, str], ...] = ()
+    """What the file has of each point, in its order: name, and type as numpy writes it, such as i4. Fields of single
+    bits are u1. Of text, the columns that are used, as f8."""
     typical_bounds: tuple[float, float, float, float, float, float] | None = None
     """As `bounds`, of nearly all sampled points: single far points do not widen them; None if unknown."""
     warnings: tuple[str, ...] = ()

@@ -51,6 +51,22 @@ class RunStatus(StrEnum):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class PointFileFacts:
+    """What is known of a whole file of points, whichever of its points a run took."""
+
+    format: str
+    """las, laz, copc, ply or ascii."""
+    n_points: int
+    """Points in the file."""
+    bounds_m: tuple[float, float, float, float]
+    """Smallest easting and northing, largest easting and northing in metres; single far points do not widen them."""
+    acquired: tuple[dt.datetime, dt.datetime] | None
+    """Earliest and latest time of a sample of its points, UTC; None without absolute times."""
+    dimensions: Mapping[str, str]
+    """What the file has of each point: names, and types as numpy writes them, such as i4."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class InputFile:
     """One input file of a run."""
 
@@ -64,6 +80,8 @@ class InputFile:
     """Points read from it; None before that, and for files that are not point clouds."""
     bounds_m: tuple[float, float, float, float] | None = None
     """Smallest easting and northing, largest easting and northing of these points in metres; None without points."""
+    file: PointFileFacts | None = None
+    """The whole file; None for files that are not point clouds, and in runs of older versions."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -180,8 +198,12 @@ class RunManifest:
 
 def _input_file(entry: Mapping[str, Any]) -> InputFile:
     """An input as JSON holds it; lists become tuples again."""
-    bounds = entry.get("bounds_m")
-    return InputFile(**{**entry, "bounds_m": None if bounds is None else tuple(bounds)})
+    bounds, file = entry.get("bounds_m"), entry.get("file")
+    values = {**entry, "bounds_m": None if bounds is None else tuple(bounds)}
+    if file is not None:
+        times = file["acquired"] and tuple(map(dt.datetime.fromisoformat, file["acquired"]))
+        values["file"] = PointFileFacts(**{**file, "bounds_m": tuple(file["bounds_m"]), "acquired": times})
+    return InputFile(**values)
 
 
 def _plain(value: Any) -> Any:

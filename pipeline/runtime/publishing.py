@@ -16,6 +16,7 @@ from urllib.parse import quote
 import numpy as np
 import pyarrow as pa
 import pyarrow.fs as pafs
+import shapely
 
 from pipeline.errors import RunError, SettingsError
 from pipeline.export import pmtiles, stac
@@ -24,7 +25,7 @@ from pipeline.export.cityjson_file import city_of
 from pipeline.export.decisions import NAME as DECISIONS_NAME
 from pipeline.export.geopackage import LAYERS, SUFFIX, TILE, GeoPackage, stored_batch
 from pipeline.export.geoparquet import table_batches, table_files
-from pipeline.export.projection import projection_to
+from pipeline.export.projection import Project, projection_to
 from pipeline.export.qml import STYLES
 from pipeline.export.terrain import FOLDER as TERRAIN
 from pipeline.export.terrain import terrain_path
@@ -38,6 +39,8 @@ _COUNTED = {"buildings": "candidates", "rejected": "rejected"}
 """Tables whose rows the manifest counts, with the names of the counts."""
 CITYJSON = ".city.json"
 """Ending of CityJSON files."""
+_POINTS_COLLECTION = f"{stac.POINTS}/{stac.COLLECTION}"
+"""The Collection of points in a catalogue."""
 _SEQUENCES = "cityjson"
 """Folder of a run with its CityJSONSeq files."""
 
@@ -196,6 +199,8 @@ def publish_stac(
 ) -> Published:
     """Write a STAC catalogue of a finished run: a Collection, and an Item per tile that has files.
 
+    Below it is a Collection of its points with an Item per input file, unless an older version made the run.
+
     A new folder appears whole; in one that exists, each file does, after all are made, and the Collection last.
 
     Raises SettingsError if `out` cannot be such a folder, and RunError if it holds another catalogue, or this one and
@@ -224,7 +229,13 @@ def publish_stac(
     files = {state["tile"]: stac.listed(state["files"], state["tile"]) for state in _states(run_dir) if state["files"]}
     for tile, key in terrains_of(run_dir).items():
         files.setdefault(tile, {})[key] = hashlib.sha256(storage.get(key)).hexdigest()
-    names = [*(stac.item_name(tile) for tile in files), stac.COLLECTION]
+    points = _point_facts(manifest)
+    names = [
+        *(stac.points_name(key) for key in points),
+        *([_POINTS_COLLECTION] if points else []),
+        *(stac.item_name(tile) for tile in files),
+        stac.COLLECTION,
+    ]
     href = run_dir.rstrip("/") + "/" if is_url(run_dir) else _relative(Path(run_dir).resolve(), target)
     with disk_at(target):
         _refuse_other_catalogue(target / stac.COLLECTION, href)
@@ -235,15 +246,16 @@ def publish_stac(
             on_event(Event(kind="progress", stage="items", done=done, total=len(files)))
         if not facts:
             raise RunError(f"the run in {run_dir} has no tile with files, so there is nothing to list")
-        items, rows, size = [], sum(tile.rows["buildings"] for tile in facts), 0
-        for tile_facts in stac.dated(facts):
+        items, rows = [], sum(tile.rows["buildings"] for tile in facts)
+        size = _put_points(made, points.values(), run, project)
+        for tile_facts in _derived(stac.dated(facts), points):
             item = stac.item(tile_facts, run, project, href if is_url(href) else f"../{href}")
             items.append({name: item[name] for name in ("id", "bbox", "properties")})
             size += _put_json(made, stac.item_name(tile_facts.key), item)
         listed = [document for document in documents if storage.has(document)]
-        size += _put_json(made, stac.COLLECTION, stac.collection(run, items, listed, href))
+        size += _put_json(made, stac.COLLECTION, stac.collection(run, items, listed, href, has_points=bool(points)))
         check_complete(run_dir, manifest, {"buildings": rows}, [name for held in files.values() for name in held])
-    return Published(place=str(target), size_bytes=size, rows={"items": len(items)})
+    return Published(place=str(target), size_bytes=size, rows={"items": len(items), "points": len(points)})
 
 
 def _run_of(run_dir: str, manifest: RunManifest, name: str | None) -> stac.Run:
@@ -256,6 +268,52 @@ def _run_of(run_dir: str, manifest: RunManifest, name: str | None) -> stac.Run:
         licence=manifest.source_licence,
         crs=manifest.crs or {},
     )
+
+
+def _point_facts(manifest: RunManifest) -> dict[str, stac.PointFacts]:
+    """The input files that gave points, by the ids of their Items; none in a run of an older version."""
+    unit_m, found = (manifest.crs or {}).get("horizontal_unit_m", 1.0), {}
+    for entry in manifest.inputs:
+        file = entry.file
+        if file is None or entry.bounds_m is None:
+            continue
+        (x0, y0, x1, y1), (left, bottom, right, top) = file.bounds_m, entry.bounds_m
+        area_m2 = (x1 - x0) * (y1 - y0)
+        facts = stac.PointFacts(
+            name=PurePosixPath(entry.path).name,
+            address=entry.path if is_url(entry.path) else None,
+            size_bytes=entry.size_bytes,
+            sha256=entry.sha256,
+            is_digest_of_file=not (is_url(entry.path) and file.format == "copc"),  # a window of it has another digest
+            format=file.format,
+            count=file.n_points,
+            bounds=(x0 / unit_m, y0 / unit_m, x1 / unit_m, y1 / unit_m),
+            taken=(left / unit_m, bottom / unit_m, right / unit_m, top / unit_m),
+            density_per_m2=file.n_points / area_m2 if area_m2 > 0.0 else None,
+            acquired=file.acquired,
+            dimensions=file.dimensions,
+        )
+        found[facts.key] = facts
+    return found
+
+
+def _derived(tiles: Iterable[stac.TileFacts], points: Mapping[str, stac.PointFacts]) -> Iterator[stac.TileFacts]:
+    """The tiles with the inputs whose points, those that the run took, reach into their bounds."""
+    keys = list(points)
+    tree = shapely.STRtree([shapely.box(*facts.taken) for facts in points.values()])
+    for tile in tiles:
+        met = sorted(tree.query(shapely.box(*tile.bounds)).tolist())
+        yield dataclasses.replace(tile, points=[keys[k] for k in met])
+
+
+def _put_points(storage: LocalStorage, points: Collection[stac.PointFacts], run: stac.Run, project: Project) -> int:
+    """Write the Items of the points, then their Collection; returns their size in bytes."""
+    items, size = [], 0
+    for facts in points:
+        item = stac.points_item(facts, run, project)
+        items.append({name: item[name] for name in ("id", "bbox", "properties")})
+        size += _put_json(storage, stac.points_name(facts.key), item)
+    return size + (_put_json(storage, _POINTS_COLLECTION, stac.points_collection(run, items)) if items else 0)
 
 
 def _tile_facts(run_dir: str, tile: str, files: Mapping[str, str], manifest: RunManifest) -> stac.TileFacts:
@@ -288,7 +346,7 @@ def _tile_facts(run_dir: str, tile: str, files: Mapping[str, str], manifest: Run
 def _catalogue_files(target: Path) -> list[Path]:
     """Files in a folder that a catalogue may have written."""
     items = [path for path in target.glob("*/*.json") if path.stem == path.parent.name]
-    return [*items, *target.glob(stac.COLLECTION)]
+    return [*items, *target.glob(f"{stac.POINTS}/*.json"), *target.glob(stac.COLLECTION)]
 
 
 def _refuse_other_catalogue(collection: Path, href: str) -> None:
@@ -429,7 +487,7 @@ def _refuse_occupied(target: Path, overwrite: bool, names: Collection[str], pres
     held = sorted(path.relative_to(target).as_posix() for path in present)
     others = [name for name in held if name not in names or not (target / name).is_file()]
     if others:
-        raise RunError(f"{target} holds {others[0]}, which is of no tile of this run: give another --out")
+        raise RunError(f"{target} holds {others[0]}, which is not of this run: give another --out")
     if held and not overwrite:
         raise RunError(f"{target} holds {held[0]} already: give another --out, or --overwrite to replace it")
 

@@ -16,7 +16,7 @@ from pipeline import __version__
 from pipeline.errors import InputError, RunCancelledError, RunError
 from pipeline.export.point_files import FOLDER as POINTS_FOLDER
 from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
-from pipeline.io import SpatialReference, Storage, is_url, shown, storage_at
+from pipeline.io import SourceInfo, SpatialReference, Storage, is_url, shown, storage_at
 from pipeline.methods import ReconstructSettings, method_named
 from pipeline.runtime.cluster.serial_executor import Executor, run_alone
 from pipeline.runtime.cluster.worker_fork_server import start_early
@@ -26,6 +26,7 @@ from pipeline.runtime.manifest import (
     NAME,
     PAGE,
     InputFile,
+    PointFileFacts,
     RunManifest,
     RunStatus,
     read_manifest,
@@ -535,20 +536,33 @@ def _input_files(
     request: RunRequest, paths: Sequence[str], ingested: Sequence[Ingested], plan: Plan
 ) -> tuple[InputFile, ...]:
     """The inputs for the manifest."""
-    sizes = {info.path: info.file_size for info in plan.sources}
+    sources = {info.path: info for info in plan.sources}
     inputs = [
         InputFile(
             path=shown(path),
             sha256=found.sha256,
-            size_bytes=sizes[shown(path)],
+            size_bytes=sources[shown(path)].file_size,
             n_points=sum(found.points_by_tile.values()),
             bounds_m=_plan_bounds_m(found),
+            file=_file_facts(sources[shown(path)]),
         )
         for path, found in zip(paths, ingested, strict=True)
     ]
     others = (request.footprints, request.guides, request.aoi, request.overrides)
     inputs.extend(input_file(name) for name in others if name is not None)
     return tuple(inputs)
+
+
+def _file_facts(info: SourceInfo) -> PointFileFacts:
+    """An input as a whole, for the manifest."""
+    x0, y0, _, x1, y1, _ = info.bounds_m
+    return PointFileFacts(
+        format=info.format,
+        n_points=info.point_count,
+        bounds_m=(x0, y0, x1, y1),
+        acquired=(info.acquired_from, info.acquired_to) if info.acquired_from and info.acquired_to else None,
+        dimensions=dict(info.facts.dimensions),
+    )
 
 
 def _digest_of(content: tuple[str, list[str] | None]) -> str:

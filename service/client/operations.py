@@ -59,6 +59,7 @@ class Operations:
         *,
         process: str = "reconstruct",
         footprints: str | Path | None = None,
+        guides: str | Path | None = None,
         outputs: Sequence[str] | None = None,
         new: bool = False,
         on_transfer: OnTransfer = ignore,
@@ -69,6 +70,7 @@ class Operations:
             tiles,
             process=process,
             footprints=footprints,
+            guides=guides,
             outputs=outputs,
             new=new,
             on_transfer=on_transfer,
@@ -83,6 +85,7 @@ class Operations:
         process: str,
         inputs: Mapping[str, Any],
         footprints: str | Path | None = None,
+        guides: str | Path | None = None,
         outputs: Sequence[str] | None = None,
         new: bool = False,
         on_transfer: OnTransfer = ignore,
@@ -95,6 +98,8 @@ class Operations:
             given["tiles"] = [await self._source(path, on_transfer) for path in paths]
         if footprints is not None:
             given["footprints"] = await self._source(footprints, on_transfer)
+        if guides is not None:
+            given["guides"] = await self._source(guides, on_transfer)
         body: dict[str, Any] = {"inputs": given}
         if outputs is not None:
             body["outputs"] = {name: {} for name in outputs}

@@ -33,7 +33,7 @@ from service.driver.messages import (
 from service.driver.shared_cluster import SharedCluster
 from service.driver.so_far import shown_while_watched
 from service.errors import RequestError
-from service.fetching import Fetched, gather
+from service.fetching import Fetched, JobFiles, gather
 from service.files import StateFolder
 from service.jobs import JobRequest
 from service.outputs import write_classification_outputs, write_comparison_outputs, write_echo, write_outputs
@@ -85,7 +85,7 @@ class Gather(Protocol):
         settings: ServiceSettings,
         target: Path,
         cancelled: Callable[[], bool],
-    ) -> tuple[list[Fetched], Fetched | None]:
+    ) -> JobFiles:
         """Fetch all inputs to this machine's disk."""
 
 
@@ -212,7 +212,7 @@ def perform(held: LeasedJob, shop: DriverParts) -> tuple[str, dict[str, Any]]:
     held.record(Event(kind="stage", stage="inputs"))
     target = folder.inputs(job.job_id, job.attempt)
     with tracing.span("stage inputs", stage="inputs"):
-        tiles, outlines = shop.tools.gather(
+        files = shop.tools.gather(
             job.request,
             store=shop.store,
             folder=folder,
@@ -220,10 +220,10 @@ def perform(held: LeasedJob, shop: DriverParts) -> tuple[str, dict[str, Any]]:
             target=target,
             cancelled=held.cancelled,
         )
-    for fetched in [*tiles, *([] if outlines is None else [outlines])]:
+    for fetched in files.all:
         scrub.name(str(fetched.path), fetched.path.name)
-    _note_inputs(held, tiles)
-    work = begin(held, shop, tiles, outlines)
+    _note_inputs(held, files.tiles)
+    work = begin(held, shop, files)
     shop.cluster.wait_until_there(held)
     held.record(Event(kind="stage", stage="plan"))
     held.engine = shop.cluster.engine()
@@ -247,11 +247,11 @@ _Work = Callable[[Executor], tuple[str, dict[str, Any]]]
 """The work that needs the workers; returns the result in one sentence, and the summary."""
 
 
-def _reconstruct(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outlines: Fetched | None) -> _Work:
+def _reconstruct(held: LeasedJob, shop: DriverParts, files: JobFiles) -> _Work:
     """The process `reconstruct`."""
     job, folder = held.job, shop.folder
     run_dir, out_dir = folder.run(job.job_id, job.attempt), folder.outputs(job.job_id, job.attempt)
-    request = run_request(job.request, tiles, outlines, run_dir, shop.settings)
+    request = run_request(job.request, files, run_dir, shop.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
         with shown_while_watched(held, run_dir, folder.so_far(job.job_id, job.attempt)):
@@ -296,11 +296,11 @@ def _published(held: LeasedJob, shop: DriverParts, run_dir: Path, out_dir: Path)
     return problems
 
 
-def _compare(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outlines: Fetched | None) -> _Work:
+def _compare(held: LeasedJob, shop: DriverParts, files: JobFiles) -> _Work:
     """The process `compare`."""
     job, folder = held.job, shop.folder
     place, out_dir = folder.comparison(job.job_id, job.attempt), folder.outputs(job.job_id, job.attempt)
-    request = compare_request(job.request, tiles, outlines, place, shop.settings)
+    request = compare_request(job.request, files, place, shop.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
         summary = shop.tools.compare(request, held.record, executor, held.cancelled)
@@ -312,11 +312,11 @@ def _compare(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outli
     return work
 
 
-def _classify(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outlines: Fetched | None) -> _Work:
+def _classify(held: LeasedJob, shop: DriverParts, files: JobFiles) -> _Work:
     """The process `classify`."""
     job, folder = held.job, shop.folder
     place, out_dir = folder.run(job.job_id, job.attempt), folder.outputs(job.job_id, job.attempt)
-    request = classify_request(job.request, tiles, outlines, place, shop.settings)
+    request = classify_request(job.request, files, place, shop.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
         summary = shop.tools.classify(request, held.record, executor, held.cancelled)
@@ -328,9 +328,9 @@ def _classify(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outl
     return work
 
 
-def _echo(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outlines: Fetched | None) -> _Work:
+def _echo(held: LeasedJob, shop: DriverParts, files: JobFiles) -> _Work:
     """The process `echo`."""
-    del tiles, outlines
+    del files
     job = held.job
     asked = job.request.echo or {}
 
@@ -343,7 +343,7 @@ def _echo(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outlines
     return work
 
 
-WORK: Mapping[str, Callable[[LeasedJob, DriverParts, Sequence[Fetched], Fetched | None], _Work]] = MappingProxyType(
+WORK: Mapping[str, Callable[[LeasedJob, DriverParts, JobFiles], _Work]] = MappingProxyType(
     {"reconstruct": _reconstruct, "compare": _compare, "classify": _classify, "echo": _echo}
 )
 """The work of each process: checks the request with the fetched inputs, and returns the rest of the work."""
@@ -361,9 +361,7 @@ def _begun(held: LeasedJob, stage: str) -> Callable[[int, int], None]:
     return written
 
 
-def run_request(
-    request: JobRequest, tiles: Sequence[Fetched], outlines: Fetched | None, out: Path, settings: ServiceSettings
-) -> RunRequest:
+def run_request(request: JobRequest, files: JobFiles, out: Path, settings: ServiceSettings) -> RunRequest:
     """The request of a run, with the fetched inputs.
 
     Raises
@@ -372,11 +370,12 @@ def run_request(
         Settings are out of range.
     """
     return RunRequest(
-        inputs=tuple(str(tile.path) for tile in tiles),
+        inputs=tuple(str(tile.path) for tile in files.tiles),
         only_files=True,  # a client's tile may be a tile index in disguise, which must not be followed
         out=str(out),
         settings=RunSettings.from_mapping(request.settings),
-        footprints=None if outlines is None else str(outlines.path),
+        footprints=None if files.footprints is None else str(files.footprints.path),
+        guides=None if files.guides is None else str(files.guides.path),
         crs=request.crs,
         vertical_unit=request.vertical_unit,
         allow_outside_area_of_use=request.allow_outside_area_of_use,
@@ -388,9 +387,7 @@ def run_request(
     )
 
 
-def compare_request(
-    request: JobRequest, tiles: Sequence[Fetched], outlines: Fetched | None, out: Path, settings: ServiceSettings
-) -> CompareRequest:
+def compare_request(request: JobRequest, files: JobFiles, out: Path, settings: ServiceSettings) -> CompareRequest:
     """The request of a comparison, with the fetched inputs.
 
     Raises
@@ -399,15 +396,13 @@ def compare_request(
         Settings are out of range, or a method is not known.
     """
     return CompareRequest(
-        run=run_request(request, tiles, outlines, out, settings),
+        run=run_request(request, files, out, settings),
         variants=parse_variants(request.methods),
         tables=own_tables(request.settings),
     )
 
 
-def classify_request(
-    request: JobRequest, tiles: Sequence[Fetched], outlines: Fetched | None, out: Path, settings: ServiceSettings
-) -> ClassifyRequest:
+def classify_request(request: JobRequest, files: JobFiles, out: Path, settings: ServiceSettings) -> ClassifyRequest:
     """The request of a classification, with the fetched inputs.
 
     Raises
@@ -417,11 +412,11 @@ def classify_request(
     """
     has_rasters = request.outputs is None or not set(RASTERS).isdisjoint(request.outputs)
     return ClassifyRequest(
-        inputs=tuple(str(tile.path) for tile in tiles),
+        inputs=tuple(str(tile.path) for tile in files.tiles),
         only_files=True,
         out=str(out),
         settings=RunSettings.from_mapping(request.settings),
-        footprints=None if outlines is None else str(outlines.path),
+        footprints=None if files.footprints is None else str(files.footprints.path),
         crs=request.crs,
         vertical_unit=request.vertical_unit,
         allow_outside_area_of_use=request.allow_outside_area_of_use,

@@ -131,7 +131,7 @@ def _cleaner(folder: Path, labels: Sequence[str]) -> Callable[[str], str]:
     paths = {entry["path"] for manifest in manifests for entry in manifest["inputs"]}
     # the request repeats them with links resolved
     requests = [manifest.get("request", {}) for manifest in manifests]
-    asked = {request.get(name) for request in requests for name in ("footprints", "overrides", "aoi")}
+    asked = {request.get(name) for request in requests for name in ("footprints", "guides", "overrides", "aoi")}
     paths |= {path for path in asked if path is not None}
     written = paths | {str(escape(path)) for path in paths} | {markdown_cell(path) for path in paths}
     return cleaner(sorted(written), folder)

@@ -190,6 +190,23 @@ _PUBLISHED = (
         filename="solar.parquet",
         schema=_binary(GEOPARQUET),
     ),
+    OutputKind(
+        output_id="party-walls",
+        title="Party walls as GeoParquet",
+        description="One row per pair of walls of two buildings that touch: the shared polygon and its area; if the "
+        "input publish names party-walls.",
+        media_type=GEOPARQUET,
+        filename="party_walls.parquet",
+        schema=_binary(GEOPARQUET),
+    ),
+    OutputKind(
+        output_id="wall-areas",
+        title="Wall areas per building as GeoParquet",
+        description="One row per building: how much of its walls is shared, inner and exposed; with the party walls.",
+        media_type=GEOPARQUET,
+        filename="wall_areas.parquet",
+        schema=_binary(GEOPARQUET),
+    ),
 )
 
 _OF_A_COMPARISON = (
@@ -274,6 +291,7 @@ FORMATS: Mapping[str, tuple[str, ...]] = {
     "cityjson": ("cityjson-zip",),
     "stac": ("stac",),
     "solar": ("solar",),
+    "party-walls": ("party-walls", "wall-areas"),
 }
 """The ids of those that are made on request, by the words of the input `publish`."""
 ON_REQUEST = frozenset(name for ids in FORMATS.values() for name in ids)

@@ -27,7 +27,9 @@ _FILES: Mapping[str, re.Pattern[str]] = MappingProxyType(
         "3dtiles": re.compile(
             rf"(tileset|terrain)\.json|(models|blocks|terrain)/{_TILE}\.glb|skylines/{_SQUARE}\.glb", re.ASCII
         ),
-        "stac": re.compile(rf"collection\.json|(?P<tile>{_TILE})/(?P=tile)\.json", re.ASCII),
+        "stac": re.compile(
+            rf"(points/)?collection\.json|(?P<tile>{_TILE})/(?P=tile)\.json|points/[\w-]+\.json", re.ASCII
+        ),
     }
 )
 """The paths of the files below an output that is a folder."""
@@ -56,10 +58,11 @@ def is_file_of(output_id: str, name: str) -> bool:
 def type_of(output_id: str, name: str) -> str:
     """The media type of a file below an output; an Item is GeoJSON.
 
-    >>> type_of("stac", "collection.json"), type_of("stac", "x85_y447/x85_y447.json")
+    >>> type_of("stac", "points/collection.json"), type_of("stac", "x85_y447/x85_y447.json")
     ('application/json', 'application/geo+json')
     """
-    return GEOJSON if output_id == "stac" and "/" in name else _TYPES[Path(name).suffix]
+    is_item = output_id == "stac" and Path(name).name != ROOTS["stac"]
+    return GEOJSON if is_item else _TYPES[Path(name).suffix]
 
 
 def _nothing(done: int, total: int) -> None:
@@ -185,6 +188,13 @@ def _solar(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> Non
     solar(str(run_dir), str(out_dir / OUTPUTS["solar"].filename), on_event=on_event)
 
 
+def _party_walls(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
+    from pipeline.runtime.party_walls import party_walls
+
+    walls, areas = (str(out_dir / OUTPUTS[name].filename) for name in FORMATS["party-walls"])
+    party_walls(str(run_dir), walls, buildings=areas, on_event=on_event)
+
+
 _WRITERS: Mapping[str, Callable[[Path, Path, _Options, Listener], None]] = MappingProxyType(
     {
         "3dtiles": _tiles,
@@ -193,6 +203,7 @@ _WRITERS: Mapping[str, Callable[[Path, Path, _Options, Listener], None]] = Mappi
         "cityjson": _cityjson,
         "stac": _stac,
         "solar": _solar,
+        "party-walls": _party_walls,
     }
 )
 

@@ -29,6 +29,7 @@ from service.store import JobFilter
 from service.wire.base import page_links, respond
 from service.wire.execute import RETRY_EXAMPLES, Execute, Retry, wanted
 from service.wire.faults import sentences, shortened
+from service.wire.inputs import FILES
 from service.wire.jobs import JobChanges, JobForm, JobList, StatusInfo
 from service.wire.queries import JobQuery, interval
 
@@ -94,7 +95,7 @@ async def _read(submission: Submission) -> Execute:
     left = settings.max_body_bytes
     async for part in form.parts():
         name = "tiles" if part.name == "tile" else part.name
-        is_file = name in {"tiles", "footprints"}
+        is_file = name in FILES
         if is_file and part.filename is not None:
             inputs.setdefault(name, []).append(await _stored(part, submission, len(inputs.get(name, ()))))
             continue

@@ -47,7 +47,7 @@ def published_file(
     folder: Annotated[str, Path(description="A folder of the output.", examples=["models"])],
     file: Annotated[str, Path(description="A file that the output names.", examples=["x85_y447.glb"])],
 ) -> Response:
-    """Models or blocks as GLB, or the Item of a tile."""
+    """Models or blocks as GLB, or an Item of a catalogue."""
     return _of_output(request, finished, output_id, f"{folder}/{file}")
 
 

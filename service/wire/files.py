@@ -20,7 +20,7 @@ ENDINGS: Mapping[str, str] = {LAZ: ".laz", LAS: ".las", PLY: ".ply", TEXT: ".xyz
 """Media types of point clouds sent by value, and the endings of their files."""
 
 _OUTLINE_ENDINGS = {b"SQLite format 3": ".gpkg", b"PAR1": ".parquet"}
-"""Endings of footprints that are sent by value, by their first bytes; others are GeoJSON."""
+"""Endings of footprints and guides that are sent by value, by their first bytes; others are GeoJSON."""
 
 Source = InputReference | Inline
 """An input: stored already, or within the request."""
@@ -69,7 +69,7 @@ class PointsByValue(Request):
 
 
 class OutlinesByValue(Request):
-    """A file of footprints within the request."""
+    """A file of footprints or guides within the request."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -107,6 +107,16 @@ def _ending_of(content: bytes) -> str:
 
 def outlines(given: Any) -> Source:
     """Footprints by reference or by value."""
+    return _vectors(given, "footprints")
+
+
+def guides(given: Any) -> Source:
+    """Guides by reference or by value."""
+    return _vectors(given, "guides")
+
+
+def _vectors(given: Any, name: str) -> Source:
+    """A vector file by reference or by value; a name of an input."""
     if isinstance(given, list):
         if len(given) != 1:
             raise ValueError("use one file")
@@ -117,11 +127,11 @@ def outlines(given: Any) -> Source:
         if given.get("encoding") == "base64":
             content = OutlinesByValue.model_validate(given).value
             ending = next((end for magic, end in _OUTLINE_ENDINGS.items() if content.startswith(magic)), ".geojson")
-            return Inline(content=content, filename=f"footprints{ending}")
+            return Inline(content=content, filename=f"{name}{ending}")
         given = given["value"]
     if not isinstance(given, Mapping) or given.get("type") != "FeatureCollection":
         raise ValueError("use an href, or a GeoJSON FeatureCollection")
-    return Inline(content=json_bytes(given), filename="footprints.geojson")
+    return Inline(content=json_bytes(given), filename=f"{name}.geojson")
 
 
 def _one_or_several(given: Any, handler: Any) -> Any:
@@ -139,20 +149,21 @@ Points = Annotated[Source, PlainValidator(points), WithJsonSchema({"oneOf": _enc
 PointClouds = Annotated[list[Points], WrapValidator(_one_or_several), Field(min_length=1)]
 """One point cloud or several."""
 
-Outlines = Annotated[
-    Source,
-    PlainValidator(outlines),
-    WithJsonSchema(
-        {
-            "oneOf": [
-                {
-                    "type": "object",
-                    "format": "geojson-feature-collection",
-                    "contentMediaType": "application/geo+json",
-                },
-                *_encoded("application/geopackage+sqlite3", "application/vnd.apache.parquet"),
-            ]
-        }
-    ),
-]
+_OF_VECTORS = WithJsonSchema(
+    {
+        "oneOf": [
+            {
+                "type": "object",
+                "format": "geojson-feature-collection",
+                "contentMediaType": "application/geo+json",
+            },
+            *_encoded("application/geopackage+sqlite3", "application/vnd.apache.parquet"),
+        ]
+    }
+)
+
+Outlines = Annotated[Source, PlainValidator(outlines), _OF_VECTORS]
 """Footprints."""
+
+Lines = Annotated[Source, PlainValidator(guides), _OF_VECTORS]
+"""Guides."""

@@ -20,7 +20,7 @@ from service.outputs.published import formats_of
 from service.run_settings import DEFAULTS, VARIANTS, choices, settings_faults, settings_schema
 from service.wire.base import OneOf, Request
 from service.wire.faults import FaultsError, shortened
-from service.wire.files import Outlines, PointClouds
+from service.wire.files import Lines, Outlines, PointClouds
 
 MAX_METHODS = 8
 """Maximum number of methods of one comparison."""
@@ -29,7 +29,7 @@ GIVEN_BY = (
     "By reference (href): an upload of this service, a path below one of its input folders, or a URL at one of its "
     "allowed hosts. By value: base64, within the limit of a request's size."
 )
-FILES = ("tiles", "footprints")
+FILES = ("tiles", "footprints", "guides")
 """Inputs that are files."""
 
 
@@ -248,6 +248,12 @@ class Inputs(JobInputs):
 class BuildingInputs(Inputs):
     """The inputs of the processes that model buildings."""
 
+    guides: Lines | None = Field(
+        None,
+        title="Guides",
+        description="Lines of roofs that models follow, such as ridges and eaves, as GeoJSON, GeoPackage or "
+        f"GeoParquet; their column kind says what they are. {GIVEN_BY}",
+    )
     bbox: Box | None = Field(
         None,
         title="Rectangle",
@@ -261,6 +267,10 @@ class BuildingInputs(Inputs):
     licence: Text | None = Field(
         None, title="Licence", description="Licence of the source data; goes into the results."
     )
+
+    def draft(self, process_id: str, outputs: tuple[str, ...] | None) -> Draft:
+        """The draft of a job; outputs are None for all."""
+        return dataclasses.replace(super().draft(process_id, outputs), guides=self.guides)
 
     def of_process(self) -> dict[str, Any]:
         """Rectangle, meshes and licence."""
@@ -306,7 +316,7 @@ class ReconstructInputs(BuildingInputs):
             default_factory=list,
             title="Publish",
             description="Also deliver the models in these formats: 3D Tiles, GeoPackage, PMTiles, CityJSON files, a "
-            "STAC catalogue, solar energy per roof plane. Naming one of their outputs does the same.",
+            "STAC catalogue, solar energy per roof plane, party walls. Naming one of their outputs does the same.",
             json_schema_extra={"uniqueItems": True},
         )
     )

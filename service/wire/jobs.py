@@ -114,6 +114,7 @@ class JobForm(Answer):
         list[File], Field(min_length=1, description="Point clouds. A field without a file name contains an href.")
     ]
     footprints: File | None = Field(None, description="Building outlines, as a file or an href.")
+    guides: File | None = Field(None, description="Lines of roofs, as a file or an href.")
     crs: str | None = None
     verticalUnit: str | None = None
     allowOutsideAreaOfUse: bool | None = None

@@ -45,7 +45,7 @@ class Preflight(BaseModel):
 
     model_config = ConfigDict(json_schema_extra=_nullable, extra="allow")
 
-    kind: Literal["points", "footprints"]
+    kind: Literal["points", "footprints", "guides"]
     format: Literal["las", "laz", "copc", "ply", "ascii", "geopackage", "geojson", "geoparquet"]
     usable: bool = Field(description="Whether a job can use it without further inputs.")
     problems: list[str] = Field(description="Problems that a job can fix, such as degrees with `crs`.")
@@ -67,6 +67,9 @@ class Preflight(BaseModel):
     hasClasses: bool | None = None
     acquiredFrom: str | None = None
     acquiredTo: str | None = None
+    shapes: list[Literal["polygons", "lines"]] | None = Field(
+        None, description="What a vector file can hold: polygons can be footprints, lines can be guides."
+    )
     featureCount: int | None = None
     layers: list[str] | None = None
 

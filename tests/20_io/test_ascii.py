@@ -64,6 +64,7 @@ def test_named_columns_fill_the_fields(tmp_path):
     assert cloud.gps_time.tolist() == [100.5, 102.5]
     assert cloud.source_id.tolist() == [7, 9]
     assert (source.info.has_returns, source.info.has_classes, source.info.has_gps_time) == (True, True, True)
+    assert source.info.facts.dimensions[2:4] == (("z", "f8"), ("classification", "f8"))
 
 
 def test_reported_columns_stand_above_all(tmp_path):

@@ -49,6 +49,15 @@ def test_every_version_and_point_format_gives_what_was_written(
     assert info.density_per_m2 == pytest.approx(0.3, rel=0.01)
 
 
+def test_dimensions_have_names_and_types_and_bits_count_as_a_byte(tmp_path, points, write_las):
+    old, new = (
+        dict(open_source(write_las(path, points(9), version=version, point_format=form)).info.facts.dimensions)
+        for path, version, form in ((tmp_path / "a.las", "1.2", 0), (tmp_path / "b.laz", "1.4", 7))
+    )
+    assert (old["X"], old["return_number"], old["scan_angle_rank"], "gps_time" in old) == ("i4", "u1", "i1", False)
+    assert (new["scan_angle"], new["gps_time"], new["blue"]) == ("i2", "f8", "u2")
+
+
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 @pytest.mark.parametrize("n", [1, 49_999, 50_000, 50_001, 100_000])
 def test_counts_around_the_size_of_a_compressed_chunk_are_read_whole(tmp_path, points, write_las, n, suffix):

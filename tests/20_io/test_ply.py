@@ -84,6 +84,7 @@ def test_return_fields_and_times_are_used(tmp_path):
     assert cloud.gps_time.tolist() == [10.5, 11.5]
     assert source.info.has_returns
     assert source.info.has_gps_time
+    assert source.info.facts.dimensions[2:4] == (("z", "f8"), ("return_number", "u1"))
 
 
 def test_single_precision_that_is_too_coarse_is_reported(tmp_path):

@@ -16,7 +16,9 @@ import pipeline.reconstruct
 from pipeline.errors import BuildingError, EmptyInputError, InconsistentInputError, InputError, RunError
 from pipeline.model import Reason
 from pipeline.runtime.digest import run_digest
+from pipeline.runtime.manifest import read_manifest
 from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.publishing import publish_stac
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL
@@ -285,3 +287,28 @@ def test_a_meadow_has_no_building_and_ends_well(tmp_path: Path, reconstruct: Any
     assert whole.counts["candidates"] == whole.counts["rejected"] == 0
     assert tiled.counts["tiles"] > 1
     assert tiled.digest == whole.digest == run_digest(whole.run_dir)
+
+
+def test_the_catalogue_of_a_run_counts_the_points_of_whole_files(tmp_path: Path, reconstruct: Any) -> None:
+    """Noise and what lies off the window are not used, and count nevertheless; the headers say how many there are."""
+    rng = np.random.default_rng(1)
+    paths = [tmp_path / "west.las", tmp_path / "east.laz"]
+    for shift, path in zip((0.0, 60.0), paths, strict=True):
+        x, y = 200_000.0 + shift + rng.uniform(0.0, 60.0, 8000), 500_000.0 + rng.uniform(0.0, 60.0, 8000)
+        noise = np.where(np.arange(8000) < 50, 7, 1)
+        write_las(path, np.column_stack((x, y, rng.normal(0.0, 0.02, 8000))), "EPSG:28992", classification=noise)
+    run_dir = reconstruct(*paths, bbox=(200_000.0, 500_000.0, 200_090.0, 500_060.0)).run_dir
+    publish_stac(run_dir, str(tmp_path / "out"))
+    documents = [json.loads(path.read_text()) for path in sorted((tmp_path / "out" / "points").glob("*-*.json"))]
+    for path, document in zip(sorted(paths), documents, strict=True):
+        header, found = laspy.open(path).header, document["properties"]
+        assert (found["title"], found["pc:count"]) == (f"Points of {path.name}", header.point_count)
+        assert found["proj:bbox"] == pytest.approx([*header.mins[:2], *header.maxs[:2]], abs=0.001)
+        assert found["pc:encoding"] == ("LASzip" if path.suffix == ".laz" else "LAS")
+        dimensions = [one.name for one in header.point_format.dimensions]
+        assert [one["name"] for one in found["pc:schemas"]] == dimensions
+    used = [entry.n_points for entry in read_manifest(run_dir).inputs]
+    assert used[0] < 5000
+    assert used[1] == 7950
+    (tile,) = (json.loads(path.read_text()) for path in (tmp_path / "out").glob("x*/*.json"))
+    assert sum(link["rel"] == "derived_from" for link in tile["links"]) == 2

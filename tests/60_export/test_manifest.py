@@ -8,7 +8,15 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import RunError
-from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, read_manifest, write_manifest
+from pipeline.runtime.manifest import InputFile, PointFileFacts, RunManifest, RunStatus, read_manifest, write_manifest
+
+FILE = PointFileFacts(
+    format="las",
+    n_points=4,
+    bounds_m=(0.0, 0.5, 2.0, 3.0),
+    acquired=(dt.datetime(2025, 1, 2, tzinfo=dt.UTC), dt.datetime(2025, 1, 2, 3, tzinfo=dt.UTC)),
+    dimensions={"X": "i4", "gps_time": "f8"},
+)
 
 
 @pytest.fixture
@@ -23,7 +31,12 @@ def manifest() -> RunManifest:
         started_at=dt.datetime(2026, 1, 2, 3, 4, 5, tzinfo=dt.UTC),
         finished_at=dt.datetime(2026, 1, 2, 3, 5, 5, 250, tzinfo=dt.UTC),
         crs={"epsg": 7415, "name": "RD + NAP", "horizontal_unit_m": 1.0, "vertical_unit_m": 1.0},
-        inputs=(InputFile(path="é.laz", sha256="cd" * 32, size_bytes=12, n_points=3),),
+        inputs=(
+            InputFile(
+                path="é.laz", sha256="cd" * 32, size_bytes=12, n_points=3, bounds_m=(0.0, 1.0, 2.0, 3.0), file=FILE
+            ),
+            InputFile(path="outlines.gpkg", sha256="ab" * 32, size_bytes=3),
+        ),
         source_licence="CC0, Kadaster",
         tiles=("x85_y447", "x86_y447"),
         failed_tiles=("x86_y447",),

@@ -232,7 +232,7 @@ def test_a_folder_with_cityjson_of_others_is_refused(run_dir: Path, tmp_path: Pa
     (out / "mine.city.json").write_text("mine")
     (tmp_path / "file").write_text("mine")
     before = content(tmp_path)
-    with pytest.raises(RunError, match=r"holds mine\.city\.json, which is of no tile of this run"):
+    with pytest.raises(RunError, match=r"holds mine\.city\.json, which is not of this run"):
         publish_cityjson(str(run_dir), str(out), overwrite=True)
     with pytest.raises(RunError, match="is a file: give the name of a folder"):
         publish_cityjson(str(run_dir), str(tmp_path / "file"), overwrite=True)

@@ -13,6 +13,7 @@ import pystac
 import pytest
 import shapely
 from command_line import invoke
+from pystac.extensions.pointcloud import PointcloudExtension
 from pystac.extensions.projection import ProjectionExtension
 from pystac.extensions.table import TableExtension
 from pystac.validation.stac_validator import JsonSchemaSTACValidator
@@ -24,7 +25,7 @@ from pipeline.export.columns import COLUMNS
 from pipeline.export.geoparquet import read_table
 from pipeline.export.projection import projection_to
 from pipeline.io import storage_at
-from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.manifest import InputFile, PointFileFacts, RunStatus
 from pipeline.runtime.publishing import publish_stac
 
 RD = {"wkt": pyproj.CRS.from_epsg(7415).to_wkt(), "epsg": 7415, "horizontal_unit_m": 1.0, "vertical_unit_m": 1.0}
@@ -53,7 +54,7 @@ def test_the_catalogue_is_valid_and_its_links_lead_somewhere(run_dir: Path, tmp_
     published = publish_stac(str(run_dir), str(out))
     assert content(run_dir) == before
     assert set(content(out)) == {"collection.json", "t1/t1.json", "t2/t2.json"}
-    assert (published.place, published.rows) == (str(out), {"items": 2})
+    assert (published.place, published.rows) == (str(out), {"items": 2, "points": 0})
     assert published.size_bytes == sum(map(len, content(out).values()))
     assert list(out.parent.iterdir()) == [out]
     for name in content(out):
@@ -264,7 +265,7 @@ def test_a_catalogue_is_replaced_only_where_asked_and_never_another_one(run_dir:
     assert content(out) == before
     (out / "t9").mkdir()
     (out / "t9" / "t9.json").write_text("{}")
-    with pytest.raises(RunError, match=r"holds t9/t9\.json, which is of no tile of this run"):
+    with pytest.raises(RunError, match=r"holds t9/t9\.json, which is not of this run"):
         publish_stac(str(run_dir), str(out), overwrite=True)
 
 
@@ -301,6 +302,85 @@ def test_a_tile_without_objects_is_its_square(tmp_path: Path) -> None:
     assert item["properties"]["proj:bbox"] == [500.0, 1000.0, 1000.0, 1500.0]
 
 
+def _input(path: str, **changes: Any) -> InputFile:
+    """An input of 1000 points, of which the run took 900 in the western half."""
+    file = PointFileFacts(
+        format=changes.pop("format", "laz"),
+        n_points=1000,
+        bounds_m=changes.pop("whole_m", (84_950.0, 446_950.0, 85_150.0, 447_050.0)),
+        acquired=changes.pop("acquired", (MADE - dt.timedelta(days=2), MADE - dt.timedelta(days=1))),
+        dimensions={"X": "i4", "classification": "u1", "gps_time": "f8"},
+    )
+    taken_m = changes.pop("taken_m", (84_950.0, 446_950.0, 85_050.0, 447_050.0))
+    found = InputFile(path=path, sha256="ab" * 32, size_bytes=12, n_points=900, bounds_m=taken_m, file=file)
+    return dataclasses.replace(found, **changes)
+
+
+def test_the_points_are_a_collection_of_their_own_with_the_counts_of_the_files(run_dir: Path, tmp_path: Path) -> None:
+    elsewhere = _input("/data/b/tile.laz", sha256="cd" * 32, taken_m=(0.0, 0.0, 1.0, 1.0), acquired=None)
+    without_points = _input("/data/c.laz", sha256="ef" * 32, bounds_m=None, n_points=0)
+    outlines = InputFile(path="/data/outlines.gpkg", sha256="0" * 64, size_bytes=3)
+    restated(run_dir, inputs=(_input("/data/a/my tile.laz"), elsewhere, without_points, outlines))
+    published = publish_stac(str(run_dir), str(tmp_path / "out"))
+    assert published.rows == {"items": 2, "points": 2}
+    names = {"points/collection.json", "points/my_tile-abababab.json", "points/tile-cdcdcdcd.json"}
+    assert {name for name in content(tmp_path / "out") if name.startswith("points")} == names
+    for name in names:
+        assert "/data" not in (tmp_path / "out" / name).read_text()
+        validated(tmp_path / "out" / name)
+    collection = pystac.Collection.from_file(str(tmp_path / "out" / "collection.json"))
+    (points,) = collection.get_children()
+    first, second = points.get_items()
+    assert (points.id, first.get_root(), first.get_parent(), first.assets) == (
+        "my models-points",
+        collection,
+        points,
+        {},
+    )
+    cloud = PointcloudExtension.ext(first)
+    assert (cloud.count, cloud.type, cloud.encoding, cloud.density) == (1000, "lidar", "LASzip", 0.05)
+    assert [(one.name, one.size, one.type) for one in cloud.schemas] == [
+        ("X", 4, "signed"),
+        ("classification", 1, "unsigned"),
+        ("gps_time", 8, "floating"),
+    ]
+    assert ProjectionExtension.ext(first).bbox == [84_950.0, 446_950.0, 85_150.0, 447_050.0]
+    assert (first.common_metadata.start_datetime, first.datetime) == (MADE - dt.timedelta(days=2), None)
+    assert second.datetime == MADE
+    assert first.properties["description"] == f"The file my tile.laz, 12 bytes, sha256 {'ab' * 32}"
+    sources = {
+        item.id: [link.get_absolute_href() for link in item.get_links("derived_from")]
+        for item in collection.get_items()
+    }
+    assert sources["t1"] == [str(tmp_path / "out" / "points" / "my_tile-abababab.json")]
+
+
+@pytest.mark.parametrize(("form", "has_digest"), [("laz", True), ("copc", False)])
+def test_points_with_an_address_are_an_asset(run_dir: Path, tmp_path: Path, form: str, has_digest: bool) -> None:
+    """A window of a remote COPC is read by its nodes, so the digest is not that of the file."""
+    restated(run_dir, inputs=(_input("https://example.org/a/tile.laz", format=form),))
+    publish_stac(str(run_dir), str(tmp_path / "out"))
+    document = validated(tmp_path / "out" / "points" / "tile-abababab.json")
+    asset = document["assets"]["points"]
+    assert (asset["href"], asset["file:size"]) == ("https://example.org/a/tile.laz", 12)
+    assert ("file:checksum" in asset, "sha256" in document["properties"]["description"]) == (has_digest, has_digest)
+    assert stac.FILE in document["stac_extensions"]
+
+
+def test_points_without_an_area_have_no_density(run_dir: Path, tmp_path: Path) -> None:
+    restated(run_dir, inputs=(_input("tile.laz", whole_m=(84_950.0, 446_950.0, 84_950.0, 447_050.0)),))
+    publish_stac(str(run_dir), str(tmp_path / "out"))
+    assert "pc:density" not in validated(tmp_path / "out" / "points" / "tile-abababab.json")["properties"]
+
+
+def test_the_points_of_another_run_are_kept(run_dir: Path, tmp_path: Path) -> None:
+    restated(run_dir, inputs=(_input("tile.laz"),))
+    publish_stac(str(run_dir), str(tmp_path / "out"))
+    restated(run_dir, inputs=(_input("tile.laz", sha256="cd" * 32),))
+    with pytest.raises(RunError, match=r"holds points/tile-abababab\.json, which is not of this run"):
+        publish_stac(str(run_dir), str(tmp_path / "out"), overwrite=True)
+
+
 def test_the_command_writes_a_catalogue(run_dir: Path, tmp_path: Path) -> None:
     code, said, _ = invoke("publish", str(run_dir), "--as", "stac", "--out", str(tmp_path / "out"), "--json")
-    assert (code, json.loads(said)["rows"]) == (0, {"items": 2})
+    assert (code, json.loads(said)["rows"]) == (0, {"items": 2, "points": 0})

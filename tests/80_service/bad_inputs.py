@@ -300,6 +300,8 @@ def _executions() -> Iterator[tuple[str, BadRequest]]:
         "an unknown input": {"colour": "red"},
         "footprints are points": {"footprints": tile},
         "footprints: two": {"footprints": [tile, tile]},
+        "guides are points": {"guides": tile},
+        "guides: two": {"guides": [tile, tile]},
         "crs: unknown": {"crs": "EPSG:999999"},
         "crs: words": {"crs": "somewhere"},
         "crs: empty": {"crs": ""},

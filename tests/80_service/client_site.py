@@ -26,6 +26,9 @@ LARGE = las_bytes(200_000, compressed=False)
 OUTLINES = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry": {"type":
 "Polygon", "coordinates": [[[84001, 447001], [84009, 447001], [84009, 447009], [84001, 447001]]]}}]}"""
 """A file of footprints."""
+LINES = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry": {"type":
+"LineString", "coordinates": [[84001, 447001], [84009, 447001]]}}]}"""
+"""A file of guides."""
 
 
 class Site:

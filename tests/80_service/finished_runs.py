@@ -27,7 +27,7 @@ from pipeline.export.records import RecordContext, RejectedObject
 from pipeline.export.tile import write_tile
 from pipeline.export.tileset import TilesetNode, root_tileset, tile_tileset
 from pipeline.model import BuildingResult, Reason
-from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, write_manifest
+from pipeline.runtime.manifest import InputFile, PointFileFacts, RunManifest, RunStatus, write_manifest
 from service.app import create_app
 from service.files import StateFolder
 from service.jobs import InputReference, Job, JobFailure, JobRequest
@@ -37,6 +37,7 @@ from service.settings import ServiceSettings
 from service.store import JobStore
 
 TILE_M = 100.0
+BOUNDS_M = (85_000.0, 447_000.0, 85_200.0, 447_200.0)
 SERVER_FOLDER = "/srv/the city's/uploads/0f0f"
 """Where the inputs of the runs lay: no answer may tell it. A page writes its apostrophe another way."""
 LINKED_FOLDER = "/mnt/disk7/0f0f"
@@ -148,7 +149,20 @@ def write_run(
         finished_at=dt.datetime(2026, 3, 1, 10, tzinfo=dt.UTC),
         crs=crs_facts(epsg),
         inputs=(
-            InputFile(path=f"{SERVER_FOLDER}/tile.laz", sha256="ab" * 32, size_bytes=1000, n_points=640),
+            InputFile(
+                path=f"{SERVER_FOLDER}/tile.laz",
+                sha256="ab" * 32,
+                size_bytes=1000,
+                n_points=640,
+                bounds_m=BOUNDS_M,
+                file=PointFileFacts(
+                    format="laz",
+                    n_points=700,
+                    bounds_m=BOUNDS_M,
+                    acquired=None,
+                    dimensions={"X": "i4", "gps_time": "f8"},
+                ),
+            ),
             InputFile(path=f"{SERVER_FOLDER}/outlines.gpkg", sha256="cd" * 32, size_bytes=20),
         ),
         request={"footprints": f"{LINKED_FOLDER}/outlines.gpkg", "overrides": None, "aoi": None},

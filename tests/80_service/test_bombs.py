@@ -282,7 +282,7 @@ def test_footprints_larger_than_memory_allows_are_refused(tmp_path: Path, monkey
     written(tmp_path, "a.geojson", json.dumps(COLLECTION).encode())
     geopackage(tmp_path / "a.gpkg")
     for name in ("a.geojson", "a.gpkg"):
-        with pytest.raises(TooLargeError, match=r"footprints in .* may have 100: cut out the area"):
+        with pytest.raises(TooLargeError, match=r"footprints or guides in .* may have 100: cut out the area"):
             examine(tmp_path / name, max_points=MOST)
 
 
@@ -393,7 +393,7 @@ def test_a_damaged_header_is_understood_or_refused_by_an_error_that_is_meant(
     except (InputError, LimitError):
         return
     json.dumps(reported, allow_nan=False)
-    assert reported["kind"] in {"points", "footprints"}
+    assert reported["kind"] in {"points", "footprints", "guides"}
 
 
 # --- the child -------------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from pipeline.runtime.resources import Resources
 from pipeline.runtime.stages.write_classified import ClassifiedFile
 from service.driver.attempt import classify_request
 from service.driver.messages import Scrubber, classification_outcome
-from service.fetching import Fetched
+from service.fetching import Fetched, JobFiles
 from service.jobs import JobRequest, JobStatus
 from service.outputs import CLASSIFICATION_OUTPUTS, write_classification_outputs
 from service.outputs.kinds import RASTERS
@@ -58,7 +58,7 @@ def test_it_takes_what_all_processes_take_and_the_cell_of_its_rasters(local_serv
     reconstruct, described = (
         local_service.client.get(f"/processes/{name}").json() for name in ("reconstruct", "classify")
     )
-    of_models = {"method", "preset", "lods", "bbox", "meshes", "points", "publish", "geoidHeight", "licence"}
+    of_models = {"guides", "method", "preset", "lods", "bbox", "meshes", "points", "publish", "geoidHeight", "licence"}
     assert set(described["inputs"]) == set(reconstruct["inputs"]) - of_models | {"rasterCell"}
     assert set(described["outputs"]) == set(CLASSIFICATION_OUTPUTS)
 
@@ -91,7 +91,7 @@ def test_faults_of_a_classification_are_reported(local_service, inputs: dict[str
 )
 def test_rasters_are_drawn_only_if_one_is_wanted(tmp_path: Path, outputs: Any, drawn: bool) -> None:
     asked = JobRequest(tiles=(), process_id="classify", outputs=outputs, raster_cell=2.0)
-    request = classify_request(asked, [], None, tmp_path / "out", ServiceSettings(state=tmp_path))
+    request = classify_request(asked, JobFiles(tiles=[]), tmp_path / "out", ServiceSettings(state=tmp_path))
     assert (request.rasters, request.raster_cell) == (drawn, 2.0 if drawn else None)
     assert request.only_files
 
@@ -144,11 +144,11 @@ def test_the_outcome_is_one_sentence(tmp_path: Path) -> None:
 def test_a_driver_classifies_a_tile_and_writes_it_back_whole(bench: Bench) -> None:
     sent = las_bytes(20_000)
 
-    def gather(request: JobRequest, *, target: Path, **_others: Any) -> tuple[list[Fetched], None]:
+    def gather(request: JobRequest, *, target: Path, **_others: Any) -> JobFiles:
         target.mkdir(parents=True)
         (target / "tile.laz").write_bytes(sent)
         tile = Fetched(reference=request.tiles[0], path=target / "tile.laz", points=20_000, sha256=None)
-        return [tile], None
+        return JobFiles(tiles=[tile])
 
     def classify_here(request: ClassifyRequest, on_event: Any, executor: Any, cancelled: Any) -> ClassifySummary:
         del executor

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from click.testing import Result
-from client_site import OUTLINES, Site
+from client_site import LINES, OUTLINES, Site
 from live_service import POINTS
 from typer.testing import CliRunner
 
@@ -59,6 +59,8 @@ def test_every_option_of_submit_arrives(site: Site) -> None:
     words += [
         "--footprints",
         str(outlines),
+        "--guides",
+        str(site.file("lines.geojson", LINES)),
         "--output",
         "report",
         "--output",
@@ -70,6 +72,7 @@ def test_every_option_of_submit_arrives(site: Site) -> None:
     assert sorted(request["outputs"]) == ["buildings", "report"]
     assert len(inputs.pop("tiles")) == 1
     assert inputs.pop("footprints")["href"].startswith("http")
+    assert inputs.pop("guides")["href"].startswith("http")
     assert inputs == {
         "crs": "EPSG:28992",
         "verticalUnit": "ft",

@@ -19,6 +19,7 @@ from pipeline.errors import ClusterError, SettingsError
 from pipeline.methods import METHODS
 from pipeline.runtime import compare
 from service.driver.attempt import compare_request
+from service.fetching import JobFiles
 from service.jobs import Fault, InputReference, JobRequest, JobStatus
 from service.outputs import COMPARISON_OUTPUTS, OUTPUTS
 from service.outputs.comparison import RUNS
@@ -211,7 +212,7 @@ def test_a_process_that_a_driver_does_not_know_fails_with_those_that_it_does(ben
 def request_of(tmp_path: Path, *methods: str, **settings: Any) -> compare.CompareRequest:
     tiles = (InputReference(kind="path", value="/data/a.laz"),)
     asked = JobRequest(tiles=tiles, process_id="compare", methods=methods, settings=settings)
-    return compare_request(asked, [], None, tmp_path / "out", ServiceSettings(state=tmp_path))
+    return compare_request(asked, JobFiles(tiles=[]), tmp_path / "out", ServiceSettings(state=tmp_path))
 
 
 def test_shared_settings_count_for_all_methods_and_a_methods_own_table_for_its_variants(tmp_path: Path) -> None:

@@ -4,14 +4,14 @@ import pytest
 from driver_bench import Bench
 from test_comparisons import faults_of
 
-from service.fetching import Fetched
+from service.fetching import JobFiles
 from service.jobs import JobStatus
 
 PLACE = "/processes/echo/execution"
 
 
-def no_inputs(*_: object, **__: object) -> tuple[list[Fetched], None]:
-    return [], None
+def no_inputs(*_: object, **__: object) -> JobFiles:
+    return JobFiles(tiles=[])
 
 
 def test_it_takes_a_message_and_no_tile(local_service) -> None:

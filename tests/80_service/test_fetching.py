@@ -30,7 +30,7 @@ from service.errors import (
     ServiceError,
     TooLargeError,
 )
-from service.fetching import Fetched, gather, materialise, resolve_inputs
+from service.fetching import Fetched, JobFiles, gather, materialise, resolve_inputs
 from service.files import StateFolder
 from service.input_policy import checked_path
 from service.jobs import InputReference, JobRequest, Upload
@@ -171,6 +171,29 @@ def test_points_are_no_footprints_and_footprints_no_points(world: World) -> None
     world.resolve(upload(points), footprints=upload(outlines))
     with pytest.raises(RequestError, match=r"b\.gpkg' is not a point cloud.*a\.laz' is not a file of footprints"):
         world.resolve(upload(outlines), footprints=upload(points))
+
+
+def test_guides_are_checked_like_footprints_and_must_be_lines(world: World) -> None:
+    tile = upload(world.add_upload("a.laz"))
+    line = b'{"type": "LineString", "coordinates": [[1, 1], [9, 1]]}'
+    polygons, lines, both = (
+        upload(world.add_upload(f"{'_'.join(shapes)}.geojson", line, shapes=shapes))
+        for shapes in (["polygons"], ["lines"], ["polygons", "lines"])
+    )
+    world.resolve(tile, footprints=polygons, guides=lines)
+    world.resolve(tile, footprints=both, guides=both)
+    with pytest.raises(RequestError, match=r"a\.laz' is not a file of guides: its name must end in \.gpkg"):
+        world.resolve(tile, guides=tile)
+    with pytest.raises(RequestError, match=r"polygons\.geojson' is not a file of guides: it holds polygons, not lines"):
+        world.resolve(tile, guides=polygons)
+    with pytest.raises(
+        RequestError, match=r"lines\.geojson' is not a file of footprints: it holds lines, not polygons"
+    ):
+        world.resolve(tile, footprints=lines)
+    request = JobRequest(tiles=(tile,), footprints=polygons, guides=lines)
+    found = gather(request, target=world.target, cancelled=lambda: False, **world.known)
+    assert [file.reference for file in found.all] == [tile, polygons, lines]
+    assert set(request.upload_ids) == {tile.value, polygons.value, lines.value}
 
 
 def test_a_problem_that_a_crs_heals_is_reported_unless_a_crs_is_given(world: World) -> None:
@@ -597,7 +620,7 @@ def test_a_tile_that_reads_as_a_tile_index_leads_nowhere(tmp_path: Path) -> None
     tile = tmp_path / "tiles.txt"
     tile.write_text(f"{secret}\ns3://bucket/others.laz\n")
     fetched = Fetched(reference=InputReference(kind="upload", value="u"), path=tile, points=0, sha256=None)
-    request = run_request(JobRequest(tiles=()), [fetched], None, tmp_path / "run", ServiceSettings())
+    request = run_request(JobRequest(tiles=()), JobFiles(tiles=[fetched]), tmp_path / "run", ServiceSettings())
     with pytest.raises(InputError, match=r"tiles\.txt: ") as refused:
         plan_inputs(request, Progress(lambda _: None))
     assert "others.laz" not in str(refused.value)

@@ -62,6 +62,7 @@ requests = st.builds(
     JobRequest,
     tiles=st.lists(references, min_size=1, max_size=3).map(tuple),
     footprints=st.none() | references,
+    guides=st.none() | references,
     bbox=st.none() | st.tuples(numbers, numbers, numbers, numbers),
     settings=st.dictionaries(st.text(max_size=5), numbers | st.booleans() | st.text(max_size=5), max_size=3),
     outputs=st.none() | st.lists(st.text(max_size=5), max_size=3).map(tuple),

@@ -107,7 +107,7 @@ def test_more_rows_than_are_taken_are_refused_before_one_is_decoded(
 ) -> None:
     monkeypatch.setattr(parquet, "ROWS_LIMIT", 1)
     monkeypatch.setattr(parquet, "DECODED_LIMIT", 0)
-    with pytest.raises(TooLargeError, match="has 2 rows, footprints may have 1"):
+    with pytest.raises(TooLargeError, match="has 2 rows, footprints or guides may have 1"):
         examine(written(tmp_path, outlines()), max_points=MOST)
 
 

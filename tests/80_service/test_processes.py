@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 
 import jsonschema
 import pytest
@@ -169,6 +170,56 @@ def test_footprints_by_value_are_geojson(local_service) -> None:
         reference = local_service.request_of(answer).footprints
         path = local_service.settings.state / "uploads" / reference.value / "footprints.geojson"
         assert json.loads(path.read_text()) == outlines
+
+
+LINE = {
+    "type": "Feature",
+    "properties": {"kind": "ridge"},
+    "geometry": {"type": "LineString", "coordinates": [[1, 1], [9, 1]]},
+}
+
+
+def test_guides_are_a_file_of_lines_by_value_or_by_reference(local_service) -> None:
+    lines = {"type": "FeatureCollection", "features": [LINE]}
+    sent = local_service.client.post("/uploads?filename=lines.geojson", content=json.dumps(lines))
+    assert (sent.status_code, sent.json()["preflight"]["kind"], sent.json()["preflight"]["shapes"]) == (
+        201,
+        "guides",
+        ["lines"],
+    )
+    for guides in (lines, {"value": lines, "mediaType": "application/geo+json"}, {"href": sent.headers["location"]}):
+        answer = execute(local_service, of_an_upload(local_service, guides=guides))
+        assert "/uploads/" in answer.json()["request"]["inputs"]["guides"]["href"]
+        upload = local_service.store.upload(local_service.request_of(answer).guides.value)
+        path = local_service.settings.state / "uploads" / upload.upload_id / upload.filename
+        assert upload.filename in {"guides.geojson", "lines.geojson"}
+        assert json.loads(path.read_text()) == lines
+
+
+def test_guides_that_cannot_be_used_are_refused_with_the_fix(local_service) -> None:
+    square = {"type": "Polygon", "coordinates": [[[1, 1], [9, 1], [9, 9], [1, 9], [1, 1]]]}
+    points, polygons = (
+        {"type": "FeatureCollection", "features": [{**LINE, "geometry": geometry}]}
+        for geometry in ({"type": "Point", "coordinates": [1, 1]}, square)
+    )
+    for guides, said in (
+        (points, "none of its 1 features is a polygon with a ring or a line.*or with lines of roofs"),
+        (polygons, "guides.geojson' is not a file of guides: it holds polygons, not lines. Upload a file that does"),
+        ({"href": "/uploads/" + "0" * 32}, "no upload"),
+        ([1, 2], r"guides is \[1, 2\]: use one file"),
+    ):
+        answer = execute(local_service, of_an_upload(local_service, guides=guides))
+        assert answer.status_code in {400, 404, 422}
+        assert re.search(said, answer.text), answer.text
+
+
+def test_the_processes_that_model_buildings_take_guides(local_service) -> None:
+    for process, takes in (("reconstruct", True), ("compare", True), ("classify", False)):
+        inputs = local_service.client.get(f"/processes/{process}").json()["inputs"]
+        assert ("guides" in inputs) == takes, process
+        if takes:
+            assert inputs["guides"]["valuePassing"] == ["byValue", "byReference"]
+            assert (inputs["guides"]["minOccurs"], inputs["guides"]["schema"]) == (0, inputs["footprints"]["schema"])
 
 
 def test_all_faults_of_a_request_are_reported_at_once(local_service) -> None:

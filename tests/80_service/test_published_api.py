@@ -19,6 +19,7 @@ from starlette.testclient import TestClient
 from pipeline.errors import RunCancelledError
 from pipeline.export.glb_container import read_document
 from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.party_walls import party_walls
 from service.keys import Scope, new_key
 from service.outputs import published
 from service.outputs.kinds import FORMATS, ON_REQUEST, OUTPUTS
@@ -110,7 +111,11 @@ def test_the_catalogue_leads_to_every_file_it_lists(client: TestClient, job_id: 
         answer = client.get(place)
         assert answer.headers["content-type"] == "application/geo+json"
         for link in answer.json()["links"]:
-            assert client.get(urljoin(place, link["href"])).json()["id"] == job_id
+            document = client.get(urljoin(place, link["href"])).json()
+            assert document["id"] == job_id or (link["rel"], document["properties"]["pc:count"]) == (
+                "derived_from",
+                700,
+            )
         assets = answer.json()["assets"]
         assert {"buildings", "planes", "rejected", "cityjson"} <= set(assets)
         for asset in assets.values():
@@ -118,6 +123,19 @@ def test_the_catalogue_leads_to_every_file_it_lists(client: TestClient, job_id: 
             assert f"1220{hashlib.sha256(file.content).hexdigest()}" == asset["file:checksum"]
             assert file.headers["content-type"] == asset["type"]
     assert "/srv/" not in client.get(address).text
+
+
+def test_the_catalogue_leads_to_the_points_and_names_no_folder(client: TestClient, job_id: str) -> None:
+    address = f"http://127.0.0.1/jobs/{job_id}/results/stac"
+    (child,) = (link["href"] for link in client.get(address).json()["links"] if link["rel"] == "child")
+    place = urljoin(address, child)
+    points = client.get(place)
+    assert (points.json()["id"], points.headers["content-type"]) == (f"{job_id}-points", "application/json")
+    (item,) = (link["href"] for link in points.json()["links"] if link["rel"] == "item")
+    answer = client.get(urljoin(place, item))
+    assert answer.headers["content-type"] == "application/geo+json"
+    assert (answer.json()["properties"]["title"], answer.json()["assets"]) == ("Points of tile.laz", {})
+    assert "/srv/" not in points.text + answer.text
 
 
 @pytest.mark.parametrize(
@@ -184,7 +202,8 @@ def test_what_cannot_be_made_leaves_the_rest(service: runs.Service, client: Test
     job = service.finished(unknown, publish=WITHOUT_SOLAR, problems=problems)
     assert set(problems) == {"3dtiles", "pmtiles", "stac"}
     assert all("CRS" in problem for problem in problems.values())
-    assert {"geopackage", "cityjson-zip"} == set(client.get(f"/jobs/{job}/results").json()) & set(ON_REQUEST)
+    there = set(client.get(f"/jobs/{job}/results").json()) & set(ON_REQUEST)
+    assert there == {"geopackage", "cityjson-zip", "party-walls", "wall-areas"}
     holes = functools.partial(runs.write_run, failed_tile="x9_y9", status=RunStatus.INCOMPLETE)
     problems.clear()
     service.finished(holes, publish=("geopackage",), problems=problems)
@@ -224,6 +243,18 @@ def test_a_cancellation_within_a_format_ends_the_work(tmp_path: Path) -> None:
 
     with pytest.raises(RunCancelledError):
         published.publish(tmp_path / "run", tmp_path / "out", ("pmtiles",), name="a", on_progress=cancelled_once)
+
+
+def test_party_walls_are_two_outputs_with_the_tables_of_the_command(
+    service: runs.Service, client: TestClient, tmp_path: Path
+) -> None:
+    run_dir = runs.write_run(tmp_path / "run")
+    party_walls(str(run_dir), str(tmp_path / "walls.parquet"), buildings=str(tmp_path / "areas.parquet"))
+    job = service.finished(publish=("party-walls",))
+    for name, file in (("party-walls", "walls.parquet"), ("wall-areas", "areas.parquet")):
+        found = pq.read_table(io.BytesIO(client.get(f"/jobs/{job}/results/{name}").content))
+        assert found.equals(pq.read_table(tmp_path / file)), name
+    assert found.num_rows > 0
 
 
 @pytest.mark.slow

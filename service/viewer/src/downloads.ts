@@ -20,6 +20,8 @@ const OUTPUTS: Record<string, [string, string, string]> = {
   "cityjson-zip": ["CityJSON, files", "One file per tile, zipped", "cityjson.zip"],
   stac: ["STAC", "A catalogue of the tiles and their files", "collection.json"],
   solar: ["Solar energy, GeoParquet", "Sky view and irradiation of every roof plane", "solar.parquet"],
+  "party-walls": ["Party walls, GeoParquet", "Walls that neighbouring buildings share", "party_walls.parquet"],
+  "wall-areas": ["Wall areas, GeoParquet", "Shared and exposed walls of every building", "wall_areas.parquet"],
 };
 
 /** Outputs of a classification. */

@@ -9,6 +9,7 @@ export const LABELS = {
   preset: "Preset",
   classes: "Classes of the file",
   footprints: "Footprints",
+  guides: "Guides",
   points: "Keep the points",
   publish: "Publish as",
   title: "Title",
@@ -22,6 +23,7 @@ export const FORMATS: Record<string, string> = {
   cityjson: "CityJSON files",
   stac: "STAC catalogue",
   solar: "Solar energy of the roofs",
+  "party-walls": "Party walls",
 };
 
 /** A message that names fields in place of inputs, and no settings of the operator. */

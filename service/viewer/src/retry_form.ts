@@ -16,7 +16,7 @@ interface InputDescription {
 }
 
 /** Inputs that a form cannot change, or that have a part of their own. */
-const ELSEWHERE = new Set(["tiles", "footprints", "settings", "priority"]);
+const ELSEWHERE = new Set(["tiles", "footprints", "guides", "settings", "priority"]);
 
 /** Inputs that are shown at once; the others are under More. */
 const FIRST = ["title", "method", "preset", "methods", "lods", "crs", "message"];

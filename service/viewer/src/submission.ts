@@ -10,7 +10,11 @@ import { bytes, count, measure, placeWords } from "./numbers";
 import { SMALL_BYTES, send } from "./sending";
 
 const TILE_ENDINGS = ".las,.laz,.ply,.xyz,.txt,.csv,.asc,.pts";
-const FOOTPRINT_ENDINGS = ".gpkg,.geojson,.json,.parquet,.geoparquet";
+const VECTOR_ENDINGS = ".gpkg,.geojson,.json,.parquet,.geoparquet";
+
+/** Inputs that are one vector file each. */
+const VECTORS = ["footprints", "guides"] as const;
+type Vector = (typeof VECTORS)[number];
 const VERTICAL_UNITS = { "": "as in the file", m: "metres", ft: "feet", "us-ft": "US survey feet" };
 
 interface Sent {
@@ -31,11 +35,15 @@ interface InputDescription {
 /** The form: tiles are sent as soon as they are dropped, the job starts on the button. */
 export class Submission {
   private tiles: Sent[] = [];
-  private footprints: Sent | null = null;
+  /** Files beside the tiles, one for each of these inputs. */
+  private readonly vectors: Record<Vector, Sent | null> = { footprints: null, guides: null };
   private starting = false;
   private readonly rows = el("ul", { class: "files" });
   private readonly unfinished = el("ul", { class: "files", "aria-label": "Interrupted uploads" });
-  private readonly footprintRow = el("ul", { class: "files" });
+  private readonly vectorRows: Record<Vector, HTMLElement> = {
+    footprints: el("ul", { class: "files" }),
+    guides: el("ul", { class: "files" }),
+  };
   private readonly note = el("div");
   private readonly go = el("button", { type: "submit", class: "primary wide" }, "Reconstruct");
   private readonly crs = el("input", { id: "crs", type: "text", placeholder: "EPSG:28992", autocomplete: "off", spellcheck: "false" });
@@ -79,12 +87,6 @@ export class Submission {
       el("span", { class: "hint" }, "or choose files: LAS, LAZ, COPC, PLY, xyz"),
     );
     this.takeDrops(zone);
-    const footprintPicker = el("input", { type: "file", id: "footprints", accept: FOOTPRINT_ENDINGS });
-    footprintPicker.addEventListener("change", () => {
-      const file = footprintPicker.files?.[0];
-      if (file !== undefined) this.setFootprints(file);
-      footprintPicker.value = "";
-    });
     this.options.append(
       el("summary", {}, "Options"),
       field(LABELS.crs, this.crs, "If the file has none or a wrong one."),
@@ -101,8 +103,10 @@ export class Submission {
       ),
       el("fieldset", { class: "field" }, el("legend", {}, "Compare with"), this.others),
       field(LABELS.classes, this.classes, "Trusted, only compared with the result, or ignored."),
-      field(LABELS.footprints, footprintPicker, "GeoPackage, GeoJSON or GeoParquet: one model per polygon."),
-      this.footprintRow,
+      field(LABELS.footprints, this.picker("footprints"), "GeoPackage, GeoJSON or GeoParquet: one model per polygon."),
+      this.vectorRows.footprints,
+      field(LABELS.guides, this.picker("guides"), "Lines of roofs that models follow, in the same formats."),
+      this.vectorRows.guides,
       el(
         "div",
         { class: "field" },
@@ -151,7 +155,7 @@ export class Submission {
   }
 
   private isSent(key: string): boolean {
-    const files = this.footprints === null ? this.tiles : [...this.tiles, this.footprints];
+    const files = this.files();
     return files.some(({ file }) => keyOf(fingerprint(file)) === key);
   }
 
@@ -258,14 +262,30 @@ export class Submission {
     this.draw();
   }
 
-  private setFootprints(file: File): void {
-    this.footprints?.calledOff.abort();
-    const sent = this.send(file, () => {
-      this.footprints = null;
+  /** The field for the file of an input. */
+  private picker(name: Vector): HTMLInputElement {
+    const picker = el("input", { type: "file", id: name, accept: VECTOR_ENDINGS });
+    picker.addEventListener("change", () => {
+      const file = picker.files?.[0];
+      if (file !== undefined) this.setVector(name, file);
+      picker.value = "";
     });
-    this.footprints = sent;
-    this.footprintRow.replaceChildren(sent.row);
+    return picker;
+  }
+
+  private setVector(name: Vector, file: File): void {
+    this.vectors[name]?.calledOff.abort();
+    const sent = this.send(file, () => {
+      this.vectors[name] = null;
+    });
+    this.vectors[name] = sent;
+    this.vectorRows[name].replaceChildren(sent.row);
     this.draw();
+  }
+
+  /** All files of the form. */
+  private files(): Sent[] {
+    return [...this.tiles, ...Object.values(this.vectors).filter((sent) => sent !== null)];
   }
 
   /** Begin to send a file; its row shows the progress and the result of the examination. */
@@ -348,7 +368,10 @@ export class Submission {
       }
       for (const [name, value] of chosen) if (value !== "") inputs[name] = value;
       if (this.anywhere.checked) inputs["allowOutsideAreaOfUse"] = true;
-      if (this.footprints?.uploaded != null) inputs["footprints"] = { href: this.footprints.uploaded.href };
+      for (const name of VECTORS) {
+        const uploaded = this.vectors[name]?.uploaded;
+        if (uploaded != null) inputs[name] = { href: uploaded.href };
+      }
       const response = await request(`processes/${variants.length > 1 ? "compare" : "reconstruct"}/execution`, {
         method: "POST",
         headers: { "Content-Type": "application/json" },
@@ -371,12 +394,14 @@ export class Submission {
 
   private clear(): void {
     this.tiles = [];
-    this.footprints = null;
+    for (const name of VECTORS) {
+      this.vectors[name] = null;
+      this.vectorRows[name].replaceChildren();
+    }
     this.title.value = "";
     this.placeRefused = false;
     this.anywhere.checked = false;
     this.rows.replaceChildren();
-    this.footprintRow.replaceChildren();
   }
 
   private tell(problem: Problem): void {
@@ -386,7 +411,7 @@ export class Submission {
 
   /** Make the button say what is missing. */
   private draw(): void {
-    const files = this.footprints === null ? this.tiles : [...this.tiles, this.footprints];
+    const files = this.files();
     const refused = files.some(({ problem }) => problem !== null);
     const waiting = files.some(({ uploaded, problem }) => uploaded === null && problem === null);
     const comparison = this.variants().length > 1;
@@ -468,8 +493,8 @@ function preflight(known: Record<string, unknown>): HTMLElement[] {
   const crs = known["crs"] as { name?: string; epsg?: number | null } | null | undefined;
   const crsText = crs == null ? "no CRS" : crs.epsg == null ? (crs.name ?? "CRS without a code") : `EPSG:${crs.epsg}`;
   const facts =
-    known["kind"] === "footprints"
-      ? [typeof known["featureCount"] === "number" ? `${count(known["featureCount"])} outlines` : null, crsText]
+    known["kind"] !== "points"
+      ? [typeof known["featureCount"] === "number" ? `${count(known["featureCount"])} ${known["kind"] === "guides" ? "lines" : "outlines"}` : null, crsText]
       : [
           typeof known["pointCount"] === "number" ? `${count(known["pointCount"])} points` : null,
           typeof known["densityPerM2"] === "number" ? measure(known["densityPerM2"], 1, "per m²") : null,
