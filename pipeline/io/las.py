@@ -6,6 +6,7 @@ unused fields can be left out, and because errors must name file and fix.
 
 from __future__ import annotations
 
+import functools
 import io
 import struct
 from collections.abc import Iterator
@@ -382,4 +383,10 @@ def _dimensions_of(point_format: laspy.PointFormat) -> tuple[tuple[str, str], ..
         laspy.DimensionKind.FloatingPoint: "f",
         laspy.DimensionKind.BitField: "u",
     }
-    return tuple((one.name, f"{letters[one.kind]}{-(-one.num_bits // 8)}") for one in point_format.dimensions)
+    return _shared(tuple((one.name, f"{letters[one.kind]}{-(-one.num_bits // 8)}") for one in point_format.dimensions))
+
+
+@functools.lru_cache(maxsize=64)
+def _shared(dimensions: tuple[tuple[str, str], ...]) -> tuple[tuple[str, str], ...]:
+    """Equal ones are one object: the driver of a country holds those of all its files."""
+    return dimensions

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime as dt
+import functools
 import json
 import time
 from collections import Counter
@@ -553,6 +554,12 @@ def _input_files(
     return tuple(inputs)
 
 
+@functools.lru_cache(maxsize=64)
+def _as_mapping(dimensions: tuple[tuple[str, str], ...]) -> Mapping[str, str]:
+    """Dimensions by name; one object for all files that have the same."""
+    return dict(dimensions)
+
+
 def _file_facts(info: SourceInfo) -> PointFileFacts:
     """An input as a whole, for the manifest."""
     x0, y0, _, x1, y1, _ = info.bounds_m
@@ -561,7 +568,7 @@ def _file_facts(info: SourceInfo) -> PointFileFacts:
         n_points=info.point_count,
         bounds_m=(x0, y0, x1, y1),
         acquired=(info.acquired_from, info.acquired_to) if info.acquired_from and info.acquired_to else None,
-        dimensions=dict(info.facts.dimensions),
+        dimensions=_as_mapping(info.facts.dimensions),
     )
 
 
