@@ -224,7 +224,7 @@ def publish_tile(task: PublishTask) -> InParts[Published]:
     try:
         if task.batches or task.rejected or task.empty_tables:
             with storage.several(task.scratch.check_cancelled) as puts:
-                written = _write(task, _records_last(puts))
+                written = _write(task, _meshes_first(puts))
             files, rows = dict(written.digests), _rows(written.tables)
     except RunCancelledError:
         raise
@@ -267,12 +267,16 @@ def _rows(tables: Mapping[str, Any]) -> tuple[Rows, ...]:
     return tuple(rows_of(tables[name], name) for name in TABLES)
 
 
-def _records_last(puts: Puts) -> Put:
-    """Concurrent puts, except that the records wait for the meshes, which they name, and all else."""
+def _meshes_first(puts: Puts) -> Put:
+    """Concurrent puts, except that all else waits for the meshes, which the rows of tables name."""
+    waits = False
 
     def put(key: str, content: bytes) -> None:
-        if key.startswith("buildings/"):
+        nonlocal waits
+        is_mesh = key.startswith("meshes/")
+        if waits and not is_mesh:
             puts.wait()
+        waits = is_mesh
         puts.put(key, content)
 
     return put
