@@ -12,7 +12,7 @@ from pipeline.export.cityjson import decimals_of, heading, json_line, whole_unit
 from pipeline.export.coordinates import SpatialReference, crs_coordinates
 from pipeline.export.obj import vertex_lines
 from pipeline.kernels.union_find import numbered_sets, united
-from pipeline.model import FloatArray, LabelArray
+from pipeline.model import BoolArray, FloatArray, LabelArray
 
 FOLDER = "terrain"
 """The folder of the run directory with the terrain of all tiles."""
@@ -87,17 +87,32 @@ def surfaces_of(triangles: LabelArray) -> list[LabelArray]:
     while waiting:
         part = waiting.pop()
         surface, fan = _surfaces_and_fans(part)
-        for number in np.unique(surface):
+        for number in range(int(surface.max(initial=-1)) + 1):
             own = surface == number
-            fans, sizes = np.unique(np.column_stack((part[own].ravel(), fan[own].ravel())), axis=0, return_counts=True)
-            again = np.flatnonzero(fans[1:, 0] == fans[:-1, 0])
-            if len(again):
-                smaller = again[0] + (sizes[again[0]] > sizes[again[0] + 1])
-                cut = (fan[own] == fans[smaller, 1]).any(axis=1)
+            cut = _smaller_fans(part[own], fan[own])
+            if cut.any():
                 waiting += [part[own][cut], part[own][~cut]]
             else:
                 found.append(part[own])
     return sorted(found, key=lambda surface: surface[0].tolist())
+
+
+def _smaller_fans(triangles: LabelArray, fan: LabelArray) -> BoolArray:
+    """The triangles (t,) of a surface in all fans but the largest around vertices where it meets itself.
+
+    If these were all its triangles, those of one fan alone.
+    """
+    fans, corner, sizes = np.unique(fan.ravel(), return_index=True, return_counts=True)
+    vertex = triangles.ravel()[corner]
+    order = np.lexsort((-fans, -sizes, vertex))
+    again = order[1:][vertex[order[1:]] == vertex[order[:-1]]]
+    smaller = np.zeros(int(fans.max(initial=-1)) + 1, np.bool_)
+    smaller[fans[again]] = True
+    cut: BoolArray = smaller[fan].any(axis=1)
+    if len(again) and cut.all():
+        smaller[fans[again[1:]]] = False
+        cut = smaller[fan].any(axis=1)
+    return cut
 
 
 def _surfaces_and_fans(triangles: LabelArray) -> tuple[LabelArray, LabelArray]:

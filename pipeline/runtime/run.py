@@ -210,7 +210,7 @@ def run_variants(
         check_scratch(request.out, resources.scratch, resources.scheduler)
     for variant in variants:
         storage_at(variant.out)  # refuses a URL of no storage before anything is read
-    if resources.workers and executor is None:
+    if resources.workers and resources.scheduler is None and executor is None:
         start_early()
     progress = Progress(on_event)
     progress.tell("run", "plan", f"run into {request.out}")

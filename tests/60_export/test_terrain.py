@@ -8,7 +8,9 @@ import small_buildings as small
 from cityjson_rules import faults
 from surface_rules import surface_faults
 
+from pipeline.export import terrain
 from pipeline.export.terrain import in_crs, read_terrain, surfaces_of, terrain_lines, terrain_obj
+from pipeline.model import LabelArray
 
 NAMES = ("compound", "feet and metres", "US feet", "unknown")
 ORIGIN = (84_750.0, 447_500.0, 0.0)
@@ -100,3 +102,30 @@ def test_surfaces_touch_themselves_nowhere(triangles: list[list[int]], sizes: li
 
 def test_there_is_no_surface_without_triangles() -> None:
     assert surfaces_of(np.empty((0, 3), np.int32)) == []
+
+
+def test_many_vertices_where_a_surface_meets_itself_are_cut_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plain with 64 groups of three square holes, of which two touch the third at a corner."""
+    side = 50
+    corner = np.arange(side * side).reshape(side, side)[:-1, :-1]
+    triangles = np.stack(
+        (corner, corner + 1, corner + side + 1, corner, corner + side + 1, corner + side), axis=-1
+    ).reshape(side - 1, side - 1, 2, 3)
+    is_hole = np.zeros((side - 1, side - 1), np.bool_)
+    for row in range(2, 48, 6):
+        for column in range(2, 48, 6):
+            is_hole[[row, row + 1, row], [column, column + 1, column + 2]] = True
+    given = triangles[~is_hole].reshape(-1, 3).astype(np.int32)
+    passes = []
+    plain = terrain._surfaces_and_fans
+
+    def counted(part: LabelArray) -> tuple[LabelArray, LabelArray]:
+        passes.append(len(part))
+        return plain(part)
+
+    monkeypatch.setattr(terrain, "_surfaces_and_fans", counted)
+    found = surfaces_of(given)
+    assert [fault for one in found for fault in surface_faults(one.tolist())] == []
+    assert sorted(np.concatenate(found).tolist()) == sorted(given.tolist())
+    assert surface_faults(given.tolist())
+    assert len(passes) < 10

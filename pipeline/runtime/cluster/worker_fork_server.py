@@ -25,13 +25,17 @@ _SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 _END_S = 2.0
 _changing = threading.Lock()
 _users = 0
+_was_used = False
 _environment: Mapping[str, str] | None = None
 
 
 def start_early() -> None:
-    """Start a fork server if there is none: it imports while this process still plans."""
+    """Start a fork server if there is none: it imports while this process still plans.
+
+    What stands in the way is said when the server is needed.
+    """
     if can_fork():
-        with _changing:
+        with _changing, contextlib.suppress(OSError):
             run_in_starter_thread(_start)
 
 
@@ -42,7 +46,7 @@ def forked_workers() -> Iterator[Mapping[str, Any]]:
     For processes that have imported Dask. There is one server per process. It stays for the next cluster, unless the
     environment changes in between. If this system cannot fork, there are no settings and workers are spawned.
     """
-    global _users  # noqa: PLW0603 - one server per process
+    global _users, _was_used  # noqa: PLW0603 - one server per process
     if not can_fork():
         yield {}
         return
@@ -51,6 +55,7 @@ def forked_workers() -> Iterator[Mapping[str, Any]]:
     with _changing:
         run_in_starter_thread(_start)
         _users += 1
+        _was_used = True
     try:
         yield _SETTINGS
     finally:
@@ -83,8 +88,9 @@ def _start() -> None:
 def _stop() -> None:
     """End the server, if there is one; by itself if all workers are gone, which counts their processor time.
 
-    Python has no public function for it.
+    One that never had workers still imports, and is not waited for. Python has no public function for it.
     """
+    global _was_used  # noqa: PLW0603 - as above
     server: Any = forkserver._forkserver  # noqa: SLF001
     pid = server._forkserver_pid  # noqa: SLF001
     if pid is None:
@@ -93,8 +99,9 @@ def _stop() -> None:
     server._forkserver_alive_fd = server._forkserver_address = server._forkserver_pid = None  # noqa: SLF001
     pidfd = os.pidfd_open(pid)
     try:
-        if not select.select([pidfd], [], [], _END_S)[0]:
+        if not select.select([pidfd], [], [], _END_S if _was_used else 0.0)[0]:
             os.kill(pid, signal.SIGKILL)
+        _was_used = False
     finally:
         os.close(pidfd)
     os.waitpid(pid, 0)
