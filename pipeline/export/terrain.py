@@ -108,10 +108,10 @@ def _smaller_fans(triangles: LabelArray, fan: LabelArray) -> BoolArray:
     again = order[1:][vertex[order[1:]] == vertex[order[:-1]]]
     smaller = np.zeros(int(fans.max(initial=-1)) + 1, np.bool_)
     smaller[fans[again]] = True
-    cut: BoolArray = smaller[fan].any(axis=1)
+    cut: BoolArray = np.logical_or.reduce(smaller[fan], axis=1)
     if len(again) and cut.all():
         smaller[fans[again[1:]]] = False
-        cut = smaller[fan].any(axis=1)
+        cut = np.logical_or.reduce(smaller[fan], axis=1)
     return cut
 
 
