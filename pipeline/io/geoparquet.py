@@ -57,12 +57,12 @@ def geometry_column(path: Path, schema: pa.Schema, column: str | None = None) ->
             str(path), f"geometry column {name!r} is not there", f"Name one of {', '.join(columns) or '(none)'}"
         )
     idle = set(columns) | _covering(columns)
-    crs = columns[name].get("crs", DEFAULT_CRS)
+    crs, types = columns[name].get("crs", DEFAULT_CRS), columns[name].get("geometry_types")
     return GeometryColumn(
         name=name,
         crs=crs if crs is None or isinstance(crs, str) else json.dumps(crs),
         encoding=str(columns[name].get("encoding")),
-        types=tuple(map(str, columns[name].get("geometry_types") or ())),
+        types=tuple(map(str, types)) if isinstance(types, list) else (),
         wanted=[field for field in schema.names if field == name or field not in idle],
     )
 

@@ -102,6 +102,8 @@ def publish(
     ------
     OSError
         The folder cannot be made.
+    MemoryError
+        A format does not fit into memory.
     """
     from pipeline.errors import RunCancelledError
 
@@ -115,7 +117,7 @@ def publish(
         on_progress(done, len(formats))
         try:
             _WRITERS[form](run_dir, out_dir, {"name": name, "geoid_height_m": geoid_height_m}, heard)
-        except RunCancelledError:
+        except (RunCancelledError, MemoryError):
             raise
         except Exception as error:  # noqa: BLE001 - the caller reports it
             problems[form] = error

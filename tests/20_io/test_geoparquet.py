@@ -16,6 +16,7 @@ from shapely import MultiPolygon, Polygon, box
 from pipeline.errors import UnreadableInputError
 from pipeline.io import SpatialReference, read_footprints
 from pipeline.io.crs import resolve_reference
+from pipeline.io.geoparquet import geometry_column
 
 RING = Polygon(box(85_040, 447_000, 85_050, 447_010).exterior, [box(85_044, 447_004, 85_046, 447_006).exterior])
 HOUSES = [box(85_000, 447_000, 85_010, 447_008), RING]
@@ -38,6 +39,14 @@ def by_hand(path, columns, geometry="geometry", **about):
 
 def wkb(geometries=HOUSES):
     return pa.array([None if g is None else shapely.to_wkb(g) for g in geometries], pa.binary())
+
+
+@pytest.mark.parametrize("types", [5, True, "Polygon", None, {"a": 1}])
+def test_types_that_are_no_list_are_taken_for_unknown(tmp_path, types):
+    path = by_hand(tmp_path / "a.parquet", {"geometry": wkb()}, encoding="WKB", crs="EPSG:28992", geometry_types=types)
+    assert len(read_footprints(path, reference()).polygons) == len(HOUSES)
+    column = geometry_column(path, pq.read_schema(path))
+    assert column.types == ()
 
 
 @pytest.mark.parametrize("encoding", ["WKB", "geoarrow"])

@@ -233,6 +233,17 @@ def test_an_unexpected_fault_leaves_out_that_format_whole(
         assert collection["id"] == "some run"
 
 
+def test_a_format_without_memory_ends_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs.write_run(tmp_path / "run")
+
+    def broken(*_: Any) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(published, "_WRITERS", {"pmtiles": broken})
+    with pytest.raises(MemoryError):
+        published.publish(tmp_path / "run", tmp_path / "out", ("pmtiles",), name="a")
+
+
 def test_a_cancellation_within_a_format_ends_the_work(tmp_path: Path) -> None:
     runs.write_run(tmp_path / "run")
     calls = iter([None, RunCancelledError("the job was cancelled")])
