@@ -20,7 +20,7 @@ from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.join import join
-from pipeline.runtime.stages.sites import RejectedSite
+from pipeline.runtime.stages.sites import RejectedSite, found_sites
 from pipeline.runtime.stages.split import split
 from pipeline.settings import RunSettings
 
@@ -57,7 +57,7 @@ def found_scene(
         splits = split(context, settings, ingested, ground, given)
         roof = settings.building.roof
         joined = join(context, settings.scene, roof, splits, given)
-        found = joined.found(scratch)
+        found = found_sites(joined.each(scratch))
         return FoundScene(
             candidates=tuple(gather(scratch, plan.grid, site, plan.gps_kind, roof)[0] for site in found.candidates),
             rejected=found.rejected,

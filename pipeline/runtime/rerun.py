@@ -223,7 +223,7 @@ class _Found:
 
     splits: Splits
     judged: FoundSites
-    """The candidates before the overrides."""
+    """The sites that overrides concern, before them."""
     outcomes: tuple[EntryOutcome, ...]
     changed: frozenset[str]
     """Buildings to model again."""
@@ -266,14 +266,16 @@ class _Search:
         ground = find_ground(context, settings, self.ingested, footprints=self.footprints is not None, only=tiles)
         splits = split(context, settings, self.ingested, ground, self.footprints, tiles)
         joined = join(context, settings.scene, settings.building.roof, splits, self.footprints)
-        judged = joined.found(context.scratch)
-        sites, outcomes = apply_overrides(context, settings, judged, self.overrides, self.ingested, ground)
-        now = {o.building_id: o.effective.fingerprint for o in outcomes if o.building_id and o.effective is not None}
         before = self.earlier.fingerprints
+        applied = apply_overrides(
+            context, settings, joined, self.overrides, self.ingested, ground, {*before, *self.only}
+        )
+        outcomes, sites = applied.outcomes, applied.sites
+        now = {o.building_id: o.effective.fingerprint for o in outcomes if o.building_id and o.effective is not None}
         changed = frozenset({name for name in {*now, *before} if now.get(name) != before.get(name)} | set(self.only))
         return _Found(
             splits=splits,
-            judged=judged,
+            judged=applied.before,
             outcomes=outcomes,
             changed=changed,
             again=FoundSites(

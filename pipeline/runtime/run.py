@@ -304,16 +304,14 @@ def _override(
 ) -> _Candidates:
     """The candidates after the overrides; the outcome of each entry goes into the run directories."""
     context.check(listed.place.folder for listed in (*found.joined.groups, *found.joined.rejected))
-    sites, entries = apply_overrides(
-        context, settings, found.joined.found(context.scratch), overrides, found.ingested, found.ground
-    )
-    for entry in entries:
+    applied = apply_overrides(context, settings, found.joined, overrides, found.ingested, found.ground)
+    for entry in applied.outcomes:
         if entry.warning:
             context.progress.warn("join", entry.warning)
     for one in runs:
-        put_json(one.run_dir, OVERRIDES, [entry.as_dict() for entry in entries])
-    stored = store_sites(context, OVERRIDDEN, sites)
-    joined = joined_of(stored, found.joined.small_fragments, found.joined.keys)
+        put_json(one.run_dir, OVERRIDES, [entry.as_dict() for entry in applied.outcomes])
+    changed = joined_of(store_sites(context, OVERRIDDEN, applied.sites), 0, {})
+    joined = found.joined.in_place_of(applied.owners, changed)
     return dataclasses.replace(found, joined=joined)
 
 

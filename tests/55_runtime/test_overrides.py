@@ -18,6 +18,7 @@ from run_tables import rows_by_id, write_footprints
 
 import pipeline.reconstruct
 import pipeline.runtime.rerun
+import pipeline.runtime.run
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.io import SpatialReference
 from pipeline.io.storage import sha256_of
@@ -115,6 +116,24 @@ def test_a_rejected_building_is_listed_among_the_rejected_with_the_user_s_note(p
     assert outline(after[name]).buffer(0.5).contains(outline(before[name]).centroid)
     assert not list(Path(summary.run_dir).glob(f"meshes/*/{name}.obj"))
     assert summary.rejected["overridden"] == 1
+
+
+def test_the_driver_keeps_only_the_tile_of_an_override_in_memory(
+    plain: Any, overridden: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = rows_by_id(plain.run_dir)
+    name = max(before)
+    apply, seen = pipeline.runtime.run.apply_overrides, []
+    monkeypatch.setattr(pipeline.runtime.run, "apply_overrides", lambda *a: seen.append(apply(*a)) or seen[0])
+    summary = overridden(f'[[building]]\nbuilding_id = "{name}"\nmethod = "kmeans"')
+    (applied,) = seen
+    assert [site.building_id for site in applied.before.candidates] == [name]
+    owner = before[name]["tile"]
+    assert [tile.key for tile in applied.owners] == [owner]
+    beside = {other for other, row in before.items() if row["tile"] == owner}
+    assert {site.building_id for site in applied.sites.candidates} == beside < set(before)
+    after = rows_by_id(summary.run_dir)
+    assert others(after, name) == others(before, name)
 
 
 def test_an_accepted_object_is_modelled_under_its_own_id(plain: Any, overridden: Any) -> None:

@@ -6,9 +6,8 @@ Candidates are first judged without overrides, so one override changes its own b
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,15 +27,16 @@ from pipeline.runtime.stages.join import join_footprints
 from pipeline.runtime.stages.sites import (
     CandidateSite,
     FoundSites,
+    Joined,
     PointRange,
     RejectedSite,
     folders_with_points,
-    largest_first,
+    found_sites,
 )
 from pipeline.runtime.stages.split import SplitWindows, split_windows
 from pipeline.settings import RunSettings
 from pipeline.terrain.candidates import Verdict
-from pipeline.tiling import MM, TileGrid, Window
+from pipeline.tiling import MM, Tile, TileGrid, Window
 
 INSIDE_M = 3.0
 """A place is inside a building that has a point this near in plan. Not a setting: the spacing of sparse clouds."""
@@ -83,39 +83,77 @@ class EntryOutcome:
         }
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Overridden:
+    """What overrides change; all other sites of the run stay where they are stored."""
+
+    before: FoundSites
+    """The sites that the overrides name, or that lie near a place of one, without overrides."""
+    owners: frozenset[Tile]
+    """The tiles that publish a site which an override changes."""
+    sites: FoundSites
+    """All sites of these tiles, after the overrides."""
+    outcomes: tuple[EntryOutcome, ...]
+    """The outcome of each entry."""
+
+
 def apply_overrides(
     context: RunContext,
     settings: RunSettings,
-    found: FoundSites,
+    joined: Joined,
     overrides: Sequence[Override],
     ingested: Sequence[Ingested],
     ground: Ground,
-) -> tuple[FoundSites, tuple[EntryOutcome, ...]]:
-    """The candidates after the overrides, and the outcome of each entry; its time counts as join and redraw."""
+    also: Collection[str] = (),
+) -> Overridden:
+    """Apply overrides; those sites count as changed that `also` names. The time counts as join and redraw.
+
+    Stored sites are looked through one group after the other, and only those that an override concerns stay in memory.
+    """
     started = time.perf_counter()
-    context.check(_read(overrides, found, context.plan.grid))
-    outcomes = outcomes_of(overrides, found, context.scratch, context.plan.grid)
+    scratch, grid = context.scratch, context.plan.grid
+    concerns = _concerned(overrides, also, grid)
+    before = found_sites(filter(concerns, joined.each(scratch)))
+    every: Iterable[CandidateSite | RejectedSite] = (*before.candidates, *before.rejected)
+    context.check(folders_with_points(part for site in every for part in site.ranges))
+    outcomes = outcomes_of(overrides, before, lambda: joined.each(scratch), scratch, grid)
     redrawn: dict[str, tuple[PointRange, ...]] = {}
     for number, layer in enumerate(_layers_of(outcomes)):
         redrawn |= _redrawn(context, settings, layer, ingested, ground, f"{REDRAWN}{number}")
-    changed = _overridden(found, outcomes, redrawn, context.scratch)
+    changed = {*also, *(o.building_id for o in outcomes if o.effective is not None)}
+    owners = frozenset(site.owner for site in every if _id_of(site) in changed)
+    sites = _overridden(found_sites(joined.each(scratch, owners)), outcomes, redrawn, scratch)
     timings = context.progress.timings
     timings["join"] = timings.get("join", 0.0) + time.perf_counter() - started - timings.get("redraw", 0.0)
-    return changed, outcomes
+    return Overridden(before=before, owners=owners, sites=sites, outcomes=outcomes)
 
 
-def _read(overrides: Sequence[Override], found: FoundSites, grid: TileGrid) -> set[str]:
-    """The folders of scratch with the points of all sites that the overrides name, or that lie near a place of one."""
-    names = {name for one in overrides for name in (one.building_id, one.source_id) if name is not None}
+def _id_of(site: CandidateSite | RejectedSite) -> str:
+    return site.building_id if isinstance(site, CandidateSite) else site.object_id
+
+
+def _concerned(
+    overrides: Sequence[Override], also: Collection[str], grid: TileGrid
+) -> Callable[[CandidateSite | RejectedSite], bool]:
+    """Whether overrides or other names name a site, or whether it may lie near a place of an override."""
+    names = {*also, *(name for one in overrides for name in (one.building_id, one.source_id) if name is not None)}
+    places = [one.point_m for one in overrides if one.point_m is not None]
+    points = shapely.MultiPoint(places)
+    shapely.prepare(points)
     reach = round(NEAREST_M * MM)
-    places = [tuple(round(value * MM) for value in one.point_m) for one in overrides if one.point_m is not None]
-    squares = [Window(x0_mm=x, y0_mm=y, x1_mm=x + 1, y1_mm=y + 1).grown(reach) for x, y in places]
+    corners = [(round(x * MM), round(y * MM)) for x, y in places]
+    squares = [Window(x0_mm=x, y0_mm=y, x1_mm=x + 1, y1_mm=y + 1).grown(reach) for x, y in corners]
     near = {tile for square in squares for tile in grid.tiles_over(square)}
-    named = [site.ranges for site in found.candidates if not names.isdisjoint((site.building_id, site.source_id))]
-    named += [site.ranges for site in found.rejected if site.object_id in names]
-    every = itertools.chain((site.ranges for site in found.candidates), (site.ranges for site in found.rejected))
-    named += [ranges for ranges in every if any(part.tile in near for part in ranges)]
-    return folders_with_points(part for ranges in named for part in ranges)
+
+    def concerns(site: CandidateSite | RejectedSite) -> bool:
+        if _id_of(site) in names or any(part.tile in near for part in site.ranges):
+            return True
+        if isinstance(site, RejectedSite):
+            return False
+        is_near = site.footprint is not None and len(places) > 0 and points.dwithin(site.footprint, NEAREST_M)
+        return is_near or site.source_id in names
+
+    return concerns
 
 
 def _redrawn(
@@ -151,9 +189,16 @@ def _redrawn(
 
 
 def outcomes_of(
-    overrides: Sequence[Override], sites: FoundSites, scratch: Scratch, grid: TileGrid
+    overrides: Sequence[Override],
+    sites: FoundSites,
+    every: Callable[[], Iterable[CandidateSite | RejectedSite]],
+    scratch: Scratch,
+    grid: TileGrid,
 ) -> tuple[EntryOutcome, ...]:
-    """Find the building of each entry, and which part of the entry takes effect."""
+    """Find the building of each entry, and which part of the entry takes effect.
+
+    `sites` are those that the overrides concern, `every` gives all of the run, for the name nearest to an unknown one.
+    """
     candidates: Sites = {site.building_id: site for site in sites.candidates}
     rejected: Sites = {site.object_id: site for site in sites.rejected}
     by_source = {site.source_id: site.building_id for site in sites.candidates if site.source_id is not None}
@@ -163,14 +208,16 @@ def outcomes_of(
         fault = ""
         if override.source_id is not None:
             name = by_source.get(override.source_id)
-            fault = "" if name else _unknown(override.source_id, by_source, "source_id of this run")
+            if name is None:
+                own = (site.source_id for site in every() if isinstance(site, CandidateSite))
+                fault = _unknown(override.source_id, filter(None, own), "source_id of this run")
         elif override.point_m is not None:
             among = (rejected, "rejected object") if override.action == "accept" else (candidates, "building")
             name, fault = _at(override.point_m, *among, scratch, grid)
         else:
             name = override.building_id
             if name not in candidates and name not in rejected:
-                fault = _unknown(str(name), [*candidates, *rejected], "building or rejected object of this run")
+                fault = _unknown(str(name), map(_id_of, every()), "building or rejected object of this run")
                 name = None
         if name is not None and name in entry_of:
             fault = f"{name} has entry {entry_of[name]} already"
@@ -198,8 +245,8 @@ def _judged(override: Override, name: str, candidates: Sites, rejected: Sites) -
 
 
 def _unknown(name: str, names: Iterable[str], what: str) -> str:
-    """The fault of an unknown name, with the known name that begins most like it."""
-    nearest = max(sorted(names), key=lambda other: _shared_start(name, other), default=None)
+    """The fault of an unknown name, with the known name that begins most like it: of several, the first."""
+    nearest = min(names, key=lambda other: (-_shared_start(name, other), other), default=None)
     return f"it is no {what}" + ("" if nearest is None else f"; the nearest is {nearest}")
 
 
@@ -295,10 +342,7 @@ def _overridden(
             points = sum(part.stop - part.start for part in ranges)
             site = dataclasses.replace(site, footprint=effective.footprint, ranges=ranges, points=points)
         candidates[name] = dataclasses.replace(site, override=effective)
-    return FoundSites(
-        candidates=largest_first(candidates.values()),
-        rejected=tuple(sorted(rejected.values(), key=lambda r: r.object_id)),
-    )
+    return found_sites((*candidates.values(), *rejected.values()))
 
 
 def _accepted(site: RejectedSite) -> CandidateSite:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Generic, TypeVar
 
 from shapely import MultiPolygon, Polygon
@@ -190,14 +190,32 @@ class Joined:
         """Digests of what lies in and around some tiles."""
         return [self.keys.get(tile, "") for tile in tiles]
 
-    def found(self, scratch: Scratch) -> FoundSites:
-        """All of them in memory, for what looks at single buildings of a run."""
-        return FoundSites(
-            candidates=largest_first(site for group in self.groups for site in group.sites(scratch)),
-            rejected=tuple(
-                sorted((site for one in self.rejected for site in one.sites(scratch)), key=lambda r: r.object_id)
-            ),
+    def each(self, scratch: Scratch, owners: Collection[Tile] | None = None) -> Iterator[CandidateSite | RejectedSite]:
+        """All candidates, then all rejected objects, or those of some owners: one stored group after the other."""
+        for stored in (self.groups, self.rejected):
+            for listed in stored:
+                if owners is None or listed.figures.owner in owners:
+                    yield from listed.sites(scratch)
+
+    def in_place_of(self, owners: Collection[Tile], other: Joined) -> Joined:
+        """These sites with those of some owners replaced by other ones."""
+        return dataclasses.replace(
+            self,
+            groups=(*(one for one in self.groups if one.figures.owner not in owners), *other.groups),
+            rejected=(*(one for one in self.rejected if one.figures.owner not in owners), *other.rejected),
         )
+
+
+def found_sites(sites: Iterable[CandidateSite | RejectedSite]) -> FoundSites:
+    """Sites in memory, in their order."""
+    candidates: list[CandidateSite] = []
+    rejected: list[RejectedSite] = []
+    for site in sites:
+        if isinstance(site, CandidateSite):
+            candidates.append(site)
+        else:
+            rejected.append(site)
+    return FoundSites(candidates=largest_first(candidates), rejected=tuple(sorted(rejected, key=lambda r: r.object_id)))
 
 
 def tiles_of(sites: Iterable[CandidateSite], grid: TileGrid) -> set[Tile]:
