@@ -46,89 +46,97 @@ _AGREEING = 0.75
 
 
 @kernel(inline="always")
-def _find_nearest(
-    points: FloatArray, members: LabelArray, place: int, squares: FloatArray, nearest: LabelArray
-) -> None:
-    """The nearest ones in plan to the point `place` among some points: squared distances and numbers, nearest first.
+def _find_nearest(points: FloatArray, first: int, x: float, y: float, squares: FloatArray, nearest: LabelArray) -> None:
+    """The nearest ones in plan to a place among some points: squared distances and numbers, nearest first.
 
     They go into `squares` and `nearest`, both (k,), of equally near ones the first; a distance is infinite where there
-    are fewer. The points ascend by x and `members` (m,) are ascending numbers of them, so the search goes west and east
-    until all others are too far.
+    are fewer. The points (m, 3) ascend by x, and from `first` on none lies west of the place: the search goes east and
+    west from there until all others are too far.
     """
     squares[:] = np.inf
-    x, y = points[place, 0], points[place, 1]
-    east = np.searchsorted(members, place)
-    west = east - 1
-    while True:
-        to_west = x - points[members[west], 0] if west >= 0 else np.inf
-        to_east = points[members[east], 0] - x if east < len(members) else np.inf
-        dx = min(to_west, to_east)
-        if dx == np.inf or dx * dx > squares[_NEAREST - 1]:
-            return
-        if to_west < to_east:
-            j = members[west]
-            west -= 1
-        else:
-            j = members[east]
-            east += 1
-        dy = points[j, 1] - y
-        square = dx * dx + dy * dy
-        k = _NEAREST - 1
-        if square > squares[k] or (square == squares[k] and j > nearest[k]):
-            continue
-        while k > 0 and (squares[k - 1] > square or (squares[k - 1] == square and nearest[k - 1] > j)):
-            squares[k], nearest[k] = squares[k - 1], nearest[k - 1]
-            k -= 1
-        squares[k], nearest[k] = square, j
+    for step, start, end in ((1, first, len(points)), (-1, first - 1, -1)):
+        for j in range(start, end, step):
+            dx, dy = points[j, 0] - x, points[j, 1] - y
+            k = _NEAREST - 1
+            if dx * dx > squares[k]:
+                break
+            square = dx * dx + dy * dy
+            if square > squares[k] or (square == squares[k] and j > nearest[k]):
+                continue
+            while k > 0 and (squares[k - 1] > square or (squares[k - 1] == square and nearest[k - 1] > j)):
+                squares[k], nearest[k] = squares[k - 1], nearest[k - 1]
+                k -= 1
+            squares[k], nearest[k] = square, j
 
 
 @kernel
-def _comparisons(points: FloatArray, strip: LabelArray, places: IntArray, strips: int) -> FloatArray:
+def _local_plane(
+    points: FloatArray, first: int, x: float, y: float, squares: FloatArray, nearest: LabelArray
+) -> tuple[float, float, float, float]:
+    """Elevation, slopes a and b, and variance of the plane of some points (m, 3) at a place.
+
+    The variance is in those of a point, infinite where no plane explains the nearest ones; other arguments are those of
+    `_find_nearest`.
+    """
+    _find_nearest(points, first, x, y, squares, nearest)
+    if squares[_NEAREST - 1] == np.inf:
+        return 0.0, 0.0, 0.0, np.inf
+    m = moments_of(points, nearest)
+    a, b = solve_plane_moments(m.xx, m.xy, m.yy, m.xz, m.yz)
+    error = 0.0
+    for j in nearest:
+        error += (points[j, 2] - m.z - a * (points[j, 0] - m.x) - b * (points[j, 1] - m.y)) ** 2
+    det = m.xx * m.yy - m.xy * m.xy
+    if error > _NEAREST * _MAX_ROUGHNESS_M**2 or det <= 1e-2 * m.xx * m.yy:
+        return 0.0, 0.0, 0.0, np.inf
+    dx, dy = x - m.x, y - m.y
+    variance = 1.0 / _NEAREST + (m.yy * dx * dx - 2.0 * m.xy * dx * dy + m.xx * dy * dy) / det
+    return m.z + a * dx + b * dy, a, b, variance
+
+
+@kernel
+def _comparisons(points: FloatArray, strip: LabelArray, step: int, strips: int) -> FloatArray:
     """Local planes of two strips at the same place, (k, 6): the strips, difference, slopes a and b, variance.
 
-    `strip` (n,) is the number of the strip of each of the points (n, 3), which ascend by x, -1 for others; `places` are
-    numbers of points.
+    `strip` (n,) is the number of the strip of each of the points (n, 3), which ascend by x, -1 for others. The places
+    are those of every `step`-th point of a strip.
     The difference of elevation in metres is that of the first strip over the second; its variance is in those of a
     point.
     """
-    rows = np.empty((len(places) * max(strips - 1, 0), 6))
-    count = 0
     start, members = counting_sort(strip, strips)
+    rows = np.empty((len(members) // step + 1, strips - 1, 6)).reshape(-1, 6)
+    count = 0
+    by_strip = points[members]
     squares = np.empty(_NEAREST)
     nearest = np.zeros(_NEAREST, np.int32)
-    found = np.empty((strips, 4))
-    for i in places:
+    first = start[:strips].copy()
+    wait = step // 2
+    for i in range(len(points)):
         own = strip[i]
         if own < 0:
             continue
-        x, y = points[i, 0], points[i, 1]
-        for s in range(strips):
-            found[s, 3] = np.inf
-            _find_nearest(points, members[start[s] : start[s + 1]], i, squares, nearest)
-            if squares[_NEAREST - 1] == np.inf:
-                continue
-            m = moments_of(points, nearest)
-            a, b = solve_plane_moments(m.xx, m.xy, m.yy, m.xz, m.yz)
-            error = 0.0
-            for j in nearest:
-                error += (points[j, 2] - m.z - a * (points[j, 0] - m.x) - b * (points[j, 1] - m.y)) ** 2
-            det = m.xx * m.yy - m.xy * m.xy
-            if error > _NEAREST * _MAX_ROUGHNESS_M**2 or det <= 1e-2 * m.xx * m.yy:
-                continue
-            dx, dy = x - m.x, y - m.y
-            found[s, 0], found[s, 1], found[s, 2] = m.z + a * dx + b * dy, a, b
-            found[s, 3] = 1.0 / _NEAREST + (m.yy * dx * dx - 2.0 * m.xy * dx * dy + m.xx * dy * dy) / det
-        for s in range(strips):
-            if s == own or found[own, 3] > _MAX_LEVERAGE or found[s, 3] > _MAX_LEVERAGE:
-                continue
-            if math.hypot(found[own, 1] - found[s, 1], found[own, 2] - found[s, 2]) > _MAX_TURN:
-                continue
-            rows[count, 0], rows[count, 1] = own, s
-            rows[count, 2] = found[own, 0] - found[s, 0]
-            rows[count, 3] = 0.5 * (found[own, 1] + found[s, 1])
-            rows[count, 4] = 0.5 * (found[own, 2] + found[s, 2])
-            rows[count, 5] = found[own, 3] + found[s, 3]
-            count += 1
+        if wait == 0:
+            wait = step
+            x, y = points[i, 0], points[i, 1]
+            z, a, b, variance = _local_plane(
+                by_strip[start[own] : start[own + 1]], first[own] - start[own], x, y, squares, nearest
+            )
+            for s in range(strips):
+                if s == own or variance > _MAX_LEVERAGE:
+                    continue
+                other_z, other_a, other_b, other_variance = _local_plane(
+                    by_strip[start[s] : start[s + 1]], first[s] - start[s], x, y, squares, nearest
+                )
+                if other_variance > _MAX_LEVERAGE or math.hypot(a - other_a, b - other_b) > _MAX_TURN:
+                    continue
+                rows[count, 0], rows[count, 1] = own, s
+                rows[count, 2] = z - other_z
+                rows[count, 3] = 0.5 * (a + other_a)
+                rows[count, 4] = 0.5 * (b + other_b)
+                rows[count, 5] = variance + other_variance
+                count += 1
+        wait -= 1
+        first[own] += 1
     return rows[:count]
 
 
@@ -187,39 +195,72 @@ def _offsets(rows: FloatArray, strips: int) -> FloatArray:
         scale = max(_NARROWEST_M, scale * _NARROWING)
 
 
+@kernel
+def _numbered(strip: npt.NDArray[np.uint16]) -> tuple[LabelArray, IntArray]:
+    """The strips with the most points, at most `_MAX_STRIPS`: the number of each point's, (n,), and their sizes (k,).
+
+    The largest has the number 0, of equal ones the first by name; points of all others have -1.
+    """
+    number = np.full(len(strip), -1, np.int32)
+    sizes = np.empty(_MAX_STRIPS, np.int64)
+    if len(strip) == 0:
+        return number, sizes[:0]
+    lowest = int(strip.min())
+    counts = np.zeros(int(strip.max()) - lowest + 1, np.int64)
+    for name in strip:
+        counts[name - lowest] += 1
+    numbers = np.full(len(counts), -1, np.int32)
+    found = 0
+    while found < _MAX_STRIPS:
+        largest = np.argmax(counts)
+        if counts[largest] < _NEAREST:
+            break
+        numbers[largest], sizes[found], counts[largest] = found, counts[largest], 0
+        found += 1
+    for i in range(len(strip)):
+        number[i] = numbers[strip[i] - lowest]
+    return number, sizes[:found]
+
+
+def _shifts_m(points: FloatArray, number: LabelArray, sizes: IntArray, min_offset_m: float) -> FloatArray | None:
+    """Offset of each strip from the mean of all their points, (k + 1, 3) float64, metres; None where strips fit.
+
+    The last row is that of the points of other strips: 0. `number` and `sizes` are those of `_numbered`, and the other
+    arguments those of `strip_offsets_m`.
+    """
+    strips, total = len(sizes), int(sizes.sum())
+    if strips < 2:
+        return None
+    few, more = (max(1, -(-total // most)) for most in (_FIRST_PLACES, _PLACES))
+    rows = _comparisons(points, number, few, strips)
+    if len(rows) >= _FEW:
+        differences = np.sort(np.abs(rows[:, 2]))
+        median = 0.5 * (differences[(len(rows) - 1) // 2] + differences[len(rows) // 2])
+        if median < 0.5 * min_offset_m:
+            return None
+    if more < few:
+        rows = _comparisons(points, number, more, strips)
+    if len(rows) < _FEW:
+        return None
+    shifts = _offsets(rows, strips).reshape(-1, 3)
+    between = shifts[rows[:, 0].astype(np.int64)] - shifts[rows[:, 1].astype(np.int64)]
+    explained = between[:, 2] - rows[:, 3] * between[:, 0] - rows[:, 4] * between[:, 1]
+    agrees = np.abs(rows[:, 2] - explained) <= 3.0 * np.sqrt(_NOISE_M**2 * rows[:, 5] + 0.03**2)
+    if agrees.mean() < _AGREEING or math.sqrt(np.mean(explained[agrees] ** 2)) <= min_offset_m:
+        return None
+    weights = sizes / total
+    return np.vstack((shifts - (weights[:, None] * shifts).sum(axis=0), np.zeros(3)))
+
+
 def strip_offsets_m(points: FloatArray, strip: npt.NDArray[np.uint16], min_offset_m: float) -> FloatArray:
     """Offset of the strip of every point from the mean of all points, (n, 3) float64, metres; 0 where strips fit.
 
     `points` (n, 3) in metres, ascending by x, `strip` (n,) their flight lines. The offsets are 0 unless strips disagree
     by more than `min_offset_m`, root mean square of the elevations over the surfaces that both saw.
     """
-    offsets = np.zeros((len(points), 3))
-    names, numbers, counts = np.unique(strip, return_inverse=True, return_counts=True)
-    large = sorted((k for k in range(len(names)) if counts[k] >= _NEAREST), key=lambda k: (-counts[k], k))[:_MAX_STRIPS]
-    if len(large) < 2:
-        return offsets
-    order = np.full(len(names), -1, np.int32)
-    order[large] = np.arange(len(large), dtype=np.int32)
-    number = order[numbers]
-    points = np.ascontiguousarray(points)
-    compared = np.flatnonzero(number >= 0)
-    for most in (_FIRST_PLACES, _PLACES):
-        step = max(1, -(-len(compared) // most))
-        rows = _comparisons(points, number, np.ascontiguousarray(compared[step // 2 :: step]), len(large))
-        if most == _FIRST_PLACES and len(rows) >= _FEW and np.median(np.abs(rows[:, 2])) < 0.5 * min_offset_m:
-            return offsets
-    if len(rows) < _FEW:
-        return offsets
-    shifts = _offsets(rows, len(large)).reshape(-1, 3)
-    between = shifts[rows[:, 0].astype(np.int64)] - shifts[rows[:, 1].astype(np.int64)]
-    explained = between[:, 2] - rows[:, 3] * between[:, 0] - rows[:, 4] * between[:, 1]
-    agrees = np.abs(rows[:, 2] - explained) <= 3.0 * np.sqrt(_NOISE_M**2 * rows[:, 5] + 0.03**2)
-    if agrees.mean() < _AGREEING or math.sqrt(np.mean(explained[agrees] ** 2)) <= min_offset_m:
-        return offsets
-    weights = counts[large] / counts[large].sum()
-    shifts = shifts - (weights[:, None] * shifts).sum(axis=0)
-    offsets[number >= 0] = shifts[number[number >= 0]]
-    return offsets
+    number, sizes = _numbered(strip)
+    shifts = _shifts_m(np.ascontiguousarray(points), number, sizes, min_offset_m)
+    return np.zeros((len(points), 3)) if shifts is None else shifts[number]
 
 
 def aligned_mm(
@@ -231,13 +272,14 @@ def aligned_mm(
     points. Every strip is moved to the mean of all points, so the building as a whole stays where the survey saw it.
     Where strips fit, or nothing shows that they do not, the points come back as they are, with nan metres.
     """
-    if len(strip) == 0 or (strip == strip[0]).all():
+    number, sizes = _numbered(strip)
+    if len(sizes) < 2:
         return xyz_mm, marked, math.nan
-    offsets = strip_offsets_m((xyz_mm - xyz_mm[0]) / 1e3, strip, min_offset_m)
-    if not offsets.any():
+    shifts = _shifts_m((xyz_mm - xyz_mm[0]) / 1e3, number, sizes, min_offset_m)
+    if shifts is None:
         return xyz_mm, marked, math.nan
-    moved = xyz_mm - np.rint(offsets * 1e3).astype(np.int64)
-    kinds = np.unique(offsets, axis=0)
-    largest_m = max(float(np.sqrt(((one - kinds) ** 2).sum(axis=1)).max()) for one in kinds)
+    moved = xyz_mm - np.rint(shifts * 1e3).astype(np.int64)[number]
+    used = shifts if sizes.sum() < len(number) else shifts[:-1]
+    largest_m = math.sqrt(((used[:, None] - used) ** 2).sum(axis=2).max())
     order = np.lexsort(moved.T[::-1])
     return moved[order], marked[order], largest_m

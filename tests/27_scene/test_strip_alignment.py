@@ -153,8 +153,9 @@ def test_the_nearest_points_are_those_that_a_search_through_all_finds(random: Ra
     members = np.array(sorted(random.sample(range(n), random.randrange(n + 1))), np.int32)
     squares, nearest = np.empty(_NEAREST), np.zeros(_NEAREST, np.int32)
     for place in range(n):
-        _find_nearest(points, members, place, squares, nearest)
+        first = int(np.searchsorted(members, place))
+        _find_nearest(points[members], first, points[place, 0], points[place, 1], squares, nearest)
         away = ((points[:, :2] - points[place, :2]) ** 2).sum(axis=1)
         found = sorted(members.tolist(), key=lambda j: (away[j], j))[:_NEAREST]
-        assert nearest[: len(found)].tolist() == found
+        assert members[nearest[: len(found)]].tolist() == found
         assert squares.tolist() == [*away[found].tolist(), *[math.inf] * (_NEAREST - len(found))]
