@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime as dt
 import hashlib
 import math
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +17,7 @@ from pipeline.compiler import kernel
 from pipeline.export.facts import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.kernels.radix_sort import radix_order
-from pipeline.model import BoolArray, Candidate, GivenHeights, GroundSource, Guide, IntArray
+from pipeline.model import BoolArray, Candidate, FloatArray, GivenHeights, GroundSource, Guide, IntArray
 from pipeline.roof.settings import GUIDE_REACH_M, RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.sites import CandidateSite, PointRange
@@ -47,6 +46,8 @@ _LARGEST_M = 2000
 """Longest side of a block by attributes: what is larger is a district, or a slip."""
 _HALF_DIAGONAL_M = 0.71
 """A cell that a footprint touches has its centre this near."""
+_FARTHEST_MM = 2**62
+"""Beyond all coordinates."""
 _HEIGHT_WITHOUT_TERRAIN_MM = 2500
 """Assumed height of the lowest point above ground where no terrain is known."""
 
@@ -74,16 +75,16 @@ def _grown(mask: BoolArray, cells: int) -> BoolArray:
 
 
 @kernel
-def _terrain_by(x_mm: IntArray, y_mm: IntArray, around: Surroundings) -> tuple[IntArray, IntArray, BoolArray, bool]:
-    """The terrain at the points (n,) of a candidate, or all where there are none.
+def _terrain_by(places_mm: IntArray, around: Surroundings) -> tuple[IntArray, IntArray, BoolArray, bool]:
+    """The terrain at the points (n, 2 or 3) of a candidate, or all where there are none.
 
     Samples (m, 3) of the terrain in millimetres, row after row; the lowest elevation at the outline, (1,) or none; the
     cells that hold the points; whether a square without points begins near one of these.
     """
     rows, columns = around.occupied.shape
     own = np.zeros((rows, columns), np.bool_)
-    for i in range(len(x_mm)):
-        own[y_mm[i] // CELL_MM - around.row0, x_mm[i] // CELL_MM - around.column0] = True
+    for i in range(len(places_mm)):
+        own[places_mm[i, 1] // CELL_MM - around.row0, places_mm[i, 0] // CELL_MM - around.column0] = True
     # terrain far from all points may lie in a tile without points, which is never made
     points_near = _grown(around.occupied, _EMPTY_CELLS)
     outline, sampled, edge = (
@@ -101,7 +102,7 @@ def _terrain_by(x_mm: IntArray, y_mm: IntArray, around: Surroundings) -> tuple[I
                 continue
             if outline[r, c] and not own[r, c] and (known == 0 or z < lowest[0]):
                 lowest[0], known = z, 1
-            if sampled[r, c] or len(x_mm) == 0:
+            if sampled[r, c] or len(places_mm) == 0:
                 samples[count, 0] = (c + around.column0) * CELL_MM + CELL_MM // 2
                 samples[count, 1] = (r + around.row0) * CELL_MM + CELL_MM // 2
                 samples[count, 2] = z
@@ -130,8 +131,9 @@ def _ascends(points: npt.NDArray[np.void]) -> bool:
 
 def stored_points(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]:
     """A candidate's points, range after range."""
-    pieces = [stored_bytes(scratch, part).view(POINT) for part in site.ranges]
-    return np.concatenate(pieces) if pieces else np.empty(0, POINT)
+    pieces = [stored_bytes(scratch, part) for part in site.ranges]
+    # as bytes: numpy copies records field by field
+    return np.concatenate(pieces).view(POINT) if pieces else np.empty(0, POINT)
 
 
 def stored_bytes(scratch: Scratch, part: PointRange) -> npt.NDArray[np.uint8]:
@@ -161,6 +163,56 @@ def canonical_order(points: npt.NDArray[np.void]) -> IntArray:
     return order
 
 
+class _Columns(NamedTuple):
+    """What a candidate takes from its points (n,), of which there is at least one."""
+
+    xyz_mm: IntArray
+    """(n, 3)."""
+    low_mm: IntArray
+    """(3,), the least of each coordinate."""
+    high_mm: IntArray
+    """(3,), the greatest."""
+    strip: npt.NDArray[np.uint16]
+    """(n,), flight lines."""
+    is_split: BoolArray
+    """(n,), the first of several returns."""
+    goes_on: int
+    """Points whose pulse went on to a later return."""
+    first_s: float
+    """The earliest GPS time."""
+    last_s: float
+    """The latest."""
+
+
+@kernel
+def _columns_of(points: npt.NDArray[np.void]) -> _Columns:
+    """The columns of points (n,)."""
+    n = len(points)
+    xyz_mm, strip, is_split = np.empty((n, 3), np.int64), np.empty(n, np.uint16), np.empty(n, np.bool_)
+    low_mm, high_mm = np.full(3, _FARTHEST_MM), np.full(3, -_FARTHEST_MM)
+    goes_on, first_s, last_s = 0, np.inf, -np.inf
+    for i in range(n):
+        point = points[i]
+        xyz_mm[i, 0], xyz_mm[i, 1], xyz_mm[i, 2] = point.x, point.y, point.z
+        strip[i] = point.source
+        is_split[i] = point.return_number == 1 and point.return_count > 1
+        goes_on += point.return_number < point.return_count
+        first_s, last_s = min(first_s, point.gps_time), max(last_s, point.gps_time)
+        for k in range(3):
+            low_mm[k], high_mm[k] = min(low_mm[k], xyz_mm[i, k]), max(high_mm[k], xyz_mm[i, k])
+    return _Columns(xyz_mm, low_mm, high_mm, strip, is_split, goes_on, first_s, last_s)
+
+
+@kernel
+def _in_metres(places_mm: IntArray, origin_mm: IntArray) -> FloatArray:
+    """Places (n, 3) about an origin (3,), metres."""
+    local_m = np.empty(places_mm.shape)
+    for i in range(len(places_mm)):
+        for k in range(3):
+            local_m[i, k] = (places_mm[i, k] - origin_mm[k]) / MM
+    return local_m
+
+
 def gather(
     scratch: Scratch,
     grid: TileGrid,
@@ -176,13 +228,10 @@ def gather(
     """
     points = points_of(scratch, site)
     footprint = site.footprint
-    columns_mm = [points[name].astype(np.int64) for name in "xyz"]
-    xyz = np.column_stack(columns_mm)
+    own = _columns_of(points)
+    xyz_mm, is_split, low, high = own.xyz_mm, own.is_split, own.low_mm, own.high_mm
     x0, y0, x1, y1 = (round(value * MM) for value in (footprint.bounds if footprint is not None else (0, 0, 0, 0)))
-    if len(xyz):
-        # by columns: numpy takes many times longer along the first axis of an (n, 3) array
-        low, high = (np.array([extreme(column) for column in columns_mm]) for extreme in (np.min, np.max))
-    else:
+    if len(points) == 0:
         low, high = np.array([x0, y0, 0], np.int64), np.array([x1, y1, 0], np.int64)
     origin_mm = low // MM * MM
     view = Window(x0_mm=int(low[0]), y0_mm=int(low[1]), x1_mm=int(high[0]) + 1, y1_mm=int(high[1]) + 1)
@@ -195,47 +244,46 @@ def gather(
             y1_mm=max(view.y1_mm, y1 + 1),
         )
     around = surroundings_of(scratch, grid, view.grown(_VIEW_M * MM))
-    ground_mm, lowest_mm, own, touches_data_edge = _terrain_by(columns_mm[0], columns_mm[1], around)
-    ground_z, ground_source = _ground_mm(lowest_mm, ground_mm[:, 2], xyz[:, 2], site.given)
+    ground_mm, lowest_mm, cells, touches_data_edge = _terrain_by(xyz_mm, around)
+    ground_z, ground_source = _ground_mm(lowest_mm, ground_mm[:, 2], xyz_mm[:, 2], site.given)
     digest = hashlib.sha256(points.tobytes())
     digest.update(ground_mm.tobytes())
     beside_mm = later_mm = np.empty((0, 3), np.int64)
     is_drawn, is_given = site.outline is not None, footprint is not None
     if roof is not None and roof.needs_facades(is_drawn=is_drawn, is_given=is_given):
-        beside_mm, later_mm = _beside(scratch, grid, xyz, _grown(own, _BESIDE_CELLS), around)
+        beside_mm, later_mm = _beside(scratch, grid, xyz_mm, _grown(cells, _BESIDE_CELLS), around)
         digest.update(beside_mm.tobytes())
         digest.update(later_mm.tobytes())
     if site.outline is not None:
         digest.update(np.rint(shapely.get_coordinates(site.outline) * MM).astype(np.int64).tobytes())
-    is_split = (points["return_number"] == 1) & (points["return_count"] > 1)
     strip_offset_m = math.nan
     if roof is not None:
-        xyz, is_split, strip_offset_m = aligned_mm(xyz, points["source"], is_split, roof.min_strip_offset_m)
+        xyz_mm, is_split, strip_offset_m = aligned_mm(xyz_mm, own.strip, is_split, roof.min_strip_offset_m)
+    points_m = _in_metres(xyz_mm, origin_mm)
     candidate = Candidate(
         building_id=site.building_id,
         origin=(float(origin_mm[0] // MM), float(origin_mm[1] // MM), float(origin_mm[2] // MM)),
-        points=(xyz - origin_mm) / MM,
-        ground=(ground_mm - origin_mm) / MM,
-        split_returns=(xyz[is_split] - origin_mm) / MM,
+        points=points_m,
+        ground=_in_metres(ground_mm, origin_mm),
+        split_returns=points_m[is_split],
         ground_z_m=math.nan if ground_z is None else (ground_z - int(origin_mm[2])) / MM,
         ground_source=ground_source,
         footprint=None if footprint is None else _moved(footprint, origin_mm),
         source_id=site.source_id,
         given=None if given is None else _local(given, footprint, around, int(origin_mm[2])),
         outline=None if site.outline is None else _moved(site.outline, origin_mm),
-        beside=(beside_mm - origin_mm) / MM,
-        beside_later=(later_mm - origin_mm) / MM,
+        beside=_in_metres(beside_mm, origin_mm),
+        beside_later=_in_metres(later_mm, origin_mm),
         touches_data_edge=touches_data_edge,
         strip_offset_m=strip_offset_m,
-        guides=_near(guides, low, high, origin_mm) if len(xyz) else (),
+        guides=_near(guides, low, high, origin_mm) if guides and len(points) else (),
     )
-    first, last = _acquired(points, gps_kind)
-    goes_on = int((points["return_number"] < points["return_count"]).sum())
+    is_dated = gps_kind is GpsTimeKind.ADJUSTED and len(points) > 0
     facts = CandidateFacts(
         input_hash=digest.hexdigest(),
-        acquired_from=first,
-        acquired_to=last,
-        through_share=goes_on / len(points) if len(points) else math.nan,
+        acquired_from=utc_of(own.first_s) if is_dated else None,
+        acquired_to=utc_of(own.last_s) if is_dated else None,
+        through_share=own.goes_on / len(points) if len(points) else math.nan,
     )
     return candidate, facts
 
@@ -264,10 +312,10 @@ def _local(
     rows, columns = around.occupied.shape
     x = (np.arange(columns, dtype=np.int64) + around.column0) * CELL_MM + CELL_MM // 2
     y = (np.arange(rows, dtype=np.int64) + around.row0) * CELL_MM + CELL_MM // 2
-    x, y = (axis.ravel() for axis in np.meshgrid(x, y))
+    centres = np.column_stack([axis.ravel() for axis in np.meshgrid(x, y)])
     touched = shapely.buffer(footprint, _HALF_DIAGONAL_M)
-    inside = shapely.intersects_xy(touched, x / MM, y / MM)
-    ground_mm, lowest_mm, _, _ = _terrain_by(x[inside], y[inside], around)
+    inside = shapely.intersects_xy(touched, centres / MM)
+    ground_mm, lowest_mm, _, _ = _terrain_by(centres[inside], around)
     terrain_mm, _ = _ground_mm(lowest_mm, ground_mm[:, 2], np.empty(0, np.int64), None)
     return dataclasses.replace(
         given,
@@ -331,10 +379,3 @@ def _moved(area: Area, origin_mm: IntArray) -> Area:
     xyz[:, :2] -= origin_mm[:2] // MM
     moved: Area = shapely.transform(area, lambda _: xyz, include_z=bool(area.has_z))
     return moved
-
-
-def _acquired(points: npt.NDArray[np.void], kind: GpsTimeKind) -> tuple[dt.datetime | None, dt.datetime | None]:
-    """First and last time of the points; None unless GPS times can be converted to dates."""
-    if kind is not GpsTimeKind.ADJUSTED or len(points) == 0:
-        return None, None
-    return utc_of(float(points["gps_time"].min())), utc_of(float(points["gps_time"].max()))
