@@ -198,6 +198,7 @@ class OpenScratch(Scratch):
     _held: dict[tuple[str, str], npt.NDArray[Any]] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False
     )
+    _seen: set[str] = dataclasses.field(default_factory=set, init=False, repr=False, compare=False)
 
     def __reduce__(self) -> tuple[type[OpenScratch], tuple[str, str]]:
         """Only the place of the folder."""
@@ -208,7 +209,12 @@ class OpenScratch(Scratch):
         found = self._held.get((name, key))
         if found is None:
             found = self._held[name, key] = super().array(name, key, mapped=mapped)
+            self._seen.add(name)
         return found
+
+    def has(self, name: str) -> bool:
+        """Whether anything is stored under a name; not asked again where an array was read from."""
+        return name in self._seen or super().has(name)
 
     def rows(self, name: str, key: str, start: int, stop: int) -> npt.NDArray[Any]:
         """Some rows of a stored array; raises ValueError if the file ends before them."""

@@ -21,6 +21,7 @@ import enum
 import functools
 import hashlib
 import itertools
+import marshal
 import os
 import pickle
 import struct
@@ -42,9 +43,13 @@ Brief = TypeVar("Brief")
 
 FOLDER = "kept"
 """Folder of scratch for all outcomes."""
-_FORMAT = 8
+_FORMAT = 9
 """Part of every key, to be raised when the class of an outcome moves or gets another content: the pickles of an older
 checkout of the same version are then not read."""
+_MARSHAL = 2
+"""Format of what keys are made from: the last one in which equal values have equal bytes, however they came about."""
+_AS_IT_IS = frozenset({float, int, str, bytes, bool, type(None)})
+"""Types that marshal writes by value."""
 _KEY_DIGITS = 40
 """Hexadecimal digits of a key: 160 bits."""
 _HEAD = struct.Struct("<QQII")
@@ -66,65 +71,42 @@ def key_of(*parts: object) -> str:
     >>> key_of(1, "a") == key_of(1, "a"), key_of(1) == key_of(1.0), key_of(("a", "b")) == key_of("ab")
     (True, False, False)
     """
-    digest = hashlib.sha256(f"{_FORMAT};{fingerprint()}".encode())
-    for part in parts:
-        _add(digest.update, part)
-    return digest.hexdigest()[:_KEY_DIGITS]
+    content = marshal.dumps((_FORMAT, fingerprint(), *map(_plain, parts)), _MARSHAL)
+    return hashlib.sha256(content).hexdigest()[:_KEY_DIGITS]
+
+
+def _plain(value: object) -> object:
+    """A value as numbers, texts, bytes and lists, which marshal writes; all else is a tuple that begins with its kind.
+
+    Raises TypeError as `key_of`.
+    """
+    kind = type(value)
+    if kind in _AS_IT_IS:
+        return value
+    if isinstance(value, np.ndarray):
+        return "array", value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, enum.Enum):
+        return "enum", kind.__name__, value.name
+    if isinstance(value, float):
+        return float(value)
+    if isinstance(value, int | str | bytes | dt.date):
+        return "text", kind.__name__, str(value)
+    if isinstance(value, shapely.Geometry):
+        return "geometry", shapely.to_wkb(value, include_srid=True)
+    if isinstance(value, tuple | Sequence):  # tuple, since a Sequence takes longer to find
+        return list(map(_plain, value))
+    if isinstance(value, Mapping):
+        return "mapping", *((_plain(name), _plain(value[name])) for name in sorted(value))
+    if dataclasses.is_dataclass(value) and kind is not type:
+        names = _names_of(kind)
+        return "fields", kind.__name__, names, *[_plain(getattr(value, name)) for name in names]
+    raise TypeError(f"the content of a {kind.__name__} is not known to key_of")
 
 
 @functools.cache
-def _fields_of(kind: Any) -> tuple[bytes, tuple[tuple[str, bytes], ...]]:
-    """Bytes that precede the values of a dataclass: its name, and each field's. Cached: a city's keys need millions."""
-    names = [field.name for field in dataclasses.fields(kind)]
-    return f"{kind.__name__} {len(names)} ".encode(), tuple((name, _plain(name)) for name in names)
-
-
-def _plain(value: object) -> bytes:
-    text = value if isinstance(value, bytes) else str(value).encode()
-    return f"{type(value).__name__} {len(text)} ".encode() + text
-
-
-def _add(update: Callable[[bytes], None], value: object) -> None:
-    kind = type(value)
-    if kind is float:  # the usual kinds first, and without a look at what else they might be
-        update(b"float " + struct.pack("<d", value))
-    elif kind is int or kind is str:
-        text = str(value).encode()
-        update(b"%b %d %b" % (kind.__name__.encode(), len(text), text))
-    elif isinstance(value, tuple):
-        _add_sequence(update, value)
-    elif value is None or isinstance(value, bool | int | str | bytes | dt.date):
-        update(_plain(value))
-    elif isinstance(value, enum.Enum):
-        _add(update, (type(value).__name__, value.name))
-    elif isinstance(value, float):
-        update(b"float " + struct.pack("<d", value))
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        head, fields = _fields_of(type(value))
-        update(head)
-        for name, name_bytes in fields:
-            update(name_bytes)
-            _add(update, getattr(value, name))
-    elif isinstance(value, Mapping):
-        update(f"mapping {len(value)} ".encode())
-        for name in sorted(value):
-            _add(update, name)
-            _add(update, value[name])
-    elif isinstance(value, shapely.Geometry):
-        _add(update, shapely.to_wkb(value, include_srid=True))
-    elif isinstance(value, np.ndarray):
-        update(f"array {value.dtype.str} {value.shape} ".encode())
-        update(np.ascontiguousarray(value).tobytes())
-    elif isinstance(value, Sequence):
-        _add_sequence(update, value)
-    else:
-        raise TypeError(f"the content of a {kind.__name__} is not known to key_of")
-
-
-def _add_sequence(update: Callable[[bytes], None], values: Sequence[object]) -> None:
-    update(b"sequence %d " % len(values))
-    for value in values:
-        _add(update, value)
+def _names_of(kind: Any) -> tuple[str, ...]:
+    """The names of the fields of a dataclass."""
+    return tuple(field.name for field in dataclasses.fields(kind))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -375,7 +375,6 @@ def _moved(area: Area, origin_mm: IntArray) -> Area:
     """An area in metres, from the CRS into a local frame."""
     if area.is_empty:
         return area
-    xyz = shapely.get_coordinates(area, include_z=bool(area.has_z))
-    xyz[:, :2] -= origin_mm[:2] // MM
-    moved: Area = shapely.transform(area, lambda _: xyz, include_z=bool(area.has_z))
+    shift_m = np.array((*origin_mm[:2] // MM, 0), np.float64)
+    moved: Area = shapely.transform(area, lambda xyz: xyz - shift_m[: xyz.shape[1]], include_z=bool(area.has_z))
     return moved
