@@ -243,7 +243,7 @@ def _checks(building: _Building, segmentation: Segmentation, roof: RoofPoints) -
     n_points, coarsest_m = len(roof.labels), building.settings.roof.templates_spacing_m
     yield Decision.check("planes_found", len(segmentation.planes), 1)
     # one point is enough
-    yield Decision.check("points_on_planes_share", np.count_nonzero(roof.labels >= 0) / n_points, 1 / n_points)
+    yield Decision.check("points_on_planes_share", int(np.count_nonzero(roof.labels >= 0)) / n_points, 1 / n_points)
     yield Decision.check(
         "point_spacing_m", roof.spacing_m, coarsest_m, "templates compete where points are as far apart"
     )

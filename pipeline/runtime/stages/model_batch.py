@@ -78,6 +78,11 @@ class BatchTask:
         """Whether buildings are modelled in child processes of the process that runs the task."""
         return self.isolation is not None
 
+    @functools.cached_property
+    def way_key(self) -> str:
+        """Digest of method and settings."""
+        return key_of(self.method, self.settings)
+
     def way_of(self, site: CandidateSite) -> BatchTask:
         """The task with the method and the settings of one site."""
         own = self.own.get(site.building_id)
@@ -278,7 +283,7 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     reused = False
     try:
         candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, task.settings.roof, task.guides)
-        made_from = key_of(candidate, task.method, _settings_key(task.settings))
+        made_from = key_of(candidate, task.way_key)
         earlier = _modelled_before(task, site.building_id, made_from)
         reused = earlier is not None
         result = earlier or reconstruct_building(candidate, task.method, task.settings)
@@ -292,12 +297,6 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
         result = _quarantined(task, candidate, result, incident)
         made_from = ""
     return _packed(task, site, result, facts, seconds, made_from, reused=reused)
-
-
-@functools.lru_cache(maxsize=8)
-def _settings_key(settings: ReconstructSettings) -> str:
-    """Digest of settings, cached since most buildings of a batch share them."""
-    return key_of(settings)
 
 
 def _modelled_before(task: BatchTask, building_id: str, made_from: str) -> BuildingResult | None:
