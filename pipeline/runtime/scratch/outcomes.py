@@ -75,12 +75,12 @@ def key_of(*parts: object) -> str:
     return hashlib.sha256(content).hexdigest()[:_KEY_DIGITS]
 
 
-def _plain(value: object) -> object:
+def _plain(value: object) -> Any:
     """A value as numbers, texts, bytes and lists, which marshal writes; all else is a tuple that begins with its kind.
 
     Raises TypeError as `key_of`.
     """
-    kind = type(value)
+    kind: Any = type(value)
     if kind in _AS_IT_IS:
         return value
     if isinstance(value, np.ndarray):
@@ -97,7 +97,7 @@ def _plain(value: object) -> object:
         return list(map(_plain, value))
     if isinstance(value, Mapping):
         return "mapping", *((_plain(name), _plain(value[name])) for name in sorted(value))
-    if dataclasses.is_dataclass(value) and kind is not type:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
         names = _names_of(kind)
         return "fields", kind.__name__, names, *[_plain(getattr(value, name)) for name in names]
     raise TypeError(f"the content of a {kind.__name__} is not known to key_of")
