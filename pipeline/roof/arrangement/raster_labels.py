@@ -277,8 +277,7 @@ def _border_cost(framed: LabelArray, here: int, around: IntArray, weight: IntArr
     cost = 0
     for q in range(8):
         other = framed[here + around[q]]
-        if other >= 0 and other != label:
-            cost += weight[q]
+        cost += weight[q] * ((other >= 0) & (other != label))
     return cost
 
 
@@ -290,25 +289,23 @@ def _settle(costs: Costs, framed: _Framed, side: int, diagonal: int, labels: Lab
     choose the same. `labels` (n,) change in place; `side` and `diagonal` are the costs of a border over a side and over
     a corner.
     """
-    at = framed.at
+    at, number = framed.at, framed.number
     around, weight = _places_around(framed.width), _weights_around(side, diagonal)
-    placed = np.full(len(framed.number), -1, np.int32)
-    waits = np.zeros(len(framed.number), np.bool_)
+    placed = np.full(len(number), -1, np.int32)
+    waits = np.zeros(len(at), np.bool_)
     for i in range(len(at)):
         placed[at[i]] = labels[i]
-    for i in range(len(at)):
-        here, own = at[i], labels[i]
-        for q in range(8):
-            label = placed[here + around[q]]
-            waits[here] |= (label != own) & (label >= 0)
+        for q in range(4, 8):
+            j = number[at[i] + around[q]]
+            if j >= 0 and labels[j] != labels[i]:
+                waits[i] = waits[j] = True
     for _ in range(_SETTLING_ROUNDS):
         changed = False
         for i in range(len(at)):
-            here = at[i]
-            if not waits[here]:
+            if not waits[i]:
                 continue
-            waits[here] = False
-            own = placed[here]
+            waits[i] = False
+            here, own = at[i], labels[i]
             best = own
             least = cost_of(costs, i, best) + _border_cost(placed, here, around, weight, own)
             tried = own
@@ -326,7 +323,9 @@ def _settle(costs: Costs, framed: _Framed, side: int, diagonal: int, labels: Lab
                 labels[i] = best
                 changed = True
                 for q in range(8):
-                    waits[here + around[q]] = True
+                    j = number[here + around[q]]
+                    if j >= 0:
+                        waits[j] = True
         if not changed:
             break
 
