@@ -285,7 +285,7 @@ def nearest_neighbours(points: FloatArray, k: int, cell_size_m: float | None = N
 
     Nearest first, of equal distances the lower index first; -1 where there are fewer other points. A point is not its
     own neighbour, another one at the same position is. Distances are in plan for points (n, 2), in space for (n, 3),
-    metres. The cell of the search grid only changes the speed; by default it holds less than one point. Raises ValueError
+    metres. The cell of the search grid only changes the speed; by default it holds under one point. Raises ValueError
     if the shape is wrong, k is negative or the cell size is not positive.
 
     Examples

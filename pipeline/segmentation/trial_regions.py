@@ -136,9 +136,7 @@ class _Trial(NamedTuple):
 
 
 @kernel
-def _joins(
-    surroundings: Surroundings, j: int, a: float, b: float, c: float, reach: float, least: float
-) -> bool:
+def _joins(surroundings: Surroundings, j: int, a: float, b: float, c: float, reach: float, least: float) -> bool:
     """Whether a point is near a plane and of its direction or, where that says nothing, in company there.
 
     `least` is the least cosine between the two directions over the cosine of the plane's slope; 0 asks for company.
@@ -230,10 +228,7 @@ def take_regions(surroundings: Surroundings, labels: LabelArray, first_label: in
     neighbours = surroundings.neighbours
     distance_m, fewest_points = limits.distance_m, limits.fewest_points
     n = len(labels)
-    seen, queue = np.full(n, -1, np.int64), np.empty(n, np.int32)
-    for i in range(n):
-        if labels[i] >= 0:
-            seen[i] = _TAKEN
+    seen, queue = np.where(labels >= 0, _TAKEN, -1), np.empty(n, np.int32)
     trial = _Trial(seen, queue)
     reached = np.zeros(n, np.int32)
     reached_again = np.zeros(n, np.int32)
@@ -255,9 +250,7 @@ def take_regions(surroundings: Surroundings, labels: LabelArray, first_label: in
                 reached[queue[q]] += 1
                 for s in range(neighbours.shape[1]):
                     j = neighbours[queue[q], s]
-                    if j < 0 or seen[j] >= region:
-                        continue
-                    if abs(height_above(surroundings.points, j, a, b, c)) <= beside:
+                    if j >= 0 and seen[j] < region and abs(height_above(surroundings.points, j, a, b, c)) <= beside:
                         seen[j] = region
                         reached[j] += 1
             if cosine_of_slope(a, b) >= limits.min_cosine:
