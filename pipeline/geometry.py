@@ -159,16 +159,21 @@ def _sort_into_grid(
     return counting_sort(cell, columns * rows)
 
 
+_POINTS_PER_CELL = 0.65
+"""Changes the speed only: eight neighbours are then mostly found in the cells of the first two rings."""
+_FIRST_RINGS = 2
+
+
 @kernel
 def _cell_for_few(points: FloatArray) -> float:
-    """Size of cells that hold about two points each, metres."""
+    """Size of cells that hold few points each, metres."""
     n = max(len(points), 1)
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
     for i in range(len(points)):
         low_x, low_y = min(low_x, points[i, 0]), min(low_y, points[i, 1])
         high_x, high_y = max(high_x, points[i, 0]), max(high_y, points[i, 1])
     width, depth = max(high_x - low_x, 0.0), max(high_y - low_y, 0.0)
-    return max(math.sqrt(2.0 * width * depth / n), max(width, depth) / n, 1e-3)
+    return max(math.sqrt(_POINTS_PER_CELL * width * depth / n), max(width, depth) / n, 1e-3)
 
 
 @kernel(inline="always")
@@ -212,7 +217,7 @@ def _nearest_neighbours(
 ) -> tuple[LabelArray, FloatArray]:
     """Kernel: neighbours (n, k) as in `nearest_neighbours`, and squared distances (n, k), infinite without a neighbour.
 
-    A cell size of 0 means about two points per cell; if neighbours need not be `named` they are all -1.
+    A cell size of 0 means few points per cell; if neighbours need not be `named` they are all -1.
     """
     n, dimensions = points.shape
     neighbours = np.full((n, k), -1, np.int32)
@@ -238,14 +243,14 @@ def _nearest_neighbours(
         # first the k least squares alone, without branches: where a square ranks cannot be foretold
         least[:] = np.inf
         count = 0
-        # the cell and those around it at once, then ring by ring: cells side by side hold a run of the sorted points
-        ring = 1
+        # the cell and two rings around it at once, then ring by ring: cells side by side hold a run of sorted points
+        ring = _FIRST_RINGS
         while True:
             for step in range(2 * ring + 1):
                 r = row + ((step + 1) // 2 if step % 2 == 1 else -(step // 2))
                 if r < 0 or r >= rows:
                     continue
-                whole = ring == 1 or step >= 2 * ring - 1
+                whole = ring == _FIRST_RINGS or step >= 2 * ring - 1
                 for side in range(1 if whole else 2):
                     low = max(column - ring, 0) if whole or side == 0 else column + ring
                     high = min(column + ring, columns - 1) if whole or side == 1 else column - ring
@@ -280,7 +285,7 @@ def nearest_neighbours(points: FloatArray, k: int, cell_size_m: float | None = N
 
     Nearest first, of equal distances the lower index first; -1 where there are fewer other points. A point is not its
     own neighbour, another one at the same position is. Distances are in plan for points (n, 2), in space for (n, 3),
-    metres. The cell of the search grid only changes the speed; by default it holds about two points. Raises ValueError
+    metres. The cell of the search grid only changes the speed; by default it holds under one point. Raises ValueError
     if the shape is wrong, k is negative or the cell size is not positive.
 
     Examples

@@ -113,7 +113,8 @@ def has_company(
     """Whether at least a share of the neighbours of point j lies within a vertical reach of a plane."""
     known = 0
     near = 0
-    for other in neighbours[j]:
+    for q in range(neighbours.shape[1]):
+        other = neighbours[j, q]
         if other >= 0:
             known += 1
             near += abs(height_above(points, other, a, b, c)) <= reach

@@ -60,6 +60,8 @@ class Surroundings(NamedTuple):
     there is no plane."""
     order: IntArray
     """(n,) int64, the points by ascending variance."""
+    cosines: FloatArray
+    """(n,) float64, cosines of the slopes of the planes."""
 
 
 @kernel
@@ -70,9 +72,10 @@ def local_planes(points: FloatArray, neighbours: LabelArray) -> Surroundings:
     """
     n = len(points)
     planes = np.zeros((n, 3))
-    variances = np.full(n, np.inf)
+    variances, cosines = np.full(n, np.inf), np.empty(n)
+    sums = np.empty(N_SUMS)
     for i in range(n):
-        sums = np.zeros(N_SUMS)
+        sums[:] = 0.0
         add_point(sums, points, i)
         for q in range(min(FITTED_NEIGHBOURS, neighbours.shape[1])):
             if neighbours[i, q] >= 0:
@@ -81,10 +84,11 @@ def local_planes(points: FloatArray, neighbours: LabelArray) -> Surroundings:
         planes[i, 0] = a
         planes[i, 1] = b
         planes[i, 2] = c
+        cosines[i] = cosine_of_slope(a, b)
         if fitted and sums[0] > 3.0:
-            square = mean_square_residual(sums, a, b, c) * cosine_of_slope(a, b) ** 2
+            square = mean_square_residual(sums, a, b, c) * cosines[i] ** 2
             variances[i] = square * sums[0] / (sums[0] - 3.0)
-    return Surroundings(points, neighbours, planes, variances, ascending_order(variances))
+    return Surroundings(points, neighbours, planes, variances, ascending_order(variances), cosines)
 
 
 @kernel(inline="always")
@@ -115,21 +119,24 @@ class TrialLimits(NamedTuple):
     """Regions with a smaller cosine of their slope are not taken."""
 
 
+_PLANES = 1 << 32
+"""Numbers for the planes of a region, and the last of them for the region itself; a region is fitted a few times."""
+_TAKEN = 1 << 62
+"""More than any number."""
+
+
 class _Trial(NamedTuple):
     """Memory of the trial regions, used again for each of them."""
 
-    asked: LabelArray
-    """(n,) int32, number of the last region that asked or holds a point."""
-    refused: LabelArray
-    """(n + 1,) int32, number of the last plane that refused a point; in the last entry how many planes there were."""
+    seen: IntArray
+    """(n,) int64, number of the last plane that refused a point or of the last region that holds it, if later;
+    `_TAKEN` for points with a label."""
     queue: LabelArray
     """(n,) int32, points of a region."""
 
 
 @kernel
-def _joins(
-    surroundings: Surroundings, cosines: FloatArray, j: int, a: float, b: float, c: float, reach: float, least: float
-) -> bool:
+def _joins(surroundings: Surroundings, j: int, a: float, b: float, c: float, reach: float, least: float) -> bool:
     """Whether a point is near a plane and of its direction or, where that says nothing, in company there.
 
     `least` is the least cosine between the two directions over the cosine of the plane's slope; 0 asks for company.
@@ -138,15 +145,13 @@ def _joins(
     if abs(height_above(points, j, a, b, c)) > reach:
         return False
     if least > 0.0:
-        return bool((a * local[j, 0] + b * local[j, 1] + 1.0) * cosines[j] >= least)
+        return bool((a * local[j, 0] + b * local[j, 1] + 1.0) * surroundings.cosines[j] >= least)
     return has_company(points, surroundings.neighbours, j, a, b, c, reach, _COMPANY)
 
 
 @kernel
 def _grow(
     surroundings: Surroundings,
-    cosines: FloatArray,
-    labels: LabelArray,
     reached: LabelArray,
     seed: int,
     limits: TrialLimits,
@@ -160,19 +165,19 @@ def _grow(
     """
     points, neighbours = surroundings.points, surroundings.neighbours
     distance_m, min_normal_cosine = limits.distance_m, limits.min_normal_cosine
-    asked, refused, queue = trial
-    n = len(points)
+    seen, queue = trial
+    plane = mark * _PLANES
+    region = plane + _PLANES - 1
     a, b, c = surroundings.planes[seed]
     sums = np.zeros(N_SUMS)
     queue[0] = seed
-    asked[seed] = mark
+    seen[seed] = region
     held = 1
     at = 0
     repeated = 0
     refit = _FIRST_REFIT
     reach = distance_m / cosine_of_slope(a, b)
     least = min_normal_cosine / cosine_of_slope(a, b)
-    refused[n] += 1
     while at < held:
         i = queue[at]
         at += 1
@@ -186,18 +191,17 @@ def _grow(
                 a, b, c = own_a, own_b, own_c
                 reach = distance_m / cosine_of_slope(a, b)
                 least = min_normal_cosine / cosine_of_slope(a, b)
-                refused[n] += 1
+                plane += 1
             refit = math.floor(_REFIT_GROWTH * sums[0]) + 1.0
         for q in range(neighbours.shape[1]):
             j = neighbours[i, q]
-            if j < 0 or labels[j] >= 0 or asked[j] == mark or refused[j] == refused[n]:
+            if j < 0 or seen[j] >= plane:
                 continue
-            if _joins(surroundings, cosines, j, a, b, c, reach, least):
-                asked[j] = mark
+            seen[j] = plane
+            if _joins(surroundings, j, a, b, c, reach, least):
+                seen[j] = region
                 queue[held] = j
                 held += 1
-            else:
-                refused[j] = refused[n]
     a, b, c, fitted = best_fit_plane(sums)
     if not fitted:
         return 0, a, b, c, 0.0
@@ -221,14 +225,11 @@ def take_regions(surroundings: Surroundings, labels: LabelArray, first_label: in
     A gain can only fall as other regions take points, so the best trial region grows again and is taken if it is still
     the best: a lazy greedy choice. Points of little variance in `local_planes` are the first seeds.
     """
-    neighbours, local = surroundings.neighbours, surroundings.planes
+    neighbours = surroundings.neighbours
     distance_m, fewest_points = limits.distance_m, limits.fewest_points
     n = len(labels)
-    cosines = np.empty(n)
-    for i in range(n):
-        cosines[i] = cosine_of_slope(local[i, 0], local[i, 1])
-    asked, queue = np.full(n, -1, np.int32), np.empty(n, np.int32)
-    trial = _Trial(asked, np.zeros(n + 1, np.int32), queue)
+    seen, queue = np.where(labels >= 0, _TAKEN, -1), np.empty(n, np.int32)
+    trial = _Trial(seen, queue)
     reached = np.zeros(n, np.int32)
     reached_again = np.zeros(n, np.int32)
     # the loss of every trial region and its seed, behind them that of none
@@ -239,17 +240,18 @@ def take_regions(surroundings: Surroundings, labels: LabelArray, first_label: in
             break
         if labels[seed] >= 0 or reached[seed] >= _TRIALS:
             continue
-        held, a, b, c, gain = _grow(surroundings, cosines, labels, reached, seed, limits, trial, mark)
+        held, a, b, c, gain = _grow(surroundings, reached, seed, limits, trial, mark)
         reached[seed] += 1
         if held >= fewest_points:
             # points just beyond the limit would only grow the same region once more
             beside = 2.0 * distance_m / cosine_of_slope(a, b)
+            region = (mark + 1) * _PLANES - 1
             for q in range(held):
                 reached[queue[q]] += 1
                 for s in range(neighbours.shape[1]):
                     j = neighbours[queue[q], s]
-                    if j >= 0 and asked[j] != mark and abs(height_above(surroundings.points, j, a, b, c)) <= beside:
-                        asked[j] = mark
+                    if j >= 0 and seen[j] < region and abs(height_above(surroundings.points, j, a, b, c)) <= beside:
+                        seen[j] = region
                         reached[j] += 1
             if cosine_of_slope(a, b) >= limits.min_cosine:
                 trials = heap_push(trials, held_trials, -gain, seed, 0)
@@ -262,7 +264,7 @@ def take_regions(surroundings: Surroundings, labels: LabelArray, first_label: in
         held_trials -= 1
         if labels[seed] >= 0:
             continue
-        held, a, b, _, gain = _grow(surroundings, cosines, labels, reached_again, seed, limits, trial, mark)
+        held, a, b, _, gain = _grow(surroundings, reached_again, seed, limits, trial, mark)
         mark += 1
         if held < fewest_points or cosine_of_slope(a, b) < limits.min_cosine:
             continue
@@ -271,6 +273,6 @@ def take_regions(surroundings: Surroundings, labels: LabelArray, first_label: in
             held_trials += 1
             continue
         for q in range(held):
-            labels[queue[q]] = label
+            labels[queue[q]], seen[queue[q]] = label, _TAKEN
         label += 1
     return label

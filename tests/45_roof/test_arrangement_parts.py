@@ -27,7 +27,7 @@ from pipeline.roof.arrangement.minimum_cut import (
     expand_labels,
     neighbour_lists,
 )
-from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, Raster, _settle
+from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, Raster, _framed, _settle
 from pipeline.roof.arrangement.subdivision import (
     EDGES,
     FACE,
@@ -144,7 +144,7 @@ def test_cells_settle_as_if_all_were_looked_at_in_every_round(seed: int) -> None
                 expected[cell] = best
     number = np.full(columns * rows, -1, np.int32)
     number[place] = np.arange(len(place))
-    _settle(costs_of_all(costs), Raster(0.0, 0.0, 1.0, columns, rows, number, place), 7, 5, labels)
+    _settle(costs_of_all(costs), _framed(Raster(0.0, 0.0, 1.0, columns, rows, number, place)), 7, 5, labels)
     assert labels.tolist() == [expected[cell] for cell in place.tolist()]
 
 

@@ -218,22 +218,25 @@ def _mark_movable(
     """
     starts, others, weights = neighbours
     number, change, queue, bound = moves
+    asked = 0
     for p in nodes:
-        if labels[p] != alpha and cost_of(costs, p, alpha) - cost_of(costs, p, labels[p]) < bound[p]:
-            number[p] = 0
-    tail = 0
-    for p in nodes:
-        if number[p] < 0:
+        if labels[p] == alpha:
             continue
         cost = cost_of(costs, p, alpha) - cost_of(costs, p, labels[p])
+        if cost < bound[p]:
+            number[p], change[p] = 0, cost
+            queue[asked] = p
+            asked += 1
+    # those that keep their label take the places of nodes that were looked at
+    tail = 0
+    for s in range(asked):
+        p = queue[s]
+        own, cost = labels[p], change[p]
         for e in range(starts[p], starts[p + 1]):
             r = others[e]
-            if number[r] >= 0:
-                cost -= weights[e]
-            elif labels[r] == alpha:
-                cost -= weights[e]  # it differs from the node's own label
-            elif labels[r] == labels[p]:
-                cost += weights[e]
+            # a neighbour with alpha differs from the node's own label
+            takes = (number[r] >= 0) | (labels[r] == alpha)
+            cost += weights[e] * ((not takes) & (labels[r] == own)) - weights[e] * takes
         change[p] = cost
         if cost >= 0:
             queue[tail] = p

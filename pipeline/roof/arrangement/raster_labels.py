@@ -13,9 +13,8 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
-from pipeline.kernels.merge_sort import in_order
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.roof.arrangement.minimum_cut import Allowed, Costs, cost_of, expand_labels, neighbour_lists
+from pipeline.roof.arrangement.minimum_cut import Allowed, Costs, Neighbours, cost_of, expand_labels
 
 COST_SCALE = 1000
 """Integer cost of one unexplained point."""
@@ -44,6 +43,32 @@ class Raster(NamedTuple):
     """(n,) int32, row * columns + column of each numbered cell, ascending."""
 
 
+_FRAME = 2
+"""Width of the frame: labels are tried as far from their points, and neighbours need no test of the border."""
+
+
+class _Framed(NamedTuple):
+    """A raster in a frame of cells that lie outside."""
+
+    number: LabelArray
+    """(rows * width,) int32, number of every cell; -1 outside."""
+    at: LabelArray
+    """(n,) int32, place of each numbered cell."""
+    width: int
+    """Columns with the frame."""
+
+
+class _Explained(NamedTuple):
+    """Planes that explain each of n points, in compressed rows."""
+
+    starts: IntArray
+    """(n + 1,) int64, first entry of every point."""
+    labels: LabelArray
+    """(m,) int32, the planes, ascending at each point."""
+    saved: LabelArray
+    """(m,) int32, by how much the point costs less than an unexplained one."""
+
+
 @kernel
 def vertical_distance_m(points: FloatArray, i: int, planes: FloatArray, k: int) -> float:
     """How far point i of (n, 3) lies above or below plane k of (m, 3), z = a x + b y + c."""
@@ -64,12 +89,16 @@ def raster_cells(edges: FloatArray, west: float, south: float, cell_m: float, co
         for e in range(len(edges)):
             if (edges[e, 1] > y) != (edges[e, 3] > y):
                 fraction = (y - edges[e, 1]) / (edges[e, 3] - edges[e, 1])
-                crossings[found] = edges[e, 0] + fraction * (edges[e, 2] - edges[e, 0])
+                x = edges[e, 0] + fraction * (edges[e, 2] - edges[e, 0])
+                k = found
+                while k > 0 and crossings[k - 1] > x:
+                    crossings[k] = crossings[k - 1]
+                    k -= 1
+                crossings[k] = x
                 found += 1
-        ordered = in_order(crossings[:found])
         for k in range(0, found - 1, 2):
-            first = max(math.ceil((ordered[k] - west) / cell_m - 0.5), 0)
-            last = min(math.floor((ordered[k + 1] - west) / cell_m - 0.5), columns - 1)
+            first = max(math.ceil((crossings[k] - west) / cell_m - 0.5), 0)
+            last = min(math.floor((crossings[k + 1] - west) / cell_m - 0.5), columns - 1)
             for c in range(first, last + 1):
                 if number[r * columns + c] < 0:
                     number[r * columns + c] = n
@@ -79,8 +108,44 @@ def raster_cells(edges: FloatArray, west: float, south: float, cell_m: float, co
 
 
 @kernel
-def _cell_costs(points: FloatArray, planes: FloatArray, cap_m: float, raster: Raster) -> Costs:
-    """Costs of k planes in n cells: other planes than those listed explain none of a cell's points."""
+def _framed(raster: Raster) -> _Framed:
+    """Put a frame around a raster."""
+    columns, width = raster.columns, raster.columns + 2 * _FRAME
+    number = np.full(width * (raster.rows + 2 * _FRAME), -1, np.int32)
+    at = np.empty(len(raster.place), np.int32)
+    for r in range(raster.rows):
+        first = (r + _FRAME) * width + _FRAME
+        for c in range(columns):
+            i = raster.number[r * columns + c]
+            number[first + c] = i
+            if i >= 0:
+                at[i] = first + c
+    return _Framed(number, at, width)
+
+
+@kernel
+def _explained(points: FloatArray, planes: FloatArray, cap_m: float) -> _Explained:
+    """Which of k planes explain each of n points, and what that saves."""
+    n, k = len(points), len(planes)
+    starts = np.empty(n + 1, np.int64)
+    labels, saved = np.empty(2 * n + k, np.int32), np.empty(2 * n + k, np.int32)
+    m = 0
+    for i in range(n):
+        starts[i] = m
+        if m + k > len(labels):
+            labels, saved = np.concatenate((labels, labels)), np.concatenate((saved, saved))
+        for label in range(k):
+            off = vertical_distance_m(points, i, planes, label)
+            if off < cap_m:
+                labels[m], saved[m] = label, COST_SCALE - int(COST_SCALE * off / cap_m)
+                m += 1
+    starts[n] = m
+    return _Explained(starts, labels, saved)
+
+
+@kernel
+def _cell_costs(points: FloatArray, explained: _Explained, raster: Raster) -> Costs:
+    """Costs of planes in n cells: other planes than those listed explain none of a cell's points."""
     n = len(raster.place)
     cell_of = np.full(len(points), -1, np.int32)
     for i in range(len(points)):
@@ -90,36 +155,33 @@ def _cell_costs(points: FloatArray, planes: FloatArray, cap_m: float, raster: Ra
             cell_of[i] = raster.number[r * raster.columns + c]
     first, members = counting_sort(cell_of, n)
     starts, others = np.zeros(n + 1, np.int64), np.empty(n, np.int64)
-    explaining, costs = np.empty(0, np.int32), np.empty(0, np.int64)
-    # the second turn writes what the first one counted
-    for turn in range(2):
-        m = 0
-        for cell in range(n):
-            others[cell] = COST_SCALE * (first[cell + 1] - first[cell])
-            for label in range(len(planes) if others[cell] > 0 else 0):
-                cost, explains = 0, False
-                for s in range(first[cell], first[cell + 1]):
-                    off = vertical_distance_m(points, members[s], planes, label)
-                    if off < cap_m:
-                        cost += int(COST_SCALE * off / cap_m)
-                        explains = True
-                    else:
-                        cost += COST_SCALE
-                if explains:
-                    if turn == 1:
-                        explaining[m], costs[m] = label, cost
-                    m += 1
-            starts[cell + 1] = m
-        if turn == 0:
-            explaining, costs = np.empty(m, np.int32), np.empty(m, np.int64)
-    return Costs(starts, explaining, costs, others)
+    room = explained.starts[len(points)]
+    labels, costs = np.empty(room, np.int32), np.empty(room, np.int64)
+    m = 0
+    for cell in range(n):
+        unexplained = COST_SCALE * np.int64(first[cell + 1] - first[cell])
+        for s in range(first[cell], first[cell + 1]):
+            for e in range(explained.starts[members[s]], explained.starts[members[s] + 1]):
+                # labels ascend at each cell
+                label, q = explained.labels[e], m
+                while q > starts[cell] and labels[q - 1] > label:
+                    q -= 1
+                if q == starts[cell] or labels[q - 1] != label:
+                    for moved in range(m, q, -1):
+                        labels[moved], costs[moved] = labels[moved - 1], costs[moved - 1]
+                    labels[q], costs[q] = label, unexplained
+                    q, m = q + 1, m + 1
+                costs[q - 1] -= explained.saved[e]
+        others[cell] = unexplained
+        starts[cell + 1] = m
+    return Costs(starts, labels[:m].copy(), costs[:m].copy(), others)
 
 
 @kernel
-def _first_labels(costs: Costs, raster: Raster) -> LabelArray:
+def _first_labels(costs: Costs, framed: _Framed) -> LabelArray:
     """The best label of every cell with points, (n,); from there outwards over those without."""
-    number, place, columns, rows = raster.number, raster.place, raster.columns, raster.rows
-    n = len(place)
+    n = len(framed.at)
+    around = np.array([1, framed.width, -1, -framed.width])
     labels = np.full(n, -1, np.int32)
     queue = np.empty(n, np.int32)
     tail = 0
@@ -137,13 +199,8 @@ def _first_labels(costs: Costs, raster: Raster) -> LabelArray:
     while head < tail:
         i = queue[head]
         head += 1
-        r, c = place[i] // columns, place[i] % columns
         for step in range(4):
-            rr = r + (step == 1) - (step == 3)
-            cc = c + (step == 0) - (step == 2)
-            if rr < 0 or cc < 0 or rr >= rows or cc >= columns:
-                continue
-            j = number[rr * columns + cc]
+            j = framed.number[framed.at[i] + around[step]]
             if j >= 0 and labels[j] < 0:
                 labels[j] = labels[i]
                 queue[tail] = j
@@ -153,56 +210,61 @@ def _first_labels(costs: Costs, raster: Raster) -> LabelArray:
     return labels
 
 
+@kernel(inline="always")
+def _places_around(width: int) -> IntArray:
+    """Steps to the eight neighbours of a cell, row by row."""
+    return np.array([-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1])
+
+
+@kernel(inline="always")
+def _weights_around(side: int, diagonal: int) -> IntArray:
+    """Costs of the borders to the eight neighbours of a cell."""
+    return np.array([diagonal, side, diagonal, side, side, diagonal, side, diagonal])
+
+
 @kernel
-def _raster_edges(raster: Raster, side: int, diagonal: int) -> tuple[IntArray, IntArray]:
-    """Pairs of neighbouring cells, over sides and corners, (m, 2), and the cost of a border between them, (m,)."""
-    number, place, columns, rows = raster.number, raster.place, raster.columns, raster.rows
-    edges = np.empty((4 * len(place), 2), np.int64)
-    weights = np.empty(4 * len(place), np.int64)
+def _raster_neighbours(framed: _Framed, side: int, diagonal: int) -> Neighbours:
+    """The neighbours of every cell over sides and corners, and the costs of borders there."""
+    n = len(framed.at)
+    around, weight = _places_around(framed.width), _weights_around(side, diagonal)
+    starts, others, weights = np.zeros(n + 1, np.int32), np.empty(8 * n, np.int32), np.empty(8 * n, np.int64)
     m = 0
-    for i in range(len(place)):
-        r, c = place[i] // columns, place[i] % columns
-        for step in range(4):
-            # east, north, north-east, north-west
-            rr = r + (step > 0)
-            cc = c + (step == 0) + (step == 2) - (step == 3)
-            if rr >= rows or cc < 0 or cc >= columns or number[rr * columns + cc] < 0:
-                continue
-            edges[m, 0] = i
-            edges[m, 1] = number[rr * columns + cc]
-            weights[m] = side if step < 2 else diagonal
-            m += 1
-    return edges[:m], weights[:m]
+    for i in range(n):
+        for q in range(8):
+            j = framed.number[framed.at[i] + around[q]]
+            if j >= 0:
+                others[m], weights[m] = j, weight[q]
+                m += 1
+        starts[i + 1] = m
+    return Neighbours(starts, others[:m].copy(), weights[:m].copy())
 
 
 @kernel
-def _near_own_points(costs: Costs, labels: LabelArray, raster: Raster, k: int) -> Allowed:
+def _near_own_points(costs: Costs, labels: LabelArray, framed: _Framed, k: int) -> Allowed:
     """For each of k labels the cells within two cells of a point that it explains, and those that start with it."""
-    number, place, columns, rows = raster.number, raster.place, raster.columns, raster.rows
-    n = len(place)
+    at, width = framed.at, framed.width
+    n = len(at)
     cell_of = np.empty(len(costs.labels), np.int32)
     for i in range(n):
-        cell_of[costs.starts[i] : costs.starts[i + 1]] = i
+        for s in range(costs.starts[i], costs.starts[i + 1]):
+            cell_of[s] = i
     first, entries = counting_sort(costs.labels, k)
     first_own, own = counting_sort(labels, k)
-    allowed = np.zeros(n, np.bool_)
+    allowed = np.zeros(len(framed.number), np.bool_)
     nodes = np.empty(min(n * k, n + 25 * len(cell_of)), np.int32)
     starts = np.zeros(k + 1, np.int32)
     m = 0
     for label in range(k):
         allowed[:] = False
         for s in range(first_own[label], first_own[label + 1]):
-            allowed[own[s]] = True
+            allowed[at[own[s]]] = True
         for s in range(first[label], first[label + 1]):
-            i = cell_of[entries[s]]
-            r, c = place[i] // columns, place[i] % columns
-            for rr in range(max(r - 2, 0), min(r + 3, rows)):
-                for cc in range(max(c - 2, 0), min(c + 3, columns)):
-                    j = number[rr * columns + cc]
-                    if j >= 0:
-                        allowed[j] = True
+            corner = at[cell_of[entries[s]]] - _FRAME * (width + 1)
+            for r in range(2 * _FRAME + 1):
+                for c in range(2 * _FRAME + 1):
+                    allowed[corner + r * width + c] = True
         for i in range(n):
-            if allowed[i]:
+            if allowed[at[i]]:
                 nodes[m] = i
                 m += 1
         starts[label + 1] = m
@@ -215,64 +277,77 @@ def _border_cost(framed: LabelArray, here: int, around: IntArray, weight: IntArr
     cost = 0
     for q in range(8):
         other = framed[here + around[q]]
-        if other >= 0 and other != label:
-            cost += weight[q]
+        cost += weight[q] * ((other >= 0) & (other != label))
     return cost
 
 
 @kernel
-def _settle(costs: Costs, raster: Raster, side: int, diagonal: int, labels: LabelArray) -> None:
+def _settle(costs: Costs, framed: _Framed, side: int, diagonal: int, labels: LabelArray) -> None:
     """Give every cell the best label among its own and its neighbours', until none changes (Besag 1986).
 
-    After the first round a cell is looked at again only if a neighbour has changed: else it would choose the same.
-    `labels` (n,) change in place; `side` and `diagonal` are the costs of a border over a side and over a corner.
+    A cell is looked at if a neighbour has another label, and again only if a neighbour has changed: else it would
+    choose the same. `labels` (n,) change in place; `side` and `diagonal` are the costs of a border over a side and over
+    a corner.
     """
-    place, columns, rows = raster.place, raster.columns, raster.rows
-    # a frame of cells without a label spares all tests of the raster's border
-    width = columns + 2
-    around = np.array([-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1])
-    weight = np.array([diagonal, side, diagonal, side, side, diagonal, side, diagonal])
-    framed = np.full(width * (rows + 2), -1, np.int32)
-    waits = np.zeros(width * (rows + 2), np.bool_)
-    at = np.empty(len(place), np.int32)
-    for i in range(len(place)):
-        at[i] = (place[i] // columns + 1) * width + place[i] % columns + 1
-        framed[at[i]] = labels[i]
-        waits[at[i]] = True
+    at, number = framed.at, framed.number
+    around, weight = _places_around(framed.width), _weights_around(side, diagonal)
+    placed = np.full(len(number), -1, np.int32)
+    waits = np.zeros(len(at), np.bool_)
+    for i in range(len(at)):
+        placed[at[i]] = labels[i]
+        for q in range(4, 8):
+            j = number[at[i] + around[q]]
+            if j >= 0 and labels[j] != labels[i]:
+                waits[i] = waits[j] = True
     for _ in range(_SETTLING_ROUNDS):
         changed = False
-        for i in range(len(place)):
-            here = at[i]
-            if not waits[here]:
+        for i in range(len(at)):
+            if not waits[i]:
                 continue
-            waits[here] = False
-            own = framed[here]
-            mixed = False
-            for q in range(8):
-                label = framed[here + around[q]]
-                mixed |= (label != own) & (label >= 0)
-            if not mixed:
-                continue
+            waits[i] = False
+            here, own = at[i], labels[i]
             best = own
-            least = cost_of(costs, i, best) + _border_cost(framed, here, around, weight, own)
+            least = cost_of(costs, i, best) + _border_cost(placed, here, around, weight, own)
             tried = own
             for s in range(8):
-                label = framed[here + around[s]]
+                label = placed[here + around[s]]
                 if label < 0 or label in (own, tried):
                     continue
                 tried = label
-                cost = cost_of(costs, i, label) + _border_cost(framed, here, around, weight, label)
+                cost = cost_of(costs, i, label) + _border_cost(placed, here, around, weight, label)
                 if cost < least or (cost == least and label < best and best != own):
                     best = label
                     least = cost
             if best != own:
-                framed[here] = best
+                placed[here] = best
                 labels[i] = best
                 changed = True
                 for q in range(8):
-                    waits[here + around[q]] = True
+                    j = number[here + around[q]]
+                    if j >= 0:
+                        waits[j] = True
         if not changed:
             break
+
+
+@kernel
+def _labels_of_halves(fine: Raster, coarse: _Framed, coarse_labels: LabelArray) -> LabelArray:
+    """Labels of a raster of half the cells, (n,), from those of the coarse one."""
+    labels = np.zeros(len(fine.place), np.int32)
+    around = _places_around(coarse.width)
+    for r in range(fine.rows):
+        for c in range(fine.columns):
+            i = fine.number[r * fine.columns + c]
+            if i < 0:
+                continue
+            here = (r // 2 + _FRAME) * coarse.width + c // 2 + _FRAME
+            j = coarse.number[here]
+            # a fine cell at the outline can lie in a coarse one that does not count: then beside it
+            for q in range(8 if j < 0 else 0):
+                if j < 0:
+                    j = coarse.number[here + around[q]]
+            labels[i] = coarse_labels[j] if j >= 0 else 0
+    return labels
 
 
 @kernel
@@ -299,29 +374,20 @@ def raster_labels(
             east, north = max(east, edges[e, end]), max(north, edges[e, end + 1])
     columns, rows = int((east - west) / cell_m) + 1, int((north - south) / cell_m) + 1
     raster = raster_cells(edges, west, south, cell_m, columns, rows)
-    costs = _cell_costs(points, planes, cap_m, raster)
-    coarse = _first_labels(costs, raster)
+    framed = _framed(raster)
+    explained = _explained(points, planes, cap_m)
+    costs = _cell_costs(points, explained, raster)
+    coarse = _first_labels(costs, framed)
     side = int(COST_SCALE * cost_per_m * cell_m * _SIDE)
     diagonal = int(COST_SCALE * cost_per_m * cell_m * _DIAGONAL)
     if len(planes) > 1:
-        _settle(costs, raster, side, diagonal, coarse)
-        pairs, weights = _raster_edges(raster, side, diagonal)
-        neighbours = neighbour_lists(len(raster.place), pairs, weights)
-        allowed = _near_own_points(costs, coarse, raster, len(planes))
+        _settle(costs, framed, side, diagonal, coarse)
+        neighbours = _raster_neighbours(framed, side, diagonal)
+        allowed = _near_own_points(costs, coarse, framed, len(planes))
         expand_labels(costs, allowed, neighbours, coarse, _ROUNDS)
 
     fine = raster_cells(edges, west, south, 0.5 * cell_m, 2 * columns, 2 * rows)
-    labels = np.full(len(fine.place), -1, np.int32)
-    for i in range(len(fine.place)):
-        r, c = fine.place[i] // (4 * columns), fine.place[i] % (2 * columns) // 2
-        # a fine cell at the outline can lie in a coarse one that does not count: then beside it
-        for reach in range(2):
-            for rr in range(max(r - reach, 0), min(r + reach + 1, rows)):
-                for cc in range(max(c - reach, 0), min(c + reach + 1, columns)):
-                    if labels[i] < 0 and raster.number[rr * columns + cc] >= 0:
-                        labels[i] = coarse[raster.number[rr * columns + cc]]
-        labels[i] = max(labels[i], 0)
+    labels = _labels_of_halves(fine, framed, coarse)
     if len(planes) > 1:
-        costs = _cell_costs(points, planes, cap_m, fine)
-        _settle(costs, fine, side // 2, diagonal // 2, labels)
+        _settle(_cell_costs(points, explained, fine), _framed(fine), side // 2, diagonal // 2, labels)
     return labels, fine
