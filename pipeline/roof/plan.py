@@ -65,7 +65,7 @@ class RoofPoints:
     points: FloatArray
     """(n, 3) float64, local metres."""
     xy_mm: IntArray
-    """(n, 2) int64, millimetres; every position once, the highest point of each."""
+    """(n, 2) int64, millimetres, ascending by x, then y; every position once, the highest point of each."""
     index: IntArray
     """(n,) int64, which of the candidate's points they are."""
     labels: LabelArray
@@ -105,10 +105,12 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
     Raises BuildingError `too_few_points` or `no_footprint`.
     """
     candidate = cloud.candidate
-    highest = candidate.points[cloud.highest]
+    index = cloud.highest
+    points = candidate.points.take(index, axis=0)
     least_z_m = candidate.ground_z_m + settings.min_roof_height_m if candidate.footprint is None else -math.inf
-    is_above = highest[:, 2] >= least_z_m
-    index, points = cloud.highest[is_above], highest[is_above]
+    is_above = points[:, 2] >= least_z_m
+    if not is_above.all():
+        index, points = index[is_above], points[is_above]
     name, fewest = "min_points", settings.min_points
     if candidate.footprint is not None and settings.min_points_in_footprint < fewest:
         name, fewest = "min_points_in_footprint", settings.min_points_in_footprint
@@ -117,7 +119,7 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
     if len(index) < fewest:
         raise BuildingError(Reason.TOO_FEW_POINTS, f"{len(index)} roof points, fewer than {name} = {fewest}")
     footprint = None if candidate.footprint is None else footprint_in_mm(candidate.footprint)
-    xy_mm = cloud.points_mm[index, :2] + (cloud.shift_m[:2] * 1e3).astype(np.int64)
+    xy_mm = cloud.points_mm.take(index, axis=0)[:, :2] + (cloud.shift_m[:2] * 1e3).astype(np.int64)
     return RoofPoints(
         points=points,
         xy_mm=xy_mm,
@@ -136,12 +138,12 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
 
 
 def _are_among(xy_mm: IntArray, others_mm: IntArray) -> BoolArray:
-    """Which of the positions, (n, 2), are rows of others."""
-    if len(others_mm) == 0:
-        return np.zeros(len(xy_mm), np.bool_)
-    keys, others = ((xy[:, 0] << 32) + xy[:, 1] for xy in (xy_mm, others_mm))
-    others.sort()
-    among: BoolArray = others[np.minimum(np.searchsorted(others, keys), len(others) - 1)] == keys
+    """Which of the positions, (n, 2) and ascending by x, then y, are rows of others."""
+    among = np.zeros(len(xy_mm), np.bool_)
+    if len(others_mm) > 0 and len(xy_mm) > 0:
+        keys, others = ((xy[:, 0] << 32) + xy[:, 1] for xy in (xy_mm, others_mm))
+        at = np.minimum(np.searchsorted(keys, others), len(keys) - 1)
+        among[at[keys[at] == others]] = True
     return among
 
 

@@ -37,13 +37,13 @@ def with_shaded_points(roof: RoofPoints, cloud: PreparedCloud, planes: Sequence[
     is_hidden = np.ones(len(cloud.points), np.bool_)
     is_hidden[cloud.visible] = False
     hidden = np.flatnonzero(is_hidden)
-    points = cloud.candidate.points[hidden]
-    xy_mm = cloud.points_mm[hidden, :2] + (cloud.shift_m[:2] * 1e3).astype(np.int64)
+    points = cloud.candidate.points.take(hidden, axis=0)
+    xy_mm = cloud.points_mm.take(hidden, axis=0)[:, :2] + (cloud.shift_m[:2] * 1e3).astype(np.int64)
     coefficients = np.array([plane.coefficients for plane in planes]).reshape(len(planes), 3)
     label = _planes_beside(points, xy_mm, coefficients, roof.xy_mm, roof.labels)
     added = np.flatnonzero(label >= 0)
     if len(added):
-        visible = cloud.candidate.points[cloud.visible]
+        visible = cloud.candidate.points.take(cloud.visible, axis=0)
         added = added[~surrounded(points[added], visible, SHADING_RADIUS_M, SHADING_HEIGHT_M)]
     if len(added) == 0:
         return roof
@@ -54,8 +54,8 @@ def with_shaded_points(roof: RoofPoints, cloud: PreparedCloud, planes: Sequence[
         return roof
     return dataclasses.replace(
         roof,
-        points=np.concatenate((roof.points, points[added]))[order],
-        xy_mm=together[order],
+        points=np.concatenate((roof.points, points[added])).take(order, axis=0),
+        xy_mm=together.take(order, axis=0),
         index=np.concatenate((roof.index, hidden[added]))[order],
         labels=np.concatenate((roof.labels, label[added]))[order],
         split=np.concatenate((roof.split, np.zeros(len(added), np.bool_)))[order],
