@@ -363,6 +363,8 @@ def _own_model(building: _Building, segmentation: Segmentation, roof: RoofPoints
 
 def _levelled_share(drawn: RoofPartition, level: RoofPartition) -> float:
     """Share of the area whose faces got another plane when they were made level; 0 without faces."""
+    if level is drawn:
+        return 0.0
     areas = shapely.area(np.array(drawn.polygons, object))
     changed_m2, whole_m2 = float(areas[drawn.labels != level.labels].sum()), float(areas.sum())
     return changed_m2 / whole_m2 if whole_m2 > 0.0 else 0.0
@@ -370,7 +372,7 @@ def _levelled_share(drawn: RoofPartition, level: RoofPartition) -> float:
 
 def _cleaned(drawn: RoofPartition, level: RoofPartition, cut: RoofPartition, left_out: int) -> str:
     """What was changed on the drawn faces, in words."""
-    made_level = int(np.count_nonzero(drawn.labels != level.labels))
+    made_level = 0 if level is drawn else int(np.count_nonzero(drawn.labels != level.labels))
     return "; ".join(
         filter(
             None,
