@@ -42,7 +42,7 @@ def prepare_cloud(candidate: Candidate, max_points: int | None = None) -> Prepar
 
 @kernel
 def _about_corner(points: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Points (n, 3) m about their lowest coordinates in whole metres, in whole mm and in metres; this corner (3,), m."""
+    """Points (n, 3) about a corner (3,) in whole metres below all, in whole mm and in metres; the corner, metres."""
     in_mm = np.empty(points.shape, np.int64)
     for i in range(len(points)):
         for k in range(3):
