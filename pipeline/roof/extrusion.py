@@ -105,32 +105,21 @@ class _Boundary(NamedTuple):
 
 
 @kernel
-def _oriented(coordinates: FloatArray, ring_of: IntArray, face_of_ring: IntArray) -> tuple[IntArray, IntArray]:
-    """Places (n, 2) of corners in whole mm, and the ring of each: outer rings counter-clockwise, holes clockwise.
+def _places(coordinates: FloatArray, ring_of: IntArray) -> tuple[IntArray, IntArray]:
+    """Places (n, 2) of corners in whole mm, and the ring of each, none twice in a row.
 
-    Rings are given closed, by `coordinates` (c, 2) with the ring of each; no place comes twice in a row.
+    Rings are given closed, by `coordinates` (c, 2) with the ring of each.
     """
     xy, ring = np.empty((len(coordinates), 2), np.int64), np.empty(len(coordinates), np.int64)
-    count = start = 0
-    while start < len(coordinates):
-        r, stop = ring_of[start], start + 1
-        twice_area = before_x = before_y = 0.0
-        while stop < len(coordinates) and ring_of[stop] == r:
-            x, y = coordinates[stop, 0] - coordinates[start, 0], coordinates[stop, 1] - coordinates[start, 1]
-            twice_area += before_x * y - x * before_y
-            before_x, before_y = x, y
-            stop += 1
-        is_hole = r > 0 and face_of_ring[r - 1] == face_of_ring[r]
-        is_turned = twice_area > 0.0 if is_hole else twice_area <= 0.0
-        first = count
-        for k in range(stop - 1 - start):
-            place = coordinates[stop - 1 - k if is_turned else start + k]
-            x, y = int(np.rint(place[0])), int(np.rint(place[1]))
-            if count == first or x != xy[count - 1, 0] or y != xy[count - 1, 1]:
-                xy[count, 0], xy[count, 1], ring[count] = x, y, r
-                count += 1
-        start = stop
-    return xy[:count], ring[:count]
+    n = 0
+    for k in range(len(coordinates) - 1):
+        if ring_of[k + 1] != ring_of[k]:  # it closes its ring
+            continue
+        x, y = int(np.rint(coordinates[k, 0])), int(np.rint(coordinates[k, 1]))
+        if n == 0 or ring[n - 1] != ring_of[k] or x != xy[n - 1, 0] or y != xy[n - 1, 1]:
+            xy[n, 0], xy[n, 1], ring[n] = x, y, ring_of[k]
+            n += 1
+    return xy[:n], ring[:n]
 
 
 @kernel
@@ -490,11 +479,11 @@ def extruded(
     """Extrude polygons that share their borders to a closed solid for every part that edges connect.
 
     Closed rings are given by `coordinates` (c, 2), mm, with the ring of each and the polygon of each ring, ascending,
-    its outer ring first. `labels` (f,) is the plane of each polygon; planes z = a x + b y + c have `coefficients`
-    (k, 3), metres. With a fault nothing else counts.
+    the outer ring first; outer rings run counter-clockwise, holes clockwise. `labels` (f,) is the plane of each
+    polygon; planes z = a x + b y + c have `coefficients` (k, 3), metres. With a fault nothing else counts.
     """
     planes = coefficients[labels]
-    places, ring = _oriented(coordinates, ring_of, face_of_ring)
+    places, ring = _places(coordinates, ring_of)
     mesh, xy, overlap = _meshed_with_crossings(places, ring, face_of_ring, planes)
     part, parts = np.zeros(len(labels), np.int32), 0
     if overlap < 0:

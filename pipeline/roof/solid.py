@@ -40,7 +40,7 @@ def solid_parts(partition: RoofPartition, planes: Sequence[Plane], ground_z_m: f
     their polygons. Coordinates of solids are multiples of 1 mm. Raises BuildingError `no_partition` where borders
     overlap, pinch, or a plane dips under the floor.
     """
-    polygons = np.array(partition.polygons, object)
+    polygons = shapely.orient_polygons(np.array(partition.polygons, object))
     lines, face_of_line = polygons, np.arange(len(polygons))
     if shapely.get_num_interior_rings(polygons).any():
         lines, face_of_line = shapely.get_rings(polygons, return_index=True)
