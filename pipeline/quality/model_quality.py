@@ -50,15 +50,17 @@ def model_quality(
     Residuals are summarised with `TOLERANCE_M`. Figures are nan if no points say anything; `bic_margin` is left open.
     """
     surface = surface_of(faces, planes)
-    top, face_of_point = surface.at(points[:, 0], points[:, 1])
-    residuals = points[:, 2] - top
+    residuals, face_of_point = surface.residuals(points)
     summary = summarise(residuals, TOLERANCE_M)
-    unexplained, hole = _seen(points, surface, residuals, faces, spacing_m)
+    unexplained = hole = math.nan
+    if summary.coverage > 0.0 and spacing_m > 0.0:
+        area_m2 = math.fsum(shapely.area([face.polygon for face in faces]).tolist())
+        unexplained, hole = _seen(points, surface, residuals, area_m2, spacing_m)
     noise = sigma = math.nan
     if is_planar:
         noise = _MAD_TO_SIGMA * summary.median_m
-        owner = np.array([face.plane for face in faces], np.int32)
-        plane_of_point = np.where(face_of_point >= 0, owner[face_of_point], np.int32(-1)).astype(np.int32)
+        # -1, no face, takes the last one: no plane
+        plane_of_point = np.array([*(face.plane for face in faces), -1], np.int32)[face_of_point]
         reach = max(TOLERANCE_M, 3.0 * noise)
         sigma = ridge_height_sigma_m(points, residuals, plane_of_point, reach, planes, solids, outline_sigma_m)
     return summary, ModelQuality(
@@ -73,11 +75,9 @@ def model_quality(
 
 
 def _seen(
-    points: FloatArray, surface: TopSurface, residuals: FloatArray, faces: Sequence[RoofFace], spacing_m: float
+    points: FloatArray, surface: TopSurface, residuals: FloatArray, area_m2: float, spacing_m: float
 ) -> tuple[float, float]:
     """Area of roof without points near it, m2, and the diameter of the largest circle on it without any point, m."""
-    if np.isnan(residuals).all() or not spacing_m > 0.0:
-        return math.nan, math.nan
     low_x, low_y, high_x, high_y = surface.bounds
     cell = max(_MIN_CELL_M, spacing_m, math.sqrt((high_x - low_x) * (high_y - low_y) / _MAX_CELLS))
     columns, rows = math.floor((high_x - low_x) / cell) + 1, math.floor((high_y - low_y) / cell) + 1
@@ -85,4 +85,4 @@ def _seen(
     places, unseen, square = surface.seen(points, residuals, raster, TOLERANCE_M, GAP_SPACINGS * spacing_m)
     if places == 0:
         return math.nan, math.nan
-    return unseen / places * math.fsum(shapely.area([face.polygon for face in faces]).tolist()), 2.0 * math.sqrt(square)
+    return unseen / places * area_m2, 2.0 * math.sqrt(square)
