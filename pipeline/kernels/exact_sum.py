@@ -41,4 +41,4 @@ def exact_sum(values: FloatArray) -> float:
         total = before + 2.0 * lost
         if total - before != 2.0 * lost:
             total = before
-    return total
+    return float(total)

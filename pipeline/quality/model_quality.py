@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import shapely
 
 from pipeline.model import FloatArray, ModelQuality, Plane, RoofFace, Solid
 from pipeline.quality.curved_roof import is_curved_roof
@@ -54,7 +53,7 @@ def model_quality(
     summary = summarise(residuals, TOLERANCE_M)
     unexplained = hole = math.nan
     if summary.coverage > 0.0 and spacing_m > 0.0:
-        area_m2 = math.fsum(shapely.area([face.polygon for face in faces]).tolist())
+        area_m2 = math.fsum(face.polygon.area for face in faces)
         unexplained, hole = _seen(points, surface, residuals, area_m2, spacing_m)
     noise = sigma = math.nan
     if is_planar:

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
+from pipeline.geometry import corners_of_rings
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.exact_sum import exact_sum
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, RoofFace
@@ -251,12 +251,10 @@ class TopSurface:
         corner: tuple[float, float] | None = None,
     ) -> None:
         n = len(polygons)
-        self._empty = all(polygon.is_empty for polygon in polygons)
+        xy, ring, face_of_ring = corners_of_rings(polygons)
+        self._empty = len(xy) == 0
         if self._empty:
             return
-        parts, owner = shapely.get_parts(np.asarray(polygons, dtype=object), return_index=True)
-        rings, part = shapely.get_rings(parts, return_index=True)
-        xy, ring = shapely.get_coordinates(rings, return_index=True)
         self._corner = (float(np.floor(xy[:, 0].min())), float(np.floor(xy[:, 1].min()))) if corner is None else corner
         xy = xy - np.array(self._corner)
         planes = np.array(coefficients, dtype=np.float64).reshape(n, 3)
@@ -269,10 +267,8 @@ class TopSurface:
             )
         elif self._corner != (0.0, 0.0):
             planes[:, 2] += planes[:, 0] * self._corner[0] + planes[:, 1] * self._corner[1]
-        edges, starts, boxes, cell_starts, cell_faces, *grid = _laid_out(xy, ring, owner[part], n, tolerance_m)
-        self._faces = _Faces(
-            *self._corner, planes, edges, starts, boxes, cell_starts, cell_faces, *grid, tolerance_m
-        )  # fmt: skip
+        laid_out = _laid_out(xy, ring, face_of_ring, n, tolerance_m)
+        self._faces = _Faces(*self._corner, planes, *laid_out, tolerance_m)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:

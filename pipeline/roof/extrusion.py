@@ -172,7 +172,7 @@ def _meshed(vertex: IntArray, ring: IntArray, face_of_ring: IntArray, count: int
 @kernel
 def _height_mm(plane: FloatArray, place: IntArray) -> float:
     """Height of a plane over a place; all in millimetres."""
-    return (plane[0] * (place[0] * 1e-3) + plane[1] * (place[1] * 1e-3) + plane[2]) * 1e3
+    return float((plane[0] * (place[0] * 1e-3) + plane[1] * (place[1] * 1e-3) + plane[2]) * 1e3)
 
 
 @kernel

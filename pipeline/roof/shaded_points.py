@@ -54,8 +54,8 @@ def with_shaded_points(roof: RoofPoints, cloud: PreparedCloud, planes: Sequence[
         return roof
     return dataclasses.replace(
         roof,
-        points=np.concatenate((roof.points, points[added])).take(order, axis=0),
-        xy_mm=together.take(order, axis=0),
+        points=np.take(np.concatenate((roof.points, points[added])), order, axis=0),
+        xy_mm=np.take(together, order, axis=0),
         index=np.concatenate((roof.index, hidden[added]))[order],
         labels=np.concatenate((roof.labels, label[added]))[order],
         split=np.concatenate((roof.split, np.zeros(len(added), np.bool_)))[order],

@@ -16,6 +16,7 @@ import numpy as np
 import shapely
 
 from pipeline.errors import BuildingError
+from pipeline.geometry import corners_of_rings
 from pipeline.model import FaceKind, Plane, Reason, RoofFace, Solid, SolidFace
 from pipeline.roof.extrusion import CROSSING, DIP, FLOOR, OVERLAP, PINCH, SOUND, WALL, Extruded, Fault, extruded
 from pipeline.roof.partition import RoofPartition
@@ -40,13 +41,9 @@ def solid_parts(partition: RoofPartition, planes: Sequence[Plane], ground_z_m: f
     their polygons. Coordinates of solids are multiples of 1 mm. Raises BuildingError `no_partition` where borders
     overlap, pinch, or a plane dips under the floor.
     """
-    polygons = shapely.orient_polygons(np.array(partition.polygons, object))
-    lines, face_of_line = polygons, np.arange(len(polygons))
-    if shapely.get_num_interior_rings(polygons).any():
-        lines, face_of_line = shapely.get_rings(polygons, return_index=True)
-    coordinates, ring = shapely.get_coordinates(lines, return_index=True)
+    xy, ring, polygon = corners_of_rings(shapely.orient_polygons(partition.polygons))
     coefficients = np.array([plane.coefficients for plane in planes]).reshape(len(planes), 3)
-    solids, fault = extruded(coordinates, ring, face_of_line, partition.labels, coefficients, round(ground_z_m * 1e3))
+    solids, fault = extruded(xy, ring, polygon, partition.labels, coefficients, round(ground_z_m * 1e3))
     if fault.kind != SOUND:
         raise BuildingError(Reason.NO_PARTITION, _words(fault))
     return _parts(solids, partition.labels.tolist())
@@ -68,7 +65,9 @@ def _words(fault: Fault) -> str:
 def _parts(solids: Extruded, labels: Sequence[int]) -> list[SolidPart]:
     """The solids as objects; `labels` are the planes of the polygons."""
     lines = shapely.linearrings(solids.outlines, indices=solids.ring_of_outline)
-    polygons = iter(shapely.polygons(lines, indices=solids.face_of_outline).tolist())
+    # without holes each ring is a polygon, which shapely makes in half the time
+    has_holes = len(lines) > np.count_nonzero(solids.source != WALL)
+    polygons = iter(shapely.polygons(lines, indices=solids.face_of_outline if has_holes else None).tolist())
     vertices, rings = solids.vertices.tolist(), solids.rings.tolist()
     corners = [tuple(vertices[start:stop]) for start, stop in pairwise(rings)]
     starts = solids.points_of_part.tolist()
