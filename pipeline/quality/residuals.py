@@ -153,13 +153,19 @@ def _residuals(points: FloatArray, faces: _Faces) -> tuple[FloatArray, LabelArra
 
 @kernel
 def _laid_out(
-    xy: FloatArray, ring_of: IntArray, face_of_ring: IntArray, n: int, tolerance: float
-) -> tuple[FloatArray, IntArray, FloatArray, LabelArray, IntArray, float, float, float, float, float, int, int]:
-    """Edges of all faces, where each face's start, their boxes; faces by cells, where each cell's start; bounds; cells.
+    xy: FloatArray,
+    ring_of: IntArray,
+    face_of_ring: IntArray,
+    planes: FloatArray,
+    origin: tuple[float, float],
+    tolerance: float,
+) -> _Faces:
+    """Faces with planes (n, 3) in a frame with this origin, by cells.
 
-    Vertices `xy` (v, 2) come ring after ring, each closed; `ring_of` (v,) is their ring, `face_of_ring` (r,) the face
-    of each ring, ascending. Those of the `n` faces without a ring are in no cell. Boxes are widened by `tolerance`.
+    Vertices `xy` (v, 2), metres, come ring after ring, each closed; `ring_of` (v,) is their ring, `face_of_ring` (r,)
+    the face of each ring, ascending. Faces without a ring are in no cell. Boxes are widened by `tolerance`.
     """
+    n = len(planes)
     edges = np.empty((len(xy), 4))
     edge_starts = np.zeros(n + 1, np.int64)
     boxes = np.empty((n, 4))
@@ -167,11 +173,12 @@ def _laid_out(
     m = 0
     for v in range(len(xy)):
         face = face_of_ring[ring_of[v]]
-        x, y = xy[v, 0], xy[v, 1]
+        x, y = xy[v, 0] - origin[0], xy[v, 1] - origin[1]
         box = boxes[face]
         box[0], box[1], box[2], box[3] = min(box[0], x), min(box[1], y), max(box[2], x), max(box[3], y)
         if v > 0 and ring_of[v - 1] == ring_of[v]:
-            edges[m, 0], edges[m, 1], edges[m, 2], edges[m, 3] = xy[v - 1, 0], xy[v - 1, 1], x, y
+            edges[m, 0], edges[m, 1] = xy[v - 1, 0] - origin[0], xy[v - 1, 1] - origin[1]
+            edges[m, 2], edges[m, 3] = x, y
             edge_starts[face + 1] = m + 1
             m += 1
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
@@ -209,8 +216,10 @@ def _laid_out(
     faces = np.empty(len(members), np.int64)
     for s in range(len(members)):
         faces[s] = face_of[members[s]]
-    edges = edges[: edge_starts[n]].copy()
-    return edges, edge_starts, boxes, starts, faces, low_x, low_y, high_x, high_y, cell, columns, rows
+    return _Faces(
+        origin[0], origin[1], planes, edges[: edge_starts[n]].copy(), edge_starts, boxes, starts, faces,
+        low_x, low_y, high_x, high_y, cell, columns, rows, tolerance,
+    )  # fmt: skip
 
 
 @kernel
@@ -256,7 +265,6 @@ class TopSurface:
         if self._empty:
             return
         self._corner = (float(np.floor(xy[:, 0].min())), float(np.floor(xy[:, 1].min()))) if corner is None else corner
-        xy = xy - np.array(self._corner)
         planes = np.array(coefficients, dtype=np.float64).reshape(n, 3)
         if origins is not None:
             shift = np.asarray(origins, dtype=np.float64)
@@ -267,8 +275,7 @@ class TopSurface:
             )
         elif self._corner != (0.0, 0.0):
             planes[:, 2] += planes[:, 0] * self._corner[0] + planes[:, 1] * self._corner[1]
-        laid_out = _laid_out(xy, ring, face_of_ring, n, tolerance_m)
-        self._faces = _Faces(*self._corner, planes, *laid_out, tolerance_m)
+        self._faces = _laid_out(xy, ring, face_of_ring, planes, self._corner, tolerance_m)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
