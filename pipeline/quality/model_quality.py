@@ -39,6 +39,7 @@ def model_quality(
     spacing_m: float,
     outline_sigma_m: float,
     is_planar: bool,
+    bic_margin: float = math.nan,
 ) -> tuple[ResidualSummary, ModelQuality]:
     """Measure a delivered model by all points (n, 3) of its candidate, local metres.
 
@@ -46,7 +47,7 @@ def model_quality(
     outline's place in plan, 0 if it was given. `is_planar` says that the faces follow the roof's planes (LoD2):
     residuals of a block are the roof's form, not noise, and the top of a block is not a ridge, so both figures are nan.
 
-    Residuals are summarised with `TOLERANCE_M`. Figures are nan if no points say anything; `bic_margin` is left open.
+    Residuals are summarised with `TOLERANCE_M`. Figures are nan if no points say anything; `bic_margin` is passed on.
     """
     surface = surface_of(faces, planes)
     residuals, face_of_point = surface.residuals(points)
@@ -69,6 +70,7 @@ def model_quality(
         unexplained_m2=unexplained,
         largest_hole_m=hole,
         ridge_z_sigma_m=sigma,
+        bic_margin=bic_margin,
         is_curved=is_planar and is_curved_roof(planes, faces, solids),
     )
 
