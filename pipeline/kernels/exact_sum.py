@@ -1,4 +1,4 @@
-"""Sums that are rounded once, so that they do not depend on the order of their terms."""
+"""Sums that are rounded once: the same in any order, as `math.fsum` (Shewchuk 1997)."""
 
 from __future__ import annotations
 
@@ -7,38 +7,39 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray
 
-_MAX_PARTIALS = 64
-"""Floating-point numbers that do not overlap fit so often into the range of exponents: 2,100 bits of 53 each."""
+_MOST_PARTS = 64
+"""Parts of a sum do not overlap: 53 bits each of the 2100 that finite numbers have."""
 
 
 @kernel
 def exact_sum(values: FloatArray) -> float:
-    """The sum of finite values (n,), as `math.fsum` has it: exact partial sums (Shewchuk 1997), rounded at the end."""
-    partials = np.empty(_MAX_PARTIALS)
+    """The sum of finite values (n,), rounded to the nearest float; what is summed on the way must not overflow."""
+    parts = np.empty(_MOST_PARTS)
     count = 0
     for value in values:
-        total, kept = value, 0
+        high, kept = value, 0
         for k in range(count):
-            larger, smaller = total, partials[k]
-            if abs(larger) < abs(smaller):
-                larger, smaller = smaller, larger
-            total = larger + smaller
-            lost = smaller - (total - larger)
-            if lost != 0.0:
-                partials[kept] = lost
+            other = parts[k]
+            if abs(high) < abs(other):
+                high, other = other, high
+            total = high + other
+            low = other - (total - high)
+            if low != 0.0:
+                parts[kept] = low
                 kept += 1
-        partials[kept] = total
+            high = total
+        parts[kept] = high
         count = kept + 1
-    total = lost = 0.0
-    while count > 0 and lost == 0.0:
+    # parts ascend: add them from the largest down until one is lost in rounding
+    total, low = 0.0, 0.0
+    while count > 0 and low == 0.0:
         count -= 1
-        before = total
-        total = before + partials[count]
-        lost = partials[count] - (total - before)
-    # halfway between two numbers, the rest decides
-    if count > 0 and lost != 0.0 and (partials[count - 1] > 0.0 if lost > 0.0 else partials[count - 1] < 0.0):
-        before = total
-        total = before + 2.0 * lost
-        if total - before != 2.0 * lost:
-            total = before
+        before, part = total, parts[count]
+        total = before + part
+        low = part - (total - before)
+    # a half is rounded to even unless smaller parts decide it
+    if count > 0 and (low < 0.0) == (parts[count - 1] < 0.0) and parts[count - 1] != 0.0:
+        twice = 2.0 * low
+        if (total + twice) - total == twice:
+            total += twice
     return float(total)
