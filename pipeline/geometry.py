@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 
 import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
@@ -482,3 +485,18 @@ def surrounded(places: FloatArray, points: FloatArray, radius_m: float = 0.5, he
         round(radius_m * 1000),
         round(height_m * 1000),
     )
+
+
+# ---------------------------------------------------------------------------------------------------------- polygons
+
+
+def corners_of_rings(polygons: Sequence[Polygon | MultiPolygon]) -> tuple[FloatArray, IntArray, IntArray]:
+    """Corners (n, 2) of all rings, which are closed, outer ones first; the ring of each; the polygon of each ring."""
+    shapes = np.array(polygons, object)
+    if all(isinstance(polygon, Polygon) for polygon in polygons) and not shapely.get_num_interior_rings(shapes).any():
+        xy, ring = shapely.get_coordinates(shapes, return_index=True)
+        return xy, ring, np.arange(len(shapes))
+    parts, owner = shapely.get_parts(shapes, return_index=True)
+    rings, part = shapely.get_rings(parts, return_index=True)
+    xy, ring = shapely.get_coordinates(rings, return_index=True)
+    return xy, ring, owner[part]

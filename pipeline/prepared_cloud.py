@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.geometry import top_visible
-from pipeline.model import Candidate, IntArray, PreparedCloud, Reason
+from pipeline.model import Candidate, FloatArray, IntArray, PreparedCloud, Reason
 from pipeline.tin.delaunay import unique_xy
 
 SHADING_RADIUS_M, SHADING_HEIGHT_M = 0.5, 1.1
@@ -23,20 +24,46 @@ def prepare_cloud(candidate: Candidate, max_points: int | None = None) -> Prepar
         raise ValueError("a point of the candidate has a coordinate that is not finite")
     if max_points is not None and len(candidate.points) > max_points:
         raise BuildingError(Reason.TOO_COMPLEX, f"{len(candidate.points)} points, more than max_points = {max_points}")
-    in_mm = np.rint(candidate.points * 1000.0).astype(np.int64)
-    shift_m = in_mm.min(axis=0) // 1000 if len(in_mm) else np.zeros(3, np.int64)
-    in_mm -= shift_m * 1000
-    points = in_mm / 1000.0
+    in_mm, points, shift_m = _about_corner(candidate.points)
     visible = np.flatnonzero(top_visible(points, SHADING_RADIUS_M, SHADING_HEIGHT_M))
-    highest, _ = unique_xy(in_mm[visible, :2], in_mm[visible, 2])
+    highest = visible
+    seen_mm = in_mm.take(visible, axis=0)
+    if not _ascend(seen_mm):  # they mostly do: points are in canonical order
+        highest = visible[unique_xy(seen_mm[:, :2], seen_mm[:, 2])[0]]
     return PreparedCloud(
         candidate=candidate,
-        shift_m=shift_m.astype(np.float64),
+        shift_m=shift_m,
         points_mm=in_mm,
         points=points,
         visible=visible,
-        highest=visible[highest],
+        highest=highest,
     )
+
+
+@kernel
+def _about_corner(points: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Points (n, 3) about a corner (3,) in whole metres below all, in whole mm and in metres; the corner, metres."""
+    in_mm = np.empty(points.shape, np.int64)
+    for i in range(len(points)):
+        for k in range(3):
+            in_mm[i, k] = int(np.rint(points[i, k] * 1000.0))
+    shift = np.zeros(3)
+    for k in range(3):
+        if len(points) > 0:
+            corner = in_mm[:, k].min() // 1000
+            in_mm[:, k] -= corner * 1000
+            shift[k] = corner
+    return in_mm, in_mm / 1000.0, shift
+
+
+@kernel
+def _ascend(xyz_mm: IntArray) -> bool:
+    """Whether points (n, 3) ascend by x, then by y, so that no two are at one position in plan."""
+    for i in range(1, len(xyz_mm)):
+        step = xyz_mm[i, 0] - xyz_mm[i - 1, 0]
+        if step < 0 or (step == 0 and xyz_mm[i, 1] <= xyz_mm[i - 1, 1]):
+            return False
+    return True
 
 
 def require_visible(cloud: PreparedCloud, index: IntArray, fewest: int, rule: str) -> None:

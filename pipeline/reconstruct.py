@@ -163,7 +163,7 @@ def reconstruct_building(candidate: Candidate, method: str, settings: Reconstruc
             decisions=decisions,
         )
         result = _given_model(blind, result)
-    return dataclasses.replace(result, decisions=tuple(decisions))
+    return result if result.solids else dataclasses.replace(result, decisions=tuple(decisions))
 
 
 def _describe(error: Exception) -> str:
@@ -363,6 +363,8 @@ def _own_model(building: _Building, segmentation: Segmentation, roof: RoofPoints
 
 def _levelled_share(drawn: RoofPartition, level: RoofPartition) -> float:
     """Share of the area whose faces got another plane when they were made level; 0 without faces."""
+    if level is drawn:
+        return 0.0
     areas = shapely.area(np.array(drawn.polygons, object))
     changed_m2, whole_m2 = float(areas[drawn.labels != level.labels].sum()), float(areas.sum())
     return changed_m2 / whole_m2 if whole_m2 > 0.0 else 0.0
@@ -370,7 +372,7 @@ def _levelled_share(drawn: RoofPartition, level: RoofPartition) -> float:
 
 def _cleaned(drawn: RoofPartition, level: RoofPartition, cut: RoofPartition, left_out: int) -> str:
     """What was changed on the drawn faces, in words."""
-    made_level = int(np.count_nonzero(drawn.labels != level.labels))
+    made_level = 0 if level is drawn else int(np.count_nonzero(drawn.labels != level.labels))
     return "; ".join(
         filter(
             None,
@@ -527,10 +529,11 @@ def _record(
     used = sorted({face.plane for part in model.parts for face in part.faces})
     number = {plane: k for k, plane in enumerate(used)}
     planes = tuple(model.planes[plane] for plane in used)
-    faces = tuple(
-        RoofFace(plane=number[face.plane], polygon=face.polygon) for part in model.parts for face in part.faces
-    )
-    solids = tuple(_renumbered(part.solid, number) for part in model.parts)
+    faces = tuple(face for part in model.parts for face in part.faces)
+    solids = tuple(part.solid for part in model.parts)
+    if used != list(range(len(used))):
+        faces = tuple(RoofFace(plane=number[face.plane], polygon=face.polygon) for face in faces)
+        solids = tuple(_renumbered(solid, number) for solid in solids)
     footprint = _united([part.footprint for part in model.parts])
     with guide_steps():
         guides = followed(candidate.guides, [face.polygon for face in faces], roof.guide_distance_m)
@@ -542,6 +545,7 @@ def _record(
         spacing_m=roof.spacing_m,
         outline_sigma_m=0.0 if candidate.footprint is not None else roof.spacing_m * DRAWN_OUTLINE_SPACINGS,
         is_planar=model.lod == "2.2",
+        bic_margin=model.bic_margin,
     )
     walls = walls_of(footprint, roof, building.settings.roof)
     overhangs = _overhangs(building, model, walls) if OVERHANGS in building.settings.lods else None
@@ -569,12 +573,13 @@ def _record(
         rmse_m=residuals.rmse_m,
         p95_m=residuals.p95_m,
         coverage=residuals.coverage,
-        quality=dataclasses.replace(quality, bic_margin=model.bic_margin),
+        quality=quality,
         touches_data_edge=candidate.touches_data_edge,
         strip_offset_m=candidate.strip_offset_m,
         walls=wall_outline(walls),
         overhangs=overhangs,
         guides=guides,
+        decisions=tuple(building.decisions),
     )
 
 

@@ -31,8 +31,10 @@ def is_curved_roof(planes: Sequence[Plane], faces: Sequence[RoofFace], solids: S
     Planes that meet in a ridge with a small turn belong to one surface; it is curved where its planes have at least
     five directions (`MIN_NORMALS`), and it is most of the roof.
     """
+    if len(planes) < MIN_NORMALS:
+        return False
     normals = [plane.normal for plane in planes]
-    if len(planes) < MIN_NORMALS or not _has_directions(normals):
+    if not _has_directions(normals):
         return False
     ridges, _ = folds(planes, solids, SLIVER_HEIGHT_M)
     surface = list(range(len(planes)))

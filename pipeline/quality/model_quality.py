@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import shapely
 
 from pipeline.model import FloatArray, ModelQuality, Plane, RoofFace, Solid
 from pipeline.quality.curved_roof import is_curved_roof
@@ -40,6 +39,7 @@ def model_quality(
     spacing_m: float,
     outline_sigma_m: float,
     is_planar: bool,
+    bic_margin: float = math.nan,
 ) -> tuple[ResidualSummary, ModelQuality]:
     """Measure a delivered model by all points (n, 3) of its candidate, local metres.
 
@@ -47,18 +47,20 @@ def model_quality(
     outline's place in plan, 0 if it was given. `is_planar` says that the faces follow the roof's planes (LoD2):
     residuals of a block are the roof's form, not noise, and the top of a block is not a ridge, so both figures are nan.
 
-    Residuals are summarised with `TOLERANCE_M`. Figures are nan if no points say anything; `bic_margin` is left open.
+    Residuals are summarised with `TOLERANCE_M`. Figures are nan if no points say anything; `bic_margin` is passed on.
     """
     surface = surface_of(faces, planes)
-    top, face_of_point = surface.at(points[:, 0], points[:, 1])
-    residuals = points[:, 2] - top
+    residuals, face_of_point = surface.residuals(points)
     summary = summarise(residuals, TOLERANCE_M)
-    unexplained, hole = _seen(points, surface, residuals, faces, spacing_m)
+    unexplained = hole = math.nan
+    if summary.coverage > 0.0 and spacing_m > 0.0:
+        area_m2 = math.fsum(face.polygon.area for face in faces)
+        unexplained, hole = _seen(points, surface, residuals, area_m2, spacing_m)
     noise = sigma = math.nan
     if is_planar:
         noise = _MAD_TO_SIGMA * summary.median_m
-        owner = np.array([face.plane for face in faces], np.int32)
-        plane_of_point = np.where(face_of_point >= 0, owner[face_of_point], np.int32(-1)).astype(np.int32)
+        # -1, no face, takes the last one: no plane
+        plane_of_point = np.array([*(face.plane for face in faces), -1], np.int32)[face_of_point]
         reach = max(TOLERANCE_M, 3.0 * noise)
         sigma = ridge_height_sigma_m(points, residuals, plane_of_point, reach, planes, solids, outline_sigma_m)
     return summary, ModelQuality(
@@ -68,16 +70,15 @@ def model_quality(
         unexplained_m2=unexplained,
         largest_hole_m=hole,
         ridge_z_sigma_m=sigma,
+        bic_margin=bic_margin,
         is_curved=is_planar and is_curved_roof(planes, faces, solids),
     )
 
 
 def _seen(
-    points: FloatArray, surface: TopSurface, residuals: FloatArray, faces: Sequence[RoofFace], spacing_m: float
+    points: FloatArray, surface: TopSurface, residuals: FloatArray, area_m2: float, spacing_m: float
 ) -> tuple[float, float]:
     """Area of roof without points near it, m2, and the diameter of the largest circle on it without any point, m."""
-    if np.isnan(residuals).all() or not spacing_m > 0.0:
-        return math.nan, math.nan
     low_x, low_y, high_x, high_y = surface.bounds
     cell = max(_MIN_CELL_M, spacing_m, math.sqrt((high_x - low_x) * (high_y - low_y) / _MAX_CELLS))
     columns, rows = math.floor((high_x - low_x) / cell) + 1, math.floor((high_y - low_y) / cell) + 1
@@ -85,4 +86,4 @@ def _seen(
     places, unseen, square = surface.seen(points, residuals, raster, TOLERANCE_M, GAP_SPACINGS * spacing_m)
     if places == 0:
         return math.nan, math.nan
-    return unseen / places * math.fsum(shapely.area([face.polygon for face in faces]).tolist()), 2.0 * math.sqrt(square)
+    return unseen / places * area_m2, 2.0 * math.sqrt(square)

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
+from pipeline.geometry import corners_of_rings
 from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.exact_sum import exact_sum
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, RoofFace
 from pipeline.quality.unseen_roof import Raster, middles_of_cells, unseen_cells
 
@@ -58,6 +59,9 @@ class _Faces(NamedTuple):
     """(m,) int64, faces by cells."""
     low_x: float
     low_y: float
+    high_x: float
+    high_y: float
+    """Bounds of the boxes."""
     cell: float
     columns: int
     rows: int
@@ -141,14 +145,27 @@ def _top_surface(px: FloatArray, py: FloatArray, faces: _Faces) -> tuple[FloatAr
 
 
 @kernel
-def _laid_out(
-    xy: FloatArray, ring_of: IntArray, face_of_ring: IntArray, n: int, tolerance: float
-) -> tuple[FloatArray, IntArray, FloatArray, LabelArray, IntArray, float, float, float, int, int]:
-    """Edges of all faces, where each face's start, their boxes; faces by cells, where each cell's start; the cells.
+def _residuals(points: FloatArray, faces: _Faces) -> tuple[FloatArray, LabelArray]:
+    """The kernel of `TopSurface.residuals`."""
+    top, number = _top_surface(points[:, 0].copy(), points[:, 1].copy(), faces)
+    return points[:, 2] - top, number
 
-    Vertices `xy` (v, 2) come ring after ring, each closed; `ring_of` (v,) is their ring, `face_of_ring` (r,) the face
-    of each ring, ascending. Those of the `n` faces without a ring are in no cell. Boxes are widened by `tolerance`.
+
+@kernel
+def _laid_out(
+    xy: FloatArray,
+    ring_of: IntArray,
+    face_of_ring: IntArray,
+    planes: FloatArray,
+    origin: tuple[float, float],
+    tolerance: float,
+) -> _Faces:
+    """Faces with planes (n, 3) in a frame with this origin, by cells.
+
+    Vertices `xy` (v, 2), metres, come ring after ring, each closed; `ring_of` (v,) is their ring, `face_of_ring` (r,)
+    the face of each ring, ascending. Faces without a ring are in no cell. Boxes are widened by `tolerance`.
     """
+    n = len(planes)
     edges = np.empty((len(xy), 4))
     edge_starts = np.zeros(n + 1, np.int64)
     boxes = np.empty((n, 4))
@@ -156,11 +173,12 @@ def _laid_out(
     m = 0
     for v in range(len(xy)):
         face = face_of_ring[ring_of[v]]
-        x, y = xy[v, 0], xy[v, 1]
+        x, y = xy[v, 0] - origin[0], xy[v, 1] - origin[1]
         box = boxes[face]
         box[0], box[1], box[2], box[3] = min(box[0], x), min(box[1], y), max(box[2], x), max(box[3], y)
         if v > 0 and ring_of[v - 1] == ring_of[v]:
-            edges[m, 0], edges[m, 1], edges[m, 2], edges[m, 3] = xy[v - 1, 0], xy[v - 1, 1], x, y
+            edges[m, 0], edges[m, 1] = xy[v - 1, 0] - origin[0], xy[v - 1, 1] - origin[1]
+            edges[m, 2], edges[m, 3] = x, y
             edge_starts[face + 1] = m + 1
             m += 1
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
@@ -198,7 +216,10 @@ def _laid_out(
     faces = np.empty(len(members), np.int64)
     for s in range(len(members)):
         faces[s] = face_of[members[s]]
-    return edges[: edge_starts[n]].copy(), edge_starts, boxes, starts, faces, low_x, low_y, cell, columns, rows
+    return _Faces(
+        origin[0], origin[1], planes, edges[: edge_starts[n]].copy(), edge_starts, boxes, starts, faces,
+        low_x, low_y, high_x, high_y, cell, columns, rows, tolerance,
+    )  # fmt: skip
 
 
 @kernel
@@ -239,14 +260,11 @@ class TopSurface:
         corner: tuple[float, float] | None = None,
     ) -> None:
         n = len(polygons)
-        self._empty = all(polygon.is_empty for polygon in polygons)
+        xy, ring, face_of_ring = corners_of_rings(polygons)
+        self._empty = len(xy) == 0
         if self._empty:
             return
-        parts, owner = shapely.get_parts(np.asarray(polygons, dtype=object), return_index=True)
-        rings, part = shapely.get_rings(parts, return_index=True)
-        xy, ring = shapely.get_coordinates(rings, return_index=True)
         self._corner = (float(np.floor(xy[:, 0].min())), float(np.floor(xy[:, 1].min()))) if corner is None else corner
-        xy = xy - np.array(self._corner)
         planes = np.array(coefficients, dtype=np.float64).reshape(n, 3)
         if origins is not None:
             shift = np.asarray(origins, dtype=np.float64)
@@ -257,22 +275,15 @@ class TopSurface:
             )
         elif self._corner != (0.0, 0.0):
             planes[:, 2] += planes[:, 0] * self._corner[0] + planes[:, 1] * self._corner[1]
-        edges, starts, boxes, cell_starts, cell_faces, west, south, cell, columns, rows = _laid_out(
-            xy, ring, owner[part], n, tolerance_m
-        )
-        self._faces = _Faces(
-            *self._corner, planes, edges, starts, boxes, cell_starts, cell_faces, west, south, cell, columns, rows,
-            tolerance_m,
-        )  # fmt: skip
+        self._faces = _laid_out(xy, ring, face_of_ring, planes, self._corner, tolerance_m)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """Smallest x, smallest y, largest x, largest y of all faces, metres; nan without any."""
         if self._empty:
             return math.nan, math.nan, math.nan, math.nan
-        east, north = self._corner
-        low, high = self._faces.boxes[:, :2].min(axis=0).tolist(), self._faces.boxes[:, 2:].max(axis=0).tolist()
-        return low[0] + east, low[1] + north, high[0] + east, high[1] + north
+        (east, north), faces = self._corner, self._faces
+        return faces.low_x + east, faces.low_y + north, faces.high_x + east, faces.high_y + north
 
     def at(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, LabelArray]:
         """Elevation of the highest face at places x, y, each (n,) finite metres, and its index into the polygons.
@@ -283,6 +294,12 @@ class TopSurface:
             return np.full(len(x), np.nan), np.full(len(x), -1, np.int32)
         x, y = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64)
         return _top_surface(x, y, self._faces)
+
+    def residuals(self, points: FloatArray) -> tuple[FloatArray, LabelArray]:
+        """Points (n, 3) minus this surface, (n,) m, nan outside all faces; and the face at each, as `at`."""
+        if self._empty or len(points) == 0:
+            return np.full(len(points), np.nan), np.full(len(points), -1, np.int32)
+        return _residuals(np.ascontiguousarray(points, dtype=np.float64), self._faces)
 
     def seen(
         self,
@@ -330,8 +347,7 @@ def surface_of(faces: Sequence[RoofFace], planes: Sequence[Plane]) -> TopSurface
 
 def vertical_residuals(points: FloatArray, faces: Sequence[RoofFace], planes: Sequence[Plane]) -> FloatArray:
     """Original points (n, 3) minus top surface of a model, (n,) m: positive above it, nan where no face covers."""
-    residuals: FloatArray = points[:, 2] - surface_of(faces, planes).elevation(points[:, 0], points[:, 1])
-    return residuals
+    return surface_of(faces, planes).residuals(points)[0]
 
 
 def _quantile(ascending: FloatArray, share: float) -> float:
@@ -340,6 +356,20 @@ def _quantile(ascending: FloatArray, share: float) -> float:
     low = math.floor(place)
     high = min(low + 1, len(ascending) - 1)
     return float(ascending[low]) + (place - low) * float(ascending[high] - ascending[low])
+
+
+@kernel
+def _distances(residuals: FloatArray, tolerance_m: float) -> tuple[FloatArray, float, int]:
+    """The absolute residuals of the covered points, the sum of their squares, and how many are within the tolerance."""
+    distances = np.empty(len(residuals))
+    covered = within = 0
+    for residual in residuals:
+        if not math.isnan(residual):
+            distances[covered] = abs(residual)
+            within += distances[covered] <= tolerance_m
+            covered += 1
+    distances = distances[:covered]
+    return distances, exact_sum(distances * distances), within
 
 
 def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummary:
@@ -353,17 +383,18 @@ def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummar
     (0.5, 0.75)
     """
     n = len(residuals)
-    distances = np.sort(np.abs(residuals[~np.isnan(residuals)]))
+    distances, squares, within = _distances(residuals, tolerance_m)
+    distances.sort()
     covered = len(distances)
     if covered == 0:
         return ResidualSummary(
             rmse_m=math.nan, median_m=math.nan, p95_m=math.nan, share_within=0.0, coverage=0.0, n_points=n
         )
     return ResidualSummary(
-        rmse_m=math.sqrt(math.fsum((distances * distances).tolist()) / covered),
+        rmse_m=math.sqrt(squares / covered),
         median_m=_quantile(distances, 0.5),
         p95_m=_quantile(distances, 0.95),
-        share_within=float(np.searchsorted(distances, tolerance_m, side="right")) / n,
+        share_within=within / n,
         coverage=covered / n,
         n_points=n,
     )

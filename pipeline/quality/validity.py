@@ -35,7 +35,7 @@ standards.
 from __future__ import annotations
 
 import math
-from itertools import chain
+from itertools import accumulate, chain
 
 import numpy as np
 
@@ -97,21 +97,14 @@ def check_solid(solid: Solid, tolerances: ValidityTolerances = DEFAULT_TOLERANCE
     """
     vertices = np.ascontiguousarray(np.rint(solid.vertices * MILLIMETRES_PER_METRE), dtype=np.int64)
     rings = [ring for face in solid.faces for ring in face.rings]
-    ring_vertices = np.fromiter(chain.from_iterable(rings), np.int64)
-    ring_offsets = _offsets([len(ring) for ring in rings])
-    face_offsets = _offsets([len(face.rings) for face in solid.faces])
+    ring_vertices = np.array(list(chain.from_iterable(rings)), np.int64)
+    ring_offsets = np.array([0, *accumulate(map(len, rings))])
+    face_offsets = np.array([0, *accumulate(len(face.rings) for face in solid.faces)])
     planarity_mm = tolerances.planarity_m * MILLIMETRES_PER_METRE
     min_cosine = math.cos(math.radians(tolerances.normals_deg))
     snap_mm = tolerances.snap_m * MILLIMETRES_PER_METRE
     found = _faults(vertices, ring_vertices, ring_offsets, face_offsets, snap_mm, planarity_mm, min_cosine)
-    return tuple(int(code) for code in np.flatnonzero(found))
-
-
-def _offsets(lengths: list[int]) -> IntArray:
-    """Where each of consecutive runs starts, and where the last ends."""
-    offsets = np.zeros(len(lengths) + 1, dtype=np.int64)
-    np.cumsum(lengths, out=offsets[1:])
-    return offsets
+    return tuple(np.flatnonzero(found).tolist())
 
 
 @kernel

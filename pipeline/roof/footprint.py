@@ -8,7 +8,9 @@ import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
+from pipeline.geometry import corners_of_rings
 from pipeline.model import FloatArray, IntArray, Reason
 from pipeline.roof.partition import RoofPartition
 
@@ -25,8 +27,7 @@ def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
 
     Raises BuildingError `no_footprint` where nothing with an area is left.
     """
-    scaled = shapely.force_2d(footprint)
-    scaled = shapely.set_coordinates(scaled, shapely.get_coordinates(scaled) * 1e3)
+    scaled = shapely.transform(footprint, lambda xy: xy * 1e3)
     if not scaled.is_valid:
         scaled = shapely.make_valid(scaled, method="structure", keep_collapsed=False)
     snapped = shapely.set_precision(scaled, 1.0)
@@ -44,10 +45,18 @@ def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
 
 def _has_repeated(polygons: list[Polygon], distance_mm: float) -> bool:
     """Whether a vertex is within a distance of the one before it."""
-    xy, ring = shapely.get_coordinates(shapely.get_rings(polygons), return_index=True)
-    steps = xy[1:] - xy[:-1]
-    squares = steps[:, 0] * steps[:, 0] + steps[:, 1] * steps[:, 1]
-    return bool((squares[ring[1:] == ring[:-1]] <= distance_mm * distance_mm).any())
+    xy, ring, _ = corners_of_rings(polygons)
+    return bool(_repeats(xy, ring, distance_mm))
+
+
+@kernel
+def _repeats(xy: FloatArray, ring: IntArray, distance: float) -> bool:
+    """Whether a corner (n, 2) is within a distance of the one before it in its ring."""
+    for i in range(1, len(xy)):
+        x, y = xy[i, 0] - xy[i - 1, 0], xy[i, 1] - xy[i - 1, 1]
+        if ring[i] == ring[i - 1] and x * x + y * y <= distance * distance:
+            return True
+    return False
 
 
 def without_repeated(polygon: Polygon, distance_mm: float) -> list[Polygon]:
@@ -135,7 +144,9 @@ def polygons_of(geometry: shapely.Geometry) -> list[Polygon]:
     """The polygons with an area in any geometry."""
     if isinstance(geometry, Polygon):
         return [geometry] if geometry.area > 0.0 else []
-    parts = shapely.get_parts(shapely.get_parts(geometry))
+    parts = shapely.get_parts(geometry)
+    if not isinstance(geometry, MultiPolygon):  # collections may hold others
+        parts = shapely.get_parts(parts)
     return [p for p in parts.tolist() if isinstance(p, Polygon) and p.area > 0.0]
 
 

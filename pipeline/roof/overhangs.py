@@ -26,8 +26,9 @@ from shapely import MultiPolygon, Polygon
 from pipeline.errors import BuildingError
 from pipeline.kernels.union_find import united
 from pipeline.model import FaceKind, IntArray, NoOverhang, Plane, Reason, Solid, SolidFace
+from pipeline.roof.extrusion import MIN_SPAN_MM, SAME_HEIGHT_MM
 from pipeline.roof.footprint import polygons_of
-from pipeline.roof.solid import MIN_SPAN_MM, SAME_HEIGHT_MM, Ring, SolidPart, height_mm, trace
+from pipeline.roof.solid import SolidPart
 
 _FORMS = ((10.0, 0, 2.0), (10.0, 7, 2.0), (30.0, 0, 5.0), (30.0, -7, 10.0), (100.0, 7, 10.0))
 """Ways to draw the same: how far the wall outline may move to a border or vertex of the roof; what is added to the
@@ -42,6 +43,7 @@ _STRAIGHT_MM = 1.5
 
 XY = tuple[int, int]
 Edge = tuple[int, int]
+Ring = list[int]
 
 
 class UndrawableError(Exception):
@@ -251,7 +253,7 @@ class _Overhangs:
             top, plane = self._top[own.face], self._planes[own.face]
             for v in itertools.chain.from_iterable(own.rings):
                 if v not in top:
-                    top[v] = height_mm(plane, self._xy[v])
+                    top[v] = _height_mm(plane, self._xy[v])
 
     def _chain(self, a: int, b: int, following: dict[int, list[int]]) -> Ring:
         """The new vertices on the border of a face from one of its own vertices to the next."""
@@ -404,7 +406,7 @@ class _Overhangs:
             ring[b] = a
         floors = []
         for _, following in sorted(below.items()):
-            rings = trace(following, self._xy)
+            rings = _trace(following, self._xy)
             solid_rings = tuple(tuple(levels.bottom(v, cell_at[v]) for v in ring) for ring in rings)
             floors.append(SolidFace(rings=solid_rings, kind=FaceKind.GROUND))
         return floors
@@ -561,3 +563,30 @@ def _is_straight(a: Sequence[int], v: Sequence[int], b: Sequence[int]) -> bool:
     start, place, end = np.array(a, np.float64), np.array(v, np.float64), np.array(b, np.float64)
     length = float(np.linalg.norm(end - start))
     return length > 0.0 and float(np.linalg.norm(np.cross(end - start, place - start))) <= _STRAIGHT_MM * length
+
+
+def _height_mm(plane: Plane, xy: tuple[int, int]) -> float:
+    """Height of a plane over a plan vertex; all in millimetres."""
+    return (plane.a * (xy[0] * 1e-3) + plane.b * (xy[1] * 1e-3) + plane.c) * 1e3
+
+
+def _trace(following: dict[int, int], xy: Sequence[tuple[int, int]]) -> list[Ring]:
+    """Closed rings of a successor table, the outer one (clockwise: a floor is seen from below) first."""
+    rings: list[Ring] = []
+    left = dict(following)
+    while left:
+        start = next(iter(left))
+        ring = [start]
+        v = left.pop(start)
+        while v != start:
+            ring.append(v)
+            v = left.pop(v)
+        rings.append(ring)
+
+    def twice_area(ring: Ring) -> int:
+        return sum(xy[a][0] * xy[b][1] - xy[b][0] * xy[a][1] for a, b in zip(ring, ring[1:] + ring[:1], strict=True))
+
+    rings.sort(key=twice_area)
+    if sum(twice_area(ring) < 0 for ring in rings) != 1:
+        raise BuildingError(Reason.NO_PARTITION, "the outline of a part is not one ring with holes")
+    return rings

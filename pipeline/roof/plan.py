@@ -65,7 +65,7 @@ class RoofPoints:
     points: FloatArray
     """(n, 3) float64, local metres."""
     xy_mm: IntArray
-    """(n, 2) int64, millimetres; every position once, the highest point of each."""
+    """(n, 2) int64, millimetres, ascending by x, then y; every position once, the highest point of each."""
     index: IntArray
     """(n,) int64, which of the candidate's points they are."""
     labels: LabelArray
@@ -105,10 +105,12 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
     Raises BuildingError `too_few_points` or `no_footprint`.
     """
     candidate = cloud.candidate
-    highest = candidate.points[cloud.highest]
+    index = cloud.highest
+    points = candidate.points.take(index, axis=0)
     least_z_m = candidate.ground_z_m + settings.min_roof_height_m if candidate.footprint is None else -math.inf
-    is_above = highest[:, 2] >= least_z_m
-    index, points = cloud.highest[is_above], highest[is_above]
+    is_above = points[:, 2] >= least_z_m
+    if not is_above.all():
+        index, points = index[is_above], points[is_above]
     name, fewest = "min_points", settings.min_points
     if candidate.footprint is not None and settings.min_points_in_footprint < fewest:
         name, fewest = "min_points_in_footprint", settings.min_points_in_footprint
@@ -117,13 +119,13 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
     if len(index) < fewest:
         raise BuildingError(Reason.TOO_FEW_POINTS, f"{len(index)} roof points, fewer than {name} = {fewest}")
     footprint = None if candidate.footprint is None else footprint_in_mm(candidate.footprint)
-    xy_mm = cloud.points_mm[index, :2] + (cloud.shift_m[:2] * 1e3).astype(np.int64)
+    xy_mm = cloud.points_mm.take(index, axis=0)[:, :2] + (cloud.shift_m[:2] * 1e3).astype(np.int64)
     return RoofPoints(
         points=points,
         xy_mm=xy_mm,
         index=index,
         labels=np.full(len(index), -1, np.int32),
-        split=_are_among(xy_mm, np.rint(candidate.split_returns[:, :2] * 1e3).astype(np.int64)),
+        split=_are_among(xy_mm, candidate.split_returns),
         spacing_m=min(max(spacing_over_area_m(points), 0.1), 3.0),
         footprint_mm=footprint,
         outline_mm=None if candidate.outline is None else footprint_in_mm(candidate.outline),
@@ -135,13 +137,21 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
     )
 
 
-def _are_among(xy_mm: IntArray, others_mm: IntArray) -> BoolArray:
-    """Which of the positions, (n, 2), are rows of others."""
-    if len(others_mm) == 0:
-        return np.zeros(len(xy_mm), np.bool_)
-    keys, others = ((xy[:, 0] << 32) + xy[:, 1] for xy in (xy_mm, others_mm))
-    others.sort()
-    among: BoolArray = others[np.minimum(np.searchsorted(others, keys), len(others) - 1)] == keys
+@kernel
+def _are_among(xy_mm: IntArray, others: FloatArray) -> BoolArray:
+    """Which of the positions, (n, 2) mm and ascending by x, then y, are those of other points (m, 3), metres."""
+    among = np.zeros(len(xy_mm), np.bool_)
+    for i in range(len(others)):
+        x, y = int(np.rint(others[i, 0] * 1e3)), int(np.rint(others[i, 1] * 1e3))
+        low, high = 0, len(xy_mm)
+        while low < high:
+            middle = (low + high) // 2
+            if xy_mm[middle, 0] < x or (xy_mm[middle, 0] == x and xy_mm[middle, 1] < y):
+                low = middle + 1
+            else:
+                high = middle
+        if low < len(xy_mm) and xy_mm[low, 0] == x and xy_mm[low, 1] == y:
+            among[low] = True
     return among
 
 
@@ -405,14 +415,16 @@ def level_unsupported_faces(
     down to the floor keeps its plane: `cut_at_floor` ends it there. Returns the partition with the labels of the new
     planes, which follow the old ones in the list.
     """
-    labels = partition.labels.copy()
-    extended = list(planes)
     floor = ground_z_m + settings.min_clearance_m
     xy, face = shapely.get_coordinates(np.array(partition.polygons, object), return_index=True)
     coefficients = np.array([plane.coefficients for plane in planes]).reshape(len(planes), 3)
     tops, bottoms, highest, fits = _fitting_faces(
-        xy, face, labels, coefficients, roof.points, roof.labels, floor, settings.max_overshoot_m
+        xy, face, partition.labels, coefficients, roof.points, roof.labels, floor, settings.max_overshoot_m
     )
+    extended = list(planes)
+    if fits.all():
+        return partition, extended
+    labels = partition.labels.copy()
     for k in np.flatnonzero(~fits).tolist():
         polygon, label = partition.polygons[k], int(labels[k])
         middle = 0.5 * (float(bottoms[k]) + float(tops[k]))

@@ -12,9 +12,6 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
-import numpy as np
-import shapely
-
 from pipeline.model import FaceKind, Plane, RoofFace, RoofType, Solid, SolidFace
 from pipeline.roof.settings import RoofTypeSettings
 
@@ -46,10 +43,8 @@ def roof_type(
     It is `none` without faces and `combination` for a roof without a simpler name.
     """
     areas: dict[int, float] = {}
-    for face, area in zip(
-        faces, shapely.area(np.array([face.polygon for face in faces], object)).tolist(), strict=True
-    ):
-        areas[face.plane] = areas.get(face.plane, 0.0) + area
+    for face in faces:
+        areas[face.plane] = areas.get(face.plane, 0.0) + face.polygon.area
     total = math.fsum(areas.values())
     if total <= 0.0:
         return RoofType.NONE
