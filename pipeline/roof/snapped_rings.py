@@ -1,0 +1,124 @@
+"""Rings on the millimetre grid, and how far apart two of them are, without an overlay."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pipeline.compiler import kernel
+from pipeline.model import FloatArray
+
+_CLEAR = 0.75
+"""An edge that keeps this far from a rounded vertex passes by its grid cell, whose corners are 0.71 away."""
+
+
+@kernel
+def _turns_left(ring: FloatArray) -> bool:
+    """Whether the interior of a ring (n, 2) is on its left."""
+    twice_area = 0.0
+    for k in range(len(ring)):
+        twice_area += ring[k - 1, 0] * ring[k, 1] - ring[k, 0] * ring[k - 1, 1]
+    return twice_area > 0.0
+
+
+@kernel
+def _is_near(ring: FloatArray, first: int, vertex: int) -> bool:
+    """Whether the edge from the vertex `first` passes near another vertex, rounded, that does not end it."""
+    second = (first + 1) % len(ring)
+    if vertex in (first, second):
+        return False
+    x, y = np.rint(ring[vertex, 0]) - ring[first, 0], np.rint(ring[vertex, 1]) - ring[first, 1]
+    ux, uy = ring[second, 0] - ring[first, 0], ring[second, 1] - ring[first, 1]
+    squared = ux * ux + uy * uy
+    t = min(max((x * ux + y * uy) / squared, 0.0), 1.0) if squared > 0.0 else 0.0
+    return math.hypot(x - t * ux, y - t * uy) <= _CLEAR
+
+
+@kernel
+def _parts(ring: FloatArray, first: int, vertex: int) -> bool:
+    """Whether the line of the edge from the vertex `first` runs between the ends of the edge from another vertex."""
+    n = len(ring)
+    ux, uy = ring[(first + 1) % n, 0] - ring[first, 0], ring[(first + 1) % n, 1] - ring[first, 1]
+    one = ux * (ring[vertex, 1] - ring[first, 1]) - uy * (ring[vertex, 0] - ring[first, 0])
+    second = (vertex + 1) % n
+    other = ux * (ring[second, 1] - ring[first, 1]) - uy * (ring[second, 0] - ring[first, 0])
+    return (one > 0.0) != (other > 0.0)
+
+
+@kernel
+def snapped_ring(ring: FloatArray) -> FloatArray:
+    """A ring (n, 2) on the grid of whole units, as `shapely.set_precision` draws it: clockwise, its first vertex last.
+
+    So it is where no two edges cross and none passes by another vertex's place on the grid: then vertices are rounded
+    and nothing else happens. Empty, (0, 2), where this is not so. The first vertex is not repeated.
+    """
+    n = len(ring)
+    low, high = np.empty((2, n)), np.empty((2, n))
+    for i in range(n):
+        for axis in range(2):
+            one, other = ring[i, axis], ring[(i + 1) % n, axis]
+            low[axis, i], high[axis, i] = min(one, other) - _CLEAR, max(one, other) + _CLEAR
+    for i in range(n):
+        left, right, bottom, top = low[0, i], high[0, i], low[1, i], high[1, i]
+        for j in range(i + 1, n):
+            if low[0, j] > right or high[0, j] < left or low[1, j] > top or high[1, j] < bottom:
+                continue
+            k, m = i + 1, (j + 1) % n
+            if _is_near(ring, i, j) or _is_near(ring, i, m) or _is_near(ring, j, i) or _is_near(ring, j, k):
+                return np.empty((0, 2))
+            if k != j and m != i and _parts(ring, i, j) and _parts(ring, j, i):
+                return np.empty((0, 2))
+    turns_left = _turns_left(ring)
+    snapped = np.empty((n if n > 2 else 0, 2))
+    for k in range(len(snapped)):
+        v = n - 1 - k if turns_left else (k + 1) % n
+        snapped[k, 0], snapped[k, 1] = np.rint(ring[v, 0]), np.rint(ring[v, 1])
+    return snapped
+
+
+@kernel
+def perimeter(ring: FloatArray) -> float:
+    """Length of a ring (n, 2)."""
+    length = 0.0
+    for k in range(len(ring)):
+        length += math.hypot(ring[k, 0] - ring[k - 1, 0], ring[k, 1] - ring[k - 1, 1])
+    return length
+
+
+@kernel
+def most_area_between(ring: FloatArray, other: FloatArray) -> float:
+    """An upper bound of the area that only one of two rings encloses, (n, 2) and (m, 2); infinite if none is found.
+
+    Each edge of `ring` is compared with the stretch of the other one between the vertices nearest to its ends: with
+    their projections on the edge the vertices of the stretch make quadrilaterals that cover all between the two.
+    """
+    n, m = len(ring), len(other)
+    step = 1 if _turns_left(ring) == _turns_left(other) else m - 1
+    nearest = np.zeros(n, np.int64)
+    for k in range(n):
+        least = math.inf
+        for i in range(m):
+            dx, dy = other[i, 0] - ring[k, 0], other[i, 1] - ring[k, 1]
+            if dx * dx + dy * dy < least:
+                least, nearest[k] = dx * dx + dy * dy, i
+    passed, area = 0, 0.0
+    for k in range(n):
+        x0, y0 = ring[k - 1, 0], ring[k - 1, 1]
+        ux, uy = ring[k, 0] - x0, ring[k, 1] - y0
+        squared = max(ux * ux + uy * uy, 1.0)
+        i, end = nearest[k - 1], nearest[k]
+        x, y, t = other[i, 0] - x0, other[i, 1] - y0, 0.0
+        while True:
+            # the triangle from where the vertex is projected to, along the edge, then on to the next vertex
+            along = 1.0 if i == end else min(max((x * ux + y * uy) / squared, 0.0), 1.0)
+            area += 0.5 * abs((along - t) * (ux * y - uy * x))
+            t = along
+            if i == end:
+                break
+            i = (i + step) % m
+            passed += 1
+            dx, dy = other[i, 0] - x0 - x, other[i, 1] - y0 - y
+            area += 0.5 * abs((x - t * ux) * dy - (y - t * uy) * dx)
+            x, y = x + dx, y + dy
+    return area if passed == m else math.inf
