@@ -21,7 +21,7 @@ from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outwar
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Point, Run, corners, merge, split
 from pipeline.roof.settings import RoofSettings
-from pipeline.roof.snapped_rings import most_area_between, perimeter, snapped_ring
+from pipeline.roof.snapped_rings import most_area_between, on_grid, perimeter, snapped_ring
 
 _FACTORS = (1.0, 0.6, 0.35)
 """Multiples of the tolerance: a ring that cannot be drawn with few lines is tried with more."""
@@ -74,20 +74,10 @@ def _drawn_back(outline_mm: MultiPolygon, reach_mm: float) -> MultiPolygon:
         return outline_mm
     parts: list[Polygon] = []
     for polygon in outline_mm.geoms:
-        buffered = shapely.buffer(polygon, -reach_mm, join_style="mitre")
-        smaller = polygons_of(_on_grid(buffered))
+        smaller = polygons_of(on_grid(shapely.buffer(polygon, -reach_mm, join_style="mitre")))
         parts.append(smaller[0] if len(smaller) == 1 else polygon)
     drawn = MultiPolygon(parts)
-    return drawn if drawn.is_valid else outline_mm
-
-
-def _on_grid(shape: shapely.Geometry) -> shapely.Geometry:
-    """A valid polygon or polygons in integer millimetres."""
-    if isinstance(shape, Polygon) and shapely.get_num_interior_rings(shape) == 0:
-        snapped = snapped_ring(shapely.get_coordinates(shape)[:-1])
-        if len(snapped):
-            return Polygon(snapped)
-    return shapely.set_precision(shape, 1.0)
+    return drawn if len(parts) == 1 or drawn.is_valid else outline_mm
 
 
 def _straight_rings(

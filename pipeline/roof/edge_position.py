@@ -190,16 +190,59 @@ def mixed_pulse_reach_mm(outline_mm: shapely.Geometry, points: EdgePoints) -> fl
     if not points.split.any():
         return 0.0
     simple = shapely.simplify(outline_mm, 0.6 * points.spacing_mm, preserve_topology=True)
-    border = simple.boundary
-    shapely.prepare(border)
-    near = shapely.dwithin(border, shapely.points(points.xy_mm[points.split].astype(np.float64)), points.band_mm)
-    # chimneys and skylights split pulses too: as many per area along the edge as amid the roof
-    middle_mm2 = shapely.buffer(simple, -points.band_mm).area
-    usual = int((~near).sum()) / middle_mm2 if middle_mm2 > 0.0 else 0.0
-    count = int(near.sum()) - usual * (simple.area - middle_mm2)
-    length = float(border.length)
+    xy, ring = shapely.get_coordinates(shapely.get_parts(simple.boundary), return_index=True)
+    near, far, length = _splits_near(xy, ring, points.xy_mm, points.split, points.band_mm)
+    count = float(near)
+    if far:
+        # chimneys and skylights split pulses too: as many per area along the edge as amid the roof
+        middle_mm2 = shapely.buffer(simple, -points.band_mm).area
+        usual = far / middle_mm2 if middle_mm2 > 0.0 else 0.0
+        count -= usual * (simple.area - middle_mm2)
     reach: float = 0.5 * count * points.spacing_mm**2 / length if length > 0.0 else 0.0
     return min(max(reach, 0.0), 1e3 * _LONGEST_REACH_M)
+
+
+@kernel
+def _splits_near(
+    rings: FloatArray, ring: IntArray, xy_mm: IntArray, split: BoolArray, band: float
+) -> tuple[int, int, float]:
+    """How many split points lie within a band by the rings, how many do not, and the length of the rings.
+
+    Rings are closed, (v, 2) with the number of the ring of every vertex, (v,).
+    """
+    length, of_ring = 0.0, 0.0
+    for v in range(1, len(rings)):
+        if ring[v] != ring[v - 1]:
+            length, of_ring = length + of_ring, 0.0
+            continue
+        dx, dy = rings[v, 0] - rings[v - 1, 0], rings[v, 1] - rings[v - 1, 1]
+        of_ring += math.sqrt(dx * dx + dy * dy)
+    near, far = 0, 0
+    for i in range(len(xy_mm)):
+        if not split[i]:
+            continue
+        is_near = False
+        for v in range(1, len(rings)):
+            if ring[v] != ring[v - 1]:
+                continue
+            ux, uy = rings[v, 0] - rings[v - 1, 0], rings[v, 1] - rings[v - 1, 1]
+            x, y = xy_mm[i, 0] - rings[v - 1, 0], xy_mm[i, 1] - rings[v - 1, 1]
+            squared = ux * ux + uy * uy
+            along = (x * ux + y * uy) / squared if squared > 0.0 else 0.0
+            if along <= 0.0:
+                off = math.sqrt(x * x + y * y)
+            elif along >= 1.0:
+                off = math.sqrt((x - ux) ** 2 + (y - uy) ** 2)
+            else:
+                off = abs((y * ux - x * uy) / squared) * math.sqrt(squared)
+            if off <= band:
+                is_near = True
+                break
+        if is_near:
+            near += 1
+        else:
+            far += 1
+    return near, far, length + of_ring
 
 
 def outward_shift_mm(border: FloatArray, run: Run, points: EdgePoints, reach_mm: float) -> float | None:

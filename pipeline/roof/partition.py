@@ -36,6 +36,8 @@ _JUST_BEYOND = 0.3
 """A crossing this share of an edge beyond its end still counts as on it: the noise of the planes moves it so far."""
 _PARALLEL = 1e-3
 """Determinant of three planes' slopes below which they do not meet in one point; numerical guard."""
+_LAST = 2**62
+"""A key behind those of all regions."""
 _INSIDE_MM = 5.0
 """How far the meeting point keeps from the sides of its facet; numerical guard."""
 
@@ -62,14 +64,15 @@ class MinAreas(NamedTuple):
 @kernel
 def connected_regions(facets: LabelArray, labels: LabelArray) -> tuple[LabelArray, int]:
     """Components of equally labelled vertices along TIN edges, (n,) numbered by their lowest vertex; their number."""
-    n = len(labels)
-    parent = np.arange(n)
+    parent = np.arange(len(labels))
     for t in range(len(facets)):
-        for k in range(3):
-            a = facets[t, k]
-            b = facets[t, (k + 1) % 3]
-            if labels[a] == labels[b]:
-                unite(parent, a, b)
+        a, b, c = facets[t, 0], facets[t, 1], facets[t, 2]
+        if labels[a] == labels[b]:
+            unite(parent, a, b)
+        if labels[b] == labels[c]:
+            unite(parent, b, c)
+        if labels[c] == labels[a] != labels[b]:
+            unite(parent, c, a)
     return numbered_sets(parent)
 
 
@@ -91,16 +94,13 @@ def _region_areas(
 
 @kernel(inline="always")
 def _adjacency(facets: LabelArray, n: int) -> tuple[LabelArray, LabelArray]:
-    """The neighbours of n vertices in compressed rows: starts (n + 1,) and vertices; those over inner edges twice."""
-    corners = np.empty(6 * len(facets), np.int32)
-    for t in range(len(facets)):
-        for k in range(6):
-            corners[6 * t + k] = facets[t, k // 2]
-    starts, adjacent = counting_sort(corners, n)
-    for s in range(len(adjacent)):
-        t, k = adjacent[s] // 6, adjacent[s] % 6
-        adjacent[s] = facets[t, (k // 2 + 1 + k % 2) % 3]
-    return starts, adjacent
+    """The facets around n vertices in compressed rows: starts (n + 1,) and the two other vertices of each, (c, 2)."""
+    starts, corners = counting_sort(facets.ravel(), n)
+    others = np.empty((len(corners), 2), np.int32)
+    for s in range(len(corners)):
+        t, k = corners[s] // 3, corners[s] % 3
+        others[s, 0], others[s, 1] = facets[t, (k + 1) % 3], facets[t, (k + 2) % 3]
+    return starts, others
 
 
 @kernel(inline="always")
@@ -161,7 +161,7 @@ def absorb_small_regions(
     """
     labels = labels.copy()
     n = len(labels)
-    starts, adjacent = _adjacency(facets, n)
+    starts, others = np.empty(0, np.int32), np.empty((0, 2), np.int32)
     border = np.zeros(len(planes) + 1, np.int64)
     for _ in range(_ABSORPTIONS):
         regions, count = connected_regions(facets, labels)
@@ -178,19 +178,20 @@ def absorb_small_regions(
                 continue
             if touched[r] != 0:
                 continue  # it grew since its area was taken: the next round judges it
+            if len(starts) == 0:
+                starts, others = _adjacency(facets, n)
             border[:] = 0
             for v in members:
-                for s in range(starts[v], starts[v + 1]):
-                    other = labels[adjacent[s]]
-                    if other != label:
-                        border[other + 1] += 1
+                for w in others[starts[v] : starts[v + 1]].ravel():
+                    if labels[w] != label:
+                        border[labels[w] + 1] += 1
             best = _best_label(x, y, z, members, label, counted, planes, border)
             if best == label:
                 continue
             for v in members:
-                for s in range(starts[v], starts[v + 1]):
-                    if labels[adjacent[s]] == best:
-                        touched[regions[adjacent[s]]] = 1
+                for w in others[starts[v] : starts[v + 1]].ravel():
+                    if labels[w] == best:
+                        touched[regions[w]] = 1
                 labels[v] = best
             changed = True
         if not changed:
@@ -286,13 +287,14 @@ def _meeting_point(tin: _Labelled, corners: LabelArray) -> tuple[float, float]:
 
 @kernel
 def _march(
-    tin: _Labelled, facets: LabelArray, neighbours: LabelArray, regions: LabelArray
-) -> tuple[FloatArray, LabelArray, LabelArray]:
-    """Rings around all roof regions: nodes (m, 2) in mm, first node (r + 1,) and region (r,) of each ring.
+    tin: _Labelled, facets: LabelArray, neighbours: LabelArray
+) -> tuple[FloatArray, LabelArray, LabelArray, LabelArray]:
+    """Rings around all roof regions: nodes (m, 2) in mm, first node (r + 1,), region and label (r,) of each ring.
 
     A ring keeps its region on the left. The state of the walk is a half-edge a -> b of a facet with a inside the
     region and b not; it leaves the facet across b -> third where third is inside too, else across third -> a.
     """
+    regions, _ = connected_regions(facets, tin.labels)
     labels = tin.labels
     mixed = 0
     for t in range(len(facets)):
@@ -302,7 +304,7 @@ def _march(
     visited = np.zeros((len(facets), 3), np.uint8)
     nodes = np.empty((2 * mixed, 2))
     ring_starts = np.zeros(mixed + 1, np.int32)
-    ring_regions = np.empty(mixed, np.int32)
+    ring_regions, ring_labels = np.empty(mixed, np.int32), np.empty(mixed, np.int32)
     count = 0
     rings = 0
     for start in range(len(facets)):
@@ -311,7 +313,7 @@ def _march(
             b = facets[start, (start_edge + 2) % 3]
             if visited[start, start_edge] != 0 or labels[a] < 0 or labels[a] == labels[b]:
                 continue
-            ring_regions[rings] = regions[a]
+            ring_regions[rings], ring_labels[rings] = regions[a], labels[a]
             t = start
             k = start_edge
             while visited[t, k] == 0:
@@ -338,7 +340,7 @@ def _march(
                 k = back
             rings += 1
             ring_starts[rings] = count
-    return nodes[:count].copy(), ring_starts[: rings + 1].copy(), ring_regions[:rings].copy()
+    return nodes[:count].copy(), ring_starts[: rings + 1], ring_regions[:rings], ring_labels[:rings]
 
 
 def march(
@@ -360,32 +362,31 @@ def march(
     >>> march(xy, triangulate(xy), labels, np.zeros((1, 3)), 0.5, 0.1).polygons[0].area
     202500.0
     """
-    regions, _ = connected_regions(tin.facets, labels)
     x, y = np.ascontiguousarray(xy_mm[:, 0]), np.ascontiguousarray(xy_mm[:, 1])
     labelled = _Labelled(x, y, labels, planes, outside_fraction, step_offset_m)
-    nodes, ring_starts, ring_regions = _march(labelled, tin.facets, tin.neighbours, regions)
+    nodes, ring_starts, ring_regions, ring_labels = _march(labelled, tin.facets, tin.neighbours)
     if len(ring_regions) == 0:
         raise BuildingError(Reason.NO_PARTITION, "no point with a plane lies inside the triangulation")
-    label_of_region = np.full(int(regions.max()) + 1, OUTSIDE, np.int32)
-    label_of_region[regions] = labels
-    return _polygons(nodes, ring_starts, ring_regions, label_of_region)
-
-
-def _polygons(
-    nodes: FloatArray, ring_starts: LabelArray, ring_regions: LabelArray, label_of_region: LabelArray
-) -> RoofPartition:
-    """Collect the rings of every region: the counter-clockwise one is its outside, the others are holes."""
-    sizes = np.diff(ring_starts)
-    ring_of_node = np.repeat(np.arange(len(sizes)), sizes)
-    following = np.arange(1, len(nodes) + 1)
-    following[ring_starts[1:] - 1] = ring_starts[:-1]
-    cross = nodes[:, 0] * nodes[following, 1] - nodes[following, 0] * nodes[:, 1]
-    twice_area = np.bincount(ring_of_node, weights=cross, minlength=len(sizes))
     # rings of one region together, the outer ring before its holes
-    order = np.lexsort((np.arange(len(sizes)), twice_area <= 0.0, ring_regions))
-    order = order[sizes[order] >= 3]
-    rings = [shapely.linearrings(nodes[ring_starts[r] : ring_starts[r + 1]]) for r in order]
-    owners = ring_regions[order]
-    bounds = [0, *(np.flatnonzero(np.diff(owners)) + 1).tolist(), len(rings)]
+    order = _ring_order(nodes, ring_starts, ring_regions)
+    rings = [nodes[start:end] for start, end in zip(ring_starts[order], ring_starts[order + 1], strict=True)]
+    bounds = [0, *(np.flatnonzero(np.diff(ring_regions[order])) + 1).tolist(), len(rings)]
     polygons = [shapely.Polygon(rings[i], rings[i + 1 : j]) for i, j in itertools.pairwise(bounds)]
-    return RoofPartition(polygons=tuple(polygons), labels=label_of_region[owners[bounds[:-1]]])
+    return RoofPartition(polygons=tuple(polygons), labels=ring_labels[order[bounds[:-1]]])
+
+
+@kernel
+def _ring_order(nodes: FloatArray, ring_starts: LabelArray, ring_regions: LabelArray) -> IntArray:
+    """Rings of at least three nodes by region, in each the counter-clockwise one, its outside, before the others."""
+    keys = np.empty(len(ring_regions), np.int64)
+    tiny = 0
+    for r in range(len(ring_regions)):
+        start, end = ring_starts[r], ring_starts[r + 1]
+        twice_area, before = 0.0, end - 1
+        for k in range(start, end):
+            twice_area += nodes[before, 0] * nodes[k, 1] - nodes[k, 0] * nodes[before, 1]
+            before = k
+        is_tiny = end - start < 3
+        keys[r] = _LAST if is_tiny else 2 * ring_regions[r] + (twice_area <= 0.0)
+        tiny += is_tiny
+    return ascending_order(keys)[: len(keys) - tiny]

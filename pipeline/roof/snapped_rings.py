@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import shapely
 
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray
@@ -122,3 +123,12 @@ def most_area_between(ring: FloatArray, other: FloatArray) -> float:
             area += 0.5 * abs((x - t * ux) * dy - (y - t * uy) * dx)
             x, y = x + dx, y + dy
     return area if passed == m else math.inf
+
+
+def on_grid(shape: shapely.Geometry) -> shapely.Geometry:
+    """The same as `shapely.set_precision(shape, 1.0)` of a shape without curves, valid."""
+    if isinstance(shape, shapely.Polygon) and shapely.get_num_interior_rings(shape) == 0:
+        snapped = snapped_ring(shapely.get_coordinates(shape)[:-1])
+        if len(snapped):
+            return shapely.Polygon(snapped)
+    return shapely.set_precision(shape, 1.0)
