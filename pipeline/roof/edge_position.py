@@ -28,7 +28,7 @@ from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.exact_sum import exact_sum
 from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.roof.lines import Run
+from pipeline.roof.lines import Run, off_piece
 
 _STRIP_SPACINGS = 2.0
 """Width of a strip along the edge."""
@@ -225,17 +225,7 @@ def _splits_near(
         for v in range(1, len(rings)):
             if ring[v] != ring[v - 1]:
                 continue
-            ux, uy = rings[v, 0] - rings[v - 1, 0], rings[v, 1] - rings[v - 1, 1]
-            x, y = xy_mm[i, 0] - rings[v - 1, 0], xy_mm[i, 1] - rings[v - 1, 1]
-            squared = ux * ux + uy * uy
-            along = (x * ux + y * uy) / squared if squared > 0.0 else 0.0
-            if along <= 0.0:
-                off = math.sqrt(x * x + y * y)
-            elif along >= 1.0:
-                off = math.sqrt((x - ux) ** 2 + (y - uy) ** 2)
-            else:
-                off = abs((y * ux - x * uy) / squared) * math.sqrt(squared)
-            if off <= band:
+            if off_piece(rings[v - 1], rings[v], xy_mm[i]) <= band:
                 is_near = True
                 break
         if is_near:

@@ -261,10 +261,12 @@ def continue_crossings(
         Coefficients in metres.
     """
     labels = labels.copy()
+    k = len(planes)
+    if k < 2:
+        return labels
     pair_keys, kinds = _pairs_that_cross(x, y, facets, labels, known, planes)
     if len(pair_keys) == 0:
         return labels
-    k = len(planes)
     for _ in range(_CONTINUATIONS):
         changed = False
         for t in range(len(facets)):
