@@ -26,7 +26,7 @@ from pipeline.compiler import kernel
 from pipeline.kernels.bounds import bounds_of
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.exact_sum import exact_sum
-from pipeline.kernels.merge_sort import ascending_order, in_order
+from pipeline.kernels.merge_sort import in_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.lines import Run, off_piece
 
@@ -162,23 +162,29 @@ def _along(
                 strip[count] = min(int((way - first) / width), strips - 1)
                 count += 1
     inward, is_split = inward[:count], is_split[:count]
-    order = ascending_order(inward)
-    by_strip, members = counting_sort(strip[:count][order], strips)
+    starts, members = counting_sort(strip[:count], strips)
+    from_edge = inward[members]
     places, distances = np.empty(strips), np.empty(count)
     seen = found = 0
     for s in range(strips):
-        if by_strip[s] == by_strip[s + 1]:
+        begin, end = starts[s], starts[s + 1]
+        if begin == end:
             continue
-        before = inward[order[members[by_strip[s]]]]
-        places[seen] = -before
+        # a few dozen points: insertion is faster than a sort of all
+        for i in range(begin + 1, end):
+            moved, k = from_edge[i], i
+            while k > begin and from_edge[k - 1] > moved:
+                from_edge[k] = from_edge[k - 1]
+                k -= 1
+            from_edge[k] = moved
+        places[seen] = -from_edge[begin]
         seen += 1
-        for k in range(by_strip[s] + 1, by_strip[s + 1]):
-            here = inward[order[members[k]]]
-            if here - before > gap:
+        for k in range(begin + 1, end):
+            distance = from_edge[k] - from_edge[k - 1]
+            if distance > gap:
                 break
-            distances[found] = here - before
+            distances[found] = distance
             found += 1
-            before = here
     return -inward, is_split, places[:seen].copy(), distances[:found].copy()
 
 
