@@ -20,6 +20,7 @@ from pipeline.model import FloatArray, Plane
 from pipeline.roof.lines import Point, Run, corners, crossing, dominant_direction, fitted_run, merge, split, square
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import RoofSettings
+from pipeline.roof.snapped_rings import differ_by_more
 
 _ROUNDS = 4
 """Most rounds in which arcs of broken faces are put back; then nothing is straightened."""
@@ -268,8 +269,12 @@ def _broken_faces(drawn: Sequence[shapely.Polygon], before: Iterable[shapely.Pol
     broken = ~shapely.is_valid(after) | shapely.is_empty(after)
     if not broken.any():
         broken |= ~shapely.is_empty(shapely.coverage_invalid_edges(after))
-    sound = ~broken
-    old: FloatArray = np.array(list(before), dtype=object)
-    area = shapely.area(shapely.symmetric_difference(after[sound], old[sound]))
-    broken[sound] |= area > tolerance * shapely.length(old[sound])
-    return set(np.flatnonzero(broken).tolist())
+    moved = {k for k, old in enumerate(before) if not broken[k] and _moved_far(drawn[k], old, tolerance * old.length)}
+    return moved | set(np.flatnonzero(broken).tolist())
+
+
+def _moved_far(drawn: shapely.Polygon, before: shapely.Polygon, area: float) -> bool:
+    """Whether more than an area is in only one of two faces."""
+    if drawn.interiors or before.interiors:
+        return bool(shapely.symmetric_difference(drawn, before).area > area)
+    return differ_by_more(*(shapely.get_coordinates(face)[:-1] for face in (drawn, before)), area)

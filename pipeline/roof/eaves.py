@@ -21,7 +21,7 @@ from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outwar
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Point, Run, corners, merge, split
 from pipeline.roof.settings import RoofSettings
-from pipeline.roof.snapped_rings import most_area_between, on_grid, perimeter, snapped_ring
+from pipeline.roof.snapped_rings import differ_by_more, on_grid, snapped_ring
 
 _FACTORS = (1.0, 0.6, 0.35)
 """Multiples of the tolerance: a ring that cannot be drawn with few lines is tried with more."""
@@ -34,8 +34,6 @@ _SURELY_SQUARE = math.radians(2.0)
 """A long line this near to a dominant direction takes it: its direction is not known better."""
 _MOVED = 0.4
 """Most area between the raw outline and the lines: this part of the tolerance times the outline's length."""
-_CERTAINLY = 0.99
-"""An upper bound of that area below this part of the most needs no exact area, whatever that is rounded to."""
 
 
 def straighten(
@@ -197,8 +195,4 @@ def _accepted(ring: FloatArray, places: Sequence[Point], tolerance: float) -> Fl
         if not parts:
             return None
         drawn = shapely.get_coordinates(max(parts, key=lambda part: part.area).exterior)[:-1]
-    if most_area_between(drawn, ring) < _CERTAINLY * _MOVED * tolerance * perimeter(ring):
-        return drawn
-    raw = Polygon(ring)
-    is_near = shapely.symmetric_difference(Polygon(drawn), raw).area <= _MOVED * tolerance * raw.length
-    return drawn if is_near else None
+    return None if differ_by_more(drawn, ring, _MOVED * tolerance * Polygon(ring).length) else drawn

@@ -12,6 +12,8 @@ from pipeline.model import FloatArray
 
 _CLEAR = 0.75
 """An edge that keeps this far from a rounded vertex passes by its grid cell, whose corners are 0.71 away."""
+_CERTAINLY = 0.99
+"""An upper bound below this part of an area needs no overlay, whatever that is rounded to."""
 
 
 @kernel
@@ -79,16 +81,7 @@ def snapped_ring(ring: FloatArray) -> FloatArray:
 
 
 @kernel
-def perimeter(ring: FloatArray) -> float:
-    """Length of a ring (n, 2)."""
-    length = 0.0
-    for k in range(len(ring)):
-        length += math.hypot(ring[k, 0] - ring[k - 1, 0], ring[k, 1] - ring[k - 1, 1])
-    return length
-
-
-@kernel
-def most_area_between(ring: FloatArray, other: FloatArray) -> float:
+def _most_area_between(ring: FloatArray, other: FloatArray) -> float:
     """An upper bound of the area that only one of two rings encloses, (n, 2) and (m, 2); infinite if none is found.
 
     Each edge of `ring` is compared with the stretch of the other one between the vertices nearest to its ends: with
@@ -123,6 +116,13 @@ def most_area_between(ring: FloatArray, other: FloatArray) -> float:
             area += 0.5 * abs((x - t * ux) * dy - (y - t * uy) * dx)
             x, y = x + dx, y + dy
     return area if passed == m else math.inf
+
+
+def differ_by_more(ring: FloatArray, other: FloatArray, area: float) -> bool:
+    """Whether more than an area is enclosed by only one of two sound rings, (n, 2) and (m, 2), not closed."""
+    if _most_area_between(ring, other) < _CERTAINLY * area:
+        return False
+    return bool(shapely.symmetric_difference(shapely.Polygon(ring), shapely.Polygon(other)).area > area)
 
 
 def on_grid(shape: shapely.Geometry) -> shapely.Geometry:
