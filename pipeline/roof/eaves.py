@@ -45,12 +45,10 @@ def straighten(
     edge that they show, and the outline is drawn back by what mixed pulses add; without them lines stay amid the raw
     zigzag.
     """
-    reach_mm = 0.0
-    if points is not None:
-        reach_mm = mixed_pulse_reach_mm(outline_mm, points)
-        outline_mm = _drawn_back(outline_mm, reach_mm)
+    reach_mm = 0.0 if points is None else mixed_pulse_reach_mm(outline_mm, points)
+    raw = _drawn_back(outline_mm, reach_mm)
     straightened: list[Polygon] = []
-    for part in outline_mm.geoms:
+    for part in raw:
         outer, *holes = _straight_rings(part, spacing_m, settings, points, reach_mm)
         drawn = Polygon(outer, holes)
         if not drawn.is_valid:
@@ -63,19 +61,17 @@ def straighten(
     result = MultiPolygon(straightened)
     if not result.is_valid:
         result = MultiPolygon(polygons_of(shapely.union_all(straightened, grid_size=1.0)))
-    return result if result.is_valid and not result.is_empty else outline_mm
+    return result if result.is_valid and not result.is_empty else MultiPolygon(raw)
 
 
-def _drawn_back(outline_mm: MultiPolygon, reach_mm: float) -> MultiPolygon:
+def _drawn_back(outline_mm: MultiPolygon, reach_mm: float) -> list[Polygon]:
     """Every part smaller by a distance all around; one that would vanish or fall apart stays."""
+    parts: list[Polygon] = list(outline_mm.geoms)
     if reach_mm <= 0.0:
-        return outline_mm
-    parts: list[Polygon] = []
-    for polygon in outline_mm.geoms:
-        smaller = polygons_of(on_grid(shapely.buffer(polygon, -reach_mm, join_style="mitre")))
-        parts.append(smaller[0] if len(smaller) == 1 else polygon)
-    drawn = MultiPolygon(parts)
-    return drawn if len(parts) == 1 or drawn.is_valid else outline_mm
+        return parts
+    smaller = [polygons_of(on_grid(shapely.buffer(part, -reach_mm, join_style="mitre"))) for part in parts]
+    drawn = [pieces[0] if len(pieces) == 1 else part for pieces, part in zip(smaller, parts, strict=True)]
+    return drawn if len(drawn) == 1 or MultiPolygon(drawn).is_valid else parts
 
 
 def _straight_rings(

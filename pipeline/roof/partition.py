@@ -9,7 +9,6 @@ borders cannot pinch (Lorensen and Cline 1987 in the plane, with many labels).
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from typing import NamedTuple
 
@@ -36,8 +35,6 @@ _JUST_BEYOND = 0.3
 """A crossing this share of an edge beyond its end still counts as on it: the noise of the planes moves it so far."""
 _PARALLEL = 1e-3
 """Determinant of three planes' slopes below which they do not meet in one point; numerical guard."""
-_LAST = 2**62
-"""A key behind those of all regions."""
 _INSIDE_MM = 5.0
 """How far the meeting point keeps from the sides of its facet; numerical guard."""
 
@@ -297,50 +294,50 @@ def _march(
     regions, _ = connected_regions(facets, tin.labels)
     labels = tin.labels
     mixed = 0
+    mixed_edges = np.empty(3 * len(facets), np.int32)
     for t in range(len(facets)):
         for k in range(3):
             a, b = facets[t, (k + 1) % 3], facets[t, (k + 2) % 3]
-            mixed += labels[a] >= 0 and labels[a] != labels[b]
+            if labels[a] >= 0 and labels[a] != labels[b]:
+                mixed_edges[mixed] = 3 * t + k
+                mixed += 1
     visited = np.zeros((len(facets), 3), np.uint8)
     nodes = np.empty((2 * mixed, 2))
     ring_starts = np.zeros(mixed + 1, np.int32)
     ring_regions, ring_labels = np.empty(mixed, np.int32), np.empty(mixed, np.int32)
     count = 0
     rings = 0
-    for start in range(len(facets)):
-        for start_edge in range(3):
-            a = facets[start, (start_edge + 1) % 3]
-            b = facets[start, (start_edge + 2) % 3]
-            if visited[start, start_edge] != 0 or labels[a] < 0 or labels[a] == labels[b]:
-                continue
-            ring_regions[rings], ring_labels[rings] = regions[a], labels[a]
-            t = start
-            k = start_edge
-            while visited[t, k] == 0:
-                visited[t, k] = 1
-                a = facets[t, (k + 1) % 3]
-                b = facets[t, (k + 2) % 3]
-                third = facets[t, k]
-                x, y = _cut_point(tin, a, b)
-                nodes[count, 0], nodes[count, 1] = np.rint(x), np.rint(y)
-                count += 1
-                side = (k + 1) % 3
-                if labels[third] != labels[a]:
-                    side = (k + 2) % 3
-                    if labels[third] != labels[b]:
-                        x, y = _meeting_point(tin, facets[t])
-                        nodes[count, 0], nodes[count, 1] = np.rint(x), np.rint(y)
-                        count += 1
-                # step over the side opposite to vertex `side`; find the same side in the neighbour
-                u = neighbours[t, side]
-                back = 0
-                while neighbours[u, back] != t:
-                    back += 1
-                t = u
-                k = back
-            rings += 1
-            ring_starts[rings] = count
-    return nodes[:count].copy(), ring_starts[: rings + 1], ring_regions[:rings], ring_labels[:rings]
+    for start in mixed_edges[:mixed]:
+        t, k = start // 3, start % 3
+        if visited[t, k] != 0:
+            continue
+        a = facets[t, (k + 1) % 3]
+        ring_regions[rings], ring_labels[rings] = regions[a], labels[a]
+        while visited[t, k] == 0:
+            visited[t, k] = 1
+            a = facets[t, (k + 1) % 3]
+            b = facets[t, (k + 2) % 3]
+            third = facets[t, k]
+            x, y = _cut_point(tin, a, b)
+            nodes[count, 0], nodes[count, 1] = np.rint(x), np.rint(y)
+            count += 1
+            side = (k + 1) % 3
+            if labels[third] != labels[a]:
+                side = (k + 2) % 3
+                if labels[third] != labels[b]:
+                    x, y = _meeting_point(tin, facets[t])
+                    nodes[count, 0], nodes[count, 1] = np.rint(x), np.rint(y)
+                    count += 1
+            # step over the side opposite to vertex `side`; find the same side in the neighbour
+            u = neighbours[t, side]
+            back = 0
+            while neighbours[u, back] != t:
+                back += 1
+            t = u
+            k = back
+        rings += 1
+        ring_starts[rings] = count
+    return nodes[:count], ring_starts[: rings + 1], ring_regions[:rings], ring_labels[:rings]
 
 
 def march(
@@ -367,26 +364,42 @@ def march(
     nodes, ring_starts, ring_regions, ring_labels = _march(labelled, tin.facets, tin.neighbours)
     if len(ring_regions) == 0:
         raise BuildingError(Reason.NO_PARTITION, "no point with a plane lies inside the triangulation")
-    # rings of one region together, the outer ring before its holes
-    order = _ring_order(nodes, ring_starts, ring_regions)
-    rings = [nodes[start:end] for start, end in zip(ring_starts[order], ring_starts[order + 1], strict=True)]
-    bounds = [0, *(np.flatnonzero(np.diff(ring_regions[order])) + 1).tolist(), len(rings)]
-    polygons = [shapely.Polygon(rings[i], rings[i + 1 : j]) for i, j in itertools.pairwise(bounds)]
-    return RoofPartition(polygons=tuple(polygons), labels=ring_labels[order[bounds[:-1]]])
+    xy, ring, face, face_labels = _by_face(nodes, ring_starts, ring_regions, ring_labels)
+    polygons = shapely.polygons(shapely.linearrings(xy, indices=ring), indices=face)
+    return RoofPartition(polygons=tuple(polygons.tolist()), labels=face_labels)
 
 
 @kernel
-def _ring_order(nodes: FloatArray, ring_starts: LabelArray, ring_regions: LabelArray) -> IntArray:
-    """Rings of at least three nodes by region, in each the counter-clockwise one, its outside, before the others."""
+def _by_face(
+    nodes: FloatArray, ring_starts: LabelArray, ring_regions: LabelArray, ring_labels: LabelArray
+) -> tuple[FloatArray, IntArray, IntArray, LabelArray]:
+    """The rings of `_march` by region, in each the counter-clockwise one, its outside, before the others.
+
+    Nodes (m, 2), the ring of each, (m,), the face of every ring, and the label of every face. Rings of fewer than three
+    nodes are left out.
+    """
     keys = np.empty(len(ring_regions), np.int64)
-    tiny = 0
     for r in range(len(ring_regions)):
         start, end = ring_starts[r], ring_starts[r + 1]
         twice_area, before = 0.0, end - 1
         for k in range(start, end):
             twice_area += nodes[before, 0] * nodes[k, 1] - nodes[k, 0] * nodes[before, 1]
             before = k
-        is_tiny = end - start < 3
-        keys[r] = _LAST if is_tiny else 2 * ring_regions[r] + (twice_area <= 0.0)
-        tiny += is_tiny
-    return ascending_order(keys)[: len(keys) - tiny]
+        keys[r] = 2 * ring_regions[r] + (twice_area <= 0.0)
+    xy, ring = np.empty(nodes.shape), np.empty(len(nodes), np.int64)
+    face, labels = np.empty(len(keys), np.int64), np.empty(len(keys), np.int32)
+    count = rings = faces = 0
+    region = -1
+    for r in ascending_order(keys):
+        start, end = ring_starts[r], ring_starts[r + 1]
+        if end - start < 3:
+            continue
+        if ring_regions[r] != region:
+            region, labels[faces] = ring_regions[r], ring_labels[r]
+            faces += 1
+        for k in range(start, end):
+            xy[count], ring[count] = nodes[k], rings
+            count += 1
+        face[rings] = faces - 1
+        rings += 1
+    return xy[:count], ring[:count], face[:rings], labels[:faces].copy()
