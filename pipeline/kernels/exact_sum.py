@@ -31,15 +31,16 @@ def exact_sum(values: FloatArray) -> float:
         parts[kept] = high
         count = kept + 1
     # parts ascend: add them from the largest down until one is lost in rounding
-    total, low = 0.0, 0.0
-    while count > 0 and low == 0.0:
+    rounded: float = 0.0
+    lost = 0.0
+    while count > 0 and lost == 0.0:
         count -= 1
-        before, part = total, parts[count]
-        total = before + part
-        low = part - (total - before)
+        before = rounded
+        rounded = before + parts[count]
+        lost = parts[count] - (rounded - before)
     # a half is rounded to even unless smaller parts decide it
-    if count > 0 and (low < 0.0) == (parts[count - 1] < 0.0) and parts[count - 1] != 0.0:
-        twice = 2.0 * low
-        if (total + twice) - total == twice:
-            total += twice
-    return total
+    if count > 0 and parts[count - 1] != 0.0 and (lost < 0.0) == (parts[count - 1] < 0.0):
+        twice = 2.0 * lost
+        if (rounded + twice) - rounded == twice:
+            rounded += twice
+    return rounded

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import shapely
 
-from pipeline.model import FloatArray, Plane
+from pipeline.model import Plane
 from pipeline.roof.lines import Point, Run, corners, crossing, dominant_direction, fitted_run, merge, split, square
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import RoofSettings
@@ -277,4 +277,4 @@ def _moved_far(drawn: shapely.Polygon, before: shapely.Polygon, area: float) -> 
     """Whether more than an area is in only one of two faces."""
     if drawn.interiors or before.interiors:
         return bool(shapely.symmetric_difference(drawn, before).area > area)
-    return differ_by_more(*(shapely.get_coordinates(face)[:-1] for face in (drawn, before)), area)
+    return differ_by_more(shapely.get_coordinates(drawn)[:-1], shapely.get_coordinates(before)[:-1], area)

@@ -262,16 +262,16 @@ def outward_shift_mm(border: FloatArray, run: Run, points: EdgePoints, reach_mm:
         there to the edge, less the reach of the mixed pulses. None where the stretch is too short, or has too few
         points.
     """
-    cells = _Cells(points.xy_mm, points.split, points.starts, *points.low_mm, points.columns, points.rows, points.cell_mm)
+    cells = _Cells(
+        points.xy_mm, points.split, points.starts, *points.low_mm, points.columns, points.rows, points.cell_mm
+    )
     line = _Line(run.x, run.y, math.cos(run.direction), math.sin(run.direction), run.first, run.last)
     shift: float = _outward_shift(cells, border, line, points.spacing_mm, points.band_mm, reach_mm)
     return None if math.isnan(shift) else shift
 
 
 @kernel
-def _outward_shift(
-    cells: _Cells, border: FloatArray, line: _Line, spacing: float, band: float, reach: float
-) -> float:
+def _outward_shift(cells: _Cells, border: FloatArray, line: _Line, spacing: float, band: float, reach: float) -> float:
     """The kernel of `outward_shift_mm`; nan for None."""
     a, b = border[line.first % len(border)], border[line.last % len(border)]
     one = (a[0] - line.x) * line.ux + (a[1] - line.y) * line.uy
@@ -291,7 +291,7 @@ def _outward_shift(
     age = squares / (2.0 * total)
     middle = in_order(places)[len(places) // 2]
     near = places[np.abs(places - middle) <= max(_STRAY_AGES * age, spacing)]
-    edge = exact_sum(near) / len(near) + age
+    edge: float = exact_sum(near) / len(near) + age
     density = (len(distances) + _PRIOR_COUNT) / (total * width)
     return edge - _own_reach(off - edge, split, density * (last - first), band, reach)
 

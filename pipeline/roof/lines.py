@@ -179,7 +179,7 @@ def off_piece(a: FloatArray, b: FloatArray, p: FloatArray) -> float:
         return math.sqrt(x * x + y * y)
     if along >= 1.0:
         return math.sqrt((p[0] - b[0]) ** 2 + (p[1] - b[1]) ** 2)
-    return abs((y * ux - x * uy) / squared) * math.sqrt(squared)
+    return float(abs((y * ux - x * uy) / squared) * math.sqrt(squared))
 
 
 @kernel
@@ -191,7 +191,7 @@ def _merge(border: FloatArray, runs: FloatArray, tolerance: float, least: int) -
     for k in range(count):
         offs[k] = _off_united(border, merged, k, closed, pairs[k])
     while count > least:
-        k = np.argmin(offs[:count])
+        k = int(np.argmin(offs[:count]))
         if offs[k] > tolerance:
             break
         merged[k] = pairs[k]

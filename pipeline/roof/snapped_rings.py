@@ -25,13 +25,19 @@ def _turns_left(ring: FloatArray) -> bool:
     return twice_area > 0.0
 
 
+@kernel(inline="always")
+def _whole(value: float) -> float:
+    """A value rounded to a whole number as GEOS does it: halves up."""
+    return float(np.ceil(value) if value - np.floor(value) >= 0.5 else np.floor(value))
+
+
 @kernel
 def _is_near(ring: FloatArray, first: int, vertex: int) -> bool:
     """Whether the edge from the vertex `first` passes near another vertex, rounded, that does not end it."""
     second = (first + 1) % len(ring)
     if vertex in (first, second):
         return False
-    x, y = np.rint(ring[vertex, 0]) - ring[first, 0], np.rint(ring[vertex, 1]) - ring[first, 1]
+    x, y = _whole(ring[vertex, 0]) - ring[first, 0], _whole(ring[vertex, 1]) - ring[first, 1]
     ux, uy = ring[second, 0] - ring[first, 0], ring[second, 1] - ring[first, 1]
     squared = ux * ux + uy * uy
     t = min(max((x * ux + y * uy) / squared, 0.0), 1.0) if squared > 0.0 else 0.0
@@ -46,7 +52,7 @@ def _parts(ring: FloatArray, first: int, vertex: int) -> bool:
     one = ux * (ring[vertex, 1] - ring[first, 1]) - uy * (ring[vertex, 0] - ring[first, 0])
     second = (vertex + 1) % n
     other = ux * (ring[second, 1] - ring[first, 1]) - uy * (ring[second, 0] - ring[first, 0])
-    return (one > 0.0) != (other > 0.0)
+    return bool((one > 0.0) != (other > 0.0))
 
 
 @kernel
@@ -76,7 +82,7 @@ def snapped_ring(ring: FloatArray) -> FloatArray:
     snapped = np.empty((n if n > 2 else 0, 2))
     for k in range(len(snapped)):
         v = n - 1 - k if turns_left else (k + 1) % n
-        snapped[k, 0], snapped[k, 1] = np.rint(ring[v, 0]), np.rint(ring[v, 1])
+        snapped[k, 0], snapped[k, 1] = _whole(ring[v, 0]), _whole(ring[v, 1])
     return snapped
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from pipeline.kernels.bounds import bounds_of
 from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.exact_sum import exact_sum
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
 from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.kernels.normal_equations import moments_of, solve_plane_moments
@@ -79,6 +80,12 @@ def test_floats_are_sorted_as_numpy_sorts_them_with_nan_at_the_end(values: list[
     keys = np.array(values, np.float64)
     assert ascending_order(keys).tolist() == np.argsort(keys, kind="stable").tolist()
     np.testing.assert_array_equal(in_order(keys), np.sort(keys))
+
+
+@given(st.lists(st.floats(-1e300, 1e300) | st.sampled_from([1.0, 2.0**53, 2.0**-53, -(2.0**-53), -1e16]), max_size=60))
+@settings(deadline=None)
+def test_a_sum_is_rounded_once_as_by_fsum(values: list[float]) -> None:
+    assert exact_sum(np.array(values, np.float64)) == math.fsum(values)
 
 
 @given(st.lists(st.integers(-2, 6), max_size=40))
