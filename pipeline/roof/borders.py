@@ -89,28 +89,29 @@ def straighten_borders(
 def _arcs(partition: RoofPartition) -> tuple[list[_Arc], list[list[list[tuple[int, bool]]]]]:
     """The arcs of a coverage, and every polygon's rings as (arc, forwards)."""
     face_rings = [
-        [[(x, y) for x, y in shapely.get_coordinates(line)[:-1].tolist()] for line in (p.exterior, *p.interiors)]
+        [list(map(tuple, shapely.get_coordinates(line)[:-1].tolist())) for line in (p.exterior, *p.interiors)]
         for p in shapely.orient_polygons(np.array(partition.polygons, dtype=object)).tolist()
     ]
     owner: dict[tuple[Point, Point], int] = {}
-    neighbours: dict[Point, set[Point]] = {}
+    degree: dict[Point, int] = {}
     for face, rings in enumerate(face_rings):
         for ring in rings:
             for a, b in zip(ring, ring[1:] + ring[:1], strict=True):
+                if (a, b) not in owner and (b, a) not in owner:
+                    degree[a] = degree.get(a, 0) + 1
+                    degree[b] = degree.get(b, 0) + 1
                 owner[a, b] = face
-                neighbours.setdefault(a, set()).add(b)
-                neighbours.setdefault(b, set()).add(a)
     arcs: list[_Arc] = []
     arc_of: dict[tuple[Point, Point], tuple[int, bool]] = {}
     rings_of_arcs: list[list[list[tuple[int, bool]]]] = []
     for face, rings in enumerate(face_rings):
         as_arcs = []
         for ring in rings:
-            nodes = [k for k, v in enumerate(ring) if len(neighbours[v]) != 2]
+            nodes = [k for k, v in enumerate(ring) if degree[v] != 2]
             # a closed border starts at the same vertex in both its faces
             start = nodes[0] if nodes else ring.index(min(ring))
             turned = [*ring[start:], *ring[:start], ring[start]]
-            stops = [k for k, v in enumerate(turned) if len(neighbours[v]) != 2] if nodes else [0, len(turned) - 1]
+            stops = [*(k - start for k in nodes), len(ring)] if nodes else [0, len(ring)]
             sequence = []
             for i, j in itertools.pairwise(stops):
                 path = turned[i : j + 1]
