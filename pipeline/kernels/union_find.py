@@ -20,6 +20,8 @@ def root_of(parent: IntArray, node: int) -> int:
 @kernel
 def unite(parent: IntArray, first: int, second: int) -> bool:
     """Unite the sets of two nodes; whether they were different ones."""
+    if parent[first] == parent[second]:
+        return False  # mostly: it saves two ways to the root
     a, b = root_of(parent, first), root_of(parent, second)
     parent[max(a, b)] = min(a, b)
     return a != b

@@ -16,10 +16,11 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import shapely
 
-from pipeline.model import FloatArray, Plane
+from pipeline.model import Plane
 from pipeline.roof.lines import Point, Run, corners, crossing, dominant_direction, fitted_run, merge, split, square
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import RoofSettings
+from pipeline.roof.snapped_rings import differ_by_more
 
 _ROUNDS = 4
 """Most rounds in which arcs of broken faces are put back; then nothing is straightened."""
@@ -88,28 +89,29 @@ def straighten_borders(
 def _arcs(partition: RoofPartition) -> tuple[list[_Arc], list[list[list[tuple[int, bool]]]]]:
     """The arcs of a coverage, and every polygon's rings as (arc, forwards)."""
     face_rings = [
-        [[(x, y) for x, y in shapely.get_coordinates(line)[:-1].tolist()] for line in (p.exterior, *p.interiors)]
+        [list(map(tuple, shapely.get_coordinates(line)[:-1].tolist())) for line in (p.exterior, *p.interiors)]
         for p in shapely.orient_polygons(np.array(partition.polygons, dtype=object)).tolist()
     ]
     owner: dict[tuple[Point, Point], int] = {}
-    neighbours: dict[Point, set[Point]] = {}
+    degree: dict[Point, int] = {}
     for face, rings in enumerate(face_rings):
         for ring in rings:
             for a, b in zip(ring, ring[1:] + ring[:1], strict=True):
+                if (a, b) not in owner and (b, a) not in owner:
+                    degree[a] = degree.get(a, 0) + 1
+                    degree[b] = degree.get(b, 0) + 1
                 owner[a, b] = face
-                neighbours.setdefault(a, set()).add(b)
-                neighbours.setdefault(b, set()).add(a)
     arcs: list[_Arc] = []
     arc_of: dict[tuple[Point, Point], tuple[int, bool]] = {}
     rings_of_arcs: list[list[list[tuple[int, bool]]]] = []
     for face, rings in enumerate(face_rings):
         as_arcs = []
         for ring in rings:
-            nodes = [k for k, v in enumerate(ring) if len(neighbours[v]) != 2]
+            nodes = [k for k, v in enumerate(ring) if degree[v] != 2]
             # a closed border starts at the same vertex in both its faces
             start = nodes[0] if nodes else ring.index(min(ring))
             turned = [*ring[start:], *ring[:start], ring[start]]
-            stops = [k for k, v in enumerate(turned) if len(neighbours[v]) != 2] if nodes else [0, len(turned) - 1]
+            stops = [*(k - start for k in nodes), len(ring)] if nodes else [0, len(ring)]
             sequence = []
             for i, j in itertools.pairwise(stops):
                 path = turned[i : j + 1]
@@ -268,8 +270,12 @@ def _broken_faces(drawn: Sequence[shapely.Polygon], before: Iterable[shapely.Pol
     broken = ~shapely.is_valid(after) | shapely.is_empty(after)
     if not broken.any():
         broken |= ~shapely.is_empty(shapely.coverage_invalid_edges(after))
-    sound = ~broken
-    old: FloatArray = np.array(list(before), dtype=object)
-    area = shapely.area(shapely.symmetric_difference(after[sound], old[sound]))
-    broken[sound] |= area > tolerance * shapely.length(old[sound])
-    return set(np.flatnonzero(broken).tolist())
+    moved = {k for k, old in enumerate(before) if not broken[k] and _moved_far(drawn[k], old, tolerance * old.length)}
+    return moved | set(np.flatnonzero(broken).tolist())
+
+
+def _moved_far(drawn: shapely.Polygon, before: shapely.Polygon, area: float) -> bool:
+    """Whether more than an area is in only one of two faces."""
+    if drawn.interiors or before.interiors:
+        return bool(shapely.symmetric_difference(drawn, before).area > area)
+    return differ_by_more(shapely.get_coordinates(drawn)[:-1], shapely.get_coordinates(before)[:-1], area)

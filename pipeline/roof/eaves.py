@@ -15,11 +15,13 @@ import shapely
 from shapely import MultiPolygon, Polygon
 from shapely.geometry.polygon import orient
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outward_shift_mm
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Point, Run, corners, merge, split
 from pipeline.roof.settings import RoofSettings
+from pipeline.roof.snapped_rings import differ_by_more, on_grid, snapped_ring
 
 _FACTORS = (1.0, 0.6, 0.35)
 """Multiples of the tolerance: a ring that cannot be drawn with few lines is tried with more."""
@@ -43,38 +45,33 @@ def straighten(
     edge that they show, and the outline is drawn back by what mixed pulses add; without them lines stay amid the raw
     zigzag.
     """
-    reach_mm = 0.0
-    if points is not None:
-        reach_mm = mixed_pulse_reach_mm(outline_mm, points)
-        outline_mm = _drawn_back(outline_mm, reach_mm)
+    reach_mm = 0.0 if points is None else mixed_pulse_reach_mm(outline_mm, points)
+    raw = _drawn_back(outline_mm, reach_mm)
     straightened: list[Polygon] = []
-    for part in outline_mm.geoms:
-        polygon = orient(part)
-        outer, *holes = _straight_rings(polygon, spacing_m, settings, points, reach_mm)
+    for part in raw:
+        outer, *holes = _straight_rings(part, spacing_m, settings, points, reach_mm)
         drawn = Polygon(outer, holes)
         if not drawn.is_valid:
             # a hole that crosses the outside cuts into it
             cut = shapely.difference(
                 Polygon(outer), shapely.union_all([Polygon(hole) for hole in holes]), grid_size=1.0
             )
-            drawn = max(polygons_of(cut), key=lambda piece: piece.area, default=polygon)
+            drawn = max(polygons_of(cut), key=lambda piece: piece.area, default=orient(part))
         straightened.append(drawn)
     result = MultiPolygon(straightened)
     if not result.is_valid:
         result = MultiPolygon(polygons_of(shapely.union_all(straightened, grid_size=1.0)))
-    return result if result.is_valid and not result.is_empty else outline_mm
+    return result if result.is_valid and not result.is_empty else MultiPolygon(raw)
 
 
-def _drawn_back(outline_mm: MultiPolygon, reach_mm: float) -> MultiPolygon:
+def _drawn_back(outline_mm: MultiPolygon, reach_mm: float) -> list[Polygon]:
     """Every part smaller by a distance all around; one that would vanish or fall apart stays."""
+    parts: list[Polygon] = list(outline_mm.geoms)
     if reach_mm <= 0.0:
-        return outline_mm
-    parts: list[Polygon] = []
-    for polygon in outline_mm.geoms:
-        smaller = polygons_of(shapely.set_precision(shapely.buffer(polygon, -reach_mm, join_style="mitre"), 1.0))
-        parts.append(smaller[0] if len(smaller) == 1 else polygon)
-    drawn = MultiPolygon(parts)
-    return drawn if drawn.is_valid else outline_mm
+        return parts
+    smaller = [polygons_of(on_grid(shapely.buffer(part, -reach_mm, join_style="mitre"))) for part in parts]
+    drawn = [pieces[0] if len(pieces) == 1 else part for pieces, part in zip(smaller, parts, strict=True)]
+    return drawn if len(drawn) == 1 or MultiPolygon(drawn).is_valid else parts
 
 
 def _straight_rings(
@@ -155,26 +152,43 @@ def _take_positions(ring: FloatArray, runs: Sequence[Run], points: EdgePoints, r
 
 
 def _rings(polygon: Polygon) -> list[FloatArray]:
-    """Vertices of the rings, the first not repeated, each starting at its vertex farthest from the centroid."""
-    rings = []
-    for line in (polygon.exterior, *polygon.interiors):
-        xy = shapely.get_coordinates(line)[:-1]
-        away = ((xy - xy.mean(axis=0)) ** 2).sum(axis=1)
-        rings.append(np.roll(xy, -int(np.argmax(np.rint(away))), axis=0))
-    return rings
+    """Vertices of the rings, the first not repeated, each starting at its vertex farthest from the centroid.
+
+    The roof is on the left of all of them.
+    """
+    lines = (polygon.exterior, *polygon.interiors)
+    return [_turned(shapely.get_coordinates(line)[:-1], k > 0) for k, line in enumerate(lines)]
+
+
+@kernel
+def _turned(ring: FloatArray, is_hole: bool) -> FloatArray:
+    """A ring (n, 2) that turns left, or right as a hole, and starts at the vertex farthest from their centroid."""
+    n = len(ring)
+    twice_area, mean_x, mean_y = 0.0, 0.0, 0.0
+    for k in range(n):
+        following = (k + 1) % n
+        twice_area += ring[k, 0] * ring[following, 1] - ring[following, 0] * ring[k, 1]
+        mean_x, mean_y = mean_x + ring[k, 0], mean_y + ring[k, 1]
+    mean_x, mean_y = mean_x / n, mean_y / n
+    start, farthest = 0, -1.0
+    turned = ring.copy() if (twice_area >= 0.0) != is_hole else np.concatenate((ring[:1], ring[:0:-1]))
+    for k in range(n):
+        x, y = turned[k, 0] - mean_x, turned[k, 1] - mean_y
+        away = np.rint(x * x + y * y)
+        if away > farthest:
+            start, farthest = k, away
+    return np.concatenate((turned[start:], turned[:start]))
 
 
 def _accepted(ring: FloatArray, places: Sequence[Point], tolerance: float) -> FloatArray | None:
     """The corners as a ring where they make a sound one near the raw ring; small loops at corners are cut off."""
     if len(places) < 3:
         return None
-    drawn = shapely.make_valid(Polygon(places), method="structure", keep_collapsed=False)
-    parts = [part for polygon in polygons_of(drawn) for part in polygons_of(shapely.set_precision(polygon, 1.0))]
-    raw = Polygon(ring)
-    if not parts:
-        return None
-    largest = Polygon(max(parts, key=lambda part: part.area).exterior)
-    if shapely.symmetric_difference(largest, raw).area > _MOVED * tolerance * raw.length:
-        return None
-    accepted: FloatArray = shapely.get_coordinates(largest.exterior)[:-1]
-    return accepted
+    drawn = snapped_ring(np.array(places))
+    if len(drawn) == 0:
+        sound = shapely.make_valid(Polygon(places), method="structure", keep_collapsed=False)
+        parts = [part for polygon in polygons_of(sound) for part in polygons_of(shapely.set_precision(polygon, 1.0))]
+        if not parts:
+            return None
+        drawn = shapely.get_coordinates(max(parts, key=lambda part: part.area).exterior)[:-1]
+    return None if differ_by_more(drawn, ring, _MOVED * tolerance * Polygon(ring).length) else drawn

@@ -25,9 +25,10 @@ import shapely
 from pipeline.compiler import kernel
 from pipeline.kernels.bounds import bounds_of
 from pipeline.kernels.counting_sort import counting_sort
-from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.exact_sum import exact_sum
+from pipeline.kernels.merge_sort import in_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.roof.lines import Run
+from pipeline.roof.lines import Run, off_piece
 
 _STRIP_SPACINGS = 2.0
 """Width of a strip along the edge."""
@@ -64,17 +65,15 @@ class _Cells(NamedTuple):
     side: int
 
 
-class _Stretch(NamedTuple):
-    """A line's point and direction, the stretch of it in ways along it, how far to look to its right and its left."""
+class _Line(NamedTuple):
+    """A line's point and direction, and the first and the last vertex of the border along it."""
 
     x: float
     y: float
     ux: float
     uy: float
-    first: float
-    last: float
-    out: float
-    depth: float
+    first: int
+    last: int
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -123,31 +122,20 @@ class EdgePoints:
         """How far within a line split pulses belong to its edge."""
         return 2e3 * _LONGEST_REACH_M + _BAND_SPACINGS * self.spacing_mm
 
-    def along(
-        self, run: Run, first_mm: float, last_mm: float, strips: int
-    ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
-        """Points by a line from `first_mm` to `last_mm` along it, in strips of equal width square to it.
-
-        How far to the line's right they lie, which are split, the place of each strip's outermost one, and the
-        distances of successive ones of a strip up to its first gap.
-        """
-        out, depth = _REACH_SPACINGS * self.spacing_mm, max(_DEPTH_SPACINGS * self.spacing_mm, 3.0 * self.band_mm)
-        ux, uy = math.cos(run.direction), math.sin(run.direction)
-        cells = _Cells(self.xy_mm, self.split, self.starts, *self.low_mm, self.columns, self.rows, self.cell_mm)
-        stretch = _Stretch(run.x, run.y, ux, uy, first_mm, last_mm, out, depth)
-        found: tuple[FloatArray, BoolArray, FloatArray, FloatArray] = _along(
-            cells, stretch, strips, _GAP_SPACINGS * self.spacing_mm
-        )
-        return found
-
 
 @kernel
 def _along(
-    cells: _Cells, stretch: _Stretch, strips: int, gap: float
+    cells: _Cells, line: _Line, ends: tuple[float, float], sides: tuple[float, float], strips: int, gap: float
 ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
-    """The kernel of `EdgePoints.along`; a distance longer than `gap` is a gap."""
+    """Points by a stretch of a line, `ends` along it, out to its right and its left, in strips of equal width.
+
+    How far to the line's right they lie, which are split, the place of each strip's outermost one, and the distances of
+    successive ones of a strip up to its first one longer than `gap`.
+    """
     columns, starts, side = cells.columns, cells.starts, cells.side
-    x0, y0, ux, uy, first, last, out, depth = stretch
+    x0, y0, ux, uy = line.x, line.y, line.ux, line.uy
+    first, last = ends
+    out, depth = sides
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
     for t in (first, last):
         for d in (out, -depth):
@@ -174,23 +162,29 @@ def _along(
                 strip[count] = min(int((way - first) / width), strips - 1)
                 count += 1
     inward, is_split = inward[:count], is_split[:count]
-    order = ascending_order(inward)
-    by_strip, members = counting_sort(strip[:count][order], strips)
+    starts, members = counting_sort(strip[:count], strips)
+    from_edge = inward[members]
     places, distances = np.empty(strips), np.empty(count)
     seen = found = 0
     for s in range(strips):
-        if by_strip[s] == by_strip[s + 1]:
+        begin, end = starts[s], starts[s + 1]
+        if begin == end:
             continue
-        before = inward[order[members[by_strip[s]]]]
-        places[seen] = -before
+        # a few dozen points: insertion is faster than a sort of all
+        for i in range(begin + 1, end):
+            moved, k = from_edge[i], i
+            while k > begin and from_edge[k - 1] > moved:
+                from_edge[k] = from_edge[k - 1]
+                k -= 1
+            from_edge[k] = moved
+        places[seen] = -from_edge[begin]
         seen += 1
-        for k in range(by_strip[s] + 1, by_strip[s + 1]):
-            here = inward[order[members[k]]]
-            if here - before > gap:
+        for k in range(begin + 1, end):
+            distance = from_edge[k] - from_edge[k - 1]
+            if distance > gap:
                 break
-            distances[found] = here - before
+            distances[found] = distance
             found += 1
-            before = here
     return -inward, is_split, places[:seen].copy(), distances[:found].copy()
 
 
@@ -202,16 +196,49 @@ def mixed_pulse_reach_mm(outline_mm: shapely.Geometry, points: EdgePoints) -> fl
     if not points.split.any():
         return 0.0
     simple = shapely.simplify(outline_mm, 0.6 * points.spacing_mm, preserve_topology=True)
-    border = simple.boundary
-    shapely.prepare(border)
-    near = shapely.dwithin(border, shapely.points(points.xy_mm[points.split].astype(np.float64)), points.band_mm)
-    # chimneys and skylights split pulses too: as many per area along the edge as amid the roof
-    middle_mm2 = shapely.buffer(simple, -points.band_mm).area
-    usual = int((~near).sum()) / middle_mm2 if middle_mm2 > 0.0 else 0.0
-    count = int(near.sum()) - usual * (simple.area - middle_mm2)
-    length = float(border.length)
+    xy, ring = shapely.get_coordinates(shapely.get_parts(simple.boundary), return_index=True)
+    near, far, length = _splits_near(xy, ring, points.xy_mm, points.split, points.band_mm)
+    count = float(near)
+    if far:
+        # chimneys and skylights split pulses too: as many per area along the edge as amid the roof
+        middle_mm2 = shapely.buffer(simple, -points.band_mm).area
+        usual = far / middle_mm2 if middle_mm2 > 0.0 else 0.0
+        count -= usual * (simple.area - middle_mm2)
     reach: float = 0.5 * count * points.spacing_mm**2 / length if length > 0.0 else 0.0
     return min(max(reach, 0.0), 1e3 * _LONGEST_REACH_M)
+
+
+@kernel
+def _splits_near(
+    rings: FloatArray, ring: IntArray, xy_mm: IntArray, split: BoolArray, band: float
+) -> tuple[int, int, float]:
+    """How many split points lie within a band by the rings, how many do not, and the length of the rings.
+
+    Rings are closed, (v, 2) with the number of the ring of every vertex, (v,).
+    """
+    length, of_ring = 0.0, 0.0
+    for v in range(1, len(rings)):
+        if ring[v] != ring[v - 1]:
+            length, of_ring = length + of_ring, 0.0
+            continue
+        dx, dy = rings[v, 0] - rings[v - 1, 0], rings[v, 1] - rings[v - 1, 1]
+        of_ring += math.sqrt(dx * dx + dy * dy)
+    near, far = 0, 0
+    for i in range(len(xy_mm)):
+        if not split[i]:
+            continue
+        is_near = False
+        for v in range(1, len(rings)):
+            if ring[v] != ring[v - 1]:
+                continue
+            if off_piece(rings[v - 1], rings[v], xy_mm[i]) <= band:
+                is_near = True
+                break
+        if is_near:
+            near += 1
+        else:
+            far += 1
+    return near, far, length + of_ring
 
 
 def outward_shift_mm(border: FloatArray, run: Run, points: EdgePoints, reach_mm: float) -> float | None:
@@ -235,37 +262,53 @@ def outward_shift_mm(border: FloatArray, run: Run, points: EdgePoints, reach_mm:
         there to the edge, less the reach of the mixed pulses. None where the stretch is too short, or has too few
         points.
     """
-    spacing = points.spacing_mm
-    ux, uy = math.cos(run.direction), math.sin(run.direction)
-    ends = border[[run.first % len(border), run.last % len(border)]] - (run.x, run.y)
-    first, last = sorted((ends[:, 0] * ux + ends[:, 1] * uy).tolist())
-    first, last = first + _MARGIN_SPACINGS * spacing, last - _MARGIN_SPACINGS * spacing
+    cells = _Cells(
+        points.xy_mm, points.split, points.starts, *points.low_mm, points.columns, points.rows, points.cell_mm
+    )
+    line = _Line(run.x, run.y, math.cos(run.direction), math.sin(run.direction), run.first, run.last)
+    shift: float = _outward_shift(cells, border, line, points.spacing_mm, points.band_mm, reach_mm)
+    return None if math.isnan(shift) else shift
+
+
+@kernel
+def _outward_shift(cells: _Cells, border: FloatArray, line: _Line, spacing: float, band: float, reach: float) -> float:
+    """The kernel of `outward_shift_mm`; nan for None."""
+    a, b = border[line.first % len(border)], border[line.last % len(border)]
+    one = (a[0] - line.x) * line.ux + (a[1] - line.y) * line.uy
+    other = (b[0] - line.x) * line.ux + (b[1] - line.y) * line.uy
+    first, last = min(one, other) + _MARGIN_SPACINGS * spacing, max(one, other) - _MARGIN_SPACINGS * spacing
     if last - first < _STRIP_SPACINGS * spacing:
-        return None
+        return np.nan
     strips = math.floor((last - first) / (_STRIP_SPACINGS * spacing))
     width = (last - first) / strips
-    off, split, places, distances = points.along(run, first, last, strips)
+    out, depth = _REACH_SPACINGS * spacing, max(_DEPTH_SPACINGS * spacing, 3.0 * band)
+    off, split, places, distances = _along(cells, line, (first, last), (out, depth), strips, _GAP_SPACINGS * spacing)
     if len(off) < 3:
-        return None
+        return np.nan
     prior = spacing * spacing / width
-    total = math.fsum(distances.tolist()) + _PRIOR_COUNT * prior
-    squares = math.fsum((distances**2).tolist()) + 2.0 * _PRIOR_AGE * _PRIOR_COUNT * prior * prior
+    total = exact_sum(distances) + _PRIOR_COUNT * prior
+    squares = exact_sum(distances * distances) + 2.0 * _PRIOR_AGE * _PRIOR_COUNT * prior * prior
     age = squares / (2.0 * total)
-    middle = np.sort(places)[len(places) // 2]
-    near = np.abs(places - middle) <= max(_STRAY_AGES * age, spacing)
-    edge: float = math.fsum(places[near].tolist()) / int(near.sum()) + age
+    middle = in_order(places)[len(places) // 2]
+    near = places[np.abs(places - middle) <= max(_STRAY_AGES * age, spacing)]
+    edge: float = exact_sum(near) / len(near) + age
     density = (len(distances) + _PRIOR_COUNT) / (total * width)
-    return edge - _own_reach(off - edge, split, density * (last - first), points.band_mm, reach_mm)
+    return edge - _own_reach(off - edge, split, density * (last - first), band, reach)
 
 
+@kernel
 def _own_reach(off: FloatArray, split: BoolArray, points_a_mm: float, band_mm: float, reach_mm: float) -> float:
     """The reach of mixed pulses at one edge, from its split pulses and the reach of the whole building, millimetres."""
     if reach_mm <= 0.0:
         return 0.0
-    near = np.abs(off) <= band_mm
-    within = off < -band_mm
-    usual = int((split & within).sum()) / max(1, int(within.sum()))
-    count = max(0.0, int((split & near).sum()) - usual * int(near.sum()))
+    near, near_split, within, within_split = 0, 0, 0, 0
+    for k in range(len(off)):
+        if abs(off[k]) <= band_mm:
+            near, near_split = near + 1, near_split + split[k]
+        elif off[k] < 0.0:
+            within, within_split = within + 1, within_split + split[k]
+    usual = within_split / max(1, within)
+    count = max(0.0, near_split - usual * near)
     # gamma prior about the building's reach, as heavy as so many split pulses
     reach = (count + _PRIOR_SPLITS) / (2.0 * points_a_mm + _PRIOR_SPLITS / reach_mm)
     return min(reach, 1e3 * _LONGEST_REACH_M)

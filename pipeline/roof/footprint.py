@@ -13,6 +13,7 @@ from pipeline.errors import BuildingError
 from pipeline.geometry import corners_of_rings
 from pipeline.model import FloatArray, IntArray, Reason
 from pipeline.roof.partition import RoofPartition
+from pipeline.roof.snapped_rings import snapped_ring
 
 _REPEATED_MM = 10.0
 """Vertices this near to the one before repeat it: below the accuracy of any footprint."""
@@ -204,6 +205,10 @@ def outline(partition: RoofPartition) -> MultiPolygon:
     outline.
     """
     polygons = np.array(partition.polygons, dtype=object)
+    if len(polygons) == 1 and shapely.get_num_interior_rings(polygons[0]) == 0:
+        alone = snapped_ring(shapely.get_coordinates(polygons[0])[:-1])
+        if len(alone):
+            return MultiPolygon([Polygon(alone)])
     if shapely.is_valid(polygons).all():
         return MultiPolygon(polygons_of(shapely.coverage_union_all(polygons)))
     return MultiPolygon(polygons_of(shapely.union_all(shapely.make_valid(polygons), grid_size=1.0)))

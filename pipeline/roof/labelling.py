@@ -63,8 +63,11 @@ def _nearest(x: IntArray, y: IntArray, query_x: IntArray, query_y: IntArray, cel
     for q in range(n):
         px, py = query_x[q] - low_x, query_y[q] - low_y
         column, row = px // cell, py // cell
-        best = squared[q]
-        index = -1
+        best, index = squared[q], -1
+        if q > 0:
+            # queries mostly follow each other: what was near to the one before bounds the search
+            index = found[q - 1]
+            best = (x[index] - query_x[q]) ** 2 + (y[index] - query_y[q]) ** 2
         # rows of cells to both sides, the nearest first; in each the cells that hold points, from the query's column on
         for away in range(max(abs(row), abs(rows - 1 - row)) + 1):
             beyond = max(0, (away - 1) * cell + 1)
@@ -261,10 +264,12 @@ def continue_crossings(
         Coefficients in metres.
     """
     labels = labels.copy()
-    pair_keys, kinds = _pairs_that_cross(x, y, facets, labels, known, planes)
-    if len(pair_keys) == 0:
-        return labels
     k = len(planes)
+    if k < 2:
+        return labels
+    pair_keys, kinds = _pairs_that_cross(x, y, facets, labels, known, planes)
+    if not kinds.any():
+        return labels
     for _ in range(_CONTINUATIONS):
         changed = False
         for t in range(len(facets)):

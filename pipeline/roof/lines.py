@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import shapely
 
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray
@@ -106,18 +105,7 @@ def split(border: FloatArray, tolerance: float, *, closed: bool) -> list[Run]:
     The first vertex of a closed border (n, 2), whose last is joined to it, is not repeated, and a run starts there.
     Such a border has at least three runs, or none.
     """
-    path = np.vstack((border, border[:1])) if closed else border
-    kept = shapely.get_coordinates(shapely.simplify(shapely.linestrings(path), tolerance, preserve_topology=False))
-    index, at = [], 0
-    for x, y in kept.tolist():
-        while path[at, 0] != x or path[at, 1] != y:
-            at += 1
-        index.append(at)
-        at += 1
-    index[-1] = len(path) - 1
-    if closed and len(index) < 4:
-        return []
-    return [fitted_run(border, first, last) for first, last in itertools.pairwise(index)]
+    return _as_runs(_split(border, tolerance, closed))
 
 
 def merge(border: FloatArray, runs: Sequence[Run], tolerance: float, *, closed: bool) -> list[Run]:
@@ -125,31 +113,107 @@ def merge(border: FloatArray, runs: Sequence[Run], tolerance: float, *, closed: 
 
     Vertices and tolerance are as for `split`; exact runs stay, and of a closed border at least three runs.
     """
-    merged = list(runs)
     least = 3 if closed else 1
+    if len(runs) <= least:
+        return list(runs)
+    rows = [(run.first, run.last, run.x, run.y, run.direction, run.length, run.exact) for run in runs]
+    return _as_runs(_merge(border, np.array(rows, np.float64), tolerance, least))
 
-    def united(k: int) -> tuple[float, Run] | None:
-        a, b = merged[k], merged[(k + 1) % len(merged)]
-        if a.exact or b.exact or len(merged) <= least or (k + 1 == len(merged) and not closed):
-            return None
-        last = b.last if b.last > a.first else b.last + len(border)
-        run = fitted_run(border, a.first, last)
-        off: float = _off_line(border, run.first, run.last, run.x, run.y, run.direction)
-        return off, run
 
-    pairs = [united(k) for k in range(len(merged))]
-    while True:
-        off, k = min(((pair[0], k) for k, pair in enumerate(pairs) if pair is not None), default=(math.inf, -1))
-        pair = pairs[k] if k >= 0 else None
-        if pair is None or off > tolerance or len(merged) <= least:
-            return merged
-        merged[k] = pair[1]
-        following = (k + 1) % len(merged)
-        del merged[following], pairs[following]
-        if following < k:
-            k -= 1
-        for j in {k, (k - 1) % len(merged)}:
-            pairs[j] = united(j)
+def _as_runs(rows: FloatArray) -> list[Run]:
+    """Runs from rows of their fields, (r, 7)."""
+    return [
+        Run(first=int(first), last=int(last), x=x, y=y, direction=direction, length=length, exact=bool(exact))
+        for first, last, x, y, direction, length, exact in rows.tolist()
+    ]
+
+
+@kernel
+def _fitted_row(border: FloatArray, first: int, last: int) -> tuple[float, float, float, float, float, float, float]:
+    """The fields of `fitted_run`."""
+    x, y, direction, length = _fit(border, first, last)
+    return float(first), float(last), x, y, direction, length, 0.0
+
+
+@kernel
+def _split(border: FloatArray, tolerance: float, closed: bool) -> FloatArray:
+    """The kernel of `split`, a row of fields per run (r, 7): the farthest vertex ends a run if it is too far."""
+    n = len(border)
+    count = n if closed else n - 1
+    ends = np.zeros(count + 1, np.bool_)
+    ends[0] = ends[count] = True
+    starts, stops = np.empty(count + 1, np.int64), np.empty(count + 1, np.int64)
+    starts[0], stops[0] = 0, count
+    left = 1
+    while left > 0:
+        left -= 1
+        i, j = starts[left], stops[left]
+        farthest, at = -1.0, i
+        for k in range(i + 1, j):
+            off = off_piece(border[i], border[j % n], border[k])
+            if off > farthest:
+                farthest, at = off, k
+        if farthest > tolerance:
+            ends[at] = True
+            # no more than `count` pieces wait, as each is a part of its own
+            starts[left], stops[left] = i, at
+            starts[left + 1], stops[left + 1] = at, j
+            left += 2
+    kept = np.flatnonzero(ends)
+    if closed and len(kept) < 4:
+        return np.empty((0, 7))
+    rows = np.empty((len(kept) - 1, 7))
+    for r in range(len(rows)):
+        rows[r] = _fitted_row(border, kept[r], kept[r + 1])
+    return rows
+
+
+@kernel
+def off_piece(a: FloatArray, b: FloatArray, p: FloatArray) -> float:
+    """Distance of a point from the piece between two others, all (2,)."""
+    ux, uy = b[0] - a[0], b[1] - a[1]
+    x, y = p[0] - a[0], p[1] - a[1]
+    squared = ux * ux + uy * uy
+    along = (x * ux + y * uy) / squared if squared > 0.0 else 0.0
+    if along <= 0.0:
+        return math.sqrt(x * x + y * y)
+    if along >= 1.0:
+        return math.sqrt((p[0] - b[0]) ** 2 + (p[1] - b[1]) ** 2)
+    return float(abs((y * ux - x * uy) / squared) * math.sqrt(squared))
+
+
+@kernel
+def _merge(border: FloatArray, runs: FloatArray, tolerance: float, least: int) -> FloatArray:
+    """The kernel of `merge`, rows of fields (r, 7); of a closed border at least three runs stay, of an open one one."""
+    closed = least > 1
+    count = len(runs)
+    merged, pairs, offs = runs.copy(), np.empty((count, 7)), np.full(count, np.inf)
+    for k in range(count):
+        offs[k] = _off_united(border, merged, k, closed, pairs[k])
+    while count > least:
+        k = int(np.argmin(offs[:count]))
+        if offs[k] > tolerance:
+            break
+        merged[k] = pairs[k]
+        following = (k + 1) % count
+        for i in range(following, count - 1):
+            merged[i], pairs[i], offs[i] = merged[i + 1], pairs[i + 1], offs[i + 1]
+        count -= 1
+        k -= following < k
+        for i in (k, (k - 1) % count):
+            offs[i] = _off_united(border, merged[:count], i, closed, pairs[i])
+    return merged[:count].copy()
+
+
+@kernel
+def _off_united(border: FloatArray, runs: FloatArray, k: int, closed: bool, united: FloatArray) -> float:
+    """How far vertices are from the line of a run and its successor, whose fields `united` takes; else infinite."""
+    a, b = runs[k], runs[(k + 1) % len(runs)]
+    if a[6] != 0.0 or b[6] != 0.0 or (k + 1 == len(runs) and not closed):
+        return np.inf
+    last = int(b[1]) + (len(border) if b[1] <= a[0] else 0)
+    united[:] = _fitted_row(border, int(a[0]), last)
+    return _off_line(border, int(a[0]), last, united[2], united[3], united[4])
 
 
 def dominant_direction(runs: Sequence[Run]) -> float | None:

@@ -9,7 +9,6 @@ borders cannot pinch (Lorensen and Cline 1987 in the plane, with many labels).
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from typing import NamedTuple
 
@@ -62,14 +61,15 @@ class MinAreas(NamedTuple):
 @kernel
 def connected_regions(facets: LabelArray, labels: LabelArray) -> tuple[LabelArray, int]:
     """Components of equally labelled vertices along TIN edges, (n,) numbered by their lowest vertex; their number."""
-    n = len(labels)
-    parent = np.arange(n)
+    parent = np.arange(len(labels))
     for t in range(len(facets)):
-        for k in range(3):
-            a = facets[t, k]
-            b = facets[t, (k + 1) % 3]
-            if labels[a] == labels[b]:
-                unite(parent, a, b)
+        a, b, c = facets[t, 0], facets[t, 1], facets[t, 2]
+        if labels[a] == labels[b]:
+            unite(parent, a, b)
+        if labels[b] == labels[c]:
+            unite(parent, b, c)
+        if labels[c] == labels[a] != labels[b]:
+            unite(parent, c, a)
     return numbered_sets(parent)
 
 
@@ -91,16 +91,13 @@ def _region_areas(
 
 @kernel(inline="always")
 def _adjacency(facets: LabelArray, n: int) -> tuple[LabelArray, LabelArray]:
-    """The neighbours of n vertices in compressed rows: starts (n + 1,) and vertices; those over inner edges twice."""
-    corners = np.empty(6 * len(facets), np.int32)
-    for t in range(len(facets)):
-        for k in range(6):
-            corners[6 * t + k] = facets[t, k // 2]
-    starts, adjacent = counting_sort(corners, n)
-    for s in range(len(adjacent)):
-        t, k = adjacent[s] // 6, adjacent[s] % 6
-        adjacent[s] = facets[t, (k // 2 + 1 + k % 2) % 3]
-    return starts, adjacent
+    """The facets around n vertices in compressed rows: starts (n + 1,) and the two other vertices of each, (c, 2)."""
+    starts, corners = counting_sort(facets.ravel(), n)
+    others = np.empty((len(corners), 2), np.int32)
+    for s in range(len(corners)):
+        t, k = corners[s] // 3, corners[s] % 3
+        others[s, 0], others[s, 1] = facets[t, (k + 1) % 3], facets[t, (k + 2) % 3]
+    return starts, others
 
 
 @kernel(inline="always")
@@ -161,7 +158,7 @@ def absorb_small_regions(
     """
     labels = labels.copy()
     n = len(labels)
-    starts, adjacent = _adjacency(facets, n)
+    starts, others = np.empty(0, np.int32), np.empty((0, 2), np.int32)
     border = np.zeros(len(planes) + 1, np.int64)
     for _ in range(_ABSORPTIONS):
         regions, count = connected_regions(facets, labels)
@@ -178,19 +175,20 @@ def absorb_small_regions(
                 continue
             if touched[r] != 0:
                 continue  # it grew since its area was taken: the next round judges it
+            if len(starts) == 0:
+                starts, others = _adjacency(facets, n)
             border[:] = 0
             for v in members:
-                for s in range(starts[v], starts[v + 1]):
-                    other = labels[adjacent[s]]
-                    if other != label:
-                        border[other + 1] += 1
+                for w in others[starts[v] : starts[v + 1]].ravel():
+                    if labels[w] != label:
+                        border[labels[w] + 1] += 1
             best = _best_label(x, y, z, members, label, counted, planes, border)
             if best == label:
                 continue
             for v in members:
-                for s in range(starts[v], starts[v + 1]):
-                    if labels[adjacent[s]] == best:
-                        touched[regions[adjacent[s]]] = 1
+                for w in others[starts[v] : starts[v + 1]].ravel():
+                    if labels[w] == best:
+                        touched[regions[w]] = 1
                 labels[v] = best
             changed = True
         if not changed:
@@ -286,59 +284,60 @@ def _meeting_point(tin: _Labelled, corners: LabelArray) -> tuple[float, float]:
 
 @kernel
 def _march(
-    tin: _Labelled, facets: LabelArray, neighbours: LabelArray, regions: LabelArray
-) -> tuple[FloatArray, LabelArray, LabelArray]:
-    """Rings around all roof regions: nodes (m, 2) in mm, first node (r + 1,) and region (r,) of each ring.
+    tin: _Labelled, facets: LabelArray, neighbours: LabelArray
+) -> tuple[FloatArray, LabelArray, LabelArray, LabelArray]:
+    """Rings around all roof regions: nodes (m, 2) in mm, first node (r + 1,), region and label (r,) of each ring.
 
     A ring keeps its region on the left. The state of the walk is a half-edge a -> b of a facet with a inside the
     region and b not; it leaves the facet across b -> third where third is inside too, else across third -> a.
     """
+    regions, _ = connected_regions(facets, tin.labels)
     labels = tin.labels
     mixed = 0
+    mixed_edges = np.empty(3 * len(facets), np.int32)
     for t in range(len(facets)):
         for k in range(3):
             a, b = facets[t, (k + 1) % 3], facets[t, (k + 2) % 3]
-            mixed += labels[a] >= 0 and labels[a] != labels[b]
+            if labels[a] >= 0 and labels[a] != labels[b]:
+                mixed_edges[mixed] = 3 * t + k
+                mixed += 1
     visited = np.zeros((len(facets), 3), np.uint8)
     nodes = np.empty((2 * mixed, 2))
     ring_starts = np.zeros(mixed + 1, np.int32)
-    ring_regions = np.empty(mixed, np.int32)
+    ring_regions, ring_labels = np.empty(mixed, np.int32), np.empty(mixed, np.int32)
     count = 0
     rings = 0
-    for start in range(len(facets)):
-        for start_edge in range(3):
-            a = facets[start, (start_edge + 1) % 3]
-            b = facets[start, (start_edge + 2) % 3]
-            if visited[start, start_edge] != 0 or labels[a] < 0 or labels[a] == labels[b]:
-                continue
-            ring_regions[rings] = regions[a]
-            t = start
-            k = start_edge
-            while visited[t, k] == 0:
-                visited[t, k] = 1
-                a = facets[t, (k + 1) % 3]
-                b = facets[t, (k + 2) % 3]
-                third = facets[t, k]
-                x, y = _cut_point(tin, a, b)
-                nodes[count, 0], nodes[count, 1] = np.rint(x), np.rint(y)
-                count += 1
-                side = (k + 1) % 3
-                if labels[third] != labels[a]:
-                    side = (k + 2) % 3
-                    if labels[third] != labels[b]:
-                        x, y = _meeting_point(tin, facets[t])
-                        nodes[count, 0], nodes[count, 1] = np.rint(x), np.rint(y)
-                        count += 1
-                # step over the side opposite to vertex `side`; find the same side in the neighbour
-                u = neighbours[t, side]
-                back = 0
-                while neighbours[u, back] != t:
-                    back += 1
-                t = u
-                k = back
-            rings += 1
-            ring_starts[rings] = count
-    return nodes[:count].copy(), ring_starts[: rings + 1].copy(), ring_regions[:rings].copy()
+    for start in mixed_edges[:mixed]:
+        t, k = start // 3, start % 3
+        if visited[t, k] != 0:
+            continue
+        a = facets[t, (k + 1) % 3]
+        ring_regions[rings], ring_labels[rings] = regions[a], labels[a]
+        while visited[t, k] == 0:
+            visited[t, k] = 1
+            a = facets[t, (k + 1) % 3]
+            b = facets[t, (k + 2) % 3]
+            third = facets[t, k]
+            x, y = _cut_point(tin, a, b)
+            nodes[count, 0], nodes[count, 1] = np.rint(x), np.rint(y)
+            count += 1
+            side = (k + 1) % 3
+            if labels[third] != labels[a]:
+                side = (k + 2) % 3
+                if labels[third] != labels[b]:
+                    x, y = _meeting_point(tin, facets[t])
+                    nodes[count, 0], nodes[count, 1] = np.rint(x), np.rint(y)
+                    count += 1
+            # step over the side opposite to vertex `side`; find the same side in the neighbour
+            u = neighbours[t, side]
+            back = 0
+            while neighbours[u, back] != t:
+                back += 1
+            t = u
+            k = back
+        rings += 1
+        ring_starts[rings] = count
+    return nodes[:count], ring_starts[: rings + 1], ring_regions[:rings], ring_labels[:rings]
 
 
 def march(
@@ -360,32 +359,47 @@ def march(
     >>> march(xy, triangulate(xy), labels, np.zeros((1, 3)), 0.5, 0.1).polygons[0].area
     202500.0
     """
-    regions, _ = connected_regions(tin.facets, labels)
     x, y = np.ascontiguousarray(xy_mm[:, 0]), np.ascontiguousarray(xy_mm[:, 1])
     labelled = _Labelled(x, y, labels, planes, outside_fraction, step_offset_m)
-    nodes, ring_starts, ring_regions = _march(labelled, tin.facets, tin.neighbours, regions)
+    nodes, ring_starts, ring_regions, ring_labels = _march(labelled, tin.facets, tin.neighbours)
     if len(ring_regions) == 0:
         raise BuildingError(Reason.NO_PARTITION, "no point with a plane lies inside the triangulation")
-    label_of_region = np.full(int(regions.max()) + 1, OUTSIDE, np.int32)
-    label_of_region[regions] = labels
-    return _polygons(nodes, ring_starts, ring_regions, label_of_region)
+    xy, ring, face, face_labels = _by_face(nodes, ring_starts, ring_regions, ring_labels)
+    polygons = shapely.polygons(shapely.linearrings(xy, indices=ring), indices=face)
+    return RoofPartition(polygons=tuple(polygons.tolist()), labels=face_labels)
 
 
-def _polygons(
-    nodes: FloatArray, ring_starts: LabelArray, ring_regions: LabelArray, label_of_region: LabelArray
-) -> RoofPartition:
-    """Collect the rings of every region: the counter-clockwise one is its outside, the others are holes."""
-    sizes = np.diff(ring_starts)
-    ring_of_node = np.repeat(np.arange(len(sizes)), sizes)
-    following = np.arange(1, len(nodes) + 1)
-    following[ring_starts[1:] - 1] = ring_starts[:-1]
-    cross = nodes[:, 0] * nodes[following, 1] - nodes[following, 0] * nodes[:, 1]
-    twice_area = np.bincount(ring_of_node, weights=cross, minlength=len(sizes))
-    # rings of one region together, the outer ring before its holes
-    order = np.lexsort((np.arange(len(sizes)), twice_area <= 0.0, ring_regions))
-    order = order[sizes[order] >= 3]
-    rings = [shapely.linearrings(nodes[ring_starts[r] : ring_starts[r + 1]]) for r in order]
-    owners = ring_regions[order]
-    bounds = [0, *(np.flatnonzero(np.diff(owners)) + 1).tolist(), len(rings)]
-    polygons = [shapely.Polygon(rings[i], rings[i + 1 : j]) for i, j in itertools.pairwise(bounds)]
-    return RoofPartition(polygons=tuple(polygons), labels=label_of_region[owners[bounds[:-1]]])
+@kernel
+def _by_face(
+    nodes: FloatArray, ring_starts: LabelArray, ring_regions: LabelArray, ring_labels: LabelArray
+) -> tuple[FloatArray, IntArray, IntArray, LabelArray]:
+    """The rings of `_march` by region, in each the counter-clockwise one, its outside, before the others.
+
+    Nodes (m, 2), the ring of each, (m,), the face of every ring, and the label of every face. Rings of fewer than three
+    nodes are left out.
+    """
+    keys = np.empty(len(ring_regions), np.int64)
+    for r in range(len(ring_regions)):
+        start, end = ring_starts[r], ring_starts[r + 1]
+        twice_area, before = 0.0, end - 1
+        for k in range(start, end):
+            twice_area += nodes[before, 0] * nodes[k, 1] - nodes[k, 0] * nodes[before, 1]
+            before = k
+        keys[r] = 2 * ring_regions[r] + (twice_area <= 0.0)
+    xy, ring = np.empty(nodes.shape), np.empty(len(nodes), np.int64)
+    face, labels = np.empty(len(keys), np.int64), np.empty(len(keys), np.int32)
+    count = rings = faces = 0
+    region = -1
+    for r in ascending_order(keys):
+        start, end = ring_starts[r], ring_starts[r + 1]
+        if end - start < 3:
+            continue
+        if ring_regions[r] != region:
+            region, labels[faces] = ring_regions[r], ring_labels[r]
+            faces += 1
+        for k in range(start, end):
+            xy[count], ring[count] = nodes[k], rings
+            count += 1
+        face[rings] = faces - 1
+        rings += 1
+    return xy[:count], ring[:count], face[:rings], labels[:faces].copy()

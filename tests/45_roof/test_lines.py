@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -46,6 +47,22 @@ def test_a_zigzag_is_one_run_and_a_corner_two() -> None:
     assert math.sin(runs[0].direction) == pytest.approx(0.0, abs=0.01)
     bent = np.vstack((zigzag, [[10_000.0, y] for y in np.arange(500.0, 8001.0, 500.0)]))
     assert len(merge(bent, split(bent, 150.0, closed=False), 260.0, closed=False)) == 2
+
+
+@given(st.integers(0, 2**32 - 1), st.booleans())
+@settings(max_examples=examples(60), deadline=None)
+def test_a_border_is_split_where_the_simplified_one_has_its_vertices(seed: int, closed: bool) -> None:
+    rng = np.random.default_rng(seed)
+    border = rng.permutation(400)[:40].reshape(20, 2).astype(np.float64)
+    path = shapely.LineString([*border, border[0]] if closed else border)
+    runs = split(border, 80.0, closed=closed)
+    kept = shapely.get_coordinates(shapely.simplify(path, 80.0, preserve_topology=False))
+    if runs:
+        assert border[[run.first for run in runs]].tolist() == kept[:-1].tolist()
+        assert [run.last for run in runs[:-1]] == [run.first for run in runs[1:]]
+    else:
+        assert closed
+        assert len(kept) < 4
 
 
 def test_a_closed_border_keeps_three_runs() -> None:
