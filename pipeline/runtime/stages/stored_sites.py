@@ -27,11 +27,12 @@ from pipeline.runtime.stages.sites import (
 )
 from pipeline.tiling import Tile, TileGrid
 
-_POINTS_PER_GROUP = 20_000
-_MOST_PER_GROUP = 64
+_POINTS_PER_GROUP = 40_000
+"""A quarter of a second of modelling: what a task costs beside it is a hundredth of that."""
+_MOST_PER_GROUP = 128
 _GROUPS = 8192
 """A run has about as many groups at most: larger runs have larger ones."""
-_LARGEST_SCALE = 16
+_LARGEST_SCALE = 8
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -108,7 +109,7 @@ def groups_of(sites: Sequence[CandidateSite], scale: int = 1) -> list[tuple[Cand
     """Group the candidates of a tile, which come largest first, so that a task models each group in some seconds.
 
     >>> site = lambda n: CandidateSite(building_id=str(n), owner=Tile(0, 0), ranges=(), points=n)
-    >>> [len(group) for group in groups_of([site(30_000), site(14_000), site(5_000), site(4_000), site(10)])]
+    >>> [len(group) for group in groups_of([site(60_000), site(28_000), site(10_000), site(8_000), site(10)])]
     [1, 2, 2]
     """
     groups: list[tuple[CandidateSite, ...]] = []
@@ -127,13 +128,13 @@ def groups_of(sites: Sequence[CandidateSite], scale: int = 1) -> list[tuple[Cand
 
 
 def scale_of(points: int) -> int:
-    """How many times larger the tasks of a run are, by the points of its candidates: 1, 2, 4, 8 or 16.
+    """How many times larger the tasks of a run are, by the points of its candidates: 1, 2, 4 or 8.
 
     A task costs driver and scheduler milliseconds, however small it is. Powers of two, so that runs of about the same
     size have the same tasks.
 
-    >>> [scale_of(points) for points in (0, 160_000_000, 200_000_000, 10**9, 10**10)]
-    [1, 1, 2, 8, 16]
+    >>> [scale_of(points) for points in (0, 320_000_000, 400_000_000, 10**9, 10**10)]
+    [1, 1, 2, 4, 8]
     """
     scale = 1
     while scale < _LARGEST_SCALE and points > _GROUPS * _POINTS_PER_GROUP * scale:
