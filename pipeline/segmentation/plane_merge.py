@@ -34,10 +34,14 @@ def touching_pairs(neighbours: LabelArray, labels: LabelArray, usable: BoolArray
     count = 0
     seen = np.empty(width + 1, np.int64)
     for i in range(labels.size):
-        mixed = labels[i] < 0
-        for q in range(width):
-            j = neighbours[i, q]
-            mixed |= (j >= 0) & (labels[j] != labels[i])
+        first = labels[i]
+        mixed = first < 0
+        if not mixed:
+            for q in range(width):
+                j = neighbours[i, q]
+                if j >= 0 and labels[j] != first:
+                    mixed = True
+                    break
         if not mixed:
             continue
         kinds = 0
@@ -53,28 +57,11 @@ def touching_pairs(neighbours: LabelArray, labels: LabelArray, usable: BoolArray
                 kinds += 1
         for s in range(kinds):
             for t in range(s):
-                codes, count = _with_code(codes, count, min(seen[s], seen[t]) * n + max(seen[s], seen[t]))
-    return codes[:count].copy()
-
-
-@kernel
-def _with_code(codes: IntArray, count: int, code: int) -> tuple[IntArray, int]:
-    """Put a code among the first `count` ones, which ascend, unless it is there; the codes and how many they are."""
-    place, end = 0, count
-    while place < end:
-        middle = (place + end) // 2
-        if codes[middle] < code:
-            place = middle + 1
-        else:
-            end = middle
-    if place < count and codes[place] == code:
-        return codes, count
-    if count == codes.size:
-        codes = np.concatenate((codes, np.empty(count, np.int64)))
-    for moved in range(count, place, -1):
-        codes[moved] = codes[moved - 1]
-    codes[place] = code
-    return codes, count + 1
+                if count == codes.size:
+                    codes = np.concatenate((codes, np.empty(count, np.int64)))
+                codes[count] = min(seen[s], seen[t]) * n + max(seen[s], seen[t])
+                count += 1
+    return _ascending_once(codes[:count])
 
 
 @kernel
