@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import RunCancelledError, RunError
+from pipeline.runtime.scratch import outcomes
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.scratch.outcomes import (
     DamagedError,
@@ -79,6 +80,16 @@ def test_equal_things_have_equal_keys_in_every_process() -> None:
     elsewhere = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert elsewhere.stdout.strip() == key_of({"b": "x", "a": [1, 2.5]})
     assert key_of(value) == key_of(pickle.loads(pickle.dumps(value)))
+
+
+def test_an_array_is_known_by_all_that_it_holds_also_a_large_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outcomes, "_LARGE", 100)
+    for count in (3, 200):
+        array = np.arange(count)
+        other = array.copy()
+        other[-1] += 1
+        assert key_of(array) == key_of(array[::-1][::-1])
+        assert len({key_of(array), key_of(other), key_of(array.view(np.uint64)), key_of(array[:, None])}) == 4
 
 
 def test_what_is_not_known_is_refused() -> None:

@@ -50,6 +50,8 @@ _MARSHAL = 2
 """Format of what keys are made from: the last one in which equal values have equal bytes, however they came about."""
 _AS_IT_IS = frozenset({float, int, str, bytes, bool, type(None)})
 """Types that marshal writes by value."""
+_LARGE = 2**24
+"""Bytes of an array from which a key holds its digest in its place: marshal writes 2 GB at once at most."""
 _KEY_DIGITS = 40
 """Hexadecimal digits of a key: 160 bits."""
 _HEAD = struct.Struct("<QQII")
@@ -84,7 +86,10 @@ def _plain(value: object) -> Any:
     if kind in _AS_IT_IS:
         return value
     if isinstance(value, np.ndarray):
-        return "array", value.dtype.str, value.shape, value.tobytes()
+        content = value.tobytes()
+        if len(content) >= _LARGE:
+            content = hashlib.sha256(content).digest()
+        return "array", value.dtype.str, value.shape, content
     if isinstance(value, enum.Enum):
         return "enum", kind.__name__, value.name
     if isinstance(value, float):
@@ -93,13 +98,13 @@ def _plain(value: object) -> Any:
         return "text", kind.__name__, str(value)
     if isinstance(value, shapely.Geometry):
         return "geometry", shapely.to_wkb(value, include_srid=True)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        names = _names_of(kind)
+        return "fields", kind.__name__, names, *[_plain(getattr(value, name)) for name in names]
     if isinstance(value, tuple | Sequence):  # tuple, since a Sequence takes longer to find
         return list(map(_plain, value))
     if isinstance(value, Mapping):
         return "mapping", *((_plain(name), _plain(value[name])) for name in sorted(value))
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        names = _names_of(kind)
-        return "fields", kind.__name__, names, *[_plain(getattr(value, name)) for name in names]
     raise TypeError(f"the content of a {kind.__name__} is not known to key_of")
 
 

@@ -204,20 +204,24 @@ def outcomes_of(
     by_source = {site.source_id: site.building_id for site in sites.candidates if site.source_id is not None}
     found: list[EntryOutcome] = []
     entry_of: dict[str, int] = {}
+    nearest_id = _nearest_names(
+        {o.building_id for o in overrides if o.building_id is not None} - {*candidates, *rejected}, map(_id_of, every())
+    )
+    own_ids = (site.source_id for site in every() if isinstance(site, CandidateSite) and site.source_id is not None)
+    nearest_source = _nearest_names({o.source_id for o in overrides if o.source_id is not None} - {*by_source}, own_ids)
     for override in overrides:
         fault = ""
         if override.source_id is not None:
             name = by_source.get(override.source_id)
             if name is None:
-                own = (site.source_id for site in every() if isinstance(site, CandidateSite))
-                fault = _unknown(override.source_id, filter(None, own), "source_id of this run")
+                fault = _unknown(nearest_source.get(override.source_id), "source_id of this run")
         elif override.point_m is not None:
             among = (rejected, "rejected object") if override.action == "accept" else (candidates, "building")
             name, fault = _at(override.point_m, *among, scratch, grid)
         else:
             name = override.building_id
             if name not in candidates and name not in rejected:
-                fault = _unknown(str(name), map(_id_of, every()), "building or rejected object of this run")
+                fault = _unknown(nearest_id.get(str(name)), "building or rejected object of this run")
                 name = None
         if name is not None and name in entry_of:
             fault = f"{name} has entry {entry_of[name]} already"
@@ -244,10 +248,19 @@ def _judged(override: Override, name: str, candidates: Sites, rejected: Sites) -
     return EntryOutcome(override=override, building_id=name, effective=effective, fault=fault)
 
 
-def _unknown(name: str, names: Iterable[str], what: str) -> str:
-    """The fault of an unknown name, with the known name that begins most like it: of several, the first."""
-    nearest = min(names, key=lambda other: (-_shared_start(name, other), other), default=None)
+def _unknown(nearest: str | None, what: str) -> str:
+    """The fault of an unknown name, with the known name that begins most like it."""
     return f"it is no {what}" + ("" if nearest is None else f"; the nearest is {nearest}")
+
+
+def _nearest_names(unknown: Collection[str], names: Iterable[str]) -> dict[str, str]:
+    """By unknown name the known one that begins most like it: of several, the first; the names are read once."""
+    best: dict[str, tuple[int, str]] = {}
+    for other in names if unknown else ():
+        for name in unknown:
+            rank = -_shared_start(name, other), other
+            best[name] = min(best.get(name, rank), rank)
+    return {name: other for name, (_, other) in best.items()}
 
 
 def _shared_start(a: str, b: str) -> int:
