@@ -8,7 +8,7 @@ from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.geometry import top_visible
 from pipeline.model import Candidate, FloatArray, IntArray, PreparedCloud, Reason
-from pipeline.tin.delaunay import unique_xy
+from pipeline.tin.delaunay import unique_xy_ranked
 
 SHADING_RADIUS_M, SHADING_HEIGHT_M = 0.5, 1.1
 """A point with another this much higher within this distance in plan is hidden: a facade, a return from below the roof.
@@ -29,7 +29,8 @@ def prepare_cloud(candidate: Candidate, max_points: int | None = None) -> Prepar
     highest = visible
     seen_mm = in_mm.take(visible, axis=0)
     if not _ascend(seen_mm):  # they mostly do: points are in canonical order
-        highest = visible[unique_xy(seen_mm[:, :2], seen_mm[:, 2])[0]]
+        kept, _, rank = unique_xy_ranked(seen_mm[:, :2], seen_mm[:, 2])
+        highest = visible[kept[np.argsort(rank)]]
     return PreparedCloud(
         candidate=candidate,
         shift_m=shift_m,

@@ -7,14 +7,14 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray
 
-_MOST_PARTS = 64
-"""Parts of a sum do not overlap: 53 bits each of the 2100 that finite numbers have."""
+_USUAL_PARTS = 64
+"""Parts of a sum do not overlap, but may have few bits each of the 2100 that finite numbers have."""
 
 
 @kernel
 def exact_sum(values: FloatArray) -> float:
     """The sum of finite values (n,), rounded to the nearest float; what is summed on the way must not overflow."""
-    parts = np.empty(_MOST_PARTS)
+    parts = np.empty(_USUAL_PARTS)
     count = 0
     for value in values:
         high, kept = value, 0
@@ -28,6 +28,8 @@ def exact_sum(values: FloatArray) -> float:
                 parts[kept] = low
                 kept += 1
             high = total
+        if kept == len(parts):
+            parts = np.concatenate((parts, np.empty(kept)))
         parts[kept] = high
         count = kept + 1
     # parts ascend: add them from the largest down until one is lost in rounding

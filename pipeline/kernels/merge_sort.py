@@ -11,6 +11,9 @@ from pipeline.model import FloatArray, IntArray
 
 Values = TypeVar("Values", IntArray, FloatArray)
 
+_MANY = 64
+"""Merging is faster from here on."""
+
 
 @kernel
 def ascending_order(keys: IntArray | FloatArray) -> IntArray:
@@ -48,3 +51,17 @@ def in_order(values: Values) -> Values:
     for i in range(len(values)):
         ordered[i] = values[order[i]]
     return ordered
+
+
+@kernel(inline="always")
+def sort_few(values: FloatArray) -> None:
+    """Put values (n,), mostly a few dozen, in ascending order where they are: by insertion, which then is fastest."""
+    if len(values) > _MANY:
+        values[:] = in_order(values)
+    else:
+        for i in range(1, len(values)):
+            moved, k = values[i], i
+            while k > 0 and values[k - 1] > moved:
+                values[k] = values[k - 1]
+                k -= 1
+            values[k] = moved

@@ -26,7 +26,7 @@ from pipeline.compiler import kernel
 from pipeline.kernels.bounds import bounds_of
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.exact_sum import exact_sum
-from pipeline.kernels.merge_sort import in_order
+from pipeline.kernels.merge_sort import in_order, sort_few
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.lines import Run, off_piece
 
@@ -170,13 +170,7 @@ def _along(
         begin, end = starts[s], starts[s + 1]
         if begin == end:
             continue
-        # a few dozen points: insertion is faster than a sort of all
-        for i in range(begin + 1, end):
-            moved, k = from_edge[i], i
-            while k > begin and from_edge[k - 1] > moved:
-                from_edge[k] = from_edge[k - 1]
-                k -= 1
-            from_edge[k] = moved
+        sort_few(from_edge[begin:end])
         places[seen] = -from_edge[begin]
         seen += 1
         for k in range(begin + 1, end):
@@ -230,6 +224,10 @@ def _splits_near(
         is_near = False
         for v in range(1, len(rings)):
             if ring[v] != ring[v - 1]:
+                continue
+            x0, x1 = rings[v - 1, 0] - xy_mm[i, 0], rings[v, 0] - xy_mm[i, 0]
+            y0, y1 = rings[v - 1, 1] - xy_mm[i, 1], rings[v, 1] - xy_mm[i, 1]
+            if min(x0, x1) > band or max(x0, x1) < -band or min(y0, y1) > band or max(y0, y1) < -band:
                 continue
             if off_piece(rings[v - 1], rings[v], xy_mm[i]) <= band:
                 is_near = True

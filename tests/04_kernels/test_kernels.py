@@ -10,11 +10,12 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.compiler import kernel
 from pipeline.kernels.bounds import bounds_of
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.exact_sum import exact_sum
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
-from pipeline.kernels.merge_sort import ascending_order, in_order
+from pipeline.kernels.merge_sort import ascending_order, in_order, sort_few
 from pipeline.kernels.normal_equations import moments_of, solve_plane_moments
 from pipeline.kernels.orientation import (
     comes_before,
@@ -27,6 +28,7 @@ from pipeline.kernels.orientation import (
 )
 from pipeline.kernels.radix_sort import radix_order
 from pipeline.kernels.union_find import numbered_sets, root_of, unite, united
+from pipeline.model import FloatArray
 
 PAIRS = st.lists(st.tuples(st.integers(0, 11), st.integers(0, 11)), max_size=20)
 
@@ -86,6 +88,25 @@ def test_floats_are_sorted_as_numpy_sorts_them_with_nan_at_the_end(values: list[
 @settings(deadline=None)
 def test_a_sum_is_rounded_once_as_by_fsum(values: list[float]) -> None:
     assert exact_sum(np.array(values, np.float64)) == math.fsum(values)
+
+
+def test_a_sum_of_many_parts_that_do_not_overlap_is_exact() -> None:
+    rng = np.random.default_rng(5)
+    values = rng.uniform(0.5, 1.5, 2000) * 2.0 ** np.linspace(-1000.0, 900.0, 2000) * rng.choice([-1.0, 1.0], 2000)
+    assert exact_sum(values) == math.fsum(values)
+
+
+@given(st.lists(st.floats(-10.0, 10.0), max_size=100))
+@settings(deadline=None)
+def test_a_few_values_are_sorted_where_they_are(values: list[float]) -> None:
+    own = np.array([0.0, *values, 0.0])
+    _sorted_inside(own)
+    assert own.tolist() == [0.0, *sorted(values), 0.0]
+
+
+@kernel
+def _sorted_inside(values: FloatArray) -> None:
+    sort_few(values[1:-1])
 
 
 @given(st.lists(st.integers(-2, 6), max_size=40))

@@ -8,7 +8,7 @@ import shapely
 from candidates_by_hand import candidate
 
 from pipeline.methods import ReconstructSettings
-from pipeline.model import Candidate, Plane, PreparedCloud
+from pipeline.model import Candidate, IntArray, Plane, PreparedCloud
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.residuals import vertical_residuals
 from pipeline.reconstruct import reconstruct_building
@@ -92,3 +92,25 @@ def test_a_narrow_lower_level_is_modelled_up_to_the_wall(strip_m: float) -> None
     near = np.abs(vertical_residuals(one.points, result.faces, result.planes)) < 0.2
     assert near[low].mean() > 0.9
     assert near[~low].mean() > 0.98
+
+
+def test_roof_points_ascend_in_plan_whatever_the_order_of_the_candidate_s() -> None:
+    rng = np.random.default_rng(3)
+    points = np.rint(np.column_stack((rng.uniform(0, 12, (2000, 2)), rng.uniform(5, 6, 2000))) * 1e3) / 1e3
+    ground = np.column_stack((np.full(4, -3.0), np.arange(4.0), np.zeros(4)))
+
+    def found(order: IntArray) -> RoofPoints:
+        one = Candidate(
+            building_id="",
+            origin=(0.0, 0.0, 0.0),
+            points=points[order],
+            ground=ground,
+            ground_z_m=0.0,
+            split_returns=points[::7],
+        )
+        return roof_points(prepare_cloud(one), RoofSettings())
+
+    shuffled, sorted_ = found(rng.permutation(2000)), found(np.lexsort((points[:, 1], points[:, 0])))
+    np.testing.assert_array_equal(shuffled.xy_mm, sorted_.xy_mm)
+    np.testing.assert_array_equal(shuffled.split, sorted_.split)
+    assert sorted_.split.sum() > 100

@@ -102,6 +102,8 @@ def test_heights_within_two_millimetres_are_one() -> None:
 
 # two courtyards that meet in one corner
 TOUCHING_LEFT = Polygon([(0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (3, 3), (3, 5), (3, 6), (0, 6)])
+ROUND = shapely.Point(0, 0).buffer(2000.0, quad_segs=5000)
+"""So many vertices that a write beyond their arrays is not hidden by spare room."""
 TOUCHING_RIGHT = Polygon([(3, 0), (6, 0), (6, 6), (3, 6), (3, 5), (5, 5), (5, 3), (3, 3), (3, 1)])
 
 
@@ -111,6 +113,7 @@ TOUCHING_RIGHT = Polygon([(3, 0), (6, 0), (6, 6), (3, 6), (3, 5), (5, 5), (5, 3)
         ([shapely.box(0, 0, 4, 4)], 4.0, r"dips 1\.000 m under the floor"),
         ([shapely.box(0, 0, 4, 4), shapely.box(0, 0, 4, 2)], 0.0, "overlap"),
         ([TOUCHING_LEFT, TOUCHING_RIGHT], 0.0, "touches itself"),
+        ([ROUND, ROUND], 0.0, "overlap"),
     ],
 )
 def test_faces_that_make_no_solid_are_refused(polygons: list[Polygon], floor_m: float, problem: str) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.merge_sort import sort_few
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.minimum_cut import Allowed, Costs, Neighbours, cost_of, expand_labels
 
@@ -90,12 +91,9 @@ def raster_cells(edges: FloatArray, west: float, south: float, cell_m: float, co
             if (edges[e, 1] > y) != (edges[e, 3] > y):
                 fraction = (y - edges[e, 1]) / (edges[e, 3] - edges[e, 1])
                 x = edges[e, 0] + fraction * (edges[e, 2] - edges[e, 0])
-                k = found
-                while k > 0 and crossings[k - 1] > x:
-                    crossings[k] = crossings[k - 1]
-                    k -= 1
-                crossings[k] = x
+                crossings[found] = x
                 found += 1
+        sort_few(crossings[:found])
         for k in range(0, found - 1, 2):
             first = max(math.ceil((crossings[k] - west) / cell_m - 0.5), 0)
             last = min(math.floor((crossings[k + 1] - west) / cell_m - 0.5), columns - 1)
