@@ -27,7 +27,7 @@ WALL, FLOOR = -1, -2
 
 
 class Fault(NamedTuple):
-    """Why there are no solids."""
+    """What is wrong with the faces, if anything is."""
 
     kind: int
     """`SOUND` where there are."""
@@ -237,7 +237,7 @@ def _stacked(
     n = len(mesh.vertex)
     points, starts, n_points = np.empty((2 * n, 3), np.int64), np.zeros(parts + 1, np.int64), 0
     node, foot, dips = np.full(n, -1), np.full(n, -1), np.zeros(parts, np.int64)
-    is_outline = np.zeros((max(parts, 1), len(xy)), np.bool_)  # there are no parts where faces overlap
+    is_outline = np.zeros((max(parts, 1), len(xy)), np.bool_)  # faces that overlap are not put into parts
     for i in range(n):
         if mesh.opposite[i] < 0:
             is_outline[part[mesh.face[i]], mesh.vertex[i]] = True

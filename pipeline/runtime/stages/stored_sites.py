@@ -28,7 +28,7 @@ from pipeline.runtime.stages.sites import (
 from pipeline.tiling import Tile, TileGrid
 
 _POINTS_PER_GROUP = 40_000
-"""A quarter of a second of modelling: what a task costs beside it is a hundredth of that."""
+"""About a quarter of a second of modelling. A task costs some five milliseconds beside it."""
 _MOST_PER_GROUP = 128
 _GROUPS = 8192
 """A run has about as many groups at most: larger runs have larger ones."""
