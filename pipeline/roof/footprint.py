@@ -13,7 +13,7 @@ from pipeline.errors import BuildingError
 from pipeline.geometry import corners_of_rings
 from pipeline.model import FloatArray, IntArray, Reason
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.snapped_rings import snapped_ring
+from pipeline.roof.snapped_rings import on_grid, snapped_ring
 
 _REPEATED_MM = 10.0
 """Vertices this near to the one before repeat it: below the accuracy of any footprint."""
@@ -31,7 +31,8 @@ def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
     scaled = shapely.transform(footprint, lambda xy: xy * 1e3)
     if not scaled.is_valid:
         scaled = shapely.make_valid(scaled, method="structure", keep_collapsed=False)
-    snapped = shapely.set_precision(scaled, 1.0)
+    parts = polygons_of(scaled)
+    snapped = on_grid(parts[0]) if len(parts) == 1 else shapely.set_precision(scaled, 1.0)
     straight = shapely.simplify(snapped, _STRAIGHT_MM, preserve_topology=True)
     cleaned = polygons_of(straight)
     if cleaned and _has_repeated(cleaned, _REPEATED_MM):
