@@ -244,7 +244,8 @@ def cost_of_driver(
     columns = [tile.column for tile in map(Tile.from_key, {key[1] for key in briefs if key[0] == "cells"})]
     block = tiles_per_block(side_mm)
     together = math.lcm(_ACROSS, block)
-    stride = -(-(max(columns) - min(columns) + 3) // together) * together
+    # no block holds tiles of two copies, wherever the city lies
+    stride = ((max(columns) + 2) // together - min(columns) // together + 1) * together
     large = copied(plan, copies, stride)
     executor = Copier(briefs, min(columns), stride, copies, block)
     before = peak_of_process()[1]
