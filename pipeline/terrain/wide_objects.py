@@ -62,12 +62,12 @@ def _floors(surface: Elevations, first: int, last: int, rise_mm: float) -> Eleva
     rows, columns = surface.shape
     out = np.full((rows, columns), NO_DATA, np.int32)
     eroded = framed(surface)
-    before, after, high, low = eroded.copy(), eroded.copy(), eroded.copy(), eroded.copy()
+    before, after = eroded.copy(), eroded.copy()
     for radius in range(1, last + 1):
-        erode_once(eroded, high, radius)
+        erode_once(eroded, radius)
         if radius < first - 1:
             continue
-        dilate_back(surface, eroded, after, low, radius)
+        dilate_back(surface, eroded, after, radius)
         if radius >= first:
             for r in range(rows):
                 for c in range(columns):
