@@ -49,6 +49,40 @@ _ENOUGH_BESIDE = 4
 
 
 @kernel
+def _mean_beside(surface: Elevations, at: int, width: int, is_fill: bool) -> int:
+    """Mean of the cells beside one that lie within `_WALL_MM` of its level, or NO_DATA without any; in mm.
+
+    `surface` holds rows of `width` cells, one after the other. The eight cells around a cell fill it, at the level of
+    the lowest; the four beside a filled cell smooth it.
+    """
+    level = surface[at]
+    if is_fill:
+        for row in range(at - width, at + width + 1, width):
+            for k in range(row - 1, row + 2):
+                level = min(level, surface[k])
+    n, total = 0, 0
+    for down in range(-1, 2):
+        for across in range(-1, 2):
+            if not is_fill and (down == 0) == (across == 0):
+                continue
+            beside = np.int64(surface[at + down * width + across])
+            # without a branch: which cells count is hard to foresee
+            counts = np.int64((beside != NO_DATA) & (abs(beside - level) <= _WALL_MM))
+            n += counts
+            total += counts * beside
+    return total // n if n > 0 else int(NO_DATA)
+
+
+@kernel(inline="always")
+def _has_data_beside(surface: Elevations, at: int, width: int) -> bool:
+    """Whether one of the nine cells around a cell holds data; `surface` as in `_mean_beside`."""
+    lowest = surface[at]
+    for row in range(at - width, at + width + 1, width):
+        lowest = min(lowest, min(surface[row - 1], min(surface[row], surface[row + 1])))
+    return bool(lowest != NO_DATA)
+
+
+@kernel
 def closed_gaps(lowest: Elevations, reach: int) -> Elevations:
     """The surface of the lowest points with gaps closed up to reach cells from their rims; elevations are in mm.
 
@@ -58,35 +92,44 @@ def closed_gaps(lowest: Elevations, reach: int) -> Elevations:
     stays NO_DATA.
     """
     rows, columns = lowest.shape
-    out = lowest.copy()
-    for number in range(2 * reach):
-        before = out.copy()
-        changed = False
-        for r in range(rows):
-            for c in range(columns):
-                # the first half of the rounds fills, the second smooths what was filled
-                if lowest[r, c] != NO_DATA or (before[r, c] == NO_DATA) != (number < reach):
-                    continue
-                level = before[r, c]
-                if number < reach:
-                    for a in range(max(r - 1, 0), min(r + 2, rows)):
-                        for b in range(max(c - 1, 0), min(c + 2, columns)):
-                            level = min(level, before[a, b])
-                n, total = 0, 0
-                for a in range(max(r - 1, 0), min(r + 2, rows)):
-                    for b in range(max(c - 1, 0), min(c + 2, columns)):
-                        beside = before[a, b]
-                        if beside == NO_DATA or (number >= reach and (a == r) == (b == c)):
-                            continue
-                        if abs(beside - level) <= _WALL_MM:
-                            n += 1
-                            total += beside
-                if n > 0:
-                    out[r, c] = total // n
-                    changed = True
-        if not changed and number >= reach:
+    width = columns + 2
+    # a frame of one cell spares tests for the edge
+    framed = np.full((rows + 2, width), NO_DATA, np.int32)
+    framed[1:-1, 1:-1] = lowest
+    surface = framed.ravel()
+    # the cells that are filled, round by round, and what they become when all cells of a round are known
+    queue, becomes = np.empty(lowest.size, np.int32), np.empty(lowest.size, np.int32)
+    is_queued = np.ones((rows + 2, width), np.bool_)
+    is_queued[1:-1, 1:-1] = lowest != NO_DATA
+    is_done = is_queued.ravel()
+    first, end = 0, 0
+    for r in range(1, rows + 1):
+        for at in range(r * width + 1, r * width + columns + 1):
+            if surface[at] == NO_DATA and _has_data_beside(surface, at, width):
+                queue[end], is_done[at] = at, True
+                end += 1
+    for number in range(reach):
+        for i in range(first, end):
+            becomes[i] = _mean_beside(surface, queue[i], width, True)
+        for i in range(first, end):
+            surface[queue[i]] = becomes[i]
+        if number == reach - 1:
             break
-    return out
+        # the next round fills the cells beside those of this one
+        begin, first = first, end
+        for i in range(begin, first):
+            for row in range(queue[i] - width, queue[i] + width + 1, width):
+                for at in range(row - 1, row + 2):
+                    if not is_done[at]:
+                        queue[end], is_done[at] = at, True
+                        end += 1
+    for _ in range(reach):
+        for i in range(end):
+            becomes[i] = _mean_beside(surface, queue[i], width, False)
+        for i in range(end):
+            if becomes[i] != NO_DATA:
+                surface[queue[i]] = becomes[i]
+    return framed[1:-1, 1:-1].copy()
 
 
 @kernel
