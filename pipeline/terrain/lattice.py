@@ -17,8 +17,24 @@ NO_DATA = np.int32(2**31 - 1)
 
 Elevations = npt.NDArray[np.int32]
 
+Part = tuple[slice, slice]
+"""Rows and columns of a lattice."""
+
 PIT_MATES = 2
 """At most this many neighbours of a pit are as deep: low outliers come alone or in small groups."""
+
+
+def part_around(part: Part, margin: int, shape: tuple[int, ...]) -> Part:
+    """A part of a lattice and a margin around it in cells, as far as a lattice of this shape goes.
+
+    >>> part_around((slice(5, 8), slice(-3, 40)), 2, (20, 30))
+    (slice(3, 10, None), slice(0, 30, None))
+    """
+    down, across = (
+        slice(min(max(along.start - margin, 0), size), max(min(along.stop + margin, size), 0))
+        for along, size in zip(part, shape, strict=True)
+    )
+    return down, across
 
 
 @kernel

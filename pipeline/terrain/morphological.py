@@ -19,7 +19,7 @@ from pipeline.model import BoolArray
 from pipeline.terrain.between_walls import between_walls
 from pipeline.terrain.embankments import embankments
 from pipeline.terrain.filter_settings import MorphologicalFilterSettings
-from pipeline.terrain.lattice import NO_DATA, Elevations
+from pipeline.terrain.lattice import NO_DATA, Elevations, Part, part_around
 from pipeline.terrain.openings import cut_off
 from pipeline.terrain.planar_fitting import leaning_planes
 from pipeline.terrain.rejoining import rejoined
@@ -225,42 +225,65 @@ def regrown(
 
 
 def morphological_ground(
-    lowest: Elevations, corner: tuple[int, int], settings: MorphologicalFilterSettings
+    lowest: Elevations,
+    corner: tuple[int, int],
+    settings: MorphologicalFilterSettings,
+    wanted: tuple[Part, int] | None = None,
 ) -> tuple[BoolArray, BoolArray]:
     """Masks of the cells that hold ground, and of those among them that joined it before any did by planes.
 
-    Both are False in cells without data. `lowest` is the elevation in mm of the lowest point of each cell, with single
-    pits cleared and NO_DATA in empty cells. `corner` is the absolute column and row of the first cell: coarse cells are
-    anchored at the CRS's origin.
+    Both are False in cells without data.
+
+    Parameters
+    ----------
+    lowest : (rows, columns) int32
+        Elevation in mm of the lowest point of each cell, with single pits cleared and NO_DATA in empty cells.
+    corner : tuple of int
+        Absolute column and row of the first cell: coarse cells and blocks are anchored at the CRS's origin.
+    wanted : tuple, optional
+        The part where terrain is needed, everywhere by default, and how far it may be drawn, in cells. No step works
+        where that cannot depend on it, and there the masks may miss ground.
     """
-    radius = settings.max_window_m
+    shape, radius = lowest.shape, settings.max_window_m
+    part, reach = wanted or ((slice(0, shape[0]), slice(0, shape[1])), 0)
     elevation = closed_gaps(lowest, GAP_CELLS)
-    nothing = np.zeros(lowest.shape, np.int32)
-    first = cut_off(elevation, nothing, settings.window_slope * 1000.0, radius)
-    is_first = (lowest != NO_DATA) & (first == 0)
-    level, slope_mm = leaning_planes(lowest, is_first, settings.trend_m, 2 * settings.trend_m)
+    first = cut_off(elevation, np.zeros(shape, np.int32), settings.window_slope * 1000.0, radius)
     if settings.looks_for_wide:
         wide = wide_objects(lowest, corner, radius, settings.widest_m // 2, settings.wide_slope * 1000.0)
         wide = with_corners(lowest, wide, first)
     else:
-        wide = np.zeros(lowest.shape, np.bool_)
+        wide = np.zeros(shape, np.bool_)
     decks = between_walls(lowest, settings.deck_m, settings.wall_drop_m * 1000.0, settings.wide_slope * 1000.0)
+    # the second openings, and before them the trend, only around what can still join
+    late = part_around(part, settings.joining_support_m(reach), shape)
+    around = part_around(late, settings.second_support_m, shape)
+    lowest, cut = np.ascontiguousarray(lowest[around]), first[around]
+    level, slope_mm = leaning_planes(lowest, (lowest != NO_DATA) & (cut == 0), settings.trend_m, 2 * settings.trend_m)
     lowest = without_clumps(lowest, level, slope_mm, round(settings.clump_depth_m * 1000))
     limits = (round(settings.residual_step_m * 1000), settings.residual_steepness_m * 1000.0)
     height, base = _heights(lowest, level, slope_mm, limits)
     narrow = settings.second_window_m
     second = cut_off(closed_gaps(height, GAP_CELLS), base, settings.residual_slope * 1000.0, narrow)
+    inner = (
+        slice(late[0].start - around[0].start, late[0].stop - around[0].start),
+        slice(late[1].start - around[1].start, late[1].stop - around[1].start),
+    )
+    lowest, second = np.ascontiguousarray(lowest[inner]), second[inner]
+    first, wide, decks = first[late], np.ascontiguousarray(wide[late]), np.ascontiguousarray(decks[late])
     # what only a wider opening sees is too wide for the second ones; on a slope it is high enough for the first
     ground = (lowest != NO_DATA) & (second == 0) & (first <= narrow) & ~wide & ~decks
     step_mm, share = round(settings.regrowth_step_m * 1000), settings.regrowth_share
     beside = (settings.regrowth_m, step_mm, 0.0, share)
-    steady = regrown(lowest, ground, wide | decks, settings.regrowth_passes, beside)
+    found, steady = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
+    steady[late] = regrown(lowest, ground, wide | decks, settings.regrowth_passes, beside)
     limits_of_planes = (settings.rejoin_m, settings.rejoin_step_m * 1000.0)
-    joined = rejoined(lowest, steady, decks, settings.rejoin_passes, limits_of_planes)
+    joined = rejoined(lowest, np.ascontiguousarray(steady[late]), decks, settings.rejoin_passes, limits_of_planes)
     beside = (settings.regrowth_m, step_mm, settings.berm_slope * 1000.0, share)
     last = min(settings.berm_passes, 1)
     joined = regrown(lowest, joined, decks, settings.berm_passes - last, beside)
     if settings.embankment_m2:
         houses = (second > 0) & (second <= _HOUSE_CELLS)
-        joined |= embankments(lowest, ground, (houses, wide), corner, settings.embankment_m2) & ~decks
-    return regrown(lowest, joined, decks, last, beside), steady
+        place = (corner[0] + late[1].start, corner[1] + late[0].start)
+        joined |= embankments(lowest, ground, (houses, wide), place, settings.embankment_m2) & ~decks
+    found[late] = regrown(lowest, joined, decks, last, beside)
+    return found, steady
