@@ -48,6 +48,10 @@ _ENOUGH_BESIDE = 4
 """Ground cells that show what lies beside a cell: twice as many as must agree. Farther ones do not count."""
 
 
+_LOW = np.int32(-(2**30))
+"""Below all elevations in mm."""
+
+
 @kernel
 def _mean_beside(surface: Elevations, at: int, width: int, is_fill: bool) -> int:
     """Mean of the cells beside one that lie within `_WALL_MM` of its level, or NO_DATA without any; in mm.
@@ -181,6 +185,29 @@ def _heights(
 
 
 @kernel
+def _highest_ground(lowest: Elevations, ground: BoolArray, reach: int) -> Elevations:
+    """Elevation in mm of the highest ground in the square of 2 reach + 1 cells around each cell; `_LOW` without any."""
+    rows, columns = lowest.shape
+    own, out = np.empty((rows, columns), np.int32), np.full((rows, columns), _LOW, np.int32)
+    for r in range(rows):
+        for c in range(columns):
+            z = lowest[r, c]
+            own[r, c] = z if ground[r, c] else _LOW
+    for r in range(rows):
+        column = np.full(columns + 2 * reach, _LOW, np.int32)
+        middle, square = column[reach : reach + columns], out[r]
+        for a in range(max(r - reach, 0), min(r + reach + 1, rows)):
+            other = own[a]
+            for c in range(columns):
+                middle[c] = max(middle[c], other[c])
+        for shift in range(2 * reach + 1):
+            other = column[shift : shift + columns]
+            for c in range(columns):
+                square[c] = max(square[c], other[c])
+    return out
+
+
+@kernel
 def regrown(
     lowest: Elevations, ground: BoolArray, barred: BoolArray, passes: int, limits: tuple[int, int, float, float]
 ) -> BoolArray:
@@ -202,10 +229,15 @@ def regrown(
     """
     reach, step_mm, rise_mm, share = limits
     rows, columns = lowest.shape
+    most = step_mm + rise_mm * math.sqrt(2 * reach * reach)
     for _ in range(passes):
         out = ground.copy()
+        highest = _highest_ground(lowest, ground, reach)
         for r in range(rows):
             for c in range(columns):
+                # higher above all ground of the largest square than any of it allows; so are most trees and roofs
+                if lowest[r, c] - highest[r, c] > most:
+                    continue
                 if ground[r, c] or lowest[r, c] == NO_DATA or barred[r, c]:
                     continue
                 beside, level, half = 0, 0, 0
