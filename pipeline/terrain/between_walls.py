@@ -136,16 +136,21 @@ def _drops(
     for k in range(n):
         # cells that lie ahead come first
         i = n - 1 - k if is_up else k
-        here, at = z_mm[i], onward[i]
-        while at >= 0 and level_mm[at] > here and abs(place[at] - place[i]) <= farthest:
-            at = onward[at]
+        here, at, number = z_mm[i], onward[i], 0
+        while at >= 0:
+            number = abs(place[at] - place[i])
+            if number > farthest:
+                at = -1
+            elif level_mm[at] > here:
+                at = onward[at]
+            else:
+                break
         if at >= 0:
-            number, fall = abs(place[at] - place[i]), here - z_mm[at]
-            if number <= farthest:
-                if fall > limits[1][number]:
-                    strides[i], falls[i] = number, fall
-                elif strides[at] > 0:
-                    strides[i], falls[i] = number + strides[at], falls[at]
+            # without branches: which of the three it is is hard to foresee
+            fall, known, depth = here - z_mm[at], strides[at], falls[at]
+            is_drop = fall > limits[1][number]
+            strides[i] = number if is_drop else number + known if known > 0 else 0
+            falls[i] = fall if is_drop else depth
         before = backward[i]
         apart = min(abs(place[before] - place[i]), farthest) if before >= 0 else 0
         level = np.int32(here - limits[0][apart])
@@ -170,13 +175,13 @@ def _widths(
         climbs[number], drops[number] = math.floor(rise), math.floor(drop_mm + rise)
     strides, falls = _drops(cells.z_mm, place, onward, backward, (climbs, drops), True)
     back, back_falls = _drops(cells.z_mm, place, backward, onward, (climbs, drops), False)
-    ahead, behind = np.full(len(back), -1.0, np.float32), np.full(len(back), -1.0, np.float32)
+    ahead, behind = np.empty(len(back), np.float32), np.empty(len(back), np.float32)
     for i in range(len(back)):
-        if strides[i] == 0 or back[i] == 0:
-            continue
         far, other_far = strides[i] * length, back[i] * length
-        if far + other_far <= widest and min(falls[i], back_falls[i]) > rise_mm * (far + other_far) / 2:
-            ahead[i], behind[i] = far, other_far
+        is_deep = min(falls[i], back_falls[i]) > rise_mm * (far + other_far) / 2
+        is_deck = is_deep & (far + other_far <= widest) & (strides[i] > 0) & (back[i] > 0)
+        ahead[i] = far if is_deck else -1.0
+        behind[i] = other_far if is_deck else -1.0
     return ahead, behind
 
 
