@@ -20,7 +20,8 @@ from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 from pipeline.terrain.support import ALONG_CELLS
 
 _DIRECTIONS = np.array([(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)])
-"""Rows and columns of a stride, whose end comes later row by row: every 18 to 27 degrees, so one of them is nearly perpendicular to any edge.
+"""Rows and columns of a stride to a later cell: every 18 to 27 degrees, so one of them is nearly perpendicular to any
+edge.
 
 This and the following define what parallel edges are; how deep drops and how wide decks are can be set."""
 
@@ -66,7 +67,11 @@ def _cells_of(lowest: Elevations) -> _Cells:
     """The cells with data of a lattice."""
     rows, columns = lowest.shape
     number = np.full((rows, columns), -1, np.int32)
-    row, column, z_mm = np.empty(lowest.size, np.int32), np.empty(lowest.size, np.int32), np.empty(lowest.size, np.int32)
+    row, column, z_mm = (
+        np.empty(lowest.size, np.int32),
+        np.empty(lowest.size, np.int32),
+        np.empty(lowest.size, np.int32),
+    )
     n = 0
     for r in range(rows):
         for c in range(columns):

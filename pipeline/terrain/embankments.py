@@ -9,6 +9,7 @@ large, if most of it is wider than a house, and if slopes of about 45 degrees at
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -92,8 +93,10 @@ _BITS = 62
 def _hidden(offsets: npt.NDArray[np.int64]) -> IntArray:
     """Which offsets each offset hides, (offsets, words) sets: those with it in the circle between them and a cell."""
     hides = offsets @ offsets.T > np.sum(offsets * offsets, axis=1)[:, None]
-    words = [[sum(1 << k for k in np.flatnonzero(row[i : i + _BITS]).tolist()) for row in hides]
-             for i in range(0, len(offsets), _BITS)]
+    words = [
+        [sum(1 << k for k in np.flatnonzero(row[i : i + _BITS]).tolist()) for row in hides]
+        for i in range(0, len(offsets), _BITS)
+    ]
     return np.ascontiguousarray(np.array(words, np.int64).T)
 
 
@@ -257,71 +260,84 @@ def _parts(
     return part, count, between[:pairs].copy()
 
 
+class _Squares(NamedTuple):
+    """The parts of all surfaces, by their squares."""
+
+    sums: Counts
+    """(parts, 6) int64, sums of the counts of their cells."""
+    starts: LabelArray
+    """(squares + 1,) int32, where the parts of each square start in `members`."""
+    members: LabelArray
+    """(parts,) int32."""
+    between: LabelArray
+    """(pairs, 2) int32, parts of two squares that a surface connects, by the square of the first."""
+    pair_starts: LabelArray
+    """(squares + 1,) int32, where those of each square start."""
+
+
 @kernel
-def _joining(
-    sums: Counts, square: LabelArray, between: LabelArray, squares: tuple[int, int], least_dm2: int
-) -> BoolArray:
+def _judge_block(
+    joins: BoolArray, squares: _Squares, within: LabelArray, surface: IntArray, whole: Counts, least_dm2: int
+) -> None:
+    """Mark in `joins` the parts of a block's terrain; `within` are its squares. The rest as in `_joining`.
+
+    `surface` and `whole` (parts,) are scratch: the first part of each part's surface, and sums over it. Both are reset
+    here, and `surface` is -1 for all parts at the end.
+    """
+    sums, starts, members = squares.sums, squares.starts, squares.members
+    for at in within:
+        for i in members[starts[at] : starts[at + 1]]:
+            surface[i] = i
+            whole[i] = 0
+    for at in within:
+        for pair in range(squares.pair_starts[at], squares.pair_starts[at + 1]):
+            one, other = squares.between[pair]
+            # links that leave the block are cut
+            if surface[other] >= 0:
+                unite(surface, one, other)
+    for at in within:
+        for i in members[starts[at] : starts[at + 1]]:
+            surface[i] = root_of(surface, i)
+            whole[surface[i]] += sums[i]
+    for at in within:
+        for i in members[starts[at] : starts[at + 1]]:
+            of = whole[surface[i]]
+            if of[_DM2] < least_dm2 or of[_NARROW] > _NARROW_SHARE * of[_CELLS] or of[_SLOPES] == 0:
+                continue
+            for is_wide, share in enumerate((_SLOPED_SHARE, _WIDE_SHARE)):
+                if of[_SLOPES] >= share * (of[_SLOPES] + of[_WALLS]):
+                    joins[i, is_wide] = True
+    for at in within:
+        surface[members[starts[at] : starts[at + 1]]] = -1
+
+
+@kernel
+def _joining(squares: _Squares, shape: tuple[int, int], least_dm2: int) -> BoolArray:
     """Whether the cells of each part join the ground, (parts, 2): those beyond wide objects, and those on them.
 
-    The parts of a block's squares make its surfaces; links that leave the block are cut.
-
-    Parameters
-    ----------
-    sums : (parts, 6) int64
-        Sums of the counts of their cells.
-    square : (parts,) int32
-        Their squares, row by row.
-    between : (pairs, 2) int32
-        Parts that a surface connects.
-    squares : tuple of int
-        Rows and columns of squares.
-    least_dm2 : int
-        Least area of a surface.
+    The parts of a block's squares make its surfaces. `shape` is rows and columns of squares, which are numbered row by
+    row; `least_dm2` is the least area of a surface.
     """
-    high, wide = squares
-    starts, members = counting_sort(square, high * wide)
-    pair_starts, pairs = counting_sort(square[between[:, 0]], high * wide)
-    totals = np.zeros((high * wide, 6), np.int64)
-    for i in range(len(sums)):
-        totals[square[i]] += sums[i]
-    out = np.zeros((len(sums), 2), np.bool_)
-    surface, whole = np.arange(len(sums)), np.zeros_like(sums)
-    block = np.full(len(sums), -1, np.int32)
-    for down in range(1 - _SQUARES, high):
-        for across in range(1 - _SQUARES, wide):
-            within = [
-                r * wide + c
-                for r in range(max(down, 0), min(down + _SQUARES, high))
-                for c in range(max(across, 0), min(across + _SQUARES, wide))
-            ]
-            area, slopes = 0, 0
-            for at in within:
-                area += totals[at, _DM2]
-                slopes += totals[at, _SLOPES]
-            if area < least_dm2 or slopes == 0:
-                continue
-            this = (down + _SQUARES) * (wide + _SQUARES) + across + _SQUARES
-            for at in within:
-                for i in members[starts[at] : starts[at + 1]]:
-                    surface[i], block[i] = i, this
-                    whole[i] = 0
-            for at in within:
-                for pair in pairs[pair_starts[at] : pair_starts[at + 1]]:
-                    if block[between[pair, 1]] == this:
-                        unite(surface, between[pair, 0], between[pair, 1])
-            for at in within:
-                for i in members[starts[at] : starts[at + 1]]:
-                    surface[i] = root_of(surface, i)
-                    whole[surface[i]] += sums[i]
-            for at in within:
-                for i in members[starts[at] : starts[at + 1]]:
-                    of = whole[surface[i]]
-                    if of[_DM2] < least_dm2 or of[_NARROW] > _NARROW_SHARE * of[_CELLS] or of[_SLOPES] == 0:
-                        continue
-                    for is_wide, share in enumerate((_SLOPED_SHARE, _WIDE_SHARE)):
-                        if of[_SLOPES] >= share * (of[_SLOPES] + of[_WALLS]):
-                            out[i, is_wide] = True
-    return out
+    rows, columns = shape
+    parts = len(squares.sums)
+    joins = np.zeros((parts, 2), np.bool_)
+    surface, whole = np.full(parts, -1, np.int64), np.zeros((parts, 6), np.int64)
+    totals = np.zeros((rows * columns, 6), np.int64)
+    for at in range(rows * columns):
+        for i in squares.members[squares.starts[at] : squares.starts[at + 1]]:
+            totals[at] += squares.sums[i]
+    within = np.empty(_SQUARES * _SQUARES, np.int32)
+    for down in range(1 - _SQUARES, rows):
+        for across in range(1 - _SQUARES, columns):
+            n, area, slopes = 0, 0, 0
+            for r in range(max(down, 0), min(down + _SQUARES, rows)):
+                for c in range(max(across, 0), min(across + _SQUARES, columns)):
+                    at = r * columns + c
+                    within[n] = at
+                    n, area, slopes = n + 1, area + totals[at, _DM2], slopes + totals[at, _SLOPES]
+            if area >= least_dm2 and slopes > 0:
+                _judge_block(joins, squares, within[:n], surface, whole, least_dm2)
+    return joins
 
 
 @kernel
@@ -372,17 +388,20 @@ def embankments(
     gentle = _continued(lowest, cells, links)
     # blocks are made of squares, and surfaces of the parts in them: nine blocks share a square
     south, west = corner[1] % _STRIDE, corner[0] % _STRIDE
-    high, wide_ = (south + rows - 1) // _STRIDE + 1, (west + columns - 1) // _STRIDE + 1
+    high, broad = (south + rows - 1) // _STRIDE + 1, (west + columns - 1) // _STRIDE + 1
     square = np.empty(n, np.int32)
     for i in range(n):
         r, c = cells[i] // columns, cells[i] % columns
-        square[i] = (south + r) // _STRIDE * wide_ + (west + c) // _STRIDE
+        square[i] = (south + r) // _STRIDE * broad + (west + c) // _STRIDE
     part, parts, between = _parts(number, cells, links, gentle, square)
     sums, square_of = np.zeros((parts, 6), np.int64), np.empty(parts, np.int32)
     for i in range(n):
         sums[part[i]] += counts[i]
         square_of[part[i]] = square[i]
-    joins = _joining(sums, square_of, between, (high, wide_), 100 * least_m2)
+    starts, members = counting_sort(square_of, high * broad)
+    pair_starts, pairs = counting_sort(square_of[between[:, 0]], high * broad)
+    squares = _Squares(sums, starts, members, between[pairs], pair_starts)
+    joins = _joining(squares, (high, broad), 100 * least_m2)
     out = np.zeros((rows, columns), np.bool_)
     for i in range(n):
         if counts[i, _NARROW] == 0 and joins[part[i], counts[i, _WIDE]]:

@@ -155,7 +155,7 @@ class MorphologicalFilterSettings(Parameters):
         return 2 * GAP_CELLS + 2 * self.second_window_m + 2 * self.trend_m + CLUMP_CELLS
 
     def joining_support_m(self, reach: int) -> int:
-        """How far terrain looks at what the openings found, by way of all that joins; `reach` as in `GroundSettings`."""
+        """How far terrain looks at what the openings found, by way of all that joins; `reach` is that of its planes."""
         steady = self.morphological_support_m + reach
         return int(max(steady, self.rejoined_support_m + min(reach, NEAR_CELLS)) - self._openings_support_m)
 

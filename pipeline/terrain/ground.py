@@ -22,7 +22,6 @@ from pipeline.terrain.rejoining import FEWEST_SIDES, meeting_sides
 from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.support import NEAR_CELLS
 
-
 _BLOCK = 64
 """Least side in cells of the blocks that are drawn from sums of their own, which stay in the processor's cache."""
 

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.model import BoolArray
+from pipeline.model import BoolArray, LabelArray
 from pipeline.terrain.between_walls import between_walls
 from pipeline.terrain.embankments import embankments
 from pipeline.terrain.filter_settings import MorphologicalFilterSettings
@@ -77,13 +77,36 @@ def _mean_beside(surface: Elevations, at: int, width: int, is_fill: bool) -> int
     return total // n if n > 0 else int(NO_DATA)
 
 
-@kernel(inline="always")
-def _has_data_beside(surface: Elevations, at: int, width: int) -> bool:
-    """Whether one of the nine cells around a cell holds data; `surface` as in `_mean_beside`."""
-    lowest = surface[at]
-    for row in range(at - width, at + width + 1, width):
-        lowest = min(lowest, min(surface[row - 1], min(surface[row], surface[row + 1])))
-    return bool(lowest != NO_DATA)
+@kernel
+def _queue_rims(queue: LabelArray, is_done: BoolArray, surface: Elevations, width: int) -> int:
+    """Put the empty cells beside cells with data into the queue; how many these are. `surface` as in `_mean_beside`.
+
+    `is_done` holds for the cells with data and in the queue, and for the frame.
+    """
+    end = 0
+    for at in range(width, surface.size - width):
+        if is_done[at]:
+            continue
+        lowest = NO_DATA
+        for row in range(at - width, at + width + 1, width):
+            lowest = min(lowest, surface[row - 1], surface[row], surface[row + 1])
+        if lowest != NO_DATA:
+            queue[end], is_done[at] = at, True
+            end += 1
+    return end
+
+
+@kernel
+def _queue_beside(queue: LabelArray, is_done: BoolArray, part: tuple[int, int], width: int) -> int:
+    """Add the empty cells beside those of the queue's last part, its first member and its end; the new end."""
+    end = part[1]
+    for i in range(part[0], part[1]):
+        for row in range(queue[i] - width, queue[i] + width + 1, width):
+            for at in range(row - 1, row + 2):
+                if not is_done[at]:
+                    queue[end], is_done[at] = at, True
+                    end += 1
+    return end
 
 
 @kernel
@@ -106,12 +129,7 @@ def closed_gaps(lowest: Elevations, reach: int) -> Elevations:
     is_queued = np.ones((rows + 2, width), np.bool_)
     is_queued[1:-1, 1:-1] = lowest != NO_DATA
     is_done = is_queued.ravel()
-    first, end = 0, 0
-    for r in range(1, rows + 1):
-        for at in range(r * width + 1, r * width + columns + 1):
-            if surface[at] == NO_DATA and _has_data_beside(surface, at, width):
-                queue[end], is_done[at] = at, True
-                end += 1
+    first, end = 0, _queue_rims(queue, is_done, surface, width)
     for number in range(reach):
         for i in range(first, end):
             becomes[i] = _mean_beside(surface, queue[i], width, True)
@@ -120,13 +138,7 @@ def closed_gaps(lowest: Elevations, reach: int) -> Elevations:
         if number == reach - 1:
             break
         # the next round fills the cells beside those of this one
-        begin, first = first, end
-        for i in range(begin, first):
-            for row in range(queue[i] - width, queue[i] + width + 1, width):
-                for at in range(row - 1, row + 2):
-                    if not is_done[at]:
-                        queue[end], is_done[at] = at, True
-                        end += 1
+        first, end = end, _queue_beside(queue, is_done, (first, end), width)
     for _ in range(reach):
         for i in range(end):
             becomes[i] = _mean_beside(surface, queue[i], width, False)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.compiler import kernel
-from pipeline.kernels.normal_equations import add_to_sums, solve_plane_moments
+from pipeline.kernels.normal_equations import solve_plane_moments
 from pipeline.model import BoolArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 
@@ -150,7 +150,11 @@ def join_planes(
 
 @kernel
 def _lean_block(
-    elevation: Elevations, used: BoolArray, halves: tuple[int, int], block: tuple[int, int], out: tuple[Elevations, Elevations]
+    elevation: Elevations,
+    used: BoolArray,
+    halves: tuple[int, int],
+    block: tuple[int, int],
+    out: tuple[Elevations, Elevations],
 ) -> None:
     """Write the trend of a block of cells, by its first row and column; the rest as in `leaning_planes`."""
     half, widest = halves

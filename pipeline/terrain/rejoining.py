@@ -50,7 +50,10 @@ def meeting_sides(sums: Sums, cell: tuple[int, int], limits: tuple[int, float], 
         n = sum_within(sums, r0, r1, c0, c1, 0)
         if n < MIN_CELLS:
             continue
-        east, north = sum_within(sums, r0, r1, c0, c1, 1) / n - cell[1], sum_within(sums, r0, r1, c0, c1, 2) / n - cell[0]
+        east, north = (
+            sum_within(sums, r0, r1, c0, c1, 1) / n - cell[1],
+            sum_within(sums, r0, r1, c0, c1, 2) / n - cell[0],
+        )
         # from its middle no plane rises or falls more than the steepest
         most = step_mm + _STEEPEST_MM * math.sqrt(east * east + north * north) + _ROUNDING_MM
         if abs(level_mm - sum_within(sums, r0, r1, c0, c1, 3) / n) > most:
@@ -100,7 +103,11 @@ def _join_block(
 
 @kernel
 def _joined(
-    lowest: Elevations, ground: BoolArray, barred: BoolArray, counts: tuple[LabelArray, LabelArray], limits: tuple[int, float]
+    lowest: Elevations,
+    ground: BoolArray,
+    barred: BoolArray,
+    counts: tuple[LabelArray, LabelArray],
+    limits: tuple[int, float],
 ) -> BoolArray:
     """Ground, and the cells that the planes through the ground of at least `FEWEST_SIDES` squares beside them meet.
 

@@ -181,7 +181,7 @@ def test_the_terrain_reaches_the_brow_of_a_sparse_scarp_and_no_lone_bump(turns: 
     lowest = np.where(kept, z, NO_DATA).astype(np.int32)
     lowest[bump] += 900 if lowest[bump] != NO_DATA else 0
     is_ground = lowest != NO_DATA
-    whole = (0, 0, 80, 80)
+    whole = (slice(0, 80), slice(0, 80))
     with_brow = ground._terrain(lowest, (is_ground, is_ground), 20, 1.0, whole, (4, 250.0))
     without = ground._terrain(lowest, (is_ground, is_ground), 20, 1.0, whole)
     brow = is_ground & (np.rot90(np.broadcast_to((c == 44) | (c == 45), (80, 80)), turns))
@@ -211,7 +211,7 @@ def test_local_planes_agree_with_least_squares_of_numpy() -> None:
     is_ground[:10, 12:24] = False
     bridge = 6
     slope = 0.15
-    terrain = ground._terrain(lowest, (is_ground, is_ground), bridge, slope, (0, 0, 31, 26))
+    terrain = ground._terrain(lowest, (is_ground, is_ground), bridge, slope, (slice(0, 26), slice(0, 31)))
     fitted = 0
     for r, c in np.ndindex(lowest.shape):
         for half in (1, 2, 4, 6):

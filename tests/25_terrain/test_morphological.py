@@ -70,10 +70,10 @@ def test_the_elements_are_octagons_that_grow_by_a_cell_and_are_nearly_round() ->
 def opened_by(surface: Grid, radius: int) -> Grid:
     """Opening of a surface by an octagon of a radius in cells; NO_DATA where the surface has none."""
     eroded = framed(surface)
-    opened, scratch = eroded.copy(), eroded.copy()
+    opened = eroded.copy()
     for number in range(1, radius + 1):
-        erode_once(eroded, scratch, number)
-    dilate_back(surface, eroded, opened, scratch, radius)
+        erode_once(eroded, number)
+    dilate_back(surface, eroded, opened, radius)
     out = surface.copy()
     known = surface != NO_DATA
     out[known] = opened[1:-1, 1:-1][known]
