@@ -337,8 +337,26 @@ def test_terrain_drawn_where_it_is_wanted_is_that_of_the_whole_window(per_cell: 
     lowest = lowest_per_cell(x, y, z, usable, *window)
     drawn, measured = ground_on(lowest, window[:2], SMALL, trusted=trusted, wanted=inner)
     np.testing.assert_array_equal(drawn[inner], whole.elevation_mm[inner])
-    np.testing.assert_array_equal(measured, whole.measured)
+    np.testing.assert_array_equal(measured[inner], whole.measured[inner])
     assert (drawn != NO_DATA).sum() < (whole.elevation_mm != NO_DATA).sum() / 2
+
+
+WANTED = dataclasses.replace(SMALL, regrowth_passes=3, rejoin_passes=3, berm_passes=2)
+"""Ground joins from far away, and no other step looks much farther."""
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("chosen", [SMALL, WANTED, FAR, BANKS])
+def test_steps_that_work_only_around_the_wanted_part_find_its_terrain(chosen: GroundSettings, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    points = wild_points(random, 260, 250, per_cell=(1.2, 0.3)[seed % 2])
+    x, y, z = (np.ascontiguousarray(points[:, k]) for k in range(3))
+    lowest = lowest_per_cell(x, y, z, np.ones(len(points), np.bool_), 0, 0, 260, 250)
+    whole, _ = ground_on(lowest, (0, 0), chosen, trusted=False)
+    for row, column in random.integers(90, 150, (12, 2)).tolist():
+        part = (slice(row, row + 8), slice(column, column + 9))
+        drawn, _ = ground_on(lowest, (0, 0), chosen, trusted=False, wanted=part)
+        np.testing.assert_array_equal(drawn[part], whole[part])
 
 
 def test_the_support_covers_both_openings_the_trend_between_them_and_the_bridge() -> None:
