@@ -64,7 +64,7 @@ def _mean_beside(surface: Elevations, at: int, width: int, is_fill: bool) -> int
         for row in range(at - width, at + width + 1, width):
             for k in range(row - 1, row + 2):
                 level = min(level, surface[k])
-    n, total = 0, 0
+    n = total = np.int64(0)
     for down in range(-1, 2):
         for across in range(-1, 2):
             if not is_fill and (down == 0) == (across == 0):
@@ -74,7 +74,7 @@ def _mean_beside(surface: Elevations, at: int, width: int, is_fill: bool) -> int
             counts = np.int64((beside != NO_DATA) & (abs(beside - level) <= _WALL_MM))
             n += counts
             total += counts * beside
-    return total // n if n > 0 else int(NO_DATA)
+    return int(total // n) if n > 0 else int(NO_DATA)
 
 
 @kernel

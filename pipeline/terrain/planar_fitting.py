@@ -46,7 +46,7 @@ def plane_sums(elevation: Elevations, used: BoolArray) -> Sums:
         below, here = sums[r], sums[r + 1]
         here[0] = 0
         # sums over the row; y is the same in all of it
-        n, x, z, xx, xz = 0, 0, 0, 0, 0
+        n = x = z = xx = xz = np.int64(0)
         for c in range(columns):
             # without a branch: which cells are used is hard to foresee
             one = np.int64(used[r, c])

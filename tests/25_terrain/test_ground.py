@@ -15,6 +15,7 @@ from pipeline.terrain import ground
 from pipeline.terrain.ground import Terrain, ground_of, ground_on, ground_points, slopes_of
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above, lowest_per_cell, without_pits
 from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS, PIT_CELLS
 
 Grid = npt.NDArray[np.int32]
 Points = npt.NDArray[np.int64]
@@ -357,6 +358,15 @@ def test_steps_that_work_only_around_the_wanted_part_find_its_terrain(chosen: Gr
         part = (slice(row, row + 8), slice(column, column + 9))
         drawn, _ = ground_on(lowest, (0, 0), chosen, trusted=False, wanted=part)
         np.testing.assert_array_equal(drawn[part], whole[part])
+
+
+@pytest.mark.parametrize("chosen", [SMALL, WANTED, FAR, BANKS, GroundSettings(), GroundSettings(bridge_m=120)])
+def test_the_support_is_that_of_the_openings_and_of_what_joins_after_them(chosen: GroundSettings) -> None:
+    openings = chosen._openings_support_m
+    assert chosen.support_m == openings + chosen.joining_support_m(chosen.reach_m) + 4
+    assert openings >= chosen.second_support_m + 2 * chosen.max_window_m + 2 * GAP_CELLS + PIT_CELLS
+    steps = (2 * GAP_CELLS, 2 * chosen.second_window_m, 2 * chosen.trend_m, CLUMP_CELLS)
+    assert chosen.second_support_m == sum(steps)
 
 
 def test_the_support_covers_both_openings_the_trend_between_them_and_the_bridge() -> None:
