@@ -360,7 +360,7 @@ def test_steps_that_work_only_around_the_wanted_part_find_its_terrain(chosen: Gr
         np.testing.assert_array_equal(drawn[part], whole[part])
 
 
-@pytest.mark.parametrize("chosen", [SMALL, WANTED, FAR, BANKS, GroundSettings(), GroundSettings(bridge_m=120)])
+@pytest.mark.parametrize("chosen", [SMALL, WANTED, FAR, BANKS, GroundSettings(), GroundSettings(bridge_m=80)])
 def test_the_support_is_that_of_the_openings_and_of_what_joins_after_them(chosen: GroundSettings) -> None:
     openings = chosen._openings_support_m
     assert chosen.support_m == openings + chosen.joining_support_m(chosen.reach_m) + 4
