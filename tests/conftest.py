@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from pipeline.model import BoolArray
     from pipeline.terrain.filter_settings import MorphologicalFilterSettings
-    from pipeline.terrain.lattice import Elevations
+    from pipeline.terrain.lattice import Elevations, Part
 
 pytest.register_assert_rewrite("schedule_contract", "schedule_store_contract", "store_contract")
 
@@ -122,11 +122,12 @@ def computed_once() -> Generator[None]:
     masks: dict[object, tuple[BoolArray, BoolArray]] = {}
 
     def kept(
-        lowest: Elevations, corner: tuple[int, int], settings: MorphologicalFilterSettings
+        lowest: Elevations, corner: tuple[int, int], settings: MorphologicalFilterSettings, wanted: tuple[Part, int]
     ) -> tuple[BoolArray, BoolArray]:
-        key = (lowest.shape, lowest.tobytes(), corner, settings)
+        # slices have no hash before Python 3.12
+        key = (lowest.shape, lowest.tobytes(), corner, settings, repr(wanted))
         if key not in masks:
-            masks[key] = filtered(lowest, corner, settings)
+            masks[key] = filtered(lowest, corner, settings, wanted)
         ground, steady = masks[key]
         return ground.copy(), steady.copy()
 

@@ -9,13 +9,15 @@ large, if most of it is wider than a house, and if slopes of about 45 degrees at
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.normal_equations import solve_plane_moments
-from pipeline.kernels.union_find import root_of, unite
+from pipeline.kernels.union_find import numbered_sets, root_of, unite
 from pipeline.model import BoolArray, IntArray, LabelArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 from pipeline.terrain.planar_fitting import MIN_SPREAD
@@ -23,6 +25,9 @@ from pipeline.terrain.support import BLOCK_CELLS, LINK_CELLS
 
 _STRIDE = 16
 """Cells from one block to the next: each cell lies in nine blocks, so no surface is cut at one place only."""
+
+_SQUARES = BLOCK_CELLS // _STRIDE
+"""Squares of that side along a side of a block."""
 
 _NOISE_MM = 300.0
 """Two points of one smooth surface may differ by this much: the noise of ranges and low plants."""
@@ -81,6 +86,22 @@ def _offsets(reach: int) -> npt.NDArray[np.int64]:
 _OFFSETS = _offsets(LINK_CELLS)
 _NONE = np.uint8(255)
 
+_BITS = 62
+"""Offsets in a word of a set of offsets."""
+
+
+def _hidden(offsets: npt.NDArray[np.int64]) -> IntArray:
+    """Which offsets each offset hides, (offsets, words) sets: those with it in the circle between them and a cell."""
+    hides = offsets @ offsets.T > np.sum(offsets * offsets, axis=1)[:, None]
+    words = [
+        [sum(1 << k for k in np.flatnonzero(row[i : i + _BITS]).tolist()) for row in hides]
+        for i in range(0, len(offsets), _BITS)
+    ]
+    return np.ascontiguousarray(np.array(words, np.int64).T)
+
+
+_HIDDEN = _hidden(_OFFSETS)
+
 _CELLS, _SLOPES, _WALLS, _DM2, _NARROW, _WIDE = range(6)
 """Columns of `Counts`: one; links up from the ground by slopes and by walls; area if not narrow; flags."""
 
@@ -92,33 +113,42 @@ Links = npt.NDArray[np.uint8]
 
 
 @kernel
+def _link(links: Links, hidden: IntArray, lowest: Elevations, r: int, c: int) -> None:
+    """Write the neighbours of one cell to `links` (`_MOST_LINKS`,); `hidden` (words,) is scratch."""
+    rows, columns = lowest.shape
+    found = 0
+    hidden[:] = 0
+    for word in range(len(hidden)):
+        first = word * _BITS
+        # the offsets from `k` on that no neighbour hides, as bits: few are left when neighbours lie on all sides
+        left, k = ((1 << min(_BITS, len(_OFFSETS) - first)) - 1) & ~hidden[word], first
+        while left != 0:
+            if left & 1 == 1:
+                a, b = r + _OFFSETS[k, 0], c + _OFFSETS[k, 1]
+                if 0 <= a < rows and 0 <= b < columns and lowest[a, b] != NO_DATA:
+                    links[found] = k
+                    found += 1
+                    if found == _MOST_LINKS:
+                        return
+                    left &= ~(_HIDDEN[k, word] >> (k - first))
+                    for later in range(word + 1, len(hidden)):
+                        hidden[later] |= _HIDDEN[k, later]
+            left >>= 1
+            k += 1
+
+
+@kernel
 def _linked(lowest: Elevations, cells: IntArray) -> Links:
     """The neighbours of some cells with data, given by row times columns plus column.
 
     A cell is a neighbour if no nearer neighbour lies in the circle between the two (Gabriel and Sokal 1969): the links
     are the same everywhere, whatever the distance of the points.
     """
-    rows, columns = lowest.shape
+    columns = lowest.shape[1]
     links = np.full((len(cells), _MOST_LINKS), _NONE, np.uint8)
+    hidden = np.zeros(_HIDDEN.shape[1], np.int64)
     for i in range(len(cells)):
-        r, c = cells[i] // columns, cells[i] % columns
-        found = 0
-        for k in range(len(_OFFSETS)):
-            down, across = _OFFSETS[k, 0], _OFFSETS[k, 1]
-            a, b = r + down, c + across
-            if a < 0 or a >= rows or b < 0 or b >= columns or lowest[a, b] == NO_DATA:
-                continue
-            is_free = True
-            for m in range(found):
-                y, x = _OFFSETS[links[i, m], 0], _OFFSETS[links[i, m], 1]
-                if y * y + x * x < y * down + x * across:
-                    is_free = False
-                    break
-            if is_free:
-                links[i, found] = k
-                found += 1
-                if found == _MOST_LINKS:
-                    break
+        _link(links[i], hidden, lowest, cells[i] // columns, cells[i] % columns)
     return links
 
 
@@ -198,69 +228,116 @@ def _continued(lowest: Elevations, cells: IntArray, links: Links) -> BoolArray:
 
 
 @kernel
-def _surfaces(place: LabelArray, at: LabelArray, links: Links, gentle: BoolArray) -> IntArray:
-    """The first member of each member's surface, (members,) int64; `place` and `at` as in `_mark`."""
-    rows, columns = place.shape
-    parent = np.arange(len(at))
-    for r in range(rows):
-        for c in range(columns):
-            i = place[r, c]
-            if i < 0:
+def _parts(
+    number: LabelArray, cells: IntArray, links: Links, gentle: BoolArray, square: LabelArray
+) -> tuple[LabelArray, int, LabelArray]:
+    """The part of each object's cell, (n,) int32; how many there are; and the pairs of parts that links connect.
+
+    A part is what is connected within a square. `number` is the row of an object's cell in the other arrays, -1 in
+    other cells. `gentle` is whether the surface continues along a link, `square` (n,) is the square of each cell.
+    """
+    columns = number.shape[1]
+    parent = np.arange(len(cells))
+    between = np.empty((np.count_nonzero(gentle), 2), np.int32)
+    pairs = 0
+    for i in range(len(cells)):
+        r, c = cells[i] // columns, cells[i] % columns
+        for m in range(_MOST_LINKS):
+            k = links[i, m]
+            if k == _NONE:
+                break
+            other = number[r + _OFFSETS[k, 0], c + _OFFSETS[k, 1]]
+            if not gentle[i, m] or other < 0:
                 continue
-            for m in range(_MOST_LINKS):
-                k = links[at[i], m]
-                if k == _NONE:
-                    break
-                a, b = r + _OFFSETS[k, 0], c + _OFFSETS[k, 1]
-                if gentle[at[i], m] and 0 <= a < rows and 0 <= b < columns and place[a, b] >= 0:
-                    unite(parent, i, place[a, b])
-    for i in range(len(at)):
-        parent[i] = root_of(parent, i)
-    return parent
+            if square[i] == square[other]:
+                unite(parent, i, other)
+            else:
+                between[pairs, 0], between[pairs, 1] = i, other
+                pairs += 1
+    part, count = numbered_sets(parent)
+    for i in range(pairs):
+        between[i, 0], between[i, 1] = part[between[i, 0]], part[between[i, 1]]
+    return part, count, between[:pairs].copy()
+
+
+class _Squares(NamedTuple):
+    """The parts of all surfaces, by their squares."""
+
+    sums: Counts
+    """(parts, 6) int64, sums of the counts of their cells."""
+    starts: LabelArray
+    """(squares + 1,) int32, where the parts of each square start in `members`."""
+    members: LabelArray
+    """(parts,) int32."""
+    between: LabelArray
+    """(pairs, 2) int32, parts of two squares that a surface connects, by the square of the first."""
+    pair_starts: LabelArray
+    """(squares + 1,) int32, where those of each square start."""
 
 
 @kernel
-def _mark(out: BoolArray, number: LabelArray, links: Links, gentle: BoolArray, counts: Counts, least_dm2: int) -> None:
-    """Mark the cells of a block's surfaces that are terrain, those on narrow objects left out.
+def _judge_block(
+    joins: BoolArray, squares: _Squares, within: LabelArray, surface: IntArray, whole: Counts, least_dm2: int
+) -> None:
+    """Mark in `joins` the parts of a block's terrain; `within` are its squares. The rest as in `_joining`.
 
-    `out` and `number` are the block's part of the lattice; `number` is the row of an object's cell in the other arrays,
-    -1 in other cells. `gentle` (objects, links) is whether the surface continues along a link; links that leave the
-    block are cut. `least_dm2` is the least area.
+    `surface` and `whole` (parts,) are scratch: the first part of each part's surface, and sums over it. Both are reset
+    here, and `surface` is -1 for all parts at the end.
     """
-    rows, columns = number.shape
-    place = np.full((rows, columns), -1, np.int32)
-    at = np.empty(rows * columns, np.int32)
-    members, area, slopes = 0, 0, 0
-    for r in range(rows):
-        for c in range(columns):
-            if number[r, c] >= 0:
-                place[r, c] = members
-                at[members] = number[r, c]
-                area += counts[number[r, c], _DM2]
-                slopes += counts[number[r, c], _SLOPES]
-                members += 1
-    if area < least_dm2 or slopes == 0:
-        return
-    at = at[:members]
-    surface = _surfaces(place, at, links, gentle)
-    sums = np.zeros((members, 6), np.int64)
-    for i in range(members):
-        for k in range(6):
-            sums[surface[i], k] += counts[at[i], k]
-    for r in range(rows):
-        for c in range(columns):
-            i = place[r, c]
-            if i < 0 or counts[at[i], _NARROW] > 0:
+    sums, starts, members = squares.sums, squares.starts, squares.members
+    for at in within:
+        for i in members[starts[at] : starts[at + 1]]:
+            surface[i] = i
+            whole[i] = 0
+    for at in within:
+        for pair in range(squares.pair_starts[at], squares.pair_starts[at + 1]):
+            one, other = squares.between[pair]
+            # links that leave the block are cut
+            if surface[other] >= 0:
+                unite(surface, one, other)
+    for at in within:
+        for i in members[starts[at] : starts[at + 1]]:
+            surface[i] = root_of(surface, i)
+            whole[surface[i]] += sums[i]
+    for at in within:
+        for i in members[starts[at] : starts[at + 1]]:
+            of = whole[surface[i]]
+            if of[_DM2] < least_dm2 or of[_NARROW] > _NARROW_SHARE * of[_CELLS] or of[_SLOPES] == 0:
                 continue
-            whole = sums[surface[i]]
-            share = _WIDE_SHARE if counts[at[i], _WIDE] > 0 else _SLOPED_SHARE
-            if (
-                whole[_DM2] >= least_dm2
-                and whole[_NARROW] <= _NARROW_SHARE * whole[_CELLS]
-                and whole[_SLOPES] > 0
-                and whole[_SLOPES] >= share * (whole[_SLOPES] + whole[_WALLS])
-            ):
-                out[r, c] = True
+            for is_wide, share in enumerate((_SLOPED_SHARE, _WIDE_SHARE)):
+                if of[_SLOPES] >= share * (of[_SLOPES] + of[_WALLS]):
+                    joins[i, is_wide] = True
+    for at in within:
+        surface[members[starts[at] : starts[at + 1]]] = -1
+
+
+@kernel
+def _joining(squares: _Squares, shape: tuple[int, int], least_dm2: int) -> BoolArray:
+    """Whether the cells of each part join the ground, (parts, 2): those beyond wide objects, and those on them.
+
+    The parts of a block's squares make its surfaces. `shape` is rows and columns of squares, which are numbered row by
+    row; `least_dm2` is the least area of a surface.
+    """
+    rows, columns = shape
+    parts = len(squares.sums)
+    joins = np.zeros((parts, 2), np.bool_)
+    surface, whole = np.full(parts, -1, np.int64), np.zeros((parts, 6), np.int64)
+    totals = np.zeros((rows * columns, 6), np.int64)
+    for at in range(rows * columns):
+        for i in squares.members[squares.starts[at] : squares.starts[at + 1]]:
+            totals[at] += squares.sums[i]
+    within = np.empty(_SQUARES * _SQUARES, np.int32)
+    for down in range(1 - _SQUARES, rows):
+        for across in range(1 - _SQUARES, columns):
+            n, area, slopes = 0, 0, 0
+            for r in range(max(down, 0), min(down + _SQUARES, rows)):
+                for c in range(max(across, 0), min(across + _SQUARES, columns)):
+                    at = r * columns + c
+                    within[n] = at
+                    n, area, slopes = n + 1, area + totals[at, _DM2], slopes + totals[at, _SLOPES]
+            if area >= least_dm2 and slopes > 0:
+                _judge_block(joins, squares, within[:n], surface, whole, least_dm2)
+    return joins
 
 
 @kernel
@@ -309,14 +386,25 @@ def embankments(
         if narrow[r, c]:
             counts[i, _DM2] = 0
     gentle = _continued(lowest, cells, links)
-    out = np.zeros((rows, columns), np.bool_)
-    south = corner[1] // _STRIDE * _STRIDE - corner[1] - BLOCK_CELLS + _STRIDE
-    west = corner[0] // _STRIDE * _STRIDE - corner[0] - BLOCK_CELLS + _STRIDE
-    for r in range(south, rows, _STRIDE):
-        for c in range(west, columns, _STRIDE):
-            r0, c0, r1, c1 = max(r, 0), max(c, 0), min(r + BLOCK_CELLS, rows), min(c + BLOCK_CELLS, columns)
-            _mark(out[r0:r1, c0:c1], number[r0:r1, c0:c1], links, gentle, counts, 100 * least_m2)
+    # blocks are made of squares, and surfaces of the parts in them: nine blocks share a square
+    south, west = corner[1] % _STRIDE, corner[0] % _STRIDE
+    high, broad = (south + rows - 1) // _STRIDE + 1, (west + columns - 1) // _STRIDE + 1
+    square = np.empty(n, np.int32)
     for i in range(n):
         r, c = cells[i] // columns, cells[i] % columns
-        out[r, c] = out[r, c] and _is_smooth(lowest, r, c)
+        square[i] = (south + r) // _STRIDE * broad + (west + c) // _STRIDE
+    part, parts, between = _parts(number, cells, links, gentle, square)
+    sums, square_of = np.zeros((parts, 6), np.int64), np.empty(parts, np.int32)
+    for i in range(n):
+        sums[part[i]] += counts[i]
+        square_of[part[i]] = square[i]
+    starts, members = counting_sort(square_of, high * broad)
+    pair_starts, pairs = counting_sort(square_of[between[:, 0]], high * broad)
+    squares = _Squares(sums, starts, members, between[pairs], pair_starts)
+    joins = _joining(squares, (high, broad), 100 * least_m2)
+    out = np.zeros((rows, columns), np.bool_)
+    for i in range(n):
+        if counts[i, _NARROW] == 0 and joins[part[i], counts[i, _WIDE]]:
+            r, c = cells[i] // columns, cells[i] % columns
+            out[r, c] = _is_smooth(lowest, r, c)
     return out

@@ -9,6 +9,7 @@ from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.support import (
     CLUMP_CELLS,
     GAP_CELLS,
+    NEAR_CELLS,
     PIT_CELLS,
     between_walls_support_m,
     embankments_support_m,
@@ -143,11 +144,20 @@ class MorphologicalFilterSettings(Parameters):
     @property
     def _openings_support_m(self) -> float:
         """How far the pit tests, openings, wide objects and decks look."""
-        openings = 2 * self.max_window_m + 2 * self.second_window_m
-        chain = 4 * GAP_CELLS + openings + 2 * self.trend_m + CLUMP_CELLS
+        chain = 2 * GAP_CELLS + 2 * self.max_window_m + self.second_support_m
         wide = wide_support_m(self.widest_m // 2) if self.looks_for_wide else 0.0
         walls = between_walls_support_m(self.deck_m)
         return PIT_CELLS + max(float(chain), wide, walls)
+
+    @property
+    def second_support_m(self) -> int:
+        """How far trend, clumps and second openings look at what the first openings found."""
+        return 2 * GAP_CELLS + 2 * self.second_window_m + 2 * self.trend_m + CLUMP_CELLS
+
+    def joining_support_m(self, reach: int) -> int:
+        """How far terrain looks at what the openings found, by way of all that joins; `reach` is that of its planes."""
+        steady = self.morphological_support_m + reach
+        return int(max(steady, self.rejoined_support_m + min(reach, NEAR_CELLS)) - self._openings_support_m)
 
     @property
     def morphological_support_m(self) -> float:

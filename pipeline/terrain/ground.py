@@ -15,43 +15,43 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
 from pipeline.terrain.hierarchical_filter import hierarchical_ground
-from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, lowest_per_cell, without_pits
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, Part, lowest_per_cell, part_around, without_pits
 from pipeline.terrain.morphological import morphological_ground
 from pipeline.terrain.planar_fitting import MIN_CELLS, plane_around, plane_sums, sum_within
 from pipeline.terrain.rejoining import FEWEST_SIDES, meeting_sides
 from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.support import NEAR_CELLS
 
+_BLOCK = 64
+"""Least side in cells of the blocks that are drawn from sums of their own, which stay in the processor's cache."""
+
 
 @kernel
-def _draw(
+def _draw_block(
     terrain: Elevations,
     lowest: Elevations,
     ground: BoolArray,
+    block: tuple[int, int, int, int],
     halves: tuple[int, int, bool],
     max_slope: float,
-    drawn: tuple[int, int, int, int],
     beside: tuple[int, float],
 ) -> None:
-    """Terrain in mm where there is none yet: the plane through the ground of the smallest square that determines one.
-
-    `halves` are the half sides of the first and the last square in cells, and whether the last one must suffice. Only
-    the cells of `drawn`, first and one past the last column and row, get an elevation. `beside` are the half side of
-    the squares beside a cell and a step in mm: ground that lies farther than the step above its plane, as at a brow or
-    a crest, is terrain itself if the planes of `meeting_sides` meet it. A half side of 0 leaves them out.
-    """
+    """Draw the cells of a block, its first and one past its last row and column; the rest as in `_draw`."""
     first, last, is_final = halves
-    rows, columns = lowest.shape
-    sums = plane_sums(lowest, ground)
-    for r in range(max(drawn[1], 0), min(drawn[3], rows)):
-        for c in range(max(drawn[0], 0), min(drawn[2], columns)):
-            if terrain[r, c] != NO_DATA:
+    south, west = max(block[0] - last, 0), max(block[2] - last, 0)
+    seen = (slice(south, block[1] + last), slice(west, block[3] + last))
+    sums = plane_sums(lowest[seen].copy(), ground[seen].copy())
+    rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
+    for r in range(block[0] - south, block[1] - south):
+        for c in range(block[2] - west, block[3] - west):
+            at = (south + r, west + c)
+            if terrain[at] != NO_DATA:
                 continue
             half = first
             while True:
                 n, level, _, _, carries = plane_around(sums, r, c, half)
                 # cells in a row carry no plane: under an object a wider square is needed
-                found = carries or (n >= MIN_CELLS and ground[r, c])
+                found = carries or (n >= MIN_CELLS and ground[at])
                 if found or half == last:
                     break
                 half = min(2 * half, last)
@@ -67,11 +67,36 @@ def _draw(
                 mean = sum_within(sums, r0, r1, c0, c1, 3) / n
                 slack = max_slope * CELL_MM * math.sqrt(east * east + north * north)
                 level = min(max(level, mean - slack), mean + slack)
-            terrain[r, c] = np.int32(round(level))
-            above = beside[0] > 0 and ground[r, c] and lowest[r, c] - level > beside[1]
+            terrain[at] = np.int32(round(level))
+            above = beside[0] > 0 and ground[at] and lowest[at] - level > beside[1]
             # squares that do not touch the cell: it must not agree with itself
-            if above and meeting_sides(sums, (r, c), beside, 1, lowest[r, c]) >= FEWEST_SIDES:
-                terrain[r, c] = lowest[r, c]
+            if above and meeting_sides(sums, (r, c), beside, 1, lowest[at]) >= FEWEST_SIDES:
+                terrain[at] = lowest[at]
+
+
+@kernel
+def _draw(
+    terrain: Elevations,
+    lowest: Elevations,
+    ground: BoolArray,
+    halves: tuple[int, int, bool],
+    max_slope: float,
+    drawn: tuple[int, int, int, int],
+    beside: tuple[int, float],
+) -> None:
+    """Terrain in mm where there is none yet: the plane through the ground of the smallest square that determines one.
+
+    `halves` are the half sides of the first and the last square in cells, and whether the last one must suffice. Only
+    the cells of `drawn`, first and one past the last row and column, get an elevation. `beside` are the half side of
+    the squares beside a cell and a step in mm: ground that lies farther than the step above its plane, as at a brow or
+    a crest, is terrain itself if the planes of `meeting_sides` meet it. A half side of 0 leaves them out.
+    """
+    side = max(_BLOCK, 2 * halves[1])
+    for r in range(drawn[0], drawn[1], side):
+        for c in range(drawn[2], drawn[3], side):
+            block = (r, min(r + side, drawn[1]), c, min(c + side, drawn[3]))
+            if np.any(terrain[r : block[1], c : block[3]] == NO_DATA):
+                _draw_block(terrain, lowest, ground, block, halves, max_slope, beside)
 
 
 def _terrain(
@@ -79,14 +104,16 @@ def _terrain(
     grounds: tuple[BoolArray, BoolArray],
     reach: int,
     max_slope: float,
-    drawn: tuple[int, int, int, int],
+    wanted: Part,
     beside: tuple[int, float] = (0, 0.0),
 ) -> Elevations:
     """Terrain in mm (rows, columns) through two masks of ground: that of squares up to `NEAR_CELLS`, and of wider ones.
 
-    No square reaches farther than `reach` cells; `drawn` and `beside` as in `_draw`.
+    No square reaches farther than `reach` cells. Only the `wanted` part gets elevations; `beside` as in `_draw`.
     """
     near = min(NEAR_CELLS, reach)
+    down, across = part_around(wanted, 0, lowest.shape)
+    drawn = (down.start, down.stop, across.start, across.stop)
     terrain = np.full(lowest.shape, NO_DATA, np.int32)
     # the squares beside a cell reach twice their half side and one cell
     sides = (min(beside[0], (near - 1) // 2), beside[1])
@@ -196,20 +223,20 @@ def ground_on(
     seen = _part_with_data(lowest, settings.reach_m + 1)
     part = np.ascontiguousarray(lowest[seen])
     if part.size:
+        down, across = (slice(0, rows), slice(0, columns)) if wanted is None else wanted
+        south, west = seen[0].start, seen[1].start
+        drawn = (slice(down.start - south, down.stop - south), slice(across.start - west, across.stop - west))
         is_ground = steady = part != NO_DATA
         beside = (0, 0.0)
         if not trusted:
             pit_depth_mm = round(settings.pit_depth_m * 1000)
             part = without_pits(part, pit_depth_mm)
-            place = (column0 + seen[1].start, row0 + seen[0].start)
+            place = (column0 + west, row0 + south)
             if settings.filter == "hierarchical":
                 is_ground = steady = hierarchical_ground(part, place, settings, pit_depth_mm)
             else:
-                is_ground, steady = morphological_ground(part, place, settings)
+                is_ground, steady = morphological_ground(part, place, settings, (drawn, settings.reach_m))
                 beside = (settings.rejoin_m, settings.rejoin_step_m * 1000.0)
-        down, across = (slice(0, rows), slice(0, columns)) if wanted is None else wanted
-        west, south = across.start - seen[1].start, down.start - seen[0].start
-        drawn = (west, south, west + across.stop - across.start, south + down.stop - down.start)
         elevation[seen] = _terrain(part, (is_ground, steady), settings.reach_m, settings.max_slope, drawn, beside)
         measured[seen] = is_ground
     return elevation, measured

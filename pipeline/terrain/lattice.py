@@ -17,8 +17,24 @@ NO_DATA = np.int32(2**31 - 1)
 
 Elevations = npt.NDArray[np.int32]
 
+Part = tuple[slice, slice]
+"""Rows and columns of a lattice."""
+
 PIT_MATES = 2
 """At most this many neighbours of a pit are as deep: low outliers come alone or in small groups."""
+
+
+def part_around(part: Part, margin: int, shape: tuple[int, ...]) -> Part:
+    """A part of a lattice and a margin around it in cells, as far as a lattice of this shape goes.
+
+    >>> part_around((slice(5, 8), slice(-3, 40)), 2, (20, 30))
+    (slice(3, 10, None), slice(0, 30, None))
+    """
+    down, across = (
+        slice(min(max(along.start - margin, 0), size), max(min(along.stop + margin, size), 0))
+        for along, size in zip(part, shape, strict=True)
+    )
+    return down, across
 
 
 @kernel
@@ -47,14 +63,16 @@ def without_pits(lowest: Elevations, depth_mm: int, mates: int = PIT_MATES) -> E
             if z == NO_DATA:
                 continue
             near, filled = 0, 0
-            for dr in range(-PIT_CELLS, PIT_CELLS + 1):
-                for dc in range(-PIT_CELLS, PIT_CELLS + 1):
-                    if (dr != 0 or dc != 0) and 0 <= r + dr < rows and 0 <= c + dc < columns:
-                        other = lowest[r + dr, c + dc]
-                        if other != NO_DATA:
-                            filled += 1
-                            if other - z <= depth_mm:
-                                near += 1
+            for a in range(max(r - PIT_CELLS, 0), min(r + PIT_CELLS + 1, rows)):
+                # most cells have enough cells near their level in the first row
+                if near > mates:
+                    break
+                for b in range(max(c - PIT_CELLS, 0), min(c + PIT_CELLS + 1, columns)):
+                    other = lowest[a, b]
+                    if other != NO_DATA and (a != r or b != c):
+                        filled += 1
+                        if other - z <= depth_mm:
+                            near += 1
             if filled > mates and near <= mates:
                 out[r, c] = NO_DATA
     return out

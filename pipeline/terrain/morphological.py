@@ -15,11 +15,11 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.model import BoolArray
+from pipeline.model import BoolArray, LabelArray
 from pipeline.terrain.between_walls import between_walls
 from pipeline.terrain.embankments import embankments
 from pipeline.terrain.filter_settings import MorphologicalFilterSettings
-from pipeline.terrain.lattice import NO_DATA, Elevations
+from pipeline.terrain.lattice import NO_DATA, Elevations, Part, part_around
 from pipeline.terrain.openings import cut_off
 from pipeline.terrain.planar_fitting import leaning_planes
 from pipeline.terrain.rejoining import rejoined
@@ -48,6 +48,67 @@ _ENOUGH_BESIDE = 4
 """Ground cells that show what lies beside a cell: twice as many as must agree. Farther ones do not count."""
 
 
+_LOW = np.int32(-(2**30))
+"""Below all elevations in mm."""
+
+
+@kernel
+def _mean_beside(surface: Elevations, at: int, width: int, is_fill: bool) -> int:
+    """Mean of the cells beside one that lie within `_WALL_MM` of its level, or NO_DATA without any; in mm.
+
+    `surface` holds rows of `width` cells, one after the other. The eight cells around a cell fill it, at the level of
+    the lowest; the four beside a filled cell smooth it.
+    """
+    level = surface[at]
+    if is_fill:
+        for row in range(at - width, at + width + 1, width):
+            for k in range(row - 1, row + 2):
+                level = min(level, surface[k])
+    n = total = np.int64(0)
+    for down in range(-1, 2):
+        for across in range(-1, 2):
+            if not is_fill and (down == 0) == (across == 0):
+                continue
+            beside = np.int64(surface[at + down * width + across])
+            # without a branch: which cells count is hard to foresee
+            counts = np.int64((beside != NO_DATA) & (abs(beside - level) <= _WALL_MM))
+            n += counts
+            total += counts * beside
+    return int(total // n) if n > 0 else int(NO_DATA)
+
+
+@kernel
+def _queue_rims(queue: LabelArray, is_done: BoolArray, surface: Elevations, width: int) -> int:
+    """Put the empty cells beside cells with data into the queue; how many these are. `surface` as in `_mean_beside`.
+
+    `is_done` holds for the cells with data and in the queue, and for the frame.
+    """
+    end = 0
+    for at in range(width, surface.size - width):
+        if is_done[at]:
+            continue
+        lowest = NO_DATA
+        for row in range(at - width, at + width + 1, width):
+            lowest = min(lowest, surface[row - 1], surface[row], surface[row + 1])
+        if lowest != NO_DATA:
+            queue[end], is_done[at] = at, True
+            end += 1
+    return end
+
+
+@kernel
+def _queue_beside(queue: LabelArray, is_done: BoolArray, part: tuple[int, int], width: int) -> int:
+    """Add the empty cells beside those of the queue's last part, its first member and its end; the new end."""
+    end = part[1]
+    for i in range(part[0], part[1]):
+        for row in range(queue[i] - width, queue[i] + width + 1, width):
+            for at in range(row - 1, row + 2):
+                if not is_done[at]:
+                    queue[end], is_done[at] = at, True
+                    end += 1
+    return end
+
+
 @kernel
 def closed_gaps(lowest: Elevations, reach: int) -> Elevations:
     """The surface of the lowest points with gaps closed up to reach cells from their rims; elevations are in mm.
@@ -58,35 +119,33 @@ def closed_gaps(lowest: Elevations, reach: int) -> Elevations:
     stays NO_DATA.
     """
     rows, columns = lowest.shape
-    out = lowest.copy()
-    for number in range(2 * reach):
-        before = out.copy()
-        changed = False
-        for r in range(rows):
-            for c in range(columns):
-                # the first half of the rounds fills, the second smooths what was filled
-                if lowest[r, c] != NO_DATA or (before[r, c] == NO_DATA) != (number < reach):
-                    continue
-                level = before[r, c]
-                if number < reach:
-                    for a in range(max(r - 1, 0), min(r + 2, rows)):
-                        for b in range(max(c - 1, 0), min(c + 2, columns)):
-                            level = min(level, before[a, b])
-                n, total = 0, 0
-                for a in range(max(r - 1, 0), min(r + 2, rows)):
-                    for b in range(max(c - 1, 0), min(c + 2, columns)):
-                        beside = before[a, b]
-                        if beside == NO_DATA or (number >= reach and (a == r) == (b == c)):
-                            continue
-                        if abs(beside - level) <= _WALL_MM:
-                            n += 1
-                            total += beside
-                if n > 0:
-                    out[r, c] = total // n
-                    changed = True
-        if not changed and number >= reach:
+    width = columns + 2
+    # a frame of one cell spares tests for the edge
+    framed = np.full((rows + 2, width), NO_DATA, np.int32)
+    framed[1:-1, 1:-1] = lowest
+    surface = framed.ravel()
+    # the cells that are filled, round by round, and what they become when all cells of a round are known
+    queue, becomes = np.empty(lowest.size, np.int32), np.empty(lowest.size, np.int32)
+    is_queued = np.ones((rows + 2, width), np.bool_)
+    is_queued[1:-1, 1:-1] = lowest != NO_DATA
+    is_done = is_queued.ravel()
+    first, end = 0, _queue_rims(queue, is_done, surface, width)
+    for number in range(reach):
+        for i in range(first, end):
+            becomes[i] = _mean_beside(surface, queue[i], width, True)
+        for i in range(first, end):
+            surface[queue[i]] = becomes[i]
+        if number == reach - 1:
             break
-    return out
+        # the next round fills the cells beside those of this one
+        first, end = end, _queue_beside(queue, is_done, (first, end), width)
+    for _ in range(reach):
+        for i in range(end):
+            becomes[i] = _mean_beside(surface, queue[i], width, False)
+        for i in range(end):
+            if becomes[i] != NO_DATA:
+                surface[queue[i]] = becomes[i]
+    return framed[1:-1, 1:-1].copy()
 
 
 @kernel
@@ -138,6 +197,29 @@ def _heights(
 
 
 @kernel
+def _highest_ground(lowest: Elevations, ground: BoolArray, reach: int) -> Elevations:
+    """Elevation in mm of the highest ground in the square of 2 reach + 1 cells around each cell; `_LOW` without any."""
+    rows, columns = lowest.shape
+    own, out = np.empty((rows, columns), np.int32), np.full((rows, columns), _LOW, np.int32)
+    for r in range(rows):
+        for c in range(columns):
+            z = lowest[r, c]
+            own[r, c] = z if ground[r, c] else _LOW
+    for r in range(rows):
+        column = np.full(columns + 2 * reach, _LOW, np.int32)
+        middle, square = column[reach : reach + columns], out[r]
+        for a in range(max(r - reach, 0), min(r + reach + 1, rows)):
+            other = own[a]
+            for c in range(columns):
+                middle[c] = max(middle[c], other[c])
+        for shift in range(2 * reach + 1):
+            other = column[shift : shift + columns]
+            for c in range(columns):
+                square[c] = max(square[c], other[c])
+    return out
+
+
+@kernel
 def regrown(
     lowest: Elevations, ground: BoolArray, barred: BoolArray, passes: int, limits: tuple[int, int, float, float]
 ) -> BoolArray:
@@ -159,10 +241,15 @@ def regrown(
     """
     reach, step_mm, rise_mm, share = limits
     rows, columns = lowest.shape
+    most = step_mm + rise_mm * math.sqrt(2 * reach * reach)
     for _ in range(passes):
         out = ground.copy()
+        highest = _highest_ground(lowest, ground, reach)
         for r in range(rows):
             for c in range(columns):
+                # higher above all ground of the largest square than any of it allows; so are most trees and roofs
+                if lowest[r, c] - highest[r, c] > most:
+                    continue
                 if ground[r, c] or lowest[r, c] == NO_DATA or barred[r, c]:
                     continue
                 beside, level, half = 0, 0, 0
@@ -182,42 +269,65 @@ def regrown(
 
 
 def morphological_ground(
-    lowest: Elevations, corner: tuple[int, int], settings: MorphologicalFilterSettings
+    lowest: Elevations,
+    corner: tuple[int, int],
+    settings: MorphologicalFilterSettings,
+    wanted: tuple[Part, int] | None = None,
 ) -> tuple[BoolArray, BoolArray]:
     """Masks of the cells that hold ground, and of those among them that joined it before any did by planes.
 
-    Both are False in cells without data. `lowest` is the elevation in mm of the lowest point of each cell, with single
-    pits cleared and NO_DATA in empty cells. `corner` is the absolute column and row of the first cell: coarse cells are
-    anchored at the CRS's origin.
+    Both are False in cells without data.
+
+    Parameters
+    ----------
+    lowest : (rows, columns) int32
+        Elevation in mm of the lowest point of each cell, with single pits cleared and NO_DATA in empty cells.
+    corner : tuple of int
+        Absolute column and row of the first cell: coarse cells and blocks are anchored at the CRS's origin.
+    wanted : tuple, optional
+        The part where terrain is needed, everywhere by default, and how far it may be drawn, in cells. No step works
+        where that cannot depend on it, and there the masks may miss ground.
     """
-    radius = settings.max_window_m
+    shape, radius = lowest.shape, settings.max_window_m
+    part, reach = wanted or ((slice(0, shape[0]), slice(0, shape[1])), 0)
     elevation = closed_gaps(lowest, GAP_CELLS)
-    nothing = np.zeros(lowest.shape, np.int32)
-    first = cut_off(elevation, nothing, settings.window_slope * 1000.0, radius)
-    is_first = (lowest != NO_DATA) & (first == 0)
-    level, slope_mm = leaning_planes(lowest, is_first, settings.trend_m, 2 * settings.trend_m)
+    first = cut_off(elevation, np.zeros(shape, np.int32), settings.window_slope * 1000.0, radius)
     if settings.looks_for_wide:
         wide = wide_objects(lowest, corner, radius, settings.widest_m // 2, settings.wide_slope * 1000.0)
         wide = with_corners(lowest, wide, first)
     else:
-        wide = np.zeros(lowest.shape, np.bool_)
+        wide = np.zeros(shape, np.bool_)
     decks = between_walls(lowest, settings.deck_m, settings.wall_drop_m * 1000.0, settings.wide_slope * 1000.0)
+    # the second openings, and before them the trend, only around what can still join
+    late = part_around(part, settings.joining_support_m(reach), shape)
+    around = part_around(late, settings.second_support_m, shape)
+    lowest, cut = np.ascontiguousarray(lowest[around]), first[around]
+    level, slope_mm = leaning_planes(lowest, (lowest != NO_DATA) & (cut == 0), settings.trend_m, 2 * settings.trend_m)
     lowest = without_clumps(lowest, level, slope_mm, round(settings.clump_depth_m * 1000))
     limits = (round(settings.residual_step_m * 1000), settings.residual_steepness_m * 1000.0)
     height, base = _heights(lowest, level, slope_mm, limits)
     narrow = settings.second_window_m
     second = cut_off(closed_gaps(height, GAP_CELLS), base, settings.residual_slope * 1000.0, narrow)
+    inner = (
+        slice(late[0].start - around[0].start, late[0].stop - around[0].start),
+        slice(late[1].start - around[1].start, late[1].stop - around[1].start),
+    )
+    lowest, second = np.ascontiguousarray(lowest[inner]), second[inner]
+    first, wide, decks = first[late], np.ascontiguousarray(wide[late]), np.ascontiguousarray(decks[late])
     # what only a wider opening sees is too wide for the second ones; on a slope it is high enough for the first
     ground = (lowest != NO_DATA) & (second == 0) & (first <= narrow) & ~wide & ~decks
     step_mm, share = round(settings.regrowth_step_m * 1000), settings.regrowth_share
     beside = (settings.regrowth_m, step_mm, 0.0, share)
-    steady = regrown(lowest, ground, wide | decks, settings.regrowth_passes, beside)
+    found, steady = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
+    steady[late] = regrown(lowest, ground, wide | decks, settings.regrowth_passes, beside)
     limits_of_planes = (settings.rejoin_m, settings.rejoin_step_m * 1000.0)
-    joined = rejoined(lowest, steady, decks, settings.rejoin_passes, limits_of_planes)
+    joined = rejoined(lowest, np.ascontiguousarray(steady[late]), decks, settings.rejoin_passes, limits_of_planes)
     beside = (settings.regrowth_m, step_mm, settings.berm_slope * 1000.0, share)
     last = min(settings.berm_passes, 1)
     joined = regrown(lowest, joined, decks, settings.berm_passes - last, beside)
     if settings.embankment_m2:
         houses = (second > 0) & (second <= _HOUSE_CELLS)
-        joined |= embankments(lowest, ground, (houses, wide), corner, settings.embankment_m2) & ~decks
-    return regrown(lowest, joined, decks, last, beside), steady
+        place = (corner[0] + late[1].start, corner[1] + late[0].start)
+        joined |= embankments(lowest, ground, (houses, wide), place, settings.embankment_m2) & ~decks
+    found[late] = regrown(lowest, joined, decks, last, beside)
+    return found, steady

@@ -25,34 +25,59 @@ def _is_square(number: int) -> bool:
 
 
 @kernel
-def _widened(values: Elevations, across: Elevations, is_square: bool, want_low: bool) -> None:
-    """Replace values, except their frame of one cell, by the extreme over a square or cross of three cells."""
+def _widen_sideways(taken: Elevations, middle: Elevations, out: Elevations, want_low: bool) -> None:
+    """Write the extremes of a row `middle` and of the cells to both sides of each of its cells in `taken`."""
+    west, east = taken[:-2], taken[2:]
+    if want_low:
+        for c in range(out.size):
+            v = min(middle[c], west[c])
+            out[c] = min(east[c], v)
+    else:
+        for c in range(out.size):
+            v = max(middle[c], west[c])
+            out[c] = max(east[c], v)
+
+
+@kernel
+def _widen_row(values: Elevations, r: int, above: Elevations, across: Elevations, kind: tuple[bool, bool]) -> None:
+    """Replace row r of values, except its ends, by the extreme over a square or cross of three cells.
+
+    `above` is the row before r as it was, and becomes row r as it was; `across` is scratch. `kind` says whether the
+    element is a square, and whether the extreme is the lowest.
+    """
+    is_square, want_low = kind
+    here, below, out = values[r], values[r + 1], values[r, 1:-1]
+    if want_low:
+        for c in range(here.size):
+            v = min(here[c], above[c])
+            across[c] = min(below[c], v)
+            above[c] = here[c]
+    else:
+        for c in range(here.size):
+            v = max(here[c], above[c])
+            across[c] = max(below[c], v)
+            above[c] = here[c]
+    # a square takes the neighbours of the column's extremes, a cross those of the row itself
+    if is_square:
+        _widen_sideways(across, across[1:-1], out, want_low)
+    else:
+        _widen_sideways(above, across[1:-1], out, want_low)
+
+
+@kernel
+def _widened(values: Elevations, first: int, last: int, want_low: bool) -> None:
+    """Replace values, except their frame of one cell, by the extremes over the first to the last piece of an octagon.
+
+    Each piece follows the one before a row behind it, so that the rows at work stay in the processor's cache.
+    """
     rows, columns = values.shape
-    row = np.empty(columns, np.int32)
-    for r in range(1, rows - 1):
-        above, here, below, out = values[r - 1], values[r], values[r + 1], across[r]
-        if want_low:
-            for c in range(columns):
-                v = min(here[c], above[c])
-                out[c] = min(below[c], v)
-        else:
-            for c in range(columns):
-                v = max(here[c], above[c])
-                out[c] = max(below[c], v)
-    for r in range(1, rows - 1):
-        # a square takes the neighbours of the column's extremes, a cross those of the row itself
-        taken = across[r] if is_square else values[r]
-        for c in range(columns):
-            row[c] = taken[c]
-        west, middle, east, out = row[:-2], across[r, 1:-1], row[2:], values[r, 1:-1]
-        if want_low:
-            for c in range(columns - 2):
-                v = min(middle[c], west[c])
-                out[c] = min(east[c], v)
-        else:
-            for c in range(columns - 2):
-                v = max(middle[c], west[c])
-                out[c] = max(east[c], v)
+    pieces = last - first + 1
+    above = np.empty((pieces, columns), np.int32)
+    above[:] = values[0]
+    across = np.empty(columns, np.int32)
+    for step in range(1, rows - 2 + pieces):
+        for piece in range(max(step - rows + 2, 0), min(pieces, step)):
+            _widen_row(values, step - piece, above[piece], across, (_is_square(first + piece), want_low))
 
 
 @kernel
@@ -68,28 +93,25 @@ def framed(surface: Elevations) -> Elevations:
 
 
 @kernel(inline="always")
-def erode_once(eroded: Elevations, scratch: Elevations, radius: int) -> None:
-    """From the erosion by the octagon of radius - 1 to that of radius, in place; both arrays are framed."""
-    _widened(eroded, scratch, _is_square(radius), True)
+def erode_once(eroded: Elevations, radius: int) -> None:
+    """From the erosion by the octagon of radius - 1 to that of radius, in place; the array is framed."""
+    _widened(eroded, radius, radius, True)
 
 
 @kernel
-def dilate_back(surface: Elevations, eroded: Elevations, opened: Elevations, scratch: Elevations, radius: int) -> None:
+def dilate_back(surface: Elevations, eroded: Elevations, opened: Elevations, radius: int) -> None:
     """From an erosion to the opening of a surface with NO_DATA in holes, written to the framed array `opened`.
 
     Elements are centred only on cells with data: beyond the edge of the data an element would see only the roof that
-    the edge cuts. `eroded`, the erosion by the octagon of a radius in cells, `opened` and `scratch` are (rows + 2,
-    columns + 2).
+    the edge cuts. `eroded`, the erosion by the octagon of a radius in cells, and `opened` are (rows + 2, columns + 2).
     """
-    rows, columns = surface.shape
     opened[:] = _LOW
-    scratch[:] = _LOW
-    for r in range(rows):
-        for c in range(columns):
-            if surface[r, c] != NO_DATA:
-                opened[r + 1, c + 1] = eroded[r + 1, c + 1]
-    for number in range(radius, 0, -1):
-        _widened(opened, scratch, _is_square(number), False)
+    for r in range(surface.shape[0]):
+        at, low, out = surface[r], eroded[r + 1, 1:-1], opened[r + 1, 1:-1]
+        for c in range(at.size):
+            v = low[c]
+            out[c] = v if at[c] != NO_DATA else _LOW
+    _widened(opened, 1, radius, False)
 
 
 @kernel
@@ -114,15 +136,17 @@ def cut_off(surface: Elevations, base_mm: Elevations, rise_mm: float, largest: i
     rows, columns = surface.shape
     found = np.zeros((rows, columns), np.uint8)
     eroded = framed(surface)
-    before, after, high, low = eroded.copy(), eroded.copy(), eroded.copy(), eroded.copy()
+    before, after = eroded.copy(), eroded.copy()
     for radius in range(1, largest + 1):
-        erode_once(eroded, high, radius)
-        dilate_back(surface, eroded, after, low, radius)
+        erode_once(eroded, radius)
+        dilate_back(surface, eroded, after, radius)
+        last = np.uint8(radius)
         for r in range(rows):
+            at, base, out = surface[r], base_mm[r], found[r]
+            high, low = before[r + 1, 1:-1], after[r + 1, 1:-1]
             for c in range(columns):
-                if surface[r, c] != NO_DATA:
-                    taken = before[r + 1, c + 1] - after[r + 1, c + 1]
-                    if taken > base_mm[r, c] + rise_mm * radius:
-                        found[r, c] = radius
+                is_cut = (high[c] - low[c] > base[c] + rise_mm * radius) & (at[c] != NO_DATA)
+                before_it = out[c]
+                out[c] = last if is_cut else before_it
         before, after = after, before
     return found

@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, LabelArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
-from pipeline.terrain.planar_fitting import Sums, plane_around, plane_sums
+from pipeline.terrain.planar_fitting import MIN_CELLS, Sums, plane_around, plane_sums, sum_within
 
 _SIDES = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
 """Directions of the squares beside a cell."""
@@ -25,6 +25,8 @@ FEWEST_SIDES = 2
 _STEEPEST_MM = 1.0 * CELL_MM
 """Rise per cell of the steepest plane that is drawn on: beyond 45 degrees it says little of the next cell's level."""
 
+_ROUNDING_MM = 1.0
+"""Far more than the rounding of a plane's elevation."""
 
 _BLOCK = 64
 """Side in cells of the blocks whose planes are summed and tested together; no plane depends on it. Small enough for the
@@ -33,20 +35,36 @@ processor's cache, and most blocks need only one pass."""
 
 @kernel(inline="always")
 def meeting_sides(sums: Sums, cell: tuple[int, int], limits: tuple[int, float], gap: int, level_mm: int) -> int:
-    """Number of squares beside a cell whose planes meet an elevation there.
+    """Number of squares beside a cell whose planes meet an elevation there, counted up to `FEWEST_SIDES`.
 
     `cell` is its row and column in `sums`; `limits` as in `rejoined`. The eight squares touch the cell with a gap of 0,
     and leave it out with a gap of 1.
     """
     half, step_mm = limits
+    rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
     met = 0
     for k in range(len(_SIDES)):
         down, across = _SIDES[k, 0] * (half + gap), _SIDES[k, 1] * (half + gap)
+        r0, r1 = max(cell[0] + down - half, 0), min(cell[0] + down + half, rows - 1) + 1
+        c0, c1 = max(cell[1] + across - half, 0), min(cell[1] + across + half, columns - 1) + 1
+        n = sum_within(sums, r0, r1, c0, c1, 0)
+        if n < MIN_CELLS:
+            continue
+        east, north = (
+            sum_within(sums, r0, r1, c0, c1, 1) / n - cell[1],
+            sum_within(sums, r0, r1, c0, c1, 2) / n - cell[0],
+        )
+        # from its middle no plane rises or falls more than the steepest
+        most = step_mm + _STEEPEST_MM * math.sqrt(east * east + north * north) + _ROUNDING_MM
+        if abs(level_mm - sum_within(sums, r0, r1, c0, c1, 3) / n) > most:
+            continue
         _, level, east, north, carries = plane_around(sums, cell[0] + down, cell[1] + across, half)
         if not carries or math.sqrt(east * east + north * north) > _STEEPEST_MM:
             continue
         if abs(level_mm - (level - east * across - north * down)) <= step_mm:
             met += 1
+            if met == FEWEST_SIDES:
+                break
     return met
 
 
@@ -56,10 +74,14 @@ def _join_block(
     lowest: Elevations,
     ground: BoolArray,
     barred: BoolArray,
+    tested: LabelArray,
     block: tuple[int, int],
     limits: tuple[int, float],
 ) -> None:
-    """Mark in `out` the cells of a block, by its first row and column, that planes on `FEWEST_SIDES` sides meet."""
+    """Mark in `out` the cells of a block, by its first row and column, that planes on `FEWEST_SIDES` sides meet.
+
+    `tested` (rows, columns) is the number of ground cells in the squares beside each cell at its last test, or 0.
+    """
     half = limits[0]
     first, left = max(block[0] - 2 * half, 0), max(block[1] - 2 * half, 0)
     last, right = block[0] + _BLOCK + 2 * half, block[1] + _BLOCK + 2 * half
@@ -68,19 +90,31 @@ def _join_block(
         for c in range(block[1], min(block[1] + _BLOCK, lowest.shape[1])):
             if ground[r, c] or barred[r, c] or lowest[r, c] == NO_DATA:
                 continue
+            # ground only grows: with as much as then it is the same
+            r0, r1 = max(r - first - 2 * half, 0), min(r - first + 2 * half + 1, sums.shape[0] - 1)
+            c0, c1 = max(c - left - 2 * half, 0), min(c - left + 2 * half + 1, sums.shape[1] - 1)
+            beside = sum_within(sums, r0, r1, c0, c1, 0)
+            if beside == tested[r, c]:
+                continue
+            tested[r, c] = beside
             met = meeting_sides(sums, (r - first, c - left), limits, 0, lowest[r, c])
             out[r, c] = met >= FEWEST_SIDES
 
 
 @kernel
 def _joined(
-    lowest: Elevations, ground: BoolArray, barred: BoolArray, seen: LabelArray, limits: tuple[int, float]
+    lowest: Elevations,
+    ground: BoolArray,
+    barred: BoolArray,
+    counts: tuple[LabelArray, LabelArray],
+    limits: tuple[int, float],
 ) -> BoolArray:
     """Ground, and the cells that the planes through the ground of at least `FEWEST_SIDES` squares beside them meet.
 
-    `seen` counts the ground cells in and around each block at its last test. Ground only grows: a block with as many as
-    then needs no test. `limits` as in `rejoined`.
+    `counts` are of the ground cells in and around each block and beside each cell at its last test. Ground only grows:
+    a block or a cell with as many as then needs no test. `limits` as in `rejoined`.
     """
+    seen, tested = counts
     margin = 2 * limits[0]
     out = ground.copy()
     for i in range(seen.shape[0]):
@@ -90,7 +124,7 @@ def _joined(
             around = np.count_nonzero(ground[r0 : r + _BLOCK + margin, c0 : c + _BLOCK + margin])
             if around != seen[i, j]:
                 seen[i, j] = around
-                _join_block(out, lowest, ground, barred, (r, c), limits)
+                _join_block(out, lowest, ground, barred, tested, (r, c), limits)
     return out
 
 
@@ -109,8 +143,9 @@ def rejoined(
         Half side in cells of the eight squares that touch a cell; farthest that a plane may pass above or below it, mm.
     """
     seen = np.zeros((-(-lowest.shape[0] // _BLOCK), -(-lowest.shape[1] // _BLOCK)), np.int32)
+    tested = np.zeros(lowest.shape, np.int32)
     for _ in range(passes):
-        out = _joined(lowest, ground, barred, seen, limits)
+        out = _joined(lowest, ground, barred, (seen, tested), limits)
         if np.array_equal(out, ground):
             break
         ground = out

@@ -62,17 +62,18 @@ def _floors(surface: Elevations, first: int, last: int, rise_mm: float) -> Eleva
     rows, columns = surface.shape
     out = np.full((rows, columns), NO_DATA, np.int32)
     eroded = framed(surface)
-    before, after, high, low = eroded.copy(), eroded.copy(), eroded.copy(), eroded.copy()
+    before, after = eroded.copy(), eroded.copy()
     for radius in range(1, last + 1):
-        erode_once(eroded, high, radius)
+        erode_once(eroded, radius)
         if radius < first - 1:
             continue
-        dilate_back(surface, eroded, after, low, radius)
+        dilate_back(surface, eroded, after, radius)
         if radius >= first:
             for r in range(rows):
+                at, floor, high, low = surface[r], out[r], before[r + 1, 1:-1], after[r + 1, 1:-1]
                 for c in range(columns):
-                    if surface[r, c] != NO_DATA and before[r + 1, c + 1] - after[r + 1, c + 1] > rise_mm * radius:
-                        out[r, c] = after[r + 1, c + 1]
+                    new, old = low[c], floor[c]
+                    floor[c] = new if (at[c] != NO_DATA) & (high[c] - new > rise_mm * radius) else old
         before, after = after, before
     return out
 
@@ -81,18 +82,20 @@ def _floors(surface: Elevations, first: int, last: int, rise_mm: float) -> Eleva
 def _on_fine(lowest: Elevations, floors: Elevations, column0: int, row0: int, above_mm: int) -> BoolArray:
     """Mask of the cells that are this far above the floor of a coarse cell beside them."""
     rows, columns = lowest.shape
-    coarse_rows, coarse_columns = floors.shape
     corner_r, corner_c = row0 // COARSE, column0 // COARSE
+    low = np.full_like(floors, NO_DATA)
+    for i in range(floors.shape[0]):
+        for j in range(floors.shape[1]):
+            # the lowest floor decides; NO_DATA is above all
+            for a in range(max(i - 1, 0), min(i + 2, floors.shape[0])):
+                for b in range(max(j - 1, 0), min(j + 2, floors.shape[1])):
+                    low[i, j] = min(low[i, j], floors[a, b])
     out = np.zeros((rows, columns), np.bool_)
     for r in range(rows):
+        i = (row0 + r) // COARSE - corner_r
         for c in range(columns):
-            if lowest[r, c] == NO_DATA:
-                continue
-            i, j = (row0 + r) // COARSE - corner_r, (column0 + c) // COARSE - corner_c
-            for a in range(max(i - 1, 0), min(i + 2, coarse_rows)):
-                for b in range(max(j - 1, 0), min(j + 2, coarse_columns)):
-                    if floors[a, b] != NO_DATA and lowest[r, c] - floors[a, b] > above_mm:
-                        out[r, c] = True
+            floor = low[i, (column0 + c) // COARSE - corner_c]
+            out[r, c] = (lowest[r, c] != NO_DATA) & (floor != NO_DATA) & (lowest[r, c] - floor > above_mm)
     return out
 
 

@@ -15,6 +15,7 @@ from pipeline.terrain import ground
 from pipeline.terrain.ground import Terrain, ground_of, ground_on, ground_points, slopes_of
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above, lowest_per_cell, without_pits
 from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS, PIT_CELLS
 
 Grid = npt.NDArray[np.int32]
 Points = npt.NDArray[np.int64]
@@ -181,7 +182,7 @@ def test_the_terrain_reaches_the_brow_of_a_sparse_scarp_and_no_lone_bump(turns: 
     lowest = np.where(kept, z, NO_DATA).astype(np.int32)
     lowest[bump] += 900 if lowest[bump] != NO_DATA else 0
     is_ground = lowest != NO_DATA
-    whole = (0, 0, 80, 80)
+    whole = (slice(0, 80), slice(0, 80))
     with_brow = ground._terrain(lowest, (is_ground, is_ground), 20, 1.0, whole, (4, 250.0))
     without = ground._terrain(lowest, (is_ground, is_ground), 20, 1.0, whole)
     brow = is_ground & (np.rot90(np.broadcast_to((c == 44) | (c == 45), (80, 80)), turns))
@@ -211,7 +212,7 @@ def test_local_planes_agree_with_least_squares_of_numpy() -> None:
     is_ground[:10, 12:24] = False
     bridge = 6
     slope = 0.15
-    terrain = ground._terrain(lowest, (is_ground, is_ground), bridge, slope, (0, 0, 31, 26))
+    terrain = ground._terrain(lowest, (is_ground, is_ground), bridge, slope, (slice(0, 26), slice(0, 31)))
     fitted = 0
     for r, c in np.ndindex(lowest.shape):
         for half in (1, 2, 4, 6):
@@ -337,8 +338,35 @@ def test_terrain_drawn_where_it_is_wanted_is_that_of_the_whole_window(per_cell: 
     lowest = lowest_per_cell(x, y, z, usable, *window)
     drawn, measured = ground_on(lowest, window[:2], SMALL, trusted=trusted, wanted=inner)
     np.testing.assert_array_equal(drawn[inner], whole.elevation_mm[inner])
-    np.testing.assert_array_equal(measured, whole.measured)
+    np.testing.assert_array_equal(measured[inner], whole.measured[inner])
     assert (drawn != NO_DATA).sum() < (whole.elevation_mm != NO_DATA).sum() / 2
+
+
+WANTED = dataclasses.replace(SMALL, regrowth_passes=3, rejoin_passes=3, berm_passes=2)
+"""Ground joins from far away, and no other step looks much farther."""
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("chosen", [SMALL, WANTED, FAR, BANKS])
+def test_steps_that_work_only_around_the_wanted_part_find_its_terrain(chosen: GroundSettings, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    points = wild_points(random, 260, 250, per_cell=(1.2, 0.3)[seed % 2])
+    x, y, z = (np.ascontiguousarray(points[:, k]) for k in range(3))
+    lowest = lowest_per_cell(x, y, z, np.ones(len(points), np.bool_), 0, 0, 260, 250)
+    whole, _ = ground_on(lowest, (0, 0), chosen, trusted=False)
+    for row, column in random.integers(90, 150, (12, 2)).tolist():
+        part = (slice(row, row + 8), slice(column, column + 9))
+        drawn, _ = ground_on(lowest, (0, 0), chosen, trusted=False, wanted=part)
+        np.testing.assert_array_equal(drawn[part], whole[part])
+
+
+@pytest.mark.parametrize("chosen", [SMALL, WANTED, FAR, BANKS, GroundSettings(), GroundSettings(bridge_m=80)])
+def test_the_support_is_that_of_the_openings_and_of_what_joins_after_them(chosen: GroundSettings) -> None:
+    openings = chosen._openings_support_m
+    assert chosen.support_m == openings + chosen.joining_support_m(chosen.reach_m) + 4
+    assert openings >= chosen.second_support_m + 2 * chosen.max_window_m + 2 * GAP_CELLS + PIT_CELLS
+    steps = (2 * GAP_CELLS, 2 * chosen.second_window_m, 2 * chosen.trend_m, CLUMP_CELLS)
+    assert chosen.second_support_m == sum(steps)
 
 
 def test_the_support_covers_both_openings_the_trend_between_them_and_the_bridge() -> None:

@@ -70,10 +70,10 @@ def test_the_elements_are_octagons_that_grow_by_a_cell_and_are_nearly_round() ->
 def opened_by(surface: Grid, radius: int) -> Grid:
     """Opening of a surface by an octagon of a radius in cells; NO_DATA where the surface has none."""
     eroded = framed(surface)
-    opened, scratch = eroded.copy(), eroded.copy()
+    opened = eroded.copy()
     for number in range(1, radius + 1):
-        erode_once(eroded, scratch, number)
-    dilate_back(surface, eroded, opened, scratch, radius)
+        erode_once(eroded, number)
+    dilate_back(surface, eroded, opened, radius)
     out = surface.copy()
     known = surface != NO_DATA
     out[known] = opened[1:-1, 1:-1][known]
@@ -413,3 +413,13 @@ def test_turning_the_scene_by_right_angles_turns_the_ground(turns: int) -> None:
 
 def test_no_data_gives_no_ground() -> None:
     assert not ground_cells(np.full((20, 20), NO_DATA, np.int32)).any()
+
+
+def test_a_cell_joins_ground_in_the_corners_of_its_largest_square_up_to_the_limit_there() -> None:
+    ground = np.zeros((9, 9), np.bool_)
+    ground[np.ix_((1, 7), (1, 7))] = True
+    for height, joins in ((424, True), (425, False)):
+        lowest = np.full((9, 9), NO_DATA, np.int32)
+        lowest[ground], lowest[4, 4] = 0, height
+        found = regrown(lowest, ground, np.zeros_like(ground), 1, (3, 0, 100.0, 0.5))
+        assert found[4, 4] == joins  # 100 mm per metre over the diagonal of three cells
