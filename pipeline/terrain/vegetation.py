@@ -6,6 +6,7 @@ integer sums: they are the same in every tile.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -53,13 +54,14 @@ def _around_wanted(cells: LabelArray, last: int, doublings: int, wanted: BoolArr
 
 
 @kernel
-def _in_order(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, members: LabelArray) -> FloatArray:
-    """Some points in an order, (3, m), from the lowest x and y of all."""
-    low_x, low_y = x_mm.min(), y_mm.min()
+def _in_order(
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, members: LabelArray, corner_mm: tuple[int, int]
+) -> FloatArray:
+    """Some points in an order, (3, m), their x and y from a corner on."""
     points = np.empty((3, members.size))
     for k in range(members.size):
         i = members[k]
-        points[0, k], points[1, k], points[2, k] = x_mm[i] - low_x, y_mm[i] - low_y, z_mm[i]
+        points[0, k], points[1, k], points[2, k] = x_mm[i] - corner_mm[0], y_mm[i] - corner_mm[1], z_mm[i]
     return points
 
 
@@ -85,35 +87,92 @@ def _block_around(
 
 
 @kernel
-def _nearest(
-    points: FloatArray,
+def _on_level(
+    z_mm: IntArray,
     start: LabelArray,
-    cell: tuple[int, int],
     shape: tuple[int, int],
-    at: tuple[float, float, float],
-    limit: float,
-    level: float,
-    out: FloatArray,
-) -> tuple[FloatArray, int]:
-    """The points (3, n) in a circle and on a level, relative to a place, in `out` or a larger array; their number.
+    at: tuple[float, float],
+    reach: float,
+    range_mm: tuple[int, int],
+    out: IntArray,
+) -> tuple[IntArray, int]:
+    """Which points lie in a range of elevations and in cells that a circle touches, and their number.
 
-    The circle reaches two cells far at most.
+    They are in `out` or a larger array. The place `at` and the radius `reach` are in cells. Unsigned numbers: what is
+    below the range is a great number above it, and no index is looked at for its sign.
     """
-    (r, c), (rows, columns) = cell, shape
-    west, east = max(c - 2, 0), min(c + 2, columns - 1)
-    found = 0
-    for rr in range(max(r - 2, 0), min(r + 3, rows)):
-        low, high = start[rr * columns + west], start[rr * columns + east + 1]
-        if found + high - low > out.shape[1]:
-            larger = np.empty((3, 2 * (found + high - low)))
-            larger[:, :found] = out[:, :found]
+    (rows, columns), (low_mm, high_mm) = shape, range_mm
+    thickness = np.uint64(high_mm - low_mm)
+    found = np.uint64(0)
+    for r in range(max(int(at[1] - reach), 0), min(int(at[1] + reach) + 1, rows)):
+        aside = max(r - at[1], at[1] - (r + 1), 0.0)
+        half = math.sqrt(max(reach * reach - aside * aside, 0.0))
+        west, east = max(int(at[0] - half), 0), min(int(at[0] + half), columns - 1)
+        low, high = np.uint64(start[r * columns + west]), np.uint64(start[r * columns + east + 1])
+        if found + high - low > out.size:
+            larger = np.empty(2 * (found + high - low), np.int64)
+            larger[:found] = out[:found]
             out = larger
         for k in range(low, high):
-            dx, dy, dz = points[0, k] - at[0], points[1, k] - at[1], points[2, k] - at[2]
             # the next one takes the place of one that is too far: no branch to predict
-            out[0, found], out[1, found], out[2, found] = dx, dy, dz
-            found += 1 if dx * dx + dy * dy <= limit and abs(dz) <= level else 0
-    return out, found
+            out[found] = k
+            found += np.uint64(np.uint64(z_mm[k] - low_mm) <= thickness)
+    return out, int(found)
+
+
+@kernel
+def _in_circle(
+    points: FloatArray, chosen: IntArray, count: int, at: tuple[float, float, float], limit: float, out: FloatArray
+) -> tuple[FloatArray, int]:
+    """Those of the chosen points (3, n) in a circle, relative to its middle, in `out` or a larger array; their number.
+
+    Points out of all reach follow up to a multiple of eight: loops over so many need no rest.
+    """
+    if count + 8 > out.shape[1]:
+        out = np.empty((3, 2 * (count + 8)))
+    px, py, pz = points[0], points[1], points[2]
+    near_x, near_y, near_z = out[0], out[1], out[2]
+    found = np.uint64(0)
+    for m in range(count):
+        k = np.uint64(chosen[m])
+        dx, dy = px[k] - at[0], py[k] - at[1]
+        near_x[found], near_y[found], near_z[found] = dx, dy, pz[k] - at[2]
+        found += np.uint64(dx * dx + dy * dy <= limit)
+    last = (int(found) + 7) // 8 * 8
+    out[:, found:last] = 1e9
+    return out, last
+
+
+@kernel(fastmath={"reassoc"})
+def _shared_moments(
+    near: FloatArray, count: int, first: tuple[float, float], second: tuple[float, float], limit: float
+) -> tuple[float, float, tuple[float, float, float, float, float, float, float, float, float, float]]:
+    """The numbers of points in each of two circles, and the moments, as by `_moments`, of those in both at once."""
+    px, py, pz = near[0], near[1], near[2]
+    of_first, of_second = 0.0, 0.0
+    n, sx, sy, sz = 0.0, 0.0, 0.0, 0.0
+    xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(count):
+        dx, dy, dz = px[k], py[k], pz[k]
+        ex, ey = dx - first[0], dy - first[1]
+        fx, fy = dx - second[0], dy - second[1]
+        in_first = 1.0 if ex * ex + ey * ey <= limit else 0.0
+        in_second = 1.0 if fx * fx + fy * fy <= limit else 0.0
+        of_first += in_first
+        of_second += in_second
+        inside = in_first * in_second
+        x, y, z = inside * dx, inside * dy, inside * dz
+        n += inside
+        sx += x
+        sy += y
+        sz += z
+        xx += x * dx
+        xy += x * dy
+        xz += x * dz
+        yy += y * dy
+        yz += y * dz
+        zz += z * dz
+    return of_first, of_second, (n, sx, sy, sz, xx, xy, xz, yy, yz, zz)
 
 
 @kernel(fastmath={"reassoc"})
@@ -121,11 +180,10 @@ def _moments(
     block: FloatArray,
     count: int,
     at: tuple[float, float, float],
-    shift: tuple[float, float],
     limit: float,
     level: float,
 ) -> tuple[float, float, float, float, float, float, float, float, float, float]:
-    """Number, and moments of first and second order about a place, of the points of a block in a circle beside it.
+    """Number, and moments of first and second order about a place, of the points of a block in a circle around it.
 
     All are whole numbers far below 2^53: no order of summing changes them, so it is left to the compiler.
     """
@@ -134,8 +192,7 @@ def _moments(
     xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(count):
         dx, dy, dz = px[k] - at[0], py[k] - at[1], pz[k] - at[2]
-        ex, ey = dx - shift[0], dy - shift[1]
-        inside = 1.0 if (ex * ex + ey * ey <= limit) & (abs(dz) <= level) else 0.0
+        inside = 1.0 if (dx * dx + dy * dy <= limit) & (abs(dz) <= level) else 0.0
         x, y, z = inside * dx, inside * dy, inside * dz
         n += inside
         sx += x
@@ -194,12 +251,15 @@ def _planar(
     shift_x = np.array([shift, diagonal, 0.0, -diagonal, -shift, -diagonal, 0.0, diagonal])
     shift_y = np.array([0.0, diagonal, shift, diagonal, 0.0, -diagonal, -shift, -diagonal])
     limit = float(radius_mm * radius_mm)
-    # cells as wide as the radius: the window in the middle reaches one of them far, the shifted ones two
-    start, members, _, _, columns, rows = points_by_cell(x_mm, y_mm, np.ones(n, np.bool_), radius_mm)
+    # cells as wide as the radius: the window in the middle reaches one of them far, the shifted ones two. Rows of
+    # cells run along y, as the vertices come in the order of x: neighbours in space are then near in memory
+    start, members, column0, row0, columns, rows = points_by_cell(y_mm, x_mm, np.ones(n, np.bool_), radius_mm)
     # copies in the order of the cells: neighbouring cells of a row are one run of memory
-    points = _in_order(x_mm, y_mm, z_mm, members)
-    block, near = np.empty((3, 256)), np.empty((3, 256))
+    points = _in_order(x_mm, y_mm, z_mm, members, (row0 * radius_mm, column0 * radius_mm))
+    z = points[2].astype(np.int64)
+    block, level, near = np.empty((3, 256)), np.empty(1024, np.int64), np.empty((3, 256))
     planar_mm2, smooth_mm2 = roughness_mm * roughness_mm, smooth_mm * smooth_mm
+    widest_mm2 = max(planar_mm2, smooth_mm2)
     for cell in range(rows * columns):
         place = (cell // columns, cell % columns)
         count = -1
@@ -211,17 +271,29 @@ def _planar(
                 block, count = _block_around(points, start, place, (rows, columns), block)
             at = (points[0, m], points[1, m], points[2, m])
             # the window in the middle first: where it is planar the eight others cannot change the verdict
-            s = _moments(block, count, at, (0.0, 0.0), limit, level_mm)
+            s = _moments(block, count, at, limit, level_mm)
             if s[0] < min_points:
                 continue
-            out[i] = 2 if _is_planar(s, smooth_mm2) else 1 if _is_planar(s, planar_mm2) else 0
-            if out[i] > 0:
+            if _is_planar(s, widest_mm2):
+                out[i] = 2 if _is_planar(s, smooth_mm2) else 1
                 continue
-            near, found = _nearest(points, start, place, (rows, columns), at, 3.25 * limit, level_mm, near)
-            for w in range(8):
-                s = _moments(near, found, (0.0, 0.0, 0.0), (shift_x[w], shift_y[w]), limit, level_mm)
-                if s[0] >= min_points and _is_planar(s, planar_mm2):
-                    out[i] = 1
+            out[i] = 0
+            in_cells, on_level = (at[1] / radius_mm, at[0] / radius_mm), (z[m] - level_mm, z[m] + level_mm)
+            level, most = _on_level(z, start, (rows, columns), in_cells, 1.81, on_level, level)
+            near, found = _in_circle(points, level, most, at, 3.25 * limit, near)
+            for w in range(0, 8, 2):
+                one, other = (shift_x[w], shift_y[w]), (shift_x[w + 1], shift_y[w + 1])
+                in_one, in_other, s = _shared_moments(near, found, one, other, limit)
+                # more points only add to the squared distances from any plane: where the points that two windows share
+                # have too much for either, both are rough; the margin is far wider than any rounding
+                bound_mm2 = 1.001 * planar_mm2 * max(in_one, in_other) / max(s[0], 1.0) + 1.0
+                if max(in_one, in_other) < min_points or (s[0] > 3 and not _is_planar(s, bound_mm2)):
+                    continue
+                for inside, place_mm in ((in_one, one), (in_other, other)):
+                    if inside >= min_points:
+                        _, _, s = _shared_moments(near, found, place_mm, place_mm, limit)
+                        out[i] = max(out[i], _is_planar(s, planar_mm2))
+                if out[i] > 0:
                     break
 
 
@@ -278,8 +350,8 @@ def _crowns(
     if n == 0:
         return out
     limit = float(radius_mm * radius_mm)
-    start, members, _, _, columns, rows = points_by_cell(x_mm, y_mm, planar >= 0, -(-radius_mm // 2))
-    points = _in_order(x_mm, y_mm, z_mm, members)
+    start, members, _, _, columns, rows = points_by_cell(y_mm, x_mm, planar >= 0, -(-radius_mm // 2))
+    points = _in_order(x_mm, y_mm, z_mm, members, (x_mm.min(), y_mm.min()))
     # one number for all three counts: of the judged, of the rough among them, and of the pierced
     marks = 1 + ((planar[members] == 0).astype(np.int64) << 20) + (several[members].astype(np.int64) << 40)
     for cell in range(rows * columns):

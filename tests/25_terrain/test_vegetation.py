@@ -119,6 +119,19 @@ def test_the_verdict_is_that_of_a_slow_twin(per_m2: float) -> None:
     assert len(set(expected)) >= 2
 
 
+@pytest.mark.parametrize("per_m2", [1.0, 4.0])
+def test_no_planar_window_is_lost_where_the_points_that_two_windows_share_are_rough(per_m2: float) -> None:
+    # about as rough as a planar window may be: some windows pass whose parts do not
+    random = np.random.default_rng(15)
+    xy = scattered(random, 16.0, per_m2)
+    points = in_mm(xy[:, 0], xy[:, 1], random.normal(0, 0.16 if per_m2 > 2 else 0.3, len(xy)))
+    found = verdicts(points)
+    expected = [slow_twin(points, k, VegetationSettings()) for k in range(len(points))]
+    assert found.tolist() == expected
+    assert expected.count(0) > 20
+    assert expected.count(1) > 20
+
+
 @pytest.mark.parametrize("slope_deg", [0.0, 20.0, 45.0, 60.0])
 @pytest.mark.parametrize("noise_m", [0.0, 0.03])
 def test_a_plane_is_planar_whatever_its_slope(slope_deg: float, noise_m: float) -> None:
