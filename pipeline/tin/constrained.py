@@ -15,7 +15,7 @@ from pipeline.compiler import kernel
 from pipeline.kernels.bounds import bounds_of
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.tin.delaunay import strip_order, insert_all
+from pipeline.tin.delaunay import insert_all, strip_order
 from pipeline.tin.greedy_insertion import Buckets, Vertices, facet_plane, facets_around, is_left, put_in, take_out
 from pipeline.tin.half_edges import following, must_flip, preceding, split_facet
 from pipeline.tin.predicates import MAX_EXTENT_MM, lies_in_circumcircle, orientation
