@@ -105,7 +105,7 @@ class AssignmentLimits(NamedTuple):
     far: int
 
 
-_STRIP_MM = 500
+_STRIP_MM = 1000
 """Side of the cells in whose order points are looked up: a matter of speed."""
 
 
