@@ -120,7 +120,7 @@ def bucket(path: Path) -> npt.NDArray[np.void]:
     with path.open("rb") as stream:
         if not path.stat().st_size:
             return np.empty(0, POINT)
-        # private, so that kernels take it for an array of their own; nobody writes to it
+        # a copy on write: kernels take arrays that they may write to, although they only read this one
         return np.frombuffer(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_COPY), POINT)
 
 
