@@ -201,7 +201,7 @@ def split_tile(
     """
     near = core.grown(round(1000 * settings.split_support_m(footprints=False)))
     near_index = np.flatnonzero(near.contains(points.x_mm, points.y_mm))
-    points = points.take(near_index)
+    points = points if len(near_index) == len(points) else points.take(near_index)
     height = height_above(points.x_mm, points.y_mm, points.z_mm, terrain.elevation_mm, terrain.column0, terrain.row0)
     building = (points.classification == BUILDING_CLASS) & classes.building
     excluded = np.zeros(len(points), np.bool_)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
 from pipeline.terrain.facets import FacetKind, LabelledTin, SceneVertices, first_corner, stands_up
 from pipeline.terrain.fragment_sums import Sum
@@ -104,24 +105,26 @@ class AssignmentLimits(NamedTuple):
     far: int
 
 
-_HINT_MM = 1000
-"""Side of the cells that each name a facet from which a walk may start: a matter of speed."""
+_STRIP_MM = 1000
+"""Side of the cells in whose order points are looked up: a matter of speed."""
 
 
 @kernel(inline="always")
-def _hints(vertices: SceneVertices, facets: LabelArray) -> tuple[LabelArray, int, int, int, int]:
-    """A facet near each cell, row by row, where there is none that of the cell before; the lattice of the cells."""
-    x, y = vertices.x_mm, vertices.y_mm
-    column0, row0 = x.min() // _HINT_MM, y.min() // _HINT_MM
-    columns, rows = x.max() // _HINT_MM - column0 + 1, y.max() // _HINT_MM - row0 + 1
-    hint = np.full(columns * rows, -1, np.int32)
-    for f in range(facets.shape[0]):
-        v = facets[f, 0]
-        hint[(y[v] // _HINT_MM - row0) * columns + x[v] // _HINT_MM - column0] = f
-    for k in range(1, hint.size):
-        if hint[k] < 0:
-            hint[k] = hint[k - 1]
-    return hint, column0, row0, columns, rows
+def _along_strips(points: ScenePoints, ground_mm: int) -> LabelArray:
+    """Indices of the points that may belong to a surface, up one strip from west to east and down the next.
+
+    Neighbours follow each other, and vertices sorted by (x, y), with their facets, are near in memory.
+    """
+    x, y = points.x_mm, points.y_mm
+    column0, row0 = x.min() // _STRIP_MM, y.min() // _STRIP_MM
+    columns, rows = x.max() // _STRIP_MM - column0 + 1, y.max() // _STRIP_MM - row0 + 1
+    keys = np.empty(x.size, np.int32)
+    for i in range(x.size):
+        c, r = x[i] // _STRIP_MM - column0, y[i] // _STRIP_MM - row0
+        wanted = points.allowed[i] != Allowed.NEVER and points.height_mm[i] >= ground_mm
+        keys[i] = c * rows + (r if c & 1 == 0 else rows - 1 - r) if wanted else -1
+    _, members = counting_sort(keys, columns * rows)
+    return members
 
 
 @kernel(inline="always")
@@ -216,17 +219,10 @@ def assign_points(
     out = np.full(points.x_mm.size, -1, np.int32)
     if facets.shape[0] == 0 or out.size == 0:
         return out
-    hint, column0, row0, columns, rows = _hints(vertices, facets)
     previous = 0
-    for i in range(out.size):
-        if points.allowed[i] == Allowed.NEVER or points.height_mm[i] < limits.ground:
-            continue
+    for i in _along_strips(points, limits.ground):
         px, py, pz = points.x_mm[i], points.y_mm[i], points.z_mm[i]
-        c, r = px // _HINT_MM - column0, py // _HINT_MM - row0
-        start = previous
-        if 0 <= c < columns and 0 <= r < rows and hint[r * columns + c] >= 0:
-            start = hint[r * columns + c]
-        f, on_edge = _facet_containing(px, py, start, x, y, facets, tin.neighbours)
+        f, on_edge = _facet_containing(px, py, previous, x, y, facets, tin.neighbours)
         if f >= 0:
             previous = f
         at_vertex = _corner_at(px, py, f, vertices, facets)

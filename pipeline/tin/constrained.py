@@ -15,7 +15,7 @@ from pipeline.compiler import kernel
 from pipeline.kernels.bounds import bounds_of
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.tin.delaunay import hilbert_order, insert_all
+from pipeline.tin.delaunay import insert_all, strip_order
 from pipeline.tin.greedy_insertion import Buckets, Vertices, facet_plane, facets_around, is_left, put_in, take_out
 from pipeline.tin.half_edges import following, must_flip, preceding, split_facet
 from pipeline.tin.predicates import MAX_EXTENT_MM, lies_in_circumcircle, orientation
@@ -229,7 +229,7 @@ def triangulate_constrained(xy_mm: IntArray, edges: IntArray) -> ConstrainedTin:
     extent = int((high - low).max())
     if extent > MAX_EXTENT_MM:
         raise ValueError(f"points extend over {extent / 1000:.3f} m: use at most {MAX_EXTENT_MM / 1000:.3f} m")
-    n, order = len(xy_mm), hilbert_order(xy_mm)
+    n, order = len(xy_mm), strip_order(xy_mm)
     x, y = np.append((xy_mm - low)[order].astype(np.float64), [[np.nan, np.nan]], axis=0).T.copy()
     origin, twin = np.empty(8 * n, np.int32), np.empty(8 * n, np.int32)
     n_facets, duplicate = insert_all(x, y, origin, twin)

@@ -1,11 +1,13 @@
 """Delaunay triangulation of points on whole millimetres: exact, canonical, incremental.
 
-Points are inserted along a Hilbert curve, every 8^k-th point first, with a walk from the facet of the point before and
+Points are inserted along narrow strips, every 8^k-th point first, with a walk from the facet of the point before and
 Lawson's flips. With the exact predicates and their symbolic perturbation the result is unique: it does not depend on
 the order of the points, and facets whose circumcircles lie in a shared part of two data sets are the same in both.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -19,36 +21,24 @@ from pipeline.tin.predicates import orientation
 MAX_WINDOW_MM = 2_000_000
 """The largest width or depth of one triangulation."""
 
-_HILBERT_BITS = 11  # of each coordinate on the curve: order only, no geometry
 _ROUND_FACTOR = 8  # points of a round over those of the round before
+_STRIP_SPACINGS = 2.0  # width of a strip in mean distances between points: order only, no geometry
 
 
 @kernel
-def _hilbert_keys(xy_mm: IntArray, x_min: int, y_min: int, shift: int) -> IntArray:
-    """Position of each point (n, 2) on the Hilbert curve, (n,)."""
-    n = len(xy_mm)
-    right_of, above = np.empty(n, np.uint32), np.empty(n, np.uint32)
-    for i in range(n):
-        right_of[i], above[i] = (xy_mm[i, 0] - x_min) >> shift, (xy_mm[i, 1] - y_min) >> shift
-    keys = np.empty(n, np.int64)
-    # without branches and in 32 bits, several points at a time are worked on
-    for i in range(n):
-        a, b, key = right_of[i], above[i], np.uint32(0)
-        for bit in range(_HILBERT_BITS - 1, -1, -1):
-            right = (a >> bit) & 1
-            upper = (b >> bit) & 1
-            key = np.uint32((key << 2) | ((3 * right) ^ upper))
-            mirrored = -(right & (1 - upper))
-            a, b = np.uint32(a ^ mirrored), np.uint32(b ^ mirrored)
-            swapped = (a ^ b) & (upper - 1)
-            a, b = np.uint32(a ^ swapped), np.uint32(b ^ swapped)
-        keys[i] = key
+def _strip_keys(xy_mm: IntArray, low: tuple[int, int], high: tuple[int, int], width: float) -> IntArray:
+    """Position of each point (n, 2) along the strips between two corners, (n,): quarters of a strip's width count."""
+    steps = np.int64(4.0 * (high[1] - low[1]) / width)
+    keys = np.empty(len(xy_mm), np.int64)
+    for i in range(len(xy_mm)):
+        strip, step = np.int64((xy_mm[i, 0] - low[0]) / width), np.int64(4.0 * (xy_mm[i, 1] - low[1]) / width)
+        keys[i] = strip * (steps + 1) + (step if strip & 1 == 0 else steps - step)
     return keys
 
 
 @kernel
 def insert_all(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelArray) -> tuple[int, int]:
-    """Triangulate vertices that follow a Hilbert curve; return the number of facets and a duplicate vertex or -1."""
+    """Triangulate vertices in the order of strips; return the number of facets and a duplicate vertex or -1."""
     n = len(x) - 1
     third = 2
     while third < n and orientation(x[0], y[0], x[1], y[1], x[third], y[third]) == 0.0:
@@ -79,16 +69,15 @@ def insert_all(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelArra
     return n_facets, -1
 
 
-def hilbert_order(xy_mm: IntArray) -> LabelArray:
-    """Indices of points, (n,) int32, in the order in which a Hilbert curve passes them; at least one point.
+def strip_order(xy_mm: IntArray) -> LabelArray:
+    """Indices of points, (n,) int32, up one strip from west to east and down the next; at least one point.
 
-    The cells of the curve are the 2^11th part of the extent; points of one cell are ordered by index.
+    Neighbours follow each other, and points sorted by (x, y) stay near the places that they had.
     """
     xy_mm = np.ascontiguousarray(xy_mm)
-    low, high = bounds_of(xy_mm)
-    extent = int((high - low).max())
-    keys = _hilbert_keys(xy_mm, int(low[0]), int(low[1]), max(0, extent.bit_length() - _HILBERT_BITS))
-    return radix_order(keys)
+    low, high = (tuple(corner.tolist()) for corner in bounds_of(xy_mm))
+    spacing = math.sqrt((high[0] - low[0]) * (high[1] - low[1]) / len(xy_mm))
+    return radix_order(_strip_keys(xy_mm, low, high, max(1.0, _STRIP_SPACINGS * spacing)))
 
 
 def triangulate(xy_mm: IntArray) -> Tin:
@@ -117,7 +106,7 @@ def triangulate(xy_mm: IntArray) -> Tin:
     extent = int((high - low).max())
     if extent > MAX_WINDOW_MM:
         raise ValueError(f"points extend over {extent / 1000:.3f} m: triangulate windows of at most 2000 m")
-    order = hilbert_order(xy_mm)
+    order = strip_order(xy_mm)
     x = np.empty(n + 1)
     y = np.empty(n + 1)
     x[:n] = (xy_mm[:, 0] - low[0])[order]

@@ -20,7 +20,7 @@ from pipeline.compiler import kernel
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Tin
 from pipeline.parameters import Parameters, parameter
-from pipeline.tin.delaunay import hilbert_order, unique_xy_ranked
+from pipeline.tin.delaunay import strip_order, unique_xy_ranked
 from pipeline.tin.half_edges import canonical_facets, locate, restore_delaunay, split_facet, start_sphere
 from pipeline.tin.predicates import MAX_EXTENT_MM, orientation
 
@@ -346,8 +346,8 @@ def insert_greedily(points_m: FloatArray, settings: GreedyInsertionSettings, cor
     low, wide = _lower_left_and_extent(xyz_mm, round(settings.margin_m * 1000.0))
     kept, kept_of_point, kept_rank = unique_xy_ranked(xyz_mm[:, :2], xyz_mm[:, 2])
     kept_mm = xyz_mm[kept]
-    along_curve = hilbert_order(kept_mm[:, :2])
-    point = kept[along_curve]
+    along_strips = strip_order(kept_mm[:, :2])
+    point = kept[along_strips]
     n = len(point)
 
     corners_xy = np.array([[0, 0], [wide[0], 0], [wide[0], wide[1]], [0, wide[1]]])
@@ -355,7 +355,7 @@ def insert_greedily(points_m: FloatArray, settings: GreedyInsertionSettings, cor
     y = np.concatenate((xyz_mm[point, 1] - low[1], corners_xy[:, 1], [0])).astype(np.float64)
     z = np.concatenate((xyz_mm[point, 2], np.full(5, round(corner_z_m * 1000.0)))).astype(np.float64)
     rank = np.empty(n + 4, np.int32)
-    rank[:n] = kept_rank[along_curve] + 2
+    rank[:n] = kept_rank[along_strips] + 2
     rank[n:] = [0, n + 2, n + 3, 1]
     surveyed_z = z.copy()
     absorption = _Absorption(

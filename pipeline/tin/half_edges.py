@@ -188,8 +188,7 @@ def canonical_facets(
     """
     n = len(order)
     first_edge = np.full(n_facets, -1, np.int32)
-    smallest = np.full(n_facets, -1, np.int32)
-    starts = np.zeros(n + 1, np.int32)
+    starts = np.zeros(n + 2, np.int32)
     for t in range(n_facets):
         e = 4 * t
         a, b, c = origin[e], origin[e + 1], origin[e + 2]
@@ -204,28 +203,29 @@ def canonical_facets(
             k = 2
             a = c
         first_edge[t] = e + k
-        smallest[t] = a
-        starts[a + 1] += 1
+        starts[a + 2] += 1
     for v in range(n):
-        starts[v + 1] += starts[v]
-    # the facets of each smallest vertex, few, by their second one, which goes before the facet in one whole number
-    n_real = starts[n]
+        starts[v + 2] += starts[v + 1]
+    # the facets of each smallest vertex: its second one goes before the facet in one whole number
+    n_real = starts[n + 1]
     sorted_facets = np.empty(n_real, np.int64)
-    ends = starts[:n].copy()
     for t in range(n_facets):
-        v = smallest[t]
-        if v < 0:
-            continue
-        facet = (np.int64(order[origin[following(first_edge[t])]]) << 32) | t
-        i = ends[v]
-        while i > starts[v] and sorted_facets[i - 1] > facet:
-            sorted_facets[i] = sorted_facets[i - 1]
-            i -= 1
-        sorted_facets[i] = facet
-        ends[v] += 1
+        if first_edge[t] >= 0:
+            v = order[origin[first_edge[t]]]
+            sorted_facets[starts[v + 1]] = (np.int64(order[origin[following(first_edge[t])]]) << 32) | t
+            starts[v + 1] += 1
+    # every start has moved to its end, which is the next one's start; the facets between are few
     number = np.full(n_facets, -1, np.int32)
-    for i in range(n_real):
-        number[sorted_facets[i] & 0xFFFFFFFF] = i
+    for v in range(n):
+        for k in range(starts[v], starts[v + 1]):
+            facet = sorted_facets[k]
+            i = k
+            while i > starts[v] and sorted_facets[i - 1] > facet:
+                sorted_facets[i] = sorted_facets[i - 1]
+                i -= 1
+            sorted_facets[i] = facet
+        for i in range(starts[v], starts[v + 1]):
+            number[sorted_facets[i] & 0xFFFFFFFF] = i
     # facet after facet as they were made: what it refers to is then near in memory
     facets = np.empty((n_real, 3), np.int32)
     neighbours = np.empty((n_real, 3), np.int32)

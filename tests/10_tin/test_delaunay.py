@@ -1,6 +1,7 @@
 """Delaunay triangulation: exact, canonical, complete."""
 
 import itertools
+import math
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.model import IntArray, Tin
-from pipeline.tin.delaunay import triangulate, unique_xy
+from pipeline.tin.delaunay import strip_order, triangulate, unique_xy
 from pipeline.tin.predicates import lies_in_circumcircle, orientation
 
 Point = tuple[int, int]
@@ -186,6 +187,23 @@ def test_the_order_of_points_changes_nothing(seed: int, size: int) -> None:
     xy = random_unique(seed, 120, size)
     turned = np.random.default_rng(seed + 1).permutation(len(xy))
     assert triangles(triangulate(xy), xy) == triangles(triangulate(xy[turned]), xy[turned])
+
+
+@pytest.mark.parametrize(("wide_mm", "deep_mm"), [(100_000, 100_000), (240_000, 25_000), (24_000, 250_000)])
+def test_strips_pass_every_point_once_and_lead_to_near_ones(wide_mm: int, deep_mm: int) -> None:
+    xy = np.random.default_rng(3).integers([500, -700], [500 + wide_mm, deep_mm - 700], (4_000, 2))
+    order = strip_order(xy)
+    assert sorted(order.tolist()) == list(range(len(xy)))
+    steps = np.hypot(*np.diff(xy[order], axis=0).T) / math.sqrt(wide_mm * deep_mm / len(xy))
+    assert steps.mean() < 1.5
+    # at the ends of strips, too
+    assert steps.max() < 6.0
+
+
+@pytest.mark.parametrize("xy", [[[5, 5]], [[5, 5], [5, 9], [5, 7]], [[9, 5], [5, 5], [7, 5]]])
+def test_strips_of_points_in_a_row_follow_it(xy: list[list[int]]) -> None:
+    places = np.array(xy)[strip_order(np.array(xy))]
+    np.testing.assert_array_equal(places, sorted(xy))
 
 
 def test_renumbering_the_points_only_renumbers_the_facets() -> None:

@@ -446,6 +446,22 @@ def test_points_inside_facets_are_assigned_as_a_slow_twin_does() -> None:
     np.testing.assert_array_equal(fragments.sums[:, Sum.POINTS], counts)
 
 
+def test_the_order_of_points_does_not_matter_nor_those_beyond_the_hull() -> None:
+    scene = built(town, seed=12, side_m=30.0)
+    random = np.random.default_rng(12)
+    far = random.random(len(scene.points.x_mm)) < 0.05
+    x = scene.points.x_mm + np.where(far, random.integers(-50_000, 50_000, len(far)), 0)
+    scene = dataclasses.replace(scene, points=scene.points._replace(x_mm=x))
+    fragments, labels = scene.cut()
+    turned = random.permutation(len(x))
+    other, other_labels = dataclasses.replace(scene, points=ScenePoints(*(v[turned] for v in scene.points))).cut()
+    assert (labels >= 0).any()
+    assert (labels[far & (np.abs(x - 15_000) > 16_000)] == -1).all()
+    np.testing.assert_array_equal(other_labels, labels[turned])
+    np.testing.assert_array_equal(other.sums, fragments.sums)
+    np.testing.assert_array_equal(other.lowest_point_mm, fragments.lowest_point_mm)
+
+
 def test_earlier_returns_above_a_surface_are_its_canopy_and_no_points_of_it() -> None:
     scene = built(box, seed=11)
     p = scene.points

@@ -21,13 +21,13 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
 from pipeline.runtime.plan import points_bytes
 from pipeline.runtime.run_context import RunContext
-from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.cleanup import clear_tiles
 from pipeline.runtime.stages.ingested import Ingested, content_by_tile, points_by_tile
 from pipeline.runtime.stages.tile_content import content_of_window
-from pipeline.runtime.stages.window_points import FOLDER, PointState, bucket_paths
+from pipeline.runtime.stages.window_points import FOLDER, PointState, bucket, bucket_paths
 from pipeline.scene import WindowPoints, lattice_of, usable_as_ground
 from pipeline.spatial_hash import first_of_each
 from pipeline.terrain.lattice import NO_DATA, lowest_per_cell
@@ -121,7 +121,7 @@ def find_cells(task: CellsTask, settings: OutlierSettings) -> TileCells:
     """
     task.scratch.check_cancelled()
     core, scratch = task.grid.core(task.tile), task.scratch
-    parts = [np.fromfile(path, POINT) for path in bucket_paths(scratch, task.tile)]
+    parts = [bucket(path) for path in bucket_paths(scratch, task.tile)]
     own, first = _columns_of(parts, core)
     del parts
     around = _around(task, core.grown(math.ceil(settings.support_m * MM)))
@@ -167,7 +167,7 @@ def is_intact(task: CellsTask, found: TileCells, folder: str) -> bool:
 def _around(task: CellsTask, window: Window) -> list[Columns]:
     """The points of other tiles in a window, without duplicates."""
     others = [bucket_paths(task.scratch, other) for other in task.grid.tiles_over(window) if other != task.tile]
-    return [_columns_of([np.fromfile(path, POINT) for path in paths], window)[0] for paths in others if paths]
+    return [_columns_of([bucket(path) for path in paths], window)[0] for paths in others if paths]
 
 
 Columns: TypeAlias = tuple[

@@ -7,7 +7,6 @@ import hashlib
 import math
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon, Polygon
 
@@ -17,7 +16,7 @@ from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import key_of
 from pipeline.runtime.stages.open_fragments import TileSurfaces, open_fragments
 from pipeline.runtime.stages.surroundings import surroundings_of, terrain_around
-from pipeline.runtime.stages.window_points import load_window
+from pipeline.runtime.stages.window_points import LoadedWindow, load_window
 from pipeline.scene import (
     BUILDING_CLASS,
     GROUND_CLASS,
@@ -135,7 +134,7 @@ def split_window(task: SplitTask, settings: SceneSettings) -> Split:
         int((assigned & ~is_building).sum()),
         int((~assigned & is_building).sum()),
     )
-    keys, starts, lowest, outcome = _store(task, loaded.core[index[assigned]], owner[assigned])
+    keys, starts, lowest, outcome = _store(task, loaded, index[assigned], owner[assigned])
     surfaces, footprints = None, None
     if result is None:
         footprints = FootprintPoints(starts=starts, keys=keys, lowest_points_mm=lowest)
@@ -161,26 +160,40 @@ def is_intact(task: SplitTask, figures: SplitFigures, folder: str) -> bool:
     return hashlib.sha256(np.ascontiguousarray(stored).data).hexdigest() == figures.outcome
 
 
-def _store(task: SplitTask, records: npt.NDArray[np.void], owner: IntArray) -> tuple[IntArray, IntArray, IntArray, str]:
-    """Store points sorted by owner; the owners, where each one's points start, their smallest points, and a digest."""
-    order = _order_by_owner(records, owner)
-    records, owner = np.take(records, order), owner[order]
-    task.scratch.put_arrays(f"{task.folder}/{task.tile.key}", {"points": records.view(np.uint8)})
-    keys, starts = np.unique(owner, return_index=True)
+def _store(
+    task: SplitTask, loaded: LoadedWindow, index: IntArray, owner: IntArray
+) -> tuple[IntArray, IntArray, IntArray, str]:
+    """Store points of the core, (n,) indices, sorted by owner.
+
+    Returns the owners, where each one's points start, their smallest points, and a digest.
+    """
+    points = loaded.points
+    order = _order_by_owner(points.x_mm[index], points.y_mm[index], points.z_mm[index], owner)
+    records, owner = np.take(loaded.core, index[order]), owner[order]
+    content = records.view(np.uint8)
+    task.scratch.put_arrays(f"{task.folder}/{task.tile.key}", {"points": content})
+    is_first = np.ones(len(owner), np.bool_)
+    is_first[1:] = owner[1:] != owner[:-1]
+    starts = np.flatnonzero(is_first)
     lowest = np.column_stack([records[name][starts] for name in "xyz"]).astype(np.int64)
-    return keys, np.append(starts, len(owner)).astype(np.int64), lowest, hashlib.sha256(records.tobytes()).hexdigest()
+    return (
+        owner[starts],
+        np.append(starts, len(owner)).astype(np.int64),
+        lowest,
+        hashlib.sha256(content.data).hexdigest(),
+    )
 
 
-def _order_by_owner(records: npt.NDArray[np.void], owner: IntArray) -> IntArray:
+def _order_by_owner(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, owner: IntArray) -> IntArray:
     """Indices that sort points by owner, then x, y and z.
 
     Owner, x and y are packed into one key where a tile is small enough for it: one sort of integers in place of four.
     """
-    if len(records) == 0:
+    if len(owner) == 0:
         return np.empty(0, np.int64)
-    x, y = records["x"] - records["x"].min(), records["y"] - records["y"].min()
+    x, y = x_mm - x_mm.min(), y_mm - y_mm.min()
     if max(int(x.max()), int(y.max())) >> _PLACE_BITS or int(owner.max()) >> (63 - 2 * _PLACE_BITS):
-        return np.lexsort((records["z"], y, x, owner)).astype(np.int64)
+        return np.lexsort((z_mm, y, x, owner)).astype(np.int64)
     key = (owner << 2 * _PLACE_BITS) | (x << _PLACE_BITS) | y
     order = radix_order(key).astype(np.int64)
     key = key[order]
@@ -188,7 +201,7 @@ def _order_by_owner(records: npt.NDArray[np.void], owner: IntArray) -> IntArray:
     if len(tied):
         rows = np.unique(np.concatenate((tied, tied + 1)))
         points = order[rows]
-        order[rows] = points[np.lexsort((points, records["z"][points], key[rows]))]
+        order[rows] = points[np.lexsort((points, z_mm[points], key[rows]))]
     return order
 
 

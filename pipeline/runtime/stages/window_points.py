@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import mmap
 from collections.abc import Iterable, Iterator
 from enum import IntEnum
 from pathlib import Path
@@ -104,7 +105,7 @@ def _buckets(scratch: Scratch, tile: Tile) -> Iterator[tuple[npt.NDArray[np.void
     states = scratch.array(f"{FOLDER}/{tile.key}", "states") if paths else np.empty(0, np.uint8)
     begin = 0
     for path in paths:
-        records = np.fromfile(path, POINT)
+        records = bucket(path)
         yield records, states[begin : begin + len(records)]
         begin += len(records)
 
@@ -112,6 +113,15 @@ def _buckets(scratch: Scratch, tile: Tile) -> Iterator[tuple[npt.NDArray[np.void
 def bucket_paths(scratch: Scratch, tile: Tile) -> list[Path]:
     """The buckets of a tile, in the order of the inputs."""
     return sorted(Path(scratch.root, "points", tile.key).glob("*.bin"))
+
+
+def bucket(path: Path) -> npt.NDArray[np.void]:
+    """The points of a bucket, (n,) POINT, mapped: a window reads all buckets that it meets, and keeps few columns."""
+    with path.open("rb") as stream:
+        if not path.stat().st_size:
+            return np.empty(0, POINT)
+        # a copy on write: kernels take arrays that they may write to, although they only read this one
+        return np.frombuffer(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_COPY), POINT)
 
 
 def folders_of(tiles: Iterable[Tile]) -> set[str]:
