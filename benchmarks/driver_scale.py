@@ -232,7 +232,8 @@ def copied(plan: Plan, copies: int, stride: int) -> Plan:
             # a copy of its own of all that a real plan holds apiece
             own = pickle.loads(pickle.dumps(info))
             path = f"{info.path}{_PATH}{copy}"
-            sources.append(dataclasses.replace(own, path=path, bounds_m=bounds, reference=info.reference))
+            facts = dataclasses.replace(own.facts, crs=info.facts.crs, dimensions=info.facts.dimensions)
+            sources.append(dataclasses.replace(own, path=path, bounds_m=bounds, reference=info.reference, facts=facts))
     return dataclasses.replace(plan, sources=tuple(sources), points=copies * plan.points)
 
 

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import shapely
 
@@ -124,8 +125,7 @@ def make_plan(
             faults.append(fault)
     if faults:
         raise all_at_fault(faults)
-    # one object for all: that of a file that a task looked at is a copy
-    sources = tuple(dataclasses.replace(info, reference=first) if info.reference == first else info for info in sources)
+    sources = _sharing(sources)
     densities = [info.density_per_m2 for info in sources if math.isfinite(info.density_per_m2)]
     density = max(densities, default=1.0)
     halo_m = settings.halo_m
@@ -148,6 +148,23 @@ def make_plan(
         ),
         warnings=tuple(warnings),
     )
+
+
+def _sharing(sources: Sequence[SourceInfo]) -> tuple[SourceInfo, ...]:
+    """The sources with one object for all equal CRS and lists of dimensions: what a task looked at has copies."""
+    reference = sources[0].reference
+    held: dict[object, Any] = {}
+    shared = []
+    for info in sources:
+        crs, dimensions = info.facts.crs, info.facts.dimensions
+        facts = dataclasses.replace(
+            info.facts,
+            crs=None if crs is None else held.setdefault(crs.srs, crs),
+            dimensions=held.setdefault(dimensions, dimensions),
+        )
+        known = reference if info.reference == reference else info.reference
+        shared.append(dataclasses.replace(info, reference=known, facts=facts))
+    return tuple(shared)
 
 
 def wanted_bounds_m(info: SourceInfo, options: ReadOptions) -> tuple[float, float, float, float] | None:
