@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
+import io
 import json
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
@@ -163,9 +164,14 @@ class RunManifest:
         cores = (grid.core(Tile.from_key(key)) for key in keys)
         return [shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM) for core in cores]
 
-    def to_json(self) -> str:
-        """The manifest as JSON text for people and programs."""
-        return json.dumps({"format": FORMAT, **_plain(self)}, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    def to_json(self) -> bytes:
+        """The manifest as JSON for people and programs, UTF-8; no second copy of it is made, since inputs are many."""
+        encoder = json.JSONEncoder(indent=2, ensure_ascii=False, allow_nan=False, default=_plain)
+        written = io.BytesIO()
+        for piece in encoder.iterencode({"format": FORMAT, **_plain(self)}):
+            written.write(piece.encode())
+        written.write(b"\n")
+        return written.getvalue()
 
     @classmethod
     def from_json(cls, text: str, source: str = NAME) -> RunManifest:
@@ -207,21 +213,19 @@ def _input_file(entry: Mapping[str, Any]) -> InputFile:
 
 
 def _plain(value: Any) -> Any:
-    """A value for JSON: dataclasses become objects, times ISO 8601."""
+    """A value that JSON does not know: dataclasses become objects, times ISO 8601."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {str(name): _plain(entry) for name, entry in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(entry) for entry in value]
+        return dict(value)
     if isinstance(value, dt.datetime):
         return value.isoformat()
-    return value
+    raise TypeError(f"a {type(value).__name__} cannot be written as JSON")
 
 
 def write_manifest(run_dir: str | Path, manifest: RunManifest, put: Put | None = None) -> None:
     """Write `run.json` atomically to a local run directory, or by `put`, which stores a file elsewhere."""
-    (put or put_local(run_dir))(NAME, manifest.to_json().encode())
+    (put or put_local(run_dir))(NAME, manifest.to_json())
 
 
 def read_manifest(run_dir: str | Path, filesystem: pafs.FileSystem | None = None) -> RunManifest:
