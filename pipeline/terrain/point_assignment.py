@@ -113,7 +113,8 @@ _STRIP_MM = 1000
 def _along_strips(points: ScenePoints, ground_mm: int) -> LabelArray:
     """Indices of the points that may belong to a surface, up one strip from west to east and down the next.
 
-    Neighbours follow each other, and vertices sorted by (x, y), with their facets, are near in memory.
+    Neighbours follow each other, and vertices sorted by (x, y), with their facets, are near in memory. The points are
+    those of a tile: the strips have a count for each square metre between them.
     """
     x, y = points.x_mm, points.y_mm
     column0, row0 = x.min() // _STRIP_MM, y.min() // _STRIP_MM

@@ -22,7 +22,7 @@ MAX_WINDOW_MM = 2_000_000
 """The largest width or depth of one triangulation."""
 
 _ROUND_FACTOR = 8  # points of a round over those of the round before
-_STRIP_SPACINGS = 2.0  # width of a strip in mean distances between points: order only, no geometry
+_STRIP_SPACINGS = 2.0  # width of a strip in mean distances between points; which facets there are does not depend on it
 
 
 @kernel
@@ -72,7 +72,8 @@ def insert_all(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelArra
 def strip_order(xy_mm: IntArray) -> LabelArray:
     """Indices of points, (n,) int32, up one strip from west to east and down the next; at least one point.
 
-    Neighbours follow each other, and points sorted by (x, y) stay near the places that they had.
+    Neighbours follow each other, and points sorted by (x, y) stay near the places that they had. Where dense clusters
+    lie far apart a strip holds many points: then only sorted ones are near their neighbours.
     """
     xy_mm = np.ascontiguousarray(xy_mm)
     low, high = (tuple(corner.tolist()) for corner in bounds_of(xy_mm))

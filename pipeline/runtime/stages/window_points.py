@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import mmap
+import os
 from collections.abc import Iterable, Iterator
 from enum import IntEnum
 from pathlib import Path
@@ -20,6 +21,9 @@ from pipeline.tiling import Tile, TileGrid, Window
 
 FOLDER = "cells"
 """Folder of scratch with the states of each tile's points."""
+_MAPPED_POINTS = 20_000
+"""A map keeps its file open, and so many inputs may reach into one tile that no process may open all at once: smaller
+buckets are read. A tile holds some millions of points, so few are larger."""
 
 
 class PointState(IntEnum):
@@ -116,12 +120,13 @@ def bucket_paths(scratch: Scratch, tile: Tile) -> list[Path]:
 
 
 def bucket(path: Path) -> npt.NDArray[np.void]:
-    """The points of a bucket, (n,) POINT, mapped: a window reads all buckets that it meets, and keeps few columns."""
+    """The points of a bucket, (n,) POINT; mapped if they are many, since of most of them few columns are wanted."""
     with path.open("rb") as stream:
-        if not path.stat().st_size:
-            return np.empty(0, POINT)
+        size = os.fstat(stream.fileno()).st_size // POINT.itemsize
+        if size < _MAPPED_POINTS:
+            return np.fromfile(stream, POINT)
         # a copy on write: kernels take arrays that they may write to, although they only read this one
-        return np.frombuffer(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_COPY), POINT)
+        return np.frombuffer(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_COPY), POINT, size)
 
 
 def folders_of(tiles: Iterable[Tile]) -> set[str]:
