@@ -354,8 +354,20 @@ def _crowns(
     points = _in_order(x_mm, y_mm, z_mm, members, (x_mm.min(), y_mm.min()))
     # one number for all three counts: of the judged, of the rough among them, and of the pierced
     marks = 1 + ((planar[members] == 0).astype(np.int64) << 20) + (several[members].astype(np.int64) << 40)
+    sums = np.zeros((rows + 1, columns + 1), np.int64)
+    for r in range(rows):
+        for c in range(columns):
+            own = marks[start[r * columns + c] : start[r * columns + c + 1]].sum()
+            sums[r + 1, c + 1] = sums[r + 1, c] + sums[r, c + 1] - sums[r, c] + own
+    widest = 2 << (PLANARITY_SCALES - 1)
     for cell in range(rows * columns):
         r, c = cell // columns, cell % columns
+        south, north = max(r - widest, 0), min(r + widest + 1, rows)
+        west, east = max(c - widest, 0), min(c + widest + 1, columns)
+        around = sums[north, east] - sums[south, east] - sums[north, west] + sums[south, west]
+        # no crown is where nothing is rough, or nothing pierced, as far as the widest sphere looks
+        if (around >> 20) & _COUNT == 0 or around >> 40 == 0:
+            continue
         for m in range(start[cell], start[cell + 1]):
             x, y, z = points[0, m], points[1, m], points[2, m]
             counts, reach, farthest = 0, 2, limit
