@@ -129,8 +129,8 @@ def _drops(
     onward, backward : (n,) int32
         Next cells with data along the direction and against it, -1 where there are none.
     limits : tuple of (strides + 1,) int64
-        By the number of strides, most of which a walk makes before it stands: the highest rise to a cell that it stands
-        on, and the least fall that is no drop, in mm.
+        Two limits in mm for each number of strides, up to the longest walk. A walk stands on a cell that rises no more
+        than the first. A fall is a drop if it is deeper than the second.
     is_up : bool
         Whether the direction leads to later cells.
     """

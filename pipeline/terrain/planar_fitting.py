@@ -187,8 +187,9 @@ def leaning_planes(elevation: Elevations, used: BoolArray, half: int, widest: in
     """The trend at every cell: level and rise of the plane through the used cells of a square around it.
 
     A square that holds fewer used cells than `half`, or all of them to one side, would carry its plane too far: there
-    the square grows. Half sides go from `half` to `widest` cells. Returns the elevation of the plane at the cell in mm,
-    NO_DATA where the largest square holds nothing, and its steepest rise in mm a cell, 0 where there is no plane.
+    the square grows. Half sides go from `half` to `widest` cells. Returns two lattices (rows, columns). The first has
+    the plane's elevation at the cell in mm. It is NO_DATA where the largest square holds nothing. The second has the
+    plane's steepest rise in mm a cell. It is 0 where there is no plane.
     """
     rows, columns = elevation.shape
     level = np.full((rows, columns), NO_DATA, np.int32)
