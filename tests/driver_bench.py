@@ -75,7 +75,7 @@ class Script:
     def run(self, request: Any, on_event: Callable[[Event], None], executor: Any, cancelled: Any) -> RunSummary:
         self.runs += 1
         self.seen.append((request, executor))
-        Path(request.out).mkdir(parents=True)
+        Path(request.out).mkdir(parents=True, exist_ok=True)
         Path(request.out, "run.json").write_text("{}")
         for done in range(4):
             on_event(Event(kind="progress", stage="split", done=done, total=3))
