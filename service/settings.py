@@ -218,9 +218,10 @@ class ServiceSettings(BaseSettings):
         "points are read, and buildings modelled, in other processes.",
     )
     drain_s: float = Field(
-        default=600.0,
+        default=30.0,
         ge=0.0,
-        description="Seconds that running jobs get after SIGTERM; then they go back to the queue.",
+        description="Seconds within which a driver ends after SIGTERM; ten seconds before, jobs that are not done are "
+        "handed back, and their next attempt resumes finished stages.",
     )
     log_json: bool = Field(default=False, description="Log one JSON object per line instead of plain lines.")
     building_timeout_s: float = Field(

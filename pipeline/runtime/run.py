@@ -267,10 +267,6 @@ def run_variants(
             tidy(context.scratch, stages, run_dirs, overridden=request.overrides is not None)
     inputs = _input_files(request, paths, found.ingested, plan)
     # a single run took all the time; of several, each took that of the shared stages and its own
-    if resources.work is None:
-        # the scratch of a run that can be resumed is gone by now
-        for one in runs:
-            one.manifest = dataclasses.replace(one.manifest, request={**one.manifest.request, "work": None})
     outcomes = [one.finish(context, found, inputs, began if len(runs) == 1 else None) for one in runs]
     seconds = time.perf_counter() - began
     progress.tell("finished", "", f"{outcomes[0].summary.counts['candidates']} candidates in {seconds:.1f} s")
@@ -393,6 +389,8 @@ class _VariantRun:
     run_dir: str
     manifest: RunManifest
     progress: Progress
+    keeps_work: bool
+    """Whether the work folder outlives the run; one in which an interrupted run resumes does not."""
     models: Models = dataclasses.field(init=False)
     published: Mapping[Place, Published] = dataclasses.field(init=False)
     without_points: tuple[str, ...] = ()
@@ -428,6 +426,7 @@ class _VariantRun:
                 source_licence=request.licence,
             ),
             progress=progress,
+            keeps_work=request.resources.work is not None,
         )
 
     @property
@@ -508,6 +507,7 @@ class _VariantRun:
         manifest = dataclasses.replace(
             self.manifest,
             status=RunStatus.INCOMPLETE if failed_tiles else RunStatus.FINISHED,
+            request=self.manifest.request if self.keeps_work else {**self.manifest.request, "work": None},
             finished_at=dt.datetime.now(tz=dt.UTC),
             inputs=inputs,
             tiles=tuple(outcome.tile.key for outcome in outcomes),

@@ -12,6 +12,7 @@ import dataclasses
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -95,11 +96,24 @@ class InThisProcess:
 
 
 class InOwnProcess:
-    """Attempts in processes of their own."""
+    """Attempts in processes of their own.
 
-    def __init__(self, shop: DriverParts, name: str) -> None:
+    Parameters
+    ----------
+    shop : DriverParts
+        Settings, folder, store, cluster.
+    name : str
+        Name of the driver.
+    work : callable
+        Called in the process with its order; `attend`, except in tests of processes that go wrong.
+    """
+
+    def __init__(
+        self, shop: DriverParts, name: str, work: Callable[[Order], tuple[str, dict[str, Any]]] = attend
+    ) -> None:
         self._shop = shop
         self._name = name
+        self._work = work
         self._pool = ChildPool(stderr=sys.stderr.fileno())
 
     def preload(self) -> None:
@@ -127,7 +141,7 @@ class InOwnProcess:
         )
         with self._pool.borrowed(held.cancelled, fresh=True, loads=LOADS) as child:
             try:
-                return _Attended(held, child, order, self._shop.cluster).result()
+                return _Attended(held, child, order, self._shop.cluster).result(self._work)
             finally:
                 child.end()
 
@@ -155,11 +169,11 @@ class _Attended:
         self._pulse_ns = 0
         self._ending_s: float | None = None
 
-    def result(self) -> tuple[str, dict[str, Any]]:
+    def result(self, work: Callable[[Order], tuple[str, dict[str, Any]]]) -> tuple[str, dict[str, Any]]:
         """The result of the attempt; raises as `perform`, and AttemptEndedError."""
         kills = system_kills()
         limit = self._limit_bytes + _MARGIN_BYTES
-        for word in self._child.converse(attend, self._order, data_limit_bytes=limit):
+        for word in self._child.converse(work, self._order, data_limit_bytes=limit):
             if isinstance(word, Finished):
                 done: tuple[str, dict[str, Any]] = word.result
                 return done

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
+import math
 import os
 import secrets
 import signal
@@ -16,8 +17,7 @@ from types import FrameType
 
 from pipeline.errors import ClusterError
 from pipeline.schedule import Outcome
-from service.driver.attempt import Tools
-from service.driver.attempt_process import DriverParts, InOwnProcess, InThisProcess, Perform
+from service.driver.attempt_process import DriverParts, InOwnProcess, Perform
 from service.driver.attempts import FIRST_PAUSE_S, LONGEST_PAUSE_S, Attempts
 from service.driver.disk_watch import LOOK_S, DiskWatch
 from service.driver.janitor import tidy
@@ -34,6 +34,8 @@ from service.store import JobStore
 
 TIDY_S = 180.0
 """Seconds between two rounds of the janitor."""
+BEAT_S = 1.0
+"""Seconds between two signs of life for the parent."""
 HAND_BACK_S = 10.0
 """Seconds of the drain that are kept for handing back the jobs that are not done."""
 _GRACE_S = 4.0
@@ -51,9 +53,10 @@ class Driver:
     name : str, optional
         Unique name of this process; made up by default.
     parent_pipe : int, optional
-        A file descriptor: when its other end closes, the parent is gone and the driver ends at once.
-    tools : Tools, optional
-        Other steps of an attempt, for tests; attempts then run in threads of this process.
+        A file descriptor: when its other end closes, the parent is gone and the driver ends at once. Into a socket the
+        driver writes a byte every second as long as it works.
+    perform : callable, optional
+        Makes what does the work of attempts, from the parts of the driver and its name.
     cluster : SharedCluster, optional
         The workers.
     """
@@ -64,7 +67,7 @@ class Driver:
         *,
         name: str | None = None,
         parent_pipe: int | None = None,
-        tools: Tools | None = None,
+        perform: Callable[[DriverParts, str], Perform] = InOwnProcess,
         cluster: SharedCluster | None = None,
     ) -> None:
         self.name = name or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
@@ -74,9 +77,7 @@ class Driver:
         self._cluster = cluster or SharedCluster(settings)
         folder = StateFolder(settings.state.resolve(), settings.reserve_bytes)
         self._shop = DriverParts(settings=settings, folder=folder, store=self._store, cluster=self._cluster)
-        self._perform: Perform = (
-            InOwnProcess(self._shop, self.name) if tools is None else InThisProcess(self._shop, self.name, tools)
-        )
+        self._perform = perform(self._shop, self.name)
         self._held: dict[str, LeasedJob] = {}
         self._busy = 0
         self._lock = threading.Lock()
@@ -90,6 +91,7 @@ class Driver:
         self._stops = 0
         self._parent_gone = False
         self._broken = False
+        self._beaten_s = -math.inf
 
     # --- from outside
 
@@ -168,7 +170,19 @@ class Driver:
 
     def _wait_for_stop(self) -> None:
         while self._stops == 0 and not self._parent_gone and not self._broken:
+            self._beat()
             time.sleep(_TICK_S)
+
+    def _beat(self) -> None:
+        """Let the parent know that this process works: that it gets its turn, and that no thread keeps the lock."""
+        if self._parent_pipe is None or time.monotonic() - self._beaten_s < BEAT_S:
+            return
+        if self._lock.acquire(timeout=BEAT_S):
+            self._lock.release()
+            self._beaten_s = time.monotonic()
+            # a pipe takes no answer; a parent that is gone is noticed elsewhere
+            with contextlib.suppress(OSError):
+                os.write(self._parent_pipe, b".")
 
     def _drain(self) -> bool:
         """Let running jobs finish, or give them back; whether all ended."""
@@ -180,6 +194,7 @@ class Driver:
             out_of_time = time.monotonic() - began_s >= drain_s
             if out_of_time or self._stops > 1 or self._parent_gone:
                 break
+            self._beat()
             time.sleep(_TICK_S)
         self._at_once.set()
         for one in self._all_held():
