@@ -24,7 +24,7 @@ from service.disk import FULL, Disk
 from service.errors import NoSpaceError, TooLargeError
 from service.filenames import clean_filename
 from service.input_policy import checked_url, shown
-from service.pace import LONGEST_LOOK_S, Pace, look_s
+from service.pace import Pace, look_s
 from service.settings import ServiceSettings
 
 ATTEMPTS = 4
@@ -38,6 +38,10 @@ REDIRECTS = frozenset({301, 302, 303, 307, 308})
 MAX_REDIRECTS = 3
 CONNECT_S = 10.0
 """Seconds for the look-up of a host's name and the connection, and as many for the handshake."""
+LOOK_S = 0.25
+"""Longest time in seconds between looks at whether the job was cancelled."""
+REPORT_S = 0.25
+"""Shortest time in seconds between reports of the bytes."""
 BLOCK_BYTES = 1 << 18
 """Bytes that are written at once."""
 
@@ -146,7 +150,7 @@ class _Watch:
         self._cancelled = cancelled
         self._progress = progress
         self._until_s = now_s + settings.max_fetch_s
-        self._look_s = look_s(settings.slow_s, settings.max_fetch_s)
+        self._look_s = min(LOOK_S, look_s(settings.slow_s, settings.max_fetch_s))
         self._reported_s = now_s
         self.pace = Pace.of(settings, now_s)
 
@@ -165,7 +169,7 @@ class _Watch:
     def took(self, count: int) -> None:
         """Count bytes that have arrived."""
         now_s = time.monotonic()
-        if self.pace.took(count, now_s) and now_s - self._reported_s >= LONGEST_LOOK_S:
+        if self.pace.took(count, now_s) and now_s - self._reported_s >= REPORT_S:
             self._reported_s = now_s
             self._progress(self.pace.total_bytes)
 

@@ -6,8 +6,6 @@ from service.settings import ServiceSettings
 
 MOST_LOOKS = 20
 """Looks at a wait within its shortest limit: it ends at most a twentieth later."""
-LONGEST_LOOK_S = 0.25
-"""Seconds between looks at a wait that someone may cancel."""
 
 
 class Pace:
@@ -67,6 +65,6 @@ def look_s(*limits_s: float) -> float:
     """Seconds between looks at a wait with these limits.
 
     >>> look_s(60.0, 3600.0), look_s(0.2)
-    (0.25, 0.01)
+    (3.0, 0.01)
     """
-    return min(LONGEST_LOOK_S, min(limits_s) / MOST_LOOKS)
+    return min(limits_s) / MOST_LOOKS

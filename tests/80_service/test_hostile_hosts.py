@@ -128,7 +128,7 @@ def test_pauses_that_a_host_asks_for_are_short_and_do_not_count_as_slow(
 def test_bytes_are_reported_as_they_come_and_a_trickle_is_not(
     host: HostileHost, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(downloads, "LONGEST_LOOK_S", 0.0)
+    monkeypatch.setattr(downloads, "REPORT_S", 0.0)
     reported: list[int] = []
     settings = ServiceSettings(state=tmp_path, input_hosts=(f"http://{host.origin}",), max_upload_bytes=1_000_000)
     with pytest.raises(TooLargeError):
