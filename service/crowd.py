@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import resource
-from collections import Counter
+from collections import Counter, defaultdict
 from http import HTTPStatus
 from typing import Protocol
 
@@ -15,7 +15,7 @@ from service.rate_limits import counted_as
 from service.settings import ServiceSettings
 
 SPARE = 32
-"""Connections above a limit that are taken, to answer /healthz and to say why nothing else is answered."""
+"""Connections above the limit that are taken, to answer /healthz and to say why nothing else is answered."""
 HEALTH = "/healthz"
 """Path that is always answered."""
 FULL = Kind(status=503, type_uri="about:blank", title=HTTPStatus(503).phrase)
@@ -35,9 +35,9 @@ class Member(Protocol):
 class Crowd:
     """The connections that are open.
 
-    A new one above the limit ends the one that has been idle longest. If none is idle, up to `SPARE` more are taken:
-    they get an answer to /healthz, and 503 to all else. Further ones end at once. Above the limit of one address no
-    idle connection ends: only its own clients suffer.
+    A new one above a limit ends the one that has been idle longest; above that of its address, one of that address. If
+    none is idle, the new one gets an answer to /healthz, and 503 to all else. Such a connection is soon over or idle,
+    so there is always room for one that asks for /healthz.
 
     Parameters
     ----------
@@ -56,6 +56,8 @@ class Crowd:
         self._counts: Counter[str] = Counter()
         self._idle: dict[Member, None] = {}
         """Idle connections, longest first."""
+        self._idle_of: defaultdict[str, dict[Member, None]] = defaultdict(dict)
+        """The same by address."""
         self._refused: set[Member] = set()
 
     @property
@@ -65,40 +67,48 @@ class Crowd:
 
     def enter(self, member: Member, address: str) -> bool:
         """Count a new connection; False if it must end at once."""
-        if self.count >= self.most and self._idle:
-            longest = next(iter(self._idle))
-            self.leave(longest)
-            longest.give_way()
         address = counted_as(address)
-        above = max(self.count + 1 - self.most, self._counts[address] + 1 - self._most_per_address)
-        if above > SPARE:
+        if self._counts[address] >= self._most_per_address:
+            self._make_way(self._idle_of[address])
+        if self.count >= self.most:
+            self._make_way(self._idle)
+        if self.count >= self.most + SPARE:
             return False
         self._addresses[member] = address
         self._counts[address] += 1
-        if above > 0:
+        if self.count > self.most or self._counts[address] > self._most_per_address:
             if not self._refused:
                 _log.warning("too many connections: %d, of them %d from %s", self.count, self._counts[address], address)
             self._refused.add(member)
         return True
 
+    def _make_way(self, idle: dict[Member, None]) -> None:
+        """End the connection that has been idle longest, if there is one."""
+        longest = next(iter(idle), None)
+        if longest is not None:
+            self.leave(longest)
+            longest.give_way()
+
     def leave(self, member: Member) -> None:
         """Count a connection no longer."""
-        address = self._addresses.pop(member, None)
-        self._idle.pop(member, None)
+        self.works(member)
         self._refused.discard(member)
+        address = self._addresses.pop(member, None)
         if address is not None:
             self._counts[address] -= 1
             if not self._counts[address]:
                 del self._counts[address]
+                self._idle_of.pop(address, None)
 
     def idles(self, member: Member) -> None:
         """Note that a connection waits for a request."""
         if member in self._addresses:
-            self._idle[member] = None
+            self._idle[member] = self._idle_of[self._addresses[member]][member] = None
 
     def works(self, member: Member) -> None:
         """Note that a connection has a request."""
-        self._idle.pop(member, None)
+        if self._idle.pop(member, member) is None:
+            del self._idle_of[self._addresses[member]][member]
 
     def app_for(self, member: Member, app: ASGIApp) -> ASGIApp:
         """The application that answers a new connection."""

@@ -183,7 +183,8 @@ class _Watch:
                 f"not fetched within {settings.max_fetch_s:g} s",
                 "Upload the file, or raise GABLEWORK_MAX_FETCH_S",
             )
-        if self.pace.is_slow(now_s):
+        # rather a look early than late
+        if self.pace.is_slow(now_s + self._look_s):
             raise UnreadableInputError(
                 shown(self._url),
                 f"the server sends less than {settings.min_bytes_per_s:g} bytes per second over {settings.slow_s:g} s",

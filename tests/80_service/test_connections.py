@@ -11,13 +11,15 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import httpx
 import pytest
 import uvicorn
 from hypothesis import given
 from hypothesis import strategies as st
-from live_service import DEADLINE_S, answer_to, serving, settings_in
+from live_service import DEADLINE_S, answer_to, raw_request, serving, settings_in
 from processes import wait_for
 from starlette.types import Receive, Scope, Send
+from tus_client import begin, offset_once_free
 from uvicorn.server import ServerState
 
 from service.connections import KEEP_ALIVE_S, TimedConnection, listen, server_config
@@ -350,11 +352,41 @@ def test_without_idle_ones_a_few_more_are_taken_and_the_rest_is_turned_away() ->
     members_of(crowd, 3 + SPARE)
 
 
+def refused_of(crowd: Crowd, members: list[Member]) -> int:
+    """How many get no answer except to /healthz."""
+    app = Endless()
+    return sum(crowd.app_for(member, app) is not app for member in members)
+
+
 def test_one_address_cannot_take_all_connections() -> None:
     crowd = Crowd(ServiceSettings(max_connections=100, max_connections_per_address=5))
-    members_of(crowd, 5 + SPARE, "2001:db8::1", idle=True)
-    assert not crowd.enter(Member(), "2001:db8::2"), "of one network"
-    members_of(crowd, 5, "2001:db8:1::1")
+    busy = members_of(crowd, 5, "2001:db8::1")
+    more = members_of(crowd, 3, "2001:db8::2")
+    assert refused_of(crowd, [*busy, *more]) == 3, "of one network"
+    assert refused_of(crowd, members_of(crowd, 5, "2001:db8:1::1")) == 0
+
+
+def test_an_address_with_too_many_idle_connections_loses_its_own() -> None:
+    crowd = Crowd(ServiceSettings(max_connections=100, max_connections_per_address=5))
+    others = members_of(crowd, 5, "192.0.2.2", idle=True)
+    own = members_of(crowd, 5, idle=True)
+    new = members_of(crowd, 1)
+    assert [one.has_ended for one in own] == [True, False, False, False, False]
+    assert not any(one.has_ended for one in others)
+    assert refused_of(crowd, new) == 0
+
+
+@pytest.mark.parametrize("idle", [True, False])
+def test_there_is_always_room_to_ask_for_the_health(idle: bool) -> None:
+    crowd = Crowd(ServiceSettings(max_connections=50, max_connections_per_address=20))
+    for flood in range(100):
+        # those that are refused get their answer, or wait for a request that never comes
+        for member in members_of(crowd, 10, f"192.0.2.{flood % 3}"):
+            if idle or refused_of(crowd, [member]):
+                crowd.idles(member)
+        asking = Member()
+        assert crowd.enter(asking, "192.0.2.0")
+        crowd.leave(asking)
 
 
 def test_files_are_left_for_all_else(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -398,12 +430,43 @@ def test_a_client_that_does_not_finish_its_request_is_disconnected(sent: bytes, 
         assert received(client).partition(b"\r\n")[0] == (b"HTTP/1.1 408 Request Timeout" if sent else b"")
 
 
-def test_a_body_that_stops_is_disconnected_and_leaves_nothing(tmp_path: Path) -> None:
+FORM = b'--x\r\nContent-Disposition: form-data; name="tiles"; filename="a.xyz"\r\n\r\n1 2 3\n'
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        LINE + b"Content-Length: 1000\r\n\r\n1 2 3\n",
+        LINE.replace(b"uploads?filename=a.xyz", b"jobs")
+        + b"Content-Type: multipart/form-data; boundary=x\r\nContent-Length: 1000\r\n\r\n"
+        + FORM,
+        LINE.replace(b"uploads?filename=a.xyz", b"jobs") + b"Content-Length: 1000\r\n\r\n{",
+    ],
+    ids=["file", "form", "document"],
+)
+def test_a_body_that_stops_is_disconnected_and_leaves_nothing(sent: bytes, tmp_path: Path) -> None:
     settings = settings_in(tmp_path, silent_s=IMPATIENT_S)
     with serving(settings) as url, connected(url) as client:
-        client.sendall(LINE + b"Content-Length: 1000\r\n\r\n1 2 3\n")
+        client.sendall(sent)
         assert received(client).startswith(b"HTTP/1.1 408 ")
-    assert not list((settings.state / "uploads").iterdir())
+        wait_for(lambda: not list((settings.state / "uploads").iterdir()), "the removal")
+
+
+def test_a_part_of_a_resumable_upload_that_stops_is_kept(tmp_path: Path) -> None:
+    settings = settings_in(tmp_path, silent_s=0.5)
+    with serving(settings) as url, httpx.Client(base_url=url, timeout=DEADLINE_S) as web:
+        place = urlsplit(begin(web)).path
+        with raw_request(
+            url,
+            f"PATCH {place}",
+            b"1 2 3\n",
+            Tus_Resumable="1.0.0",
+            Upload_Offset="0",
+            Content_Type="application/offset+octet-stream",
+            Content_Length="1000",
+        ) as client:
+            assert received(client).startswith(b"HTTP/1.1 408 ")
+        assert offset_once_free(web, place) == 6
 
 
 def test_a_slow_client_may_go_on_as_long_as_it_sends(tmp_path: Path) -> None:
@@ -414,9 +477,10 @@ def test_a_slow_client_may_go_on_as_long_as_it_sends(tmp_path: Path) -> None:
 
 
 def test_the_health_of_a_full_service_can_be_asked(tmp_path: Path) -> None:
-    with serving(settings_in(tmp_path, max_connections_per_address=1)) as url, connected(url) as client:
-        client.sendall(GET)
-        assert client.recv(65_536).startswith(b"HTTP/1.1 200")
+    settings = settings_in(tmp_path, max_connections_per_address=1)
+    with serving(settings) as url, connected(url) as client:
+        client.sendall(HEAD + b"1 2 3\n")
+        wait_for(lambda: list((settings.state / "uploads").iterdir()), "the upload")
         assert answer_to(url, "GET /healthz").startswith(b"HTTP/1.1 200")
         refused = answer_to(url, "GET /jobs")
     assert refused.startswith(b"HTTP/1.1 503")
