@@ -1,12 +1,13 @@
 """Hosts and clients that are slow on purpose, against `gablework serve`: how long each keeps a slot or a connection.
 
-    python benchmarks/hostile_hosts.py [--tempers body,headers] [--cancel-after 3] [--only hosts|cancel|clients]
+    python benchmarks/hostile_hosts.py [--tempers body,headers] [--cancel-after 3] [--only hosts|cancel|clients|flood]
 
 - hosts: for each temper of `tests/hostile_host.py` a job whose tile is at such a host (a byte a second), and the
   seconds until it has ended and a job that waited for its slot runs. The driver has one slot.
 - cancel: the same, but the job is dismissed by DELETE a few seconds after it began.
 - clients: connections that send a head, a body or nothing, or read an answer, a byte a second; and an upload with 2 kB
   per second, which must live.
+- flood: more connections than the service takes, half of them in the middle of a body, and how long /healthz takes.
 
 All of it stays on loopback.
 """
@@ -19,6 +20,7 @@ import json
 import os
 import signal
 import socket
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -41,6 +43,7 @@ LONGEST_S = 400.0
 """Seconds after which a wait counts as endless."""
 SLOW_BYTES_PER_S = 2000
 SLOW_UPLOAD_S = 130
+FLOOD = 2000
 OVER = {"successful", "failed", "dismissed"}
 
 
@@ -195,12 +198,37 @@ def measured_clients(url: str) -> None:
     print(f"/healthz meanwhile: {1e3 * slowest:.0f} ms at most")
 
 
+def measured_flood(url: str) -> None:
+    """Print how long /healthz takes beside more connections than the service takes."""
+    place = urlsplit(url)
+    post = (
+        f"POST /uploads?filename=a.xyz HTTP/1.1\r\nHost: {place.netloc}\r\nContent-Length: 100000000\r\n\r\n1".encode()
+    )
+    with contextlib.ExitStack() as stack:
+        ended = 0
+        for number in range(FLOOD):
+            try:
+                link = stack.enter_context(socket.create_connection((place.hostname, place.port)))
+                link.sendall(post if number % 2 else b"GET /")
+            except OSError:
+                ended += 1
+        took_s = []
+        for _ in range(50):
+            began_s = time.monotonic()
+            httpx.get(f"{url}/healthz").raise_for_status()
+            took_s.append(time.monotonic() - began_s)
+        other = httpx.get(f"{url}/jobs").status_code
+    median_s = statistics.median(took_s)
+    print(f"{FLOOD} connections, {ended} ended while they were opened; /jobs answers {other}")
+    print(f"/healthz 50 times: median {1e3 * median_s:.0f} ms, {1e3 * max(took_s):.0f} ms at most")
+
+
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tempers", default=",".join(TEMPERS))
     parser.add_argument("--cancel-after", type=float, default=3.0, metavar="S")
-    parser.add_argument("--only", choices=("hosts", "cancel", "clients"))
+    parser.add_argument("--only", choices=("hosts", "cancel", "clients", "flood"))
     options = parser.parse_args()
     tempers = options.tempers.split(",")
     with hostile_host() as host, tempfile.TemporaryDirectory() as folder:
@@ -210,6 +238,8 @@ def main() -> None:
                 measured_hosts(url, host, tempers, options.cancel_after)
             if options.only in {None, "clients"}:
                 measured_clients(url)
+            if options.only in {None, "flood"}:
+                measured_flood(url)
             if options.only in {None, "hosts"}:
                 measured_hosts(url, host, tempers, None)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 import resource
+import time
 from collections import Counter, defaultdict
 from http import HTTPStatus
 from typing import Protocol
@@ -21,6 +23,8 @@ HEALTH = "/healthz"
 FULL = Kind(status=503, type_uri="about:blank", title=HTTPStatus(503).phrase)
 """The answer to a request over a connection above a limit."""
 RETRY_AFTER_S = 5
+WARNINGS_S = 60.0
+"""Seconds between warnings of too many connections."""
 
 _log = logging.getLogger("gablework.service")
 
@@ -59,6 +63,7 @@ class Crowd:
         self._idle_of: defaultdict[str, dict[Member, None]] = defaultdict(dict)
         """The same by address."""
         self._refused: set[Member] = set()
+        self._next_warning_s = -math.inf
 
     @property
     def count(self) -> int:
@@ -77,10 +82,16 @@ class Crowd:
         self._addresses[member] = address
         self._counts[address] += 1
         if self.count > self.most or self._counts[address] > self._most_per_address:
-            if not self._refused:
-                _log.warning("too many connections: %d, of them %d from %s", self.count, self._counts[address], address)
             self._refused.add(member)
+            self._warn(address)
         return True
+
+    def _warn(self, address: str) -> None:
+        """Say that there are too many, now and then: a client that opens many must not fill the log."""
+        now_s = time.monotonic()
+        if now_s >= self._next_warning_s:
+            self._next_warning_s = now_s + WARNINGS_S
+            _log.warning("too many connections: %d, of them %d from %s", self.count, self._counts[address], address)
 
     def _make_way(self, idle: dict[Member, None]) -> None:
         """End the connection that has been idle longest, if there is one."""

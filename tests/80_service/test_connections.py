@@ -376,6 +376,14 @@ def test_an_address_with_too_many_idle_connections_loses_its_own() -> None:
     assert refused_of(crowd, new) == 0
 
 
+def test_many_connections_do_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    crowd = Crowd(ServiceSettings(max_connections=5))
+    for _ in range(10):
+        for member in members_of(crowd, 10):
+            crowd.leave(member)
+    assert caplog.text.count("too many connections: 6, of them 6 from 192.0.2.1") == 1
+
+
 @pytest.mark.parametrize("idle", [True, False])
 def test_there_is_always_room_to_ask_for_the_health(idle: bool) -> None:
     crowd = Crowd(ServiceSettings(max_connections=50, max_connections_per_address=20))
