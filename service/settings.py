@@ -188,9 +188,10 @@ class ServiceSettings(BaseSettings):
         description="Seconds between a driver's checks for work and for dismissals.",
     )
     drain_s: float = Field(
-        default=600.0,
+        default=30.0,
         ge=0.0,
-        description="Seconds that running jobs get after SIGTERM; then they go back to the queue.",
+        description="Seconds that running jobs get after SIGTERM; then they are handed back, and their next attempt resumes "
+        "finished stages.",
     )
     log_json: bool = Field(default=False, description="Log one JSON object per line instead of plain lines.")
     building_timeout_s: float = Field(
