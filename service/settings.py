@@ -190,8 +190,8 @@ class ServiceSettings(BaseSettings):
     drain_s: float = Field(
         default=30.0,
         ge=0.0,
-        description="Seconds that running jobs get after SIGTERM; then they are handed back, and their next attempt resumes "
-        "finished stages.",
+        description="Seconds that running jobs get after SIGTERM; then they are handed back, and their next attempt "
+        "resumes finished stages.",
     )
     log_json: bool = Field(default=False, description="Log one JSON object per line instead of plain lines.")
     building_timeout_s: float = Field(

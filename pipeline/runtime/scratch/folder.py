@@ -24,7 +24,7 @@ from uuid import uuid4
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import RunCancelledError
+from pipeline.errors import RunCancelledError, RunOverError
 
 POINT = np.dtype(
     [
@@ -89,7 +89,7 @@ class Scratch:
             (folder / self.attempt).touch()
 
     def path(self, *parts: str) -> Path:
-        """A path inside; its folder exists afterwards. Raises RunCancelledError if scratch, and the run, is gone."""
+        """A path inside; its folder exists afterwards. Raises RunOverError if scratch, and the run, is gone."""
         path = os.path.join(self.root, *parts)  # noqa: PTH118 - a Path takes longer
         folder = os.path.dirname(path)  # noqa: PTH120
         if not os.path.isdir(folder):  # noqa: PTH112
@@ -102,7 +102,7 @@ class Scratch:
             for above in reversed(Path(folder, "any").relative_to(self.root).parents[:-1]):
                 Path(self.root, above).mkdir(exist_ok=True)
         except FileNotFoundError:
-            raise RunCancelledError(f"{self.root} is gone: the run is over") from None
+            raise RunOverError(f"{self.root} is gone: the run is over") from None
 
     def put_arrays(self, name: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
         """Store arrays, one file each under the folder `name`, so that they can be mapped."""
@@ -183,9 +183,12 @@ class Scratch:
         return self.has(_CANCELLED) or not self.has(".")
 
     def check_cancelled(self) -> None:
-        """Raise `RunCancelledError` in a task of a run that was cancelled."""
-        if self.cancelled:
+        """Raise `RunCancelledError` in a task of a run that was cancelled, `RunOverError` where its mark is gone."""
+        if not self.cancelled:
+            return
+        if not self.attempt and self.has(_CANCELLED):
             raise RunCancelledError("the run was cancelled")
+        raise RunOverError(f"the run in {self.root} is over: it was cancelled, or the folder was removed")
 
 
 @dataclasses.dataclass(frozen=True)

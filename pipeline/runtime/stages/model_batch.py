@@ -257,7 +257,8 @@ def _loads(task: BatchTask) -> tuple[str, ...]:
 
 
 def _cancelled(task: BatchTask) -> bool:
-    return task.scratch.cancelled
+    task.scratch.check_cancelled()  # its error says more than a yes would
+    return False
 
 
 def model_site(task: BatchTask, site: CandidateSite) -> Packed:
