@@ -285,3 +285,5 @@ def test_the_wheel_of_the_image_holds_all_modules_and_the_page(image: Image, roo
     wanted = {path.relative_to(source).as_posix() for path in paths if path.is_file()}
     assert len(wanted) > 100
     assert wanted - held == set()
+    licences = {name.partition(".dist-info/licenses/")[2] for name in held}
+    assert {"LICENSE", "THIRD_PARTY_NOTICES.md"} <= licences
