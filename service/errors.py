@@ -29,6 +29,7 @@ ServiceError
 ├── NotReplayableError       a delivery that is being sent, or whose webhook is gone
 ├── ChangedMeanwhileError    the record has changed since the client read it
 ├── LeaseLostError           a driver's claim on a job has passed to another
+├── AttemptEndedError        the process of an attempt ended before the attempt
 ├── StoreError               the database does not answer, or is not migrated
 │   ├── StoreBusyError       others hold its locks for too long
 │   ├── StoreNewerError      a newer version has migrated it
@@ -44,6 +45,18 @@ from collections.abc import Sequence
 
 class ServiceError(Exception):
     """Base of the service's own errors."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Survive pickling between the processes of a driver, whatever a class takes."""
+        return _again, (type(self), self.args, self.__dict__)
+
+
+def _again(kind: type[ServiceError], arguments: tuple[object, ...], members: dict[str, object]) -> ServiceError:
+    """An error as it was pickled, without the call of its class."""
+    error = kind.__new__(kind, *arguments)
+    error.args = arguments
+    error.__dict__.update(members)
+    return error
 
 
 class NoSuchJobError(ServiceError):
@@ -257,6 +270,37 @@ class StoreFullError(StoreError):
 
 class LeaseLostError(ServiceError):
     """A driver's claim on a job has passed to another driver, or the job is over."""
+
+
+class AttemptEndedError(ServiceError):
+    """The process of an attempt ended, or was ended, before the attempt.
+
+    Parameters
+    ----------
+    detail : str
+        What happened, in words that follow the name of the attempt.
+    is_own : bool
+        Whether the attempt itself is the cause: it stood still, took too much memory, or met a signal of its own. One
+        that was killed from outside is not.
+    """
+
+    def __init__(self, detail: str, *, is_own: bool) -> None:
+        self.is_own = is_own
+        super().__init__(detail)
+
+
+class UnexpectedError(ServiceError):
+    """An exception that was not raised on purpose, of another process, which has logged it.
+
+    Parameters
+    ----------
+    kind : str
+        Name of its class.
+    """
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        super().__init__(kind)
 
 
 class StartUpError(ServiceError):

@@ -60,6 +60,8 @@ class Fault(StrEnum):
     """There is no cluster, or it was lost repeatedly."""
     LOST = "lost"
     """Drivers died repeatedly during the job."""
+    STALLED = "stalled"
+    """Its attempts stood still, or ended by themselves, again and again."""
     NO_SPACE = "no-space"
     """The disk had no room for it, repeatedly."""
     INTERNAL = "internal"
@@ -220,6 +222,12 @@ class Job:
     """Number of claims; names the folder of the attempt."""
     lost_attempts: int = 0
     """Attempts whose driver or cluster was lost; too many of them end the job."""
+    own_ends: int = 0
+    """Attempts in a row that stood still, or ended by themselves, at stage `own_end_stage`; too many end the job."""
+    own_end_stage: str = ""
+    """The stage of the last of them."""
+    outside_ends: int = 0
+    """Attempts whose process was killed from outside."""
     lease_owner: str | None = None
     """Name of the driver that holds it."""
     lease_until: dt.datetime | None = None
@@ -236,6 +244,18 @@ class Job:
     """The span of the request that made it, as the header of that name; None without traces."""
     watched_at: dt.datetime | None = None
     """When a client last read the buildings that it had so far; not written every time."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EndedAttempt:
+    """An attempt whose process ended, or was ended, before the attempt."""
+
+    stage: str
+    """The stage that ran."""
+    detail: str
+    """What happened, in words that follow the name of the attempt."""
+    is_own: bool
+    """Whether the attempt itself is the cause; False if it was killed from outside."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

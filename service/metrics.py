@@ -38,6 +38,11 @@ class _Jobs(Collector):
             "Longest wait of a job in the queue; 0 if none waits.",
             value=self._oldest_s(counts.get(JobStatus.ACCEPTED, 0)),
         )
+        yield GaugeMetricFamily(
+            "gablework_stalled_jobs",
+            "Running jobs that make no progress, and whose process was not ended yet.",
+            value=len(self._store.stalled()),
+        )
         states, slots = self._store.schedules.counts()
         schedules = GaugeMetricFamily("gablework_schedules", "Schedules by state.", labels=["state"])
         for state, count in states.items():

@@ -154,6 +154,7 @@ FAILURES: Mapping[Fault, Kind] = {
     Fault.REFUSED: Kind(status=422, type_uri=f"{OWN}job-failed-refused", title="An input is not allowed or too large"),
     Fault.CLUSTER: Kind(status=503, type_uri=f"{OWN}job-failed-cluster", title="The cluster was away or lost"),
     Fault.LOST: Kind(status=503, type_uri=f"{OWN}job-failed-lost", title="Drivers were lost over the job"),
+    Fault.STALLED: Kind(status=500, type_uri=f"{OWN}job-failed-stalled", title="The job stood still again and again"),
     Fault.NO_SPACE: Kind(status=507, type_uri=f"{OWN}job-failed-no-space", title="The disk had no room for the job"),
     Fault.INTERNAL: Kind(status=500, type_uri=f"{OWN}job-failed-internal", title="A fault of the service"),
 }

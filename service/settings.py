@@ -180,18 +180,48 @@ class ServiceSettings(BaseSettings):
         allow_inf_nan=False,
         description="Seconds after which a silent driver's job passes to another.",
     )
-    max_attempts: int = Field(default=3, ge=1, description="Number of lost drivers after which a job fails.")
+    max_attempts: int = Field(
+        default=3,
+        ge=1,
+        description="Number of lost drivers after which a job fails; also of attempts that stood still, or ended by "
+        "themselves, in the same stage.",
+    )
     poll_s: float = Field(
         default=0.5,
         gt=0.0,
         allow_inf_nan=False,
         description="Seconds between a driver's checks for work and for dismissals.",
     )
+    stall_s: float = Field(
+        default=600.0,
+        gt=0.0,
+        allow_inf_nan=False,
+        description="Seconds without any progress of a job (a file, a task, a building) after which its process is "
+        "ended and the job tried again. Stages whose steps take longer have limits of their own.",
+    )
+    stop_s: float = Field(
+        default=5.0,
+        gt=0.0,
+        le=600.0,
+        description="Seconds that the process of a job gets to stop, after a dismissal or SIGTERM; then it is ended.",
+    )
+    stalled_days: float = Field(
+        default=30.0,
+        ge=0.0,
+        le=36_500.0,
+        description="Days for which the inputs are kept of a job that failed since it stood still again and again.",
+    )
+    attempt_memory_bytes: int = Field(
+        default=4 * _GIB,
+        ge=_GIB,
+        description="Resident memory at which the process of a job is stopped. It plans, and reads vector files; "
+        "points are read, and buildings modelled, in other processes.",
+    )
     drain_s: float = Field(
         default=30.0,
         ge=0.0,
-        description="Seconds that running jobs get after SIGTERM; then they are handed back, and their next attempt "
-        "resumes finished stages.",
+        description="Seconds within which a driver ends after SIGTERM; ten seconds before, jobs that are not done are "
+        "handed back, and their next attempt resumes finished stages.",
     )
     log_json: bool = Field(default=False, description="Log one JSON object per line instead of plain lines.")
     building_timeout_s: float = Field(

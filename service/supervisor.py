@@ -36,8 +36,17 @@ LONGEST_PAUSE_S = 5.0
 STEADY_S = 60.0
 """Seconds after which a driver counts as steady: if it dies, the pauses begin anew."""
 
-GRACE_S = 30.0
+GRACE_S = 10.0
 """Seconds that a driver gets for its own end, in addition to those for draining."""
+
+SILENT_S = 30.0
+"""Seconds without a sign of life after which a driver is killed: it is stopped, or one of its threads keeps the others
+from working. Its jobs go on in the next one."""
+
+START_S = 120.0
+"""Seconds until the first sign of life, on a busy machine with cold caches."""
+
+_TICK_S = 0.2
 
 _log = logging.getLogger("gablework.serve")
 
@@ -85,8 +94,8 @@ class Supervisor:
     Parameters
     ----------
     command : sequence of str
-        Starts a driver; its unique name is appended. Its standard input is a pipe that closes when this process ends in
-        any way.
+        Starts a driver; its unique name is appended. Its standard input is a socket that closes when this process ends
+        in any way, and takes a byte every second as a sign of life.
     environment : mapping
         Its environment.
     on_death : callable
@@ -99,6 +108,7 @@ class Supervisor:
         self._on_death = on_death
         self._name = ""
         self._child: subprocess.Popen[bytes] | None = None
+        self._signs: socket.socket | None = None
         # a signal handler may take it while this thread holds it
         self._lock = threading.RLock()
         self._ending = threading.Event()
@@ -128,14 +138,20 @@ class Supervisor:
             if not self._ending.is_set():
                 self._name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
                 command = [*self._command, self._name]
-                self._child = subprocess.Popen(command, env=self._environment, stdin=subprocess.PIPE)  # noqa: S603
+                ours, theirs = socket.socketpair()
+                ours.settimeout(_TICK_S)
+                with theirs:
+                    self._child = subprocess.Popen(command, env=self._environment, stdin=theirs.fileno())  # noqa: S603
+                if self._signs is not None:
+                    self._signs.close()
+                self._signs = ours
 
     def _keep(self) -> None:
         while not self._ending.is_set():
             began = time.monotonic()
             child = self._child
             assert child is not None
-            code = child.wait()
+            code = self._watched(child)
             if self._ending.is_set():
                 return
             self.deaths = 1 if time.monotonic() - began > STEADY_S else self.deaths + 1
@@ -145,6 +161,29 @@ class Supervisor:
             if self._ending.wait(wait_s):
                 return
             self._launch()
+
+    def _watched(self, child: subprocess.Popen[bytes]) -> int:
+        """The return code of a driver, which is killed if it gives no sign of life for too long."""
+        signs, silent_s = self._signs, SILENT_S - START_S
+        assert signs is not None
+        while child.poll() is None:
+            began_s = time.monotonic()
+            try:
+                if signs.recv(4096):
+                    silent_s = 0.0
+                    continue
+                # its end is closed: it ends, or has broken off
+                time.sleep(_TICK_S)
+            except TimeoutError:
+                pass
+            # if this process was stopped, too, that time says nothing about the driver
+            silent_s += min(time.monotonic() - began_s, 2.0 * _TICK_S)
+            if silent_s > SILENT_S and not self._ending.is_set():
+                _log.error(
+                    "the driver gave no sign of life for %.0f s and is killed; its jobs go on in another", silent_s
+                )
+                child.kill()
+        return child.wait()
 
     def ask_to_end(self) -> None:
         """Ask the driver once to finish its jobs and end; a second signal would end it at once."""

@@ -15,6 +15,8 @@ from pipeline.runtime.compare import CompareRequest, CompareSummary
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.run import RunSummary
 from service.driver.attempt import Tools
+from service.driver.attempt_child import Order
+from service.driver.attempt_process import DriverParts, InOwnProcess, InThisProcess, Perform
 from service.driver.process import Driver
 from service.driver.shared_cluster import SharedCluster
 from service.fetching import Fetched, JobFiles
@@ -34,6 +36,11 @@ class Engine:
 
     started = 0
     stopped = 0
+    address = "tcp://127.0.0.1:1"
+    embedded = True
+
+    def mend(self, workers: int) -> None:
+        """Nothing to mend."""
 
     def executor(self, priority: int = 0) -> Any:
         return SimpleNamespace(priority=priority)
@@ -75,7 +82,7 @@ class Script:
     def run(self, request: Any, on_event: Callable[[Event], None], executor: Any, cancelled: Any) -> RunSummary:
         self.runs += 1
         self.seen.append((request, executor))
-        Path(request.out).mkdir(parents=True)
+        Path(request.out).mkdir(parents=True, exist_ok=True)
         Path(request.out, "run.json").write_text("{}")
         for done in range(4):
             on_event(Event(kind="progress", stage="split", done=done, total=3))
@@ -131,8 +138,10 @@ class Bench:
         self.patch = patch
         self.script = Script()
         self.tools: dict[str, Any] = {}
+        self.work: Callable[[Order], tuple[str, dict[str, Any]]] | None = None
+        """What processes of attempts do in place of the script, which runs in threads of this process."""
         self.settings = ServiceSettings(
-            state=folder, poll_s=0.02, lease_s=30.0, driver_jobs=1, drain_s=30.0, max_attempts=3
+            state=folder, poll_s=0.02, lease_s=30.0, driver_jobs=1, drain_s=40.0, max_attempts=3
         )
         self.store = JobStore(with_tables(self.settings.database))
         self.folder = StateFolder(folder.resolve())
@@ -144,7 +153,14 @@ class Bench:
         scripted = {name: getattr(self.script, name) for name in SCRIPTED}
         tools = Tools(**(scripted | self.tools))
         cluster = SharedCluster(settings, Engine)
-        driver = Driver(settings, name=f"d{len(self._running)}", parent_pipe=parent_pipe, tools=tools, cluster=cluster)
+
+        def perform(shop: DriverParts, name: str) -> Perform:
+            if self.work is not None:
+                return InOwnProcess(shop, name, self.work)
+            return InThisProcess(shop, name, tools)
+
+        name = f"d{len(self._running)}"
+        driver = Driver(settings, name=name, parent_pipe=parent_pipe, perform=perform, cluster=cluster)
         thread = threading.Thread(target=lambda: self.codes.append(driver.run()), daemon=True)
         self._running.append((driver, thread))
         thread.start()

@@ -24,6 +24,7 @@ from pipeline.runtime.resources import Resources
 from pipeline.runtime.run_context import RunContext, run_context
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
+from pipeline.runtime.scratch.location import resumable_scratch
 from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest
@@ -79,7 +80,7 @@ class ClassifyRequest:
     raster_cell: float | None = None
     """Side of their cells in units of the CRS; None for half a metre."""
     resources: Resources = dataclasses.field(default_factory=Resources)
-    """What the command runs with; scratch lies in `out`, and no work folder is used."""
+    """What the command runs with; scratch lies in `out`, and no other work folder is used."""
     overwrite: bool = False
     """Replace files of the same names."""
 
@@ -166,7 +167,7 @@ def classify(
         plan,
         progress,
         request.resources,
-        _scratch(out),
+        resumable_scratch(str(out / _SCRATCH)) if request.resources.resume else _scratch(out),
         dataclasses.replace(expected(plan, 0), models=False),
         loads=loads_of("classify", footprints=footprints is not None),
         executor=executor,

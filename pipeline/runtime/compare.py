@@ -202,6 +202,6 @@ def _checked(request: RunRequest) -> Path:
         raise RunError(f"{out} is not empty ({left[0]} …): give another --out, or --overwrite")
     # an interrupted comparison has no summary, and only files that a comparison writes
     strange = [name for name in left if name not in (RUNS, _SCRATCH, *_WRITTEN) and not name.startswith(".")]
-    if left and SUMMARY not in left and (strange or RUNS not in left):
+    if left and SUMMARY not in left and (strange or not {RUNS, _SCRATCH}.intersection(left)):
         raise RunError(f"{out} holds {(strange or left)[0]} and is no comparison: give another --out")
     return out

@@ -20,6 +20,7 @@ from pipeline.runtime.monitoring.events import Watch, never
 from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.plan import Plan, check_places, make_plan, without_far_files
 from pipeline.runtime.resources import Resources
+from pipeline.runtime.scratch.location import SCRATCH
 from pipeline.settings import RunSettings
 
 
@@ -62,6 +63,13 @@ class RunRequest:
     """Licence of the source data, in the user's words."""
     overwrite: bool = False
     """Replace an earlier run in `out`."""
+
+    @property
+    def work(self) -> str | None:
+        """The folder that stores the outcomes of tasks beyond the run; None if nothing is stored."""
+        if self.resources.work is None and self.resources.resume:
+            return str(Path(self.out).resolve() / SCRATCH)
+        return self.resources.work
 
 
 def plan_inputs(
@@ -122,7 +130,7 @@ def request_record(request: RunRequest) -> dict[str, object]:
         "guides": request.guides,
         "overrides": request.overrides,
         "aoi": request.aoi,
-        "work": request.resources.work,
+        "work": request.work,
     }
     return {
         **{name: None if path is None else _whole(path) for name, path in files.items()},

@@ -40,8 +40,9 @@ from pipeline.runtime.overrides.overrides_file import Override, read_overrides
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
 from pipeline.runtime.run_context import RunContext, run_context
+from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_results
-from pipeline.runtime.scratch.location import check_scratch, run_scratch
+from pipeline.runtime.scratch.location import check_scratch, resumable_scratch, run_scratch
 from pipeline.runtime.scratch.outcomes import Place
 from pipeline.runtime.scratch.work_folder import is_known, locked_work
 from pipeline.runtime.stages.apply_overrides import apply_overrides
@@ -207,8 +208,8 @@ def run_variants(
         Files about an earlier run, removed together with its results.
     """
     started_at, began = dt.datetime.now(tz=dt.UTC), time.perf_counter()
-    resources, settings = request.resources, variants[0].settings_in(request.settings)
-    if resources.work is None:
+    resources, settings, work = request.resources, variants[0].settings_in(request.settings), request.work
+    if work is None:
         check_scratch(request.out, resources.scratch, resources.scheduler)
     for variant in variants:
         storage_at(variant.out)  # refuses a URL of no storage before anything is read
@@ -232,13 +233,13 @@ def run_variants(
         for one in runs:
             one.check_same = locks.enter_context(locked_results(one.run_dir))
             # the process that held it a moment ago may have left something
-            check_out(one.run_dir, overwrite=request.overwrite, work=resources.work)
+            check_out(one.run_dir, overwrite=request.overwrite, work=work)
         context = locks.enter_context(
             run_context(
                 plan,
                 progress,
                 resources,
-                run_scratch(request.out, resources.scratch) if resources.work is None else locked_work(resources.work),
+                _scratch_of(request),
                 expected(plan, None if footprints is None else len(footprints.polygons)),
                 loads=loads_of("reconstruct", footprints=footprints is not None, method=settings.general.method),
                 executor=executor,
@@ -247,9 +248,7 @@ def run_variants(
         )
         # all checks passed: only now are results of an earlier run removed
         for one in runs:
-            one.begin(
-                footprints, guides, resources.work, points=request.points, terrain=settings.general.terrain != "none"
-            )
+            one.begin(footprints, guides, work, points=request.points, terrain=settings.general.terrain != "none")
         for path in outdated:
             path.unlink(missing_ok=True)
         try:
@@ -275,6 +274,15 @@ def run_variants(
     seconds = time.perf_counter() - began
     progress.tell("finished", "", f"{outcomes[0].summary.counts['candidates']} candidates in {seconds:.1f} s")
     return outcomes
+
+
+def _scratch_of(request: RunRequest) -> contextlib.AbstractContextManager[Scratch]:
+    """Scratch that ends with the run, outlives it, or stays if the run is interrupted."""
+    if request.resources.work is not None:
+        return locked_work(request.resources.work)
+    if request.work is not None:
+        return resumable_scratch(request.work)
+    return run_scratch(request.out, request.resources.scratch)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -384,6 +392,8 @@ class _VariantRun:
     run_dir: str
     manifest: RunManifest
     progress: Progress
+    keeps_work: bool
+    """Whether the work folder outlives the run; one in which an interrupted run resumes does not."""
     check_same: Callable[[], None] = dataclasses.field(init=False)
     """Raises FolderLostError if the run directory was removed since it was locked."""
     models: Models = dataclasses.field(init=False)
@@ -403,7 +413,7 @@ class _VariantRun:
         settings = variant.settings_in(request.settings)
         return cls(
             variant=variant,
-            run_dir=_checked(variant.out, overwrite=request.overwrite, work=request.resources.work),
+            run_dir=_checked(variant.out, overwrite=request.overwrite, work=request.work),
             manifest=RunManifest(
                 status=RunStatus.RUNNING,
                 engine_version=__version__,
@@ -421,6 +431,7 @@ class _VariantRun:
                 source_licence=request.licence,
             ),
             progress=progress,
+            keeps_work=request.resources.work is not None,
         )
 
     @property
@@ -502,6 +513,7 @@ class _VariantRun:
         manifest = dataclasses.replace(
             self.manifest,
             status=RunStatus.INCOMPLETE if failed_tiles else RunStatus.FINISHED,
+            request=self.manifest.request if self.keeps_work else {**self.manifest.request, "work": None},
             finished_at=dt.datetime.now(tz=dt.UTC),
             inputs=inputs,
             tiles=tuple(outcome.tile.key for outcome in outcomes),
@@ -643,7 +655,8 @@ def check_out(out: str, *, overwrite: bool, work: str | None = None) -> None:
     storage = storage_at(out)
     run_dir = storage.place
     try:
-        left = storage.names()
+        # a run that was interrupted before it wrote anything left only its work
+        left = [name for name in storage.names() if work is None or Path(run_dir, name) != Path(work)]
         of_work = work is not None and _is_of_work(run_dir, work)
         if left and not overwrite and not of_work:
             raise RunError(f"{run_dir} is not empty ({left[0]} …): give another --out, or --overwrite")

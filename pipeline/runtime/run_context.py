@@ -280,7 +280,7 @@ def run_context(
         with traced, about(run=opened.name), _watching(opened, cancelled) as was_cancelled, engine:
             progress.watch = Watch(
                 cancelled=was_cancelled,
-                check_scratch=opened.check_cancelled,
+                check_scratch=opened.check_mark,
                 stop=opened.cancel,
                 listener=progress.listener,
             )

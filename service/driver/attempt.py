@@ -18,11 +18,14 @@ from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables,
 from pipeline.runtime.monitoring import tracing
 from pipeline.runtime.monitoring.events import Event, Listener
 from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
 from pipeline.settings import RunSettings
 from service.driver.failures import failure_of, has_no_space
-from service.driver.leased_job import LOG, LeasedJob
+from service.driver.gathered import gathered_before, note_gathered
+from service.driver.leased_job import LOG
 from service.driver.messages import (
+    Scrubber,
     classification_digest,
     classification_outcome,
     comparison_digest,
@@ -30,17 +33,15 @@ from service.driver.messages import (
     digest_of,
     outcome,
 )
-from service.driver.shared_cluster import SharedCluster
-from service.driver.so_far import shown_while_watched
+from service.driver.workplace import INPUTS
 from service.errors import RequestError
-from service.fetching import Fetched, JobFiles, gather
+from service.fetching import Fetched, JobFiles, UploadTable, gather
 from service.files import StateFolder
-from service.jobs import JobRequest
+from service.jobs import Job, JobRequest, LogLevel
 from service.outputs import write_classification_outputs, write_comparison_outputs, write_echo, write_outputs
 from service.outputs.kinds import RASTERS
 from service.outputs.published import publish
 from service.settings import ServiceSettings
-from service.store import JobStore
 
 _NAMED = 10
 """Inputs that the log of a job names."""
@@ -80,7 +81,7 @@ class Gather(Protocol):
         self,
         request: JobRequest,
         *,
-        store: JobStore,
+        store: UploadTable,
         folder: StateFolder,
         settings: ServiceSettings,
         target: Path,
@@ -165,26 +166,79 @@ class Tools:
     write_classification: WriteClassification = write_classification_outputs
 
 
+class Held(Protocol):
+    """The job, for the work on it: `Held` in the driver, `ChildJob` in the process of an attempt."""
+
+    job: Job
+    scrub: Scrubber
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """Additional fields of a log line."""
+
+    def cancelled(self) -> bool:
+        """Whether the attempt must end."""
+
+    def wait(self, seconds: float) -> bool:
+        """Wait, at most until the attempt must end; returns whether it must."""
+
+    def record(self, event: Event) -> None:
+        """Take an event of the run."""
+
+    def note(self, message: str, *, level: LogLevel = LogLevel.INFO, **facts: Any) -> None:
+        """Add a line to the job's log."""
+
+
+class Workers(Protocol):
+    """`SharedCluster`, or what stands for it in the process of an attempt."""
+
+    def executor(self, held: Any) -> Executor:
+        """An executor for the run of a job, as soon as there are workers."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class DriverParts:
-    """The parts of a driver that its attempts use."""
+class AttemptParts:
+    """What the work on a job needs beside the job."""
 
     settings: ServiceSettings
     folder: StateFolder
-    store: JobStore
-    cluster: SharedCluster
+    place: Path
+    """The folder in which the attempt works."""
+    uploads: UploadTable
+    """Knows the uploads of the job."""
+    workers: Workers
     tools: Tools = Tools()
 
+    @property
+    def inputs(self) -> Path:
+        """The fetched inputs."""
+        return self.place / INPUTS
 
-def perform(held: LeasedJob, shop: DriverParts) -> tuple[str, dict[str, Any]]:
+    @property
+    def run(self) -> Path:
+        """The run directory."""
+        return self.place / "run"
+
+    @property
+    def comparison(self) -> Path:
+        """The folder of a comparison."""
+        return self.place / "comparison"
+
+    @property
+    def outputs(self) -> Path:
+        """The outputs."""
+        return self.place / "outputs"
+
+
+def perform(held: Held, parts: AttemptParts) -> tuple[str, dict[str, Any]]:
     """Do all the work of a job.
 
     Parameters
     ----------
-    held : LeasedJob
+    held : Held
         The job; records the progress, and may be cancelled.
-    shop : DriverParts
-        Store, folder, cluster.
+    parts : AttemptParts
+        Folder, uploads, workers.
 
     Returns
     -------
@@ -198,43 +252,47 @@ def perform(held: LeasedJob, shop: DriverParts) -> tuple[str, dict[str, Any]]:
     Exception
         Any other error; `failures` describes it.
     """
-    job, folder = held.job, shop.folder
+    job = held.job
     begin = WORK.get(job.request.process_id)
     if begin is None:
         raise RequestError([f"this driver does not run the process {job.request.process_id}, only {', '.join(WORK)}"])
-    attempt = folder.attempt(job.job_id, job.attempt)
-    # the number of an attempt is unique; files there are from before a backup of the database was restored
-    shutil.rmtree(attempt, ignore_errors=True)
-    attempt.mkdir(parents=True)
     scrub = held.scrub
     # the scrubber would not recognise a folder with blanks in its name as one path
-    scrub.name(f"{folder.root}/", "/state/")
+    scrub.name(f"{parts.folder.root}/", "/state/")
     held.record(Event(kind="stage", stage="inputs"))
-    target = folder.inputs(job.job_id, job.attempt)
     with tracing.span("stage inputs", stage="inputs"):
-        files = shop.tools.gather(
-            job.request,
-            store=shop.store,
-            folder=folder,
-            settings=shop.settings,
-            target=target,
-            cancelled=held.cancelled,
-        )
+        files = _gathered(held, parts)
     for fetched in files.all:
         scrub.name(str(fetched.path), fetched.path.name)
     _note_inputs(held, files.tiles)
-    work = begin(held, shop, files)
-    shop.cluster.wait_until_there(held)
+    work = begin(held, parts, files)
+    executor = parts.workers.executor(held)
     held.record(Event(kind="stage", stage="plan"))
-    held.engine = shop.cluster.engine()
-    # jobs are interactive: they go before batch runs on the same scheduler
-    done = work(held.engine.executor(job.priority))
+    done = work(executor)
     _check(held)
-    shutil.rmtree(target, ignore_errors=True)
+    shutil.rmtree(parts.inputs, ignore_errors=True)
     return done
 
 
-def _note_inputs(held: LeasedJob, tiles: Sequence[Fetched]) -> None:
+def _gathered(held: Held, parts: AttemptParts) -> JobFiles:
+    """The inputs; those of an attempt that was handed back are used again."""
+    before = gathered_before(parts.inputs, held.job.request)
+    if before is not None:
+        return before
+    shutil.rmtree(parts.inputs, ignore_errors=True)
+    files = parts.tools.gather(
+        held.job.request,
+        store=parts.uploads,
+        folder=parts.folder,
+        settings=parts.settings,
+        target=parts.inputs,
+        cancelled=held.cancelled,
+    )
+    note_gathered(parts.inputs, files)
+    return files
+
+
+def _note_inputs(held: Held, tiles: Sequence[Fetched]) -> None:
     """Say in the job's log which program runs on what."""
     if tiles:
         names = ", ".join(tile.path.name for tile in tiles[:_NAMED])
@@ -247,36 +305,36 @@ _Work = Callable[[Executor], tuple[str, dict[str, Any]]]
 """The work that needs the workers; returns the result in one sentence, and the summary."""
 
 
-def _reconstruct(held: LeasedJob, shop: DriverParts, files: JobFiles) -> _Work:
+def _reconstruct(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
     """The process `reconstruct`."""
-    job, folder = held.job, shop.folder
-    run_dir, out_dir = folder.run(job.job_id, job.attempt), folder.outputs(job.job_id, job.attempt)
-    request = run_request(job.request, files, run_dir, shop.settings)
+    job, out_dir = held.job, parts.outputs
+    request = run_request(job.request, files, parts.run, parts.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
-        with shown_while_watched(held, run_dir, folder.so_far(job.job_id, job.attempt)):
-            summary = shop.tools.run(request, held.record, executor, held.cancelled)
-        problems = _published(held, shop, run_dir, out_dir)
+        summary = parts.tools.run(request, held.record, executor, held.cancelled)
+        # an attempt before may have left a part of them
+        shutil.rmtree(out_dir, ignore_errors=True)
+        problems = _published(held, parts)
         begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
-            shop.tools.write_outputs(Path(request.out), out_dir, job.request.outputs, begin)
+            parts.tools.write_outputs(Path(request.out), out_dir, job.request.outputs, begin)
         found = digest_of(summary, held.scrub, __version__) | ({"unpublished": problems} if problems else {})
         return outcome(summary, problems), found
 
     return work
 
 
-def _published(held: LeasedJob, shop: DriverParts, run_dir: Path, out_dir: Path) -> dict[str, str]:
+def _published(held: Held, parts: AttemptParts) -> dict[str, str]:
     """Write the further formats of a job, if it wants any; why some could not be made, for clients."""
     request = held.job.request
     if not request.publish:
         return {}
     on_progress = _begun(held, "formats")
-    held.scrub.name(str(run_dir), "this job")
+    held.scrub.name(str(parts.run), "this job")
     with tracing.span("stage formats", stage="formats"):
-        found = shop.tools.publish(
-            run_dir,
-            out_dir,
+        found = parts.tools.publish(
+            parts.run,
+            parts.outputs,
             request.publish,
             name=held.job.job_id,
             geoid_height_m=request.geoid_height,
@@ -296,60 +354,60 @@ def _published(held: LeasedJob, shop: DriverParts, run_dir: Path, out_dir: Path)
     return problems
 
 
-def _compare(held: LeasedJob, shop: DriverParts, files: JobFiles) -> _Work:
+def _compare(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
     """The process `compare`."""
-    job, folder = held.job, shop.folder
-    place, out_dir = folder.comparison(job.job_id, job.attempt), folder.outputs(job.job_id, job.attempt)
-    request = compare_request(job.request, files, place, shop.settings)
+    job, place, out_dir = held.job, parts.comparison, parts.outputs
+    request = compare_request(job.request, files, place, parts.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
-        summary = shop.tools.compare(request, held.record, executor, held.cancelled)
+        summary = parts.tools.compare(request, held.record, executor, held.cancelled)
+        shutil.rmtree(out_dir, ignore_errors=True)
         begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
-            shop.tools.write_comparison(place, list(summary.runs), out_dir, job.request.outputs, begin)
+            parts.tools.write_comparison(place, list(summary.runs), out_dir, job.request.outputs, begin)
         return comparison_outcome(summary), comparison_digest(summary, held.scrub, __version__)
 
     return work
 
 
-def _classify(held: LeasedJob, shop: DriverParts, files: JobFiles) -> _Work:
+def _classify(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
     """The process `classify`."""
-    job, folder = held.job, shop.folder
-    place, out_dir = folder.run(job.job_id, job.attempt), folder.outputs(job.job_id, job.attempt)
-    request = classify_request(job.request, files, place, shop.settings)
+    job, out_dir = held.job, parts.outputs
+    request = classify_request(job.request, files, parts.run, parts.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
-        summary = shop.tools.classify(request, held.record, executor, held.cancelled)
+        summary = parts.tools.classify(request, held.record, executor, held.cancelled)
+        shutil.rmtree(out_dir, ignore_errors=True)
         begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
-            shop.tools.write_classification(summary, out_dir, job.request.outputs, begin, held.scrub)
+            parts.tools.write_classification(summary, out_dir, job.request.outputs, begin, held.scrub)
         return classification_outcome(summary), classification_digest(summary, held.scrub, __version__)
 
     return work
 
 
-def _echo(held: LeasedJob, shop: DriverParts, files: JobFiles) -> _Work:
+def _echo(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
     """The process `echo`."""
     del files
-    job = held.job
-    asked = job.request.echo or {}
+    asked = held.job.request.echo or {}
 
     def work(_executor: Executor) -> tuple[str, dict[str, Any]]:
         held.wait(asked["delay"])
         _begun(held, "outputs")
-        write_echo(asked["message"], shop.folder.outputs(job.job_id, job.attempt))
+        shutil.rmtree(parts.outputs, ignore_errors=True)
+        write_echo(asked["message"], parts.outputs)
         return "echoed", {"engine_version": __version__}
 
     return work
 
 
-WORK: Mapping[str, Callable[[LeasedJob, DriverParts, JobFiles], _Work]] = MappingProxyType(
+WORK: Mapping[str, Callable[[Held, AttemptParts, JobFiles], _Work]] = MappingProxyType(
     {"reconstruct": _reconstruct, "compare": _compare, "classify": _classify, "echo": _echo}
 )
 """The work of each process: checks the request with the fetched inputs, and returns the rest of the work."""
 
 
-def _begun(held: LeasedJob, stage: str) -> Callable[[int, int], None]:
+def _begun(held: Held, stage: str) -> Callable[[int, int], None]:
     """Record that a stage of the driver's own begins; returns a function that records the progress."""
     _check(held)
     held.record(Event(kind="stage", stage=stage))
@@ -380,11 +438,16 @@ def run_request(request: JobRequest, files: JobFiles, out: Path, settings: Servi
         vertical_unit=request.vertical_unit,
         allow_outside_area_of_use=request.allow_outside_area_of_use,
         bbox=request.bbox,
-        resources=settings.resources,
+        resources=_resources(settings),
         meshes=request.meshes,
         points=request.points,
         licence=request.licence,
     )
+
+
+def _resources(settings: ServiceSettings) -> Resources:
+    """What runs run with: one that is handed back resumes."""
+    return dataclasses.replace(settings.resources, resume=True)
 
 
 def compare_request(request: JobRequest, files: JobFiles, out: Path, settings: ServiceSettings) -> CompareRequest:
@@ -396,7 +459,8 @@ def compare_request(request: JobRequest, files: JobFiles, out: Path, settings: S
         Settings are out of range, or a method is not known.
     """
     return CompareRequest(
-        run=run_request(request, files, out, settings),
+        # an attempt that was handed back may have begun it
+        run=dataclasses.replace(run_request(request, files, out, settings), overwrite=True),
         variants=parse_variants(request.methods),
         tables=own_tables(request.settings),
     )
@@ -422,10 +486,12 @@ def classify_request(request: JobRequest, files: JobFiles, out: Path, settings: 
         allow_outside_area_of_use=request.allow_outside_area_of_use,
         rasters=has_rasters,
         raster_cell=request.raster_cell if has_rasters else None,
-        resources=settings.resources,
+        resources=_resources(settings),
+        # files of an attempt that was handed back
+        overwrite=True,
     )
 
 
-def _check(held: LeasedJob) -> None:
+def _check(held: Held) -> None:
     if held.cancelled():
         raise RunCancelledError("the job was cancelled")

@@ -8,16 +8,27 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ClusterError, GableworkError, RunCancelledError
 from service import traces
-from service.driver.attempt import DriverParts, perform
+from service.driver import workplace
+from service.driver.attempt_process import DriverParts, Perform
 from service.driver.failures import FULL_BYTES, NO_SPACE_PAUSE_S, failure_of, has_no_space, is_tried_again, pause_s
 from service.driver.finished_work import leave, take_over
 from service.driver.leased_job import LOG, LeasedJob, Stop
-from service.errors import LeaseLostError, NoSpaceError, ServiceError, StoreError
-from service.jobs import JobStatus, LogLevel
+from service.driver.so_far import shown_while_watched
+from service.errors import (
+    AttemptEndedError,
+    LeaseLostError,
+    NoSpaceError,
+    ServiceError,
+    StoreError,
+    UnexpectedError,
+)
+from service.jobs import EndedAttempt, JobStatus, LogLevel
+from service.store.policies import after_end
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 15.0
@@ -33,14 +44,17 @@ class Attempts:
     ----------
     shop : DriverParts
         Store, folder, cluster.
+    perform : Perform
+        Does the work.
     name : str
         Name of the driver, for messages.
     ending : threading.Event
         Set when the driver ends: it then waits for the database no longer than one more try.
     """
 
-    def __init__(self, shop: DriverParts, *, name: str, ending: threading.Event) -> None:
+    def __init__(self, shop: DriverParts, perform: Perform, *, name: str, ending: threading.Event) -> None:
         self._shop = shop
+        self._perform = perform
         self._name = name
         self._ending = ending
 
@@ -49,14 +63,12 @@ class Attempts:
         LOG.info("the job runs", extra=held.facts)
         with held:
             try:
-                if held.cancelled():
-                    raise RunCancelledError("the job was cancelled")  # noqa: TRY301
-                with traces.attempt(held.job, self._name):
-                    found = take_over(self._shop.folder, held.job)
-                    message, summary = perform(held, self._shop) if found is None else found
+                message, summary = self._worked(held)
             except BaseException as error:  # noqa: BLE001 - every exception must end the job, not the driver
+                held.rest()
                 self._end_early(held, error)
                 return
+            held.rest()
             held.end_stage()
             done = self._settle(
                 held,
@@ -74,6 +86,25 @@ class Attempts:
             except OSError as error:
                 LOG.warning("the job must be run again: %s", error, extra=held.facts)
 
+    def _worked(self, held: LeasedJob) -> tuple[str, dict[str, Any]]:
+        """The result of the work, whose files are in the attempt's folder."""
+        folder, job = self._shop.folder, held.job
+        if held.cancelled():
+            raise RunCancelledError("the job was cancelled")
+        found = take_over(folder, job)
+        if found is not None:
+            return found
+        place, is_resumed = workplace.take(folder, job)
+        held.place = place
+        if is_resumed:
+            held.note("the attempt goes on where the one before stopped")
+        with contextlib.ExitStack() as shown:
+            if job.request.process_id == "reconstruct":
+                shown.enter_context(shown_while_watched(held, place / "run", folder.so_far(job.job_id, job.attempt)))
+            done = self._perform(held, place)
+        workplace.deliver(place, folder, job)
+        return done
+
     def _end_early(self, held: LeasedJob, error: BaseException) -> None:
         """Write the outcome of an attempt that did not succeed: dismissed, given back, tried again or failed."""
         job, reason = held.job, held.stopped_for
@@ -86,23 +117,33 @@ class Attempts:
             return
         if reason is Stop.NO_SPACE:
             error = NoSpaceError("the disk is full except for its reserve")
+        elif reason is Stop.STALLED:
+            error = AttemptEndedError(f"made no progress for {held.step_s:g} s", is_own=True)
         elif reason is not None:
-            self._forget(held)
+            is_handed_back = reason is Stop.RELEASED and self._hand_back(held)
+            if not is_handed_back:
+                self._forget(held)
             message = f"driver {self._name} ended; the job waits for another" if reason is Stop.RELEASED else ""
             lost = reason is Stop.LOST
             self._settle(held, lambda: self._shop.store.release(job, lost=lost, message=message), JobStatus.ACCEPTED)
             return
         elif self._is_full(error):
             error = NoSpaceError(f"the disk is full ({type(error).__name__})")
+        if isinstance(error, AttemptEndedError):
+            self._end_by_itself(held, error)
+            return
         reference = secrets.token_hex(4)
         facts: dict[str, Any] = {**held.facts, "reference": reference}
-        expected = isinstance(error, GableworkError | ServiceError)
+        expected = isinstance(error, GableworkError | ServiceError) and not isinstance(error, UnexpectedError)
         LOG.warning("the attempt failed: %s", error, extra=facts, exc_info=None if expected else error)
-        held.note(f"the attempt failed: {type(error).__name__} (reference {reference})", level=LogLevel.WARNING)
+        kind = error.kind if isinstance(error, UnexpectedError) else type(error).__name__
+        held.note(f"the attempt failed: {kind} (reference {reference})", level=LogLevel.WARNING)
         if isinstance(error, ClusterError) and held.engine is not None:
             self._shop.cluster.replace(held.engine)
-        self._forget(held)
-        if is_tried_again(error, job, self._shop.settings.max_attempts):
+        is_again = is_tried_again(error, job, self._shop.settings.max_attempts)
+        if not (is_again and isinstance(error, ClusterError) and self._hand_back(held)):
+            self._forget(held)
+        if is_again:
             pause = NO_SPACE_PAUSE_S if isinstance(error, NoSpaceError) else pause_s(job.lost_attempts)
             message = f"waiting: {held.scrub(str(error))}; tried again in {pause:g} s"
             lost = isinstance(error, ClusterError | NoSpaceError)
@@ -114,6 +155,42 @@ class Attempts:
             return
         failure = failure_of(error, scrub=held.scrub, reference=reference, attempts=job.lost_attempts + 1)
         self._settle(held, lambda: self._shop.store.fail(job, failure), JobStatus.FAILED)
+
+    def _end_by_itself(self, held: LeasedJob, error: AttemptEndedError) -> None:
+        """Write the outcome of an attempt whose process ended first: it is tried again, or the job failed."""
+        job, settings = held.job, self._shop.settings
+        LOG.error("the attempt %s at stage %r", error, held.stage, extra=held.facts)
+        held.note(f"the attempt {error} at stage {held.stage}", level=LogLevel.ERROR)
+        ended = EndedAttempt(stage=held.stage, detail=str(error), is_own=error.is_own)
+        status = after_end(job, ended, settings.max_attempts)
+        if status is JobStatus.FAILED and held.place is not None:
+            self._so_far_is_over(held)
+            workplace.keep_inputs(held.place)
+        else:
+            self._forget(held)
+        self._settle(
+            held,
+            lambda: self._shop.store.end_attempt(
+                job, ended, max_attempts=settings.max_attempts, kept_days=settings.stalled_days
+            ),
+            status,
+        )
+
+    def _hand_back(self, held: LeasedJob) -> bool:
+        """Leave the folder of an attempt for the next one; whether that worked."""
+        if held.place is None:
+            return False
+        self._so_far_is_over(held)
+        try:
+            workplace.hand_back(held.place, held.job)
+        except OSError as error:
+            LOG.warning("the next attempt begins anew: %s", error, extra=held.facts)
+            return False
+        return True
+
+    def _so_far_is_over(self, held: LeasedJob) -> None:
+        """Remove the buildings that readers saw so far: those of the next attempt replace them."""
+        shutil.rmtree(self._shop.folder.so_far(held.job.job_id, held.job.attempt), ignore_errors=True)
 
     def _is_full(self, error: BaseException) -> bool:
         """Whether the full disk is the cause. What a worker met arrives in words, so the disk is looked at, too."""
@@ -159,9 +236,11 @@ class Attempts:
         """Remove the folder of this attempt, of the whole job, or of the attempts before this one."""
         job, folder = held.job, self._shop.folder
         if whole:
-            shutil.rmtree(folder.job(job.job_id), ignore_errors=True)
+            workplace.discard(folder.job(job.job_id))
         elif before:
             for number in range(1, job.attempt):
-                shutil.rmtree(folder.attempt(job.job_id, number), ignore_errors=True)
+                workplace.discard(folder.attempt(job.job_id, number))
         else:
-            shutil.rmtree(folder.attempt(job.job_id, job.attempt), ignore_errors=True)
+            for place in {held.place, folder.attempt(job.job_id, job.attempt)} - {None}:
+                assert isinstance(place, Path)
+                workplace.discard(place)

@@ -14,6 +14,7 @@ from service.errors import (
     NoSuchUploadError,
     RequestError,
     StoreError,
+    UnexpectedError,
 )
 from service.jobs import Fault, Job, JobFailure
 
@@ -94,8 +95,9 @@ def failure_of(error: BaseException, *, scrub: Callable[[str], str], reference: 
         )
     if isinstance(error, RunError):
         return JobFailure(fault=Fault.INTERNAL, detail=f"{message} (reference {reference})")
+    kind = error.kind if isinstance(error, UnexpectedError) else type(error).__name__
     detail = (
-        f"an unexpected fault of the service, {type(error).__name__} (reference {reference}): "
+        f"an unexpected fault of the service, {kind} (reference {reference}): "
         "its operator finds it in the driver's log under this reference"
     )
     return JobFailure(fault=Fault.INTERNAL, detail=detail)

@@ -6,12 +6,11 @@ import contextlib
 import datetime as dt
 import logging
 import os
-import re
 import shutil
 import time
 from pathlib import Path
 
-from service.driver import finished_work
+from service.driver import finished_work, workplace
 from service.errors import NoSuchJobError, UploadInUseError
 from service.files import StateFolder, is_id
 from service.jobs import JobStatus
@@ -24,7 +23,9 @@ LOG = logging.getLogger("gablework.driver")
 
 SO_FAR_S = 60.0
 """Seconds for which the buildings that a job had so far stay readable after they last changed."""
-_ATTEMPT = re.compile(r"attempt-([0-9]+)")
+_DOOMED_S = 3600.0
+"""Seconds from which a folder counts as left that another process began to remove."""
+_DAY_S = 86_400.0
 
 
 def tidy(store: JobStore, folder: StateFolder, settings: ServiceSettings) -> list[Path]:
@@ -46,7 +47,11 @@ def tidy(store: JobStore, folder: StateFolder, settings: ServiceSettings) -> lis
     list of Path
         The removed folders.
     """
-    removed = [*retire_jobs(store, folder, settings), *tidy_jobs(store, folder), *tidy_uploads(store, folder)]
+    removed = [
+        *retire_jobs(store, folder, settings),
+        *tidy_jobs(store, folder, settings.stalled_days),
+        *tidy_uploads(store, folder),
+    ]
     store.forget_answers()
     store.fill_ballast(folder.reserve_bytes)
     return removed
@@ -81,8 +86,10 @@ def retire_jobs(store: JobStore, folder: StateFolder, settings: ServiceSettings)
     return removed
 
 
-def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
+def tidy_jobs(store: JobStore, folder: StateFolder, stalled_days: float = 0.0) -> list[Path]:
     """Remove the folders of jobs that are gone or dismissed, and of attempts that are over.
+
+    Inputs that an attempt left which stood still are kept for `stalled_days`.
 
     Folders are listed before the database is read, and a job is in the database before it has a folder. A folder that
     the database does not know therefore belongs to a job that was removed.
@@ -104,10 +111,18 @@ def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
         # a job that waits or failed needs no attempt, one that runs or succeeded only its last
         last = attempt if status in {JobStatus.ACCEPTED, JobStatus.FAILED} else attempt - 1
         for path in _entries(folder.job(job_id)):
-            number = _ATTEMPT.fullmatch(path.name)
+            number = workplace.number_of(path)
+            if number is None:
+                # renamed to be removed, by a process that died
+                removed += [path] if path.name.startswith(".") and _is_old(path, _DOOMED_S) else []
+                continue
             # results whose end no driver could write yet: the next one does
-            is_kept = not status.is_over and finished_work.is_left(path)
-            if number is not None and int(number[1]) <= last and not is_kept:
+            is_kept = not status.is_over and (
+                finished_work.is_left(path) or workplace.is_needed(path, attempt, waits=status is JobStatus.ACCEPTED)
+            )
+            if status is JobStatus.FAILED and workplace.has_kept_inputs(path):
+                is_kept = not _is_old(path, stalled_days * _DAY_S)
+            if number <= last and not is_kept:
                 removed.append(path)
     for path in removed:
         shutil.rmtree(path, ignore_errors=True)

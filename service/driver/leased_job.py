@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import threading
 import time
+from collections.abc import Callable
 from enum import IntEnum
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
@@ -25,6 +28,8 @@ _FLUSH_S = 0.5
 """Minimum seconds between two writes of progress."""
 _WATCHED_S = 60.0
 """Seconds for which a job counts as watched after a client read its buildings."""
+ABANDON_S = 120.0
+"""Seconds after the request to stop from which an attempt that goes on loses its lease; its process is ended before."""
 _MAX_PENDING = 500
 """Maximum number of events that wait while the database does not answer; the oldest are dropped first."""
 
@@ -32,8 +37,19 @@ _MAX_PENDING = 500
 class Engine(Protocol):
     """`pipeline.runtime.cluster.dask_executor.Cluster`."""
 
+    @property
+    def address(self) -> str:
+        """The scheduler's address."""
+
+    @property
+    def embedded(self) -> bool:
+        """Whether the workers belong to this process."""
+
     def executor(self, priority: int = 0) -> Executor:
         """An executor for one run."""
+
+    def mend(self, workers: int) -> None:
+        """Restart embedded workers that were given up, if there are fewer than there should be."""
 
     def __enter__(self) -> Self:
         """Start."""
@@ -49,21 +65,23 @@ class Stop(IntEnum):
 
     NO_SPACE = 1
     """Only the reserve of the disk is free: the job is tried again later."""
-    RELEASED = 2
+    STALLED = 2
+    """It makes no progress."""
+    RELEASED = 3
     """The driver ends: the job goes back to the queue."""
-    DISMISSED = 3
+    DISMISSED = 4
     """The client dismissed it."""
-    LOST = 4
+    LOST = 5
     """The job belongs to another driver, or may belong to one by now."""
 
 
 class LeasedJob:
     """Holds a claimed job while the driver works on it; a context manager.
 
-    A thread renews the lease three times within its length, whatever the run does. (The run's heavy work is in other
-    processes. Its work in this process releases the interpreter's lock at least every few milliseconds, as numpy and
-    pyarrow do.) If the database does not answer for the length of the lease, another driver may have the job: the
-    attempt ends.
+    A thread renews the lease three times within its length, as long as the attempt gets somewhere: it is stopped when
+    it makes no progress for longer than a step of its stage may take. If the attempt does not end although it was
+    stopped, the lease is no longer renewed, and another driver takes the job. If the database does not answer for the
+    length of the lease, another driver may have the job: the attempt ends.
 
     Parameters
     ----------
@@ -77,13 +95,29 @@ class LeasedJob:
         Seconds between checks for a dismissal.
     claimed_s : float
         `time.monotonic()` of a moment before the claim.
+    step_s : callable
+        Seconds that one step of a stage may take, by the stage's name.
     """
 
-    def __init__(self, store: JobStore, job: Job, *, lease_s: float, poll_s: float, claimed_s: float) -> None:
+    def __init__(
+        self,
+        store: JobStore,
+        job: Job,
+        *,
+        lease_s: float,
+        poll_s: float,
+        claimed_s: float,
+        step_s: Callable[[str], float],
+    ) -> None:
         self.job = job
         self._store = store
         self._lease_s = lease_s
         self._poll_s = min(poll_s, lease_s / 6.0)
+        self._step_s = step_s
+        self.stage = ""
+        """The stage that runs."""
+        self._moved_s = claimed_s
+        self._stopped_s = math.inf
         self._renewed_s = claimed_s
         self._renewed_at_s = time.time()
         self._written_s = claimed_s
@@ -104,6 +138,8 @@ class LeasedJob:
         self._log = AttemptLog(self.scrub, WORDS)
         self.engine: Engine | None = None
         """The workers that run the attempt; None before it runs."""
+        self.place: Path | None = None
+        """The folder in which the attempt works; None before it begins."""
 
     def __enter__(self) -> Self:
         """Start the thread."""
@@ -147,11 +183,33 @@ class LeasedJob:
         with self._lock:
             if self._stop is None or reason > self._stop:
                 self._stop = reason
+            self._stopped_s = min(self._stopped_s, time.monotonic())
         self._stopped.set()
+
+    def move(self) -> None:
+        """Note that the attempt got somewhere."""
+        self._moved_s = time.monotonic()
+
+    def rest(self) -> None:
+        """Note that the work is over, and only its outcome must still be written: no progress is expected."""
+        self._moved_s = math.inf
+
+    @property
+    def step_s(self) -> float:
+        """Seconds that one step of the present stage may take."""
+        return self._step_s(self.stage)
+
+    @property
+    def _left_s(self) -> float:
+        """Seconds until the attempt counts as stalled."""
+        return self.step_s - (time.monotonic() - self._moved_s)
 
     def record(self, event: Event) -> None:
         """Take an event of the run. Another thread writes it soon, and the run never waits for that."""
+        self.move()
         with self._lock:
+            if event.kind == "stage":
+                self.stage = event.stage
             self._log.hear(event)
             shown = None if event.kind == "detail" else self._job_event(event)
             if shown is None:
@@ -226,6 +284,13 @@ class LeasedJob:
     def _keep(self) -> None:
         """Renew the lease, check for a dismissal and write events until the attempt is over."""
         while not self._over.wait(self._poll_s):
+            if self._left_s <= 0.0 and self._stop is None:
+                LOG.error("no progress for %g s at stage %r: it is stopped", self.step_s, self.stage, extra=self.facts)
+                self.stop(Stop.STALLED)
+            if time.monotonic() - self._stopped_s > ABANDON_S:
+                LOG.error("the attempt does not end: its lease is no longer renewed", extra=self.facts)
+                self.stop(Stop.LOST)
+                return
             try:
                 self._look()
                 if time.monotonic() - self._written_s >= _FLUSH_S:
@@ -251,7 +316,7 @@ class LeasedJob:
         """Renew the lease if that is due, otherwise check for a dismissal and for readers."""
         now_s = time.monotonic()
         if now_s - self._renewed_s >= self._lease_s / 3.0 - self._poll_s:
-            wanted = self._store.renew(self.job, lease_s=self._lease_s)
+            wanted = self._store.renew(self.job, lease_s=self._lease_s, due_s=self._left_s)
             self._renewed_s, self._renewed_at_s = now_s, time.time()
         else:
             wishes = self._store.still_held(self.job)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
+import math
 import os
 import secrets
 import signal
@@ -15,12 +17,13 @@ from types import FrameType
 
 from pipeline.errors import ClusterError
 from pipeline.schedule import Outcome
-from service.driver.attempt import DriverParts, Tools
+from service.driver.attempt_process import DriverParts, InOwnProcess, Perform
 from service.driver.attempts import FIRST_PAUSE_S, LONGEST_PAUSE_S, Attempts
 from service.driver.disk_watch import LOOK_S, DiskWatch
 from service.driver.janitor import tidy
 from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.driver.logs import configure, quieten
+from service.driver.progress import step_s
 from service.driver.shared_cluster import SharedCluster
 from service.driver.webhooks import Sender
 from service.errors import LeaseLostError, StoreError
@@ -31,8 +34,12 @@ from service.store import JobStore
 
 TIDY_S = 180.0
 """Seconds between two rounds of the janitor."""
-GRACE_S = 20.0
-"""Seconds that a cancelled run gets to end."""
+BEAT_S = 1.0
+"""Seconds between two signs of life for the parent."""
+HAND_BACK_S = 10.0
+"""Seconds of the drain that are kept for handing back the jobs that are not done."""
+_GRACE_S = 4.0
+"""Seconds, after those in which a job's process must stop, in which the outcome of its attempt must be written."""
 _TICK_S = 0.1
 
 
@@ -46,9 +53,10 @@ class Driver:
     name : str, optional
         Unique name of this process; made up by default.
     parent_pipe : int, optional
-        A file descriptor: when its other end closes, the parent is gone and the driver ends at once.
-    tools : Tools, optional
-        The steps of an attempt.
+        A file descriptor: when its other end closes, the parent is gone and the driver ends at once. Into a socket the
+        driver writes a byte every second as long as it works.
+    perform : callable, optional
+        Makes what does the work of attempts, from the parts of the driver and its name.
     cluster : SharedCluster, optional
         The workers.
     """
@@ -59,7 +67,7 @@ class Driver:
         *,
         name: str | None = None,
         parent_pipe: int | None = None,
-        tools: Tools | None = None,
+        perform: Callable[[DriverParts, str], Perform] = InOwnProcess,
         cluster: SharedCluster | None = None,
     ) -> None:
         self.name = name or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
@@ -68,15 +76,14 @@ class Driver:
         self._store = JobStore(settings.database, wait_s=settings.database_wait_s)
         self._cluster = cluster or SharedCluster(settings)
         folder = StateFolder(settings.state.resolve(), settings.reserve_bytes)
-        self._shop = DriverParts(
-            settings=settings, folder=folder, store=self._store, cluster=self._cluster, tools=tools or Tools()
-        )
+        self._shop = DriverParts(settings=settings, folder=folder, store=self._store, cluster=self._cluster)
+        self._perform = perform(self._shop, self.name)
         self._held: dict[str, LeasedJob] = {}
         self._busy = 0
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._at_once = threading.Event()
-        self._attempts = Attempts(self._shop, name=self.name, ending=self._stopping)
+        self._attempts = Attempts(self._shop, self._perform, name=self.name, ending=self._stopping)
         self._disk_watch = DiskWatch(folder.disk, self._all_held)
         self._sender = Sender(self._store, folder, settings, name=self.name)
         self._ended = threading.Event()
@@ -84,6 +91,7 @@ class Driver:
         self._stops = 0
         self._parent_gone = False
         self._broken = False
+        self._beaten_s = -math.inf
 
     # --- from outside
 
@@ -132,6 +140,7 @@ class Driver:
         for thread in threads:
             if thread.ident is not None:
                 thread.join(1.0 if clean else _TICK_S)
+        self._perform.close()
         self._cluster.close()
         self._store.close()
         LOG.info("the driver has ended", extra=self._facts)
@@ -143,6 +152,7 @@ class Driver:
         """Wait for the database, start the workers, then let the slots claim."""
         try:
             self._shop.folder.make()
+            self._perform.preload()
             if not self._until_done(self._store.migrate, "the database cannot be migrated"):
                 return
             try:
@@ -160,23 +170,37 @@ class Driver:
 
     def _wait_for_stop(self) -> None:
         while self._stops == 0 and not self._parent_gone and not self._broken:
+            self._beat()
             time.sleep(_TICK_S)
+
+    def _beat(self) -> None:
+        """Let the parent know that this process works: that it gets its turn, and that no thread keeps the lock."""
+        if self._parent_pipe is None or time.monotonic() - self._beaten_s < BEAT_S:
+            return
+        if self._lock.acquire(timeout=BEAT_S):
+            self._lock.release()
+            self._beaten_s = time.monotonic()
+            # a pipe takes no answer; a parent that is gone is noticed elsewhere
+            with contextlib.suppress(OSError):
+                os.write(self._parent_pipe, b".")
 
     def _drain(self) -> bool:
         """Let running jobs finish, or give them back; whether all ended."""
         began_s = time.monotonic()
         held = self._all_held()
-        LOG.info("the driver ends: its %d running jobs get %g s", len(held), self._settings.drain_s, extra=self._facts)
+        drain_s = max(0.0, self._settings.drain_s - HAND_BACK_S)
+        LOG.info("the driver ends: its %d running jobs get %g s", len(held), drain_s, extra=self._facts)
         while self._is_busy():
-            out_of_time = time.monotonic() - began_s >= self._settings.drain_s
+            out_of_time = time.monotonic() - began_s >= drain_s
             if out_of_time or self._stops > 1 or self._parent_gone:
                 break
+            self._beat()
             time.sleep(_TICK_S)
         self._at_once.set()
         for one in self._all_held():
             LOG.info("the job is given back", extra=one.facts)
             one.stop(Stop.RELEASED)
-        deadline_s = time.monotonic() + GRACE_S
+        deadline_s = time.monotonic() + self._settings.stop_s + _GRACE_S
         while self._is_busy() and time.monotonic() < deadline_s:
             time.sleep(_TICK_S)
         stuck = self._all_held()
@@ -255,7 +279,14 @@ class Driver:
         job = self._store.claim(self.name, lease_s=settings.lease_s, max_attempts=settings.max_attempts)
         if job is None:
             return False
-        held = LeasedJob(self._store, job, lease_s=settings.lease_s, poll_s=settings.poll_s, claimed_s=claimed_s)
+        held = LeasedJob(
+            self._store,
+            job,
+            lease_s=settings.lease_s,
+            poll_s=settings.poll_s,
+            claimed_s=claimed_s,
+            step_s=functools.partial(step_s, stall_s=settings.stall_s, building_timeout_s=settings.building_timeout_s),
+        )
         with self._lock:
             self._held[job.job_id] = held
         try:

@@ -74,6 +74,8 @@ WORDS = MappingProxyType(
 """Descriptions of stages. Those without a weight belong to a comparison and are short."""
 
 _LAST = 99
+_START_S = 60.0
+"""Seconds for the starts of the processes that model a building, on a busy machine."""
 
 
 def percent(stage: str, done: int, total: int, weights: Mapping[str, int] = WEIGHTS) -> int:
@@ -104,3 +106,27 @@ def percent(stage: str, done: int, total: int, weights: Mapping[str, int] = WEIG
     before = sum(weights[name] for name in names[: names.index(stage)])
     share = min(max(done / total, 0.0), 1.0) if total > 0 else 0.0
     return min(_LAST, int(before + weights[stage] * share))
+
+
+def step_s(stage: str, *, stall_s: float, building_timeout_s: float) -> float:
+    """Seconds that one step of a stage may take: an attempt that says nothing for longer stands still.
+
+    Parameters
+    ----------
+    stage : str
+        The stage; an unknown one is like most.
+    stall_s : float
+        Limit of most stages: of one task, one file, one building.
+    building_timeout_s : float
+        Limit of a building. One that ends its process is tried again, and its points are saved.
+
+    Examples
+    --------
+    >>> step_s("split", stall_s=600.0, building_timeout_s=600.0)
+    600.0
+    >>> step_s("reconstruct", stall_s=600.0, building_timeout_s=600.0)
+    1860.0
+    """
+    if stage == "reconstruct":
+        return max(stall_s, 3.0 * building_timeout_s + _START_S)
+    return stall_s

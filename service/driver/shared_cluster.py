@@ -11,6 +11,7 @@ from urllib.parse import urlsplit
 
 from pipeline.errors import ClusterError, RunCancelledError
 from pipeline.runtime.cluster.dask_executor import Cluster
+from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.engine import workers_that_fit
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.monitoring.machine import cores, memory_bytes
@@ -69,6 +70,21 @@ class SharedCluster:
             if self._engine is None:
                 self._engine = self._make().__enter__()
             return self._engine
+
+    def executor(self, held: LeasedJob) -> Executor:
+        """An executor for the run of a job, as soon as there are workers.
+
+        Raises
+        ------
+        ClusterError
+            They do not start, or the driver ends.
+        RunCancelledError
+            The job was cancelled while it waited for them.
+        """
+        self.wait_until_there(held)
+        held.engine = self.engine()
+        # jobs are interactive: they go before batch runs on the same scheduler
+        return held.engine.executor(held.job.priority)
 
     def replace(self, broken: Engine) -> None:
         """Stop workers that broke; the next run starts new ones. A scheduler elsewhere is left alone.

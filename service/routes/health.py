@@ -31,7 +31,10 @@ async def healthz() -> Response:
     return respond(Health(status="ok"))
 
 
-_READY = {"status": "ok", "checks": {"database": "ok", "state": "ok", "disk": "ok", "driver": "running"}}
+_READY = {
+    "status": "ok",
+    "checks": {"database": "ok", "state": "ok", "disk": "ok", "driver": "running", "slots": "ok"},
+}
 _PROBE_BYTES = 4096
 """Bytes that are written to see whether the disk is full: one block, since a file without bytes needs none."""
 
@@ -51,7 +54,8 @@ _PROBE_BYTES = 4096
 def readyz(request: Request, store: Store, folder: Folder) -> Response:
     """Check whether the database answers, the state folder can be written, and the reserve of its disk is free.
 
-    The driver is listed but does not count: without a driver jobs are still accepted, and wait. With less than the
+    The driver is listed but does not count: without a driver jobs are still accepted, and wait. Slots are listed, too:
+    how many running jobs make no progress, until the driver ends their processes. With less than the
     reserve free, the status is `degraded`, with 200: uploads and jobs are refused with 507, but results can be fetched
     and removed, which is how room is made.
     """
@@ -60,6 +64,7 @@ def readyz(request: Request, store: Store, folder: Folder) -> Response:
     checks["disk"] = disk = _disk(folder)
     driver = getattr(request.app.state, "driver", None)
     checks["driver"] = "elsewhere" if driver is None else driver()
+    checks["slots"] = _slots(store)
     status: Literal["ok", "degraded", "unavailable"] = "ok" if disk == "ok" else "degraded"
     return respond(
         Health(status=status if is_ready else "unavailable", checks=checks),
@@ -86,6 +91,14 @@ def _database(store: JobStore) -> str:
     except StoreError:
         return "does not answer, or is not migrated"
     return "ok"
+
+
+def _slots(store: JobStore) -> str:
+    try:
+        stalled = len(store.stalled())
+    except StoreError:
+        return "not known: the database does not answer"
+    return "ok" if stalled == 0 else f"{stalled} running {'job makes' if stalled == 1 else 'jobs make'} no progress"
 
 
 def _state(folder: StateFolder) -> str:

@@ -15,7 +15,8 @@ from starlette.concurrency import run_in_threadpool
 
 from service.errors import JobNotOverError, RequestError
 from service.files import StateFolder
-from service.jobs import Job, JobStatus
+from service.jobs import Fault, Job, JobStatus
+from service.keys import Scope
 from service.multipart import Part
 from service.processes import process_named
 from service.routes.answers import JOB_ID, JOB_MADE, STATUS_EXAMPLE, document, problems, reference
@@ -218,7 +219,7 @@ router.add_api_route(
     "/jobs/{jobID}/retry",
     summary="Try a job again",
     status_code=201,
-    responses={201: JOB_MADE, **problems(400, 404, 409, 422, 507)},
+    responses={201: JOB_MADE, **problems(400, 403, 404, 409, 422, 507)},
 )
 async def retry(
     job_id: JobId,
@@ -226,11 +227,16 @@ async def retry(
     submitting: Submitting,
     changes: Annotated[Retry | None, Body(openapi_examples=RETRY_EXAMPLES)] = None,
 ) -> Response:
-    """Start a new job with the request of one that is over, with changes if some are given. The old job stays."""
+    """Start a new job with the request of one that is over, with changes if some are given. The old job stays.
+
+    A job that failed since its attempts stood still needs a key with the scope `admin`.
+    """
     async with submitting as submission:
         before = await run_in_threadpool(submission.store.get, job_id, owner=submission.caller.owner)
         if not before.status.is_over:
             raise JobNotOverError(f"job {job_id} is {before.status.value}: dismiss it first, or wait until it is over")
+        if before.failure is not None and before.failure.fault is Fault.STALLED:
+            submission.caller.require(Scope.ADMIN)
         execute = (changes or Retry()).applied_to(execute_request(before.request, base, before.priority))
         draft = process_named(before.request.process_id).draft(execute, submission.settings)
         return await submission.submit(draft, lambda job: job_made(job, base))

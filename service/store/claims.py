@@ -8,9 +8,9 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from service.jobs import Job, JobFailure, JobStatus
+from service.jobs import EndedAttempt, Job, JobFailure, JobStatus
 from service.store.changes import lock_held, move
-from service.store.policies import after_loss, loss
+from service.store.policies import after_end, after_loss, loss, own_ends, standstill
 from service.store.records import job_of, storable
 from service.store.tables import JOBS
 
@@ -74,14 +74,15 @@ def take_first(connection: Connection, driver: str, *, now: dt.datetime, lease_s
         lease_until=now + dt.timedelta(seconds=lease_s),
         started_at=row.started_at or now,
         not_before=None,
+        progress_due_at=None,
         progress=0,
         stage="",
     )
     return str(row.job_id)
 
 
-def renew(connection: Connection, held: Job, *, until: dt.datetime) -> bool:
-    """Extend a lease; True if the job must be dismissed.
+def renew(connection: Connection, held: Job, *, until: dt.datetime, due_at: dt.datetime | None) -> bool:
+    """Extend a lease; True if the job must be dismissed. The job counts as stalled after `due_at`.
 
     An expired lease that no driver took can be renewed.
 
@@ -91,7 +92,9 @@ def renew(connection: Connection, held: Job, *, until: dt.datetime) -> bool:
         The job is no longer held.
     """
     row = lock_held(connection, held)
-    connection.execute(sa.update(JOBS).where(JOBS.c.job_id == held.job_id).values(lease_until=until))
+    connection.execute(
+        sa.update(JOBS).where(JOBS.c.job_id == held.job_id).values(lease_until=until, progress_due_at=due_at)
+    )
     return bool(row.dismiss_requested)
 
 
@@ -130,6 +133,40 @@ def release(
         return
     reason = message or f"driver {held.lease_owner} gave the job back; it waits for another"
     move(connection, row, JobStatus.ACCEPTED, now=now, message=reason, not_before=not_before, **counted)
+
+
+def end_attempt(
+    connection: Connection, held: Job, ended: EndedAttempt, *, now: dt.datetime, max_attempts: int, kept_days: float
+) -> None:
+    """Put a job back into the queue whose attempt's process ended, or end it: see `after_end`.
+
+    Raises
+    ------
+    LeaseLostError
+        The job is no longer held.
+    """
+    row = lock_held(connection, held)
+    job = job_of(row)
+    status = after_end(job, ended, max_attempts)
+    counted: dict[str, Any] = {"own_ends": own_ends(job, ended), "outside_ends": job.outside_ends + (not ended.is_own)}
+    if ended.is_own:
+        counted["own_end_stage"] = storable(ended.stage, 64)
+    if status is JobStatus.FAILED:
+        failure = standstill(job, ended, kept_days)
+        kept = {"inputs_until": now + dt.timedelta(days=kept_days)}
+        move(connection, row, status, now=now, message=failure.detail, **counted, **kept, **failed_values(failure))
+    elif status is JobStatus.DISMISSED:
+        move(connection, row, status, now=now, message="dismissed", **counted)
+    else:
+        message = f"attempt {job.attempt} {ended.detail} at stage {ended.stage}; the job waits for another attempt"
+        move(connection, row, status, now=now, message=message, **counted)
+
+
+def stalled(connection: Connection, now: dt.datetime) -> list[str]:
+    """Ids of the running jobs that make no progress: none was seen in time, or their lease has ended."""
+    late = sa.or_(JOBS.c.progress_due_at <= now, JOBS.c.lease_until <= now)
+    found = sa.select(JOBS.c.job_id).where(JOBS.c.status == JobStatus.RUNNING.value, late).order_by(JOBS.c.job_id)
+    return list(connection.execute(found).scalars())
 
 
 def _claimable(now: dt.datetime) -> sa.ColumnElement[bool]:

@@ -4,12 +4,25 @@ from __future__ import annotations
 
 import builtins
 import datetime as dt
+import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 from service.deliveries import Claim, Delivery, StoredAnswer
-from service.jobs import Job, JobEvent, JobFailure, JobRequest, JobStatus, LogLevel, LogLine, NewLogLine, Upload, Wishes
+from service.jobs import (
+    EndedAttempt,
+    Job,
+    JobEvent,
+    JobFailure,
+    JobRequest,
+    JobStatus,
+    LogLevel,
+    LogLine,
+    NewLogLine,
+    Upload,
+    Wishes,
+)
 from service.keys import Key
 from service.store import (
     changes,
@@ -345,8 +358,10 @@ class JobStore:
             webhook_deliveries.give_up_all(connection, driver)
             return claims.give_up_all(connection, driver, now=now, max_attempts=max_attempts)
 
-    def renew(self, job: Job, *, lease_s: float) -> bool:
+    def renew(self, job: Job, *, lease_s: float, due_s: float = math.inf) -> bool:
         """Hold a job for `lease_s` seconds from now; True if it must be dismissed.
+
+        It counts as stalled if it is not renewed with a later `due_s`, seconds from now.
 
         Raises
         ------
@@ -354,8 +369,9 @@ class JobStore:
             The job is no longer held.
         """
         with self._database.write() as connection:
-            until = self._database.now(connection) + dt.timedelta(seconds=lease_s)
-            return claims.renew(connection, job, until=until)
+            now = self._database.now(connection)
+            due_at = None if math.isinf(due_s) else now + dt.timedelta(seconds=due_s)
+            return claims.renew(connection, job, until=now + dt.timedelta(seconds=lease_s), due_at=due_at)
 
     def still_held(self, job: Job) -> Wishes:
         """What clients want from a job that is held; only reads, and takes no lock.
@@ -438,6 +454,34 @@ class JobStore:
             now = self._database.now(connection)
             later = now + dt.timedelta(seconds=retry_after_s) if retry_after_s > 0.0 else None
             claims.release(connection, job, now=now, lost=lost, message=message, not_before=later)
+
+    def end_attempt(self, job: Job, ended: EndedAttempt, *, max_attempts: int, kept_days: float) -> None:
+        """Put a job back into the queue whose attempt's process ended, or end it after too many of them.
+
+        Parameters
+        ----------
+        job : Job
+            As it was claimed.
+        ended : EndedAttempt
+            What happened.
+        max_attempts : int
+            Number of attempts in a row that may end by themselves in one stage.
+        kept_days : float
+            Days for which the inputs of a job that failed so are kept.
+
+        Raises
+        ------
+        LeaseLostError
+            The job is no longer held.
+        """
+        with self._database.write() as connection:
+            now = self._database.now(connection)
+            claims.end_attempt(connection, job, ended, now=now, max_attempts=max_attempts, kept_days=kept_days)
+
+    def stalled(self) -> builtins.list[str]:
+        """Ids of the running jobs that make no progress."""
+        with self._database.read() as connection:
+            return claims.stalled(connection, self._database.now(connection))
 
     def _finish(self, job: Job, status: JobStatus, *, message: str, **values: Any) -> None:
         with self._database.write() as connection:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import datetime as dt
 
-from service.jobs import Fault, Job, JobFailure, JobStatus
+from service.jobs import EndedAttempt, Fault, Job, JobFailure, JobStatus
+
+MAX_OUTSIDE_ENDS = 20
+"""Kills of a job's processes from outside after which the job fails, too."""
 
 
 def lease_expired(job: Job, now: dt.datetime) -> bool:
@@ -46,6 +49,52 @@ def loss(job: Job) -> JobFailure:
         fault=Fault.LOST,
         detail=f"{drivers} lost during this job{stage}, so it is not tried again. It may need more memory than the "
         "driver's machine has: submit it with fewer or smaller tiles, or ask the operator for the driver's log",
+    )
+
+
+def after_end(job: Job, ended: EndedAttempt, max_attempts: int) -> JobStatus:
+    """The next status of a job after an attempt whose process ended before it.
+
+    Parameters
+    ----------
+    job : Job
+        As it was before; `own_ends` and `outside_ends` do not count this end yet.
+    ended : EndedAttempt
+        The attempt.
+    max_attempts : int
+        Number of attempts in a row that may end by themselves in one stage.
+
+    Returns
+    -------
+    JobStatus
+        Dismissed if that was requested, failed after too many ends, otherwise accepted: it waits again.
+    """
+    if job.dismiss_requested:
+        return JobStatus.DISMISSED
+    is_last = own_ends(job, ended) >= max_attempts if ended.is_own else job.outside_ends + 1 >= MAX_OUTSIDE_ENDS
+    return JobStatus.FAILED if is_last else JobStatus.ACCEPTED
+
+
+def own_ends(job: Job, ended: EndedAttempt) -> int:
+    """Attempts in a row that ended by themselves in one stage, with this one: another stage means progress."""
+    if not ended.is_own:
+        return job.own_ends
+    return job.own_ends + 1 if job.own_end_stage == ended.stage else 1
+
+
+def standstill(job: Job, ended: EndedAttempt, kept_days: float) -> JobFailure:
+    """The failure of a job whose attempts ended too often."""
+    stage = f" at stage {ended.stage}" if ended.stage else ""
+    if ended.is_own:
+        times = own_ends(job, ended)
+        attempts = "an attempt" if times == 1 else f"{times} attempts in a row"
+        what = f"{attempts} ended by themselves{stage}: the last one {ended.detail}"
+    else:
+        what = f"the process of {job.outside_ends + 1} attempts was killed from outside, the last time{stage}"
+    return JobFailure(
+        fault=Fault.STALLED,
+        detail=f"{what}, so the job is not tried again. Its inputs are kept for {kept_days:g} days. Ask the operator "
+        "for the driver's log; only an operator's key, with the scope admin, may retry the job",
     )
 
 

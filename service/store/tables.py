@@ -71,9 +71,15 @@ JOBS = sa.Table(
     sa.Column("watched_at", UtcTime),
     sa.Column("last_log_line", sa.Integer, nullable=False, server_default="0"),
     sa.Column("traceparent", sa.String(55)),
+    sa.Column("own_ends", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("own_end_stage", sa.String(64), nullable=False, server_default=""),
+    sa.Column("outside_ends", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("progress_due_at", UtcTime),
+    sa.Column("inputs_until", UtcTime),
 )
 """One row per job. `duration_ms` is set when a job that was started is over; `last_event` counts its events,
-`last_log_line` the lines of its log.
+`last_log_line` the lines of its log. A running job counts as stalled after `progress_due_at`; the inputs of a failed
+one are kept until `inputs_until`.
 
 `schedule_id` is not a foreign key: a job stays when its schedule is removed, and still names it.
 """

@@ -100,14 +100,17 @@ def remove(connection: Connection, upload_id: str) -> None:
 
 
 def expired(connection: Connection, now: dt.datetime) -> list[Upload]:
-    """Uploads whose time is over and that no waiting or running job and no schedule needs."""
+    """Uploads whose time is over and that no waiting or running job and no schedule needs, nor one that stood still."""
     planned = sa.exists(
         sa.select(SCHEDULE_UPLOADS.c.schedule_id).where(SCHEDULE_UPLOADS.c.upload_id == UPLOADS.c.upload_id)
     )
     needed = sa.exists(
         sa.select(JOBS.c.job_id)
         .join(JOB_UPLOADS, JOB_UPLOADS.c.job_id == JOBS.c.job_id)
-        .where(JOB_UPLOADS.c.upload_id == UPLOADS.c.upload_id, JOBS.c.status.in_(_NOT_OVER))
+        .where(
+            JOB_UPLOADS.c.upload_id == UPLOADS.c.upload_id,
+            sa.or_(JOBS.c.status.in_(_NOT_OVER), JOBS.c.inputs_until > now),
+        )
     )
     old = sa.select(UPLOADS).where(UPLOADS.c.expires_at <= now, ~needed, ~planned).order_by(UPLOADS.c.expires_at)
     return [upload_of(row) for row in connection.execute(old)]

@@ -238,18 +238,24 @@ def test_a_driver_that_must_end_gives_its_job_back_at_once(bench: Bench, how: st
     assert bench.codes == [0]
     waiting = bench.store.get(job.job_id)
     assert (waiting.status, waiting.attempt, waiting.lost_attempts) == (JobStatus.ACCEPTED, 1, 0)
-    assert not bench.folder.attempt(job.job_id, 1).exists()
+    left = bench.folder.run(job.job_id, 1) / "left"
+    left.write_text("by the first attempt")
     bench.script.go_on.set()
     bench.driver()
     done = bench.over(job)
     assert (done.status, done.attempt) == (JobStatus.SUCCESSFUL, 2)
+    # the second attempt went on in the folder of the first, with its inputs, and its results are under its own number
+    first, second = (request for request, _ in bench.script.seen)
+    assert (first.out, first.inputs) == (second.out, second.inputs)
+    assert not bench.folder.attempt(job.job_id, 1).exists()
+    assert (bench.folder.run(job.job_id, 2) / "left").read_text() == "by the first attempt"
 
 
 def test_a_run_that_does_not_end_when_called_off_does_not_keep_the_job(bench: Bench) -> None:
-    bench.patch.setattr(process, "GRACE_S", 0.1)
+    bench.patch.setattr(process, "_GRACE_S", 0.1)
     job = bench.submit()
     bench.script.steps.append(lambda *_given: bench.script.go_on.wait(LONG_S))
-    driver = bench.driver(drain_s=0.0)
+    driver = bench.driver(drain_s=0.0, stop_s=0.1)
     bench.runs()
     driver.stop()
     bench.join()

@@ -266,7 +266,7 @@ def test_the_page_names_settings_that_exist_with_their_defaults() -> None:
     for name in re.findall(r"GABLEWORK_([A-Z_]+)", text):
         assert name.lower() in fields
     reported = dict(re.findall(r"`GABLEWORK_([A-Z_]+)` \((\d+)", text))
-    assert set(reported) == {"LEASE_S", "MAX_ATTEMPTS", "DRIVER_JOBS", "DRAIN_S"}
+    assert set(reported) == {"LEASE_S", "MAX_ATTEMPTS", "DRIVER_JOBS", "DRAIN_S", "STALL_S", "STOP_S", "STALLED_DAYS"}
     for name, value in reported.items():
         assert fields[name.lower()].default == float(value)
 

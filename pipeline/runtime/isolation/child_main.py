@@ -23,7 +23,18 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import RunError
-from pipeline.runtime.isolation.messages import Batch, Begun, Finished, Frames, OutOfMemory, Raised, Ready, frame
+from pipeline.runtime.isolation.messages import (
+    Batch,
+    Begun,
+    Finished,
+    Frames,
+    Heard,
+    OutOfMemory,
+    Raised,
+    Ready,
+    Said,
+    frame,
+)
 from pipeline.runtime.isolation.start_up import start_own_process
 
 NAME = "gablework-child"
@@ -31,6 +42,17 @@ NAME = "gablework-child"
 _PIECE = 2**20
 _PR_SET_PDEATHSIG, _PR_SET_NAME = 1, 15
 _FIRST_VICTIM = "1000"
+
+HEARD: queue.SimpleQueue[Any] = queue.SimpleQueue()
+"""What the parent sends to the item that is worked on, in order."""
+_sending = threading.Lock()
+_to_parent: list[int] = []
+"""The descriptor of the pipe to the parent, once it is known."""
+
+
+def say(content: object) -> None:
+    """Send something to the parent from the item that is worked on, from any thread; it must be picklable."""
+    _send(_to_parent[0], Said(content))
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -46,6 +68,7 @@ def main(arguments: Sequence[str]) -> None:
 def serve_parent(parent: int, loads: Sequence[str]) -> None:
     """Process batches from standard input until the parent is gone."""
     incoming, outgoing = _private_pipes()
+    _to_parent[:] = [outgoing]
     end_with_parent(parent)
     name_process(NAME)
     _be_killed_first()
@@ -112,8 +135,11 @@ def _receive(incoming: int, batches: queue.SimpleQueue[Batch]) -> None:
     frames = Frames()
     try:
         while received := os.read(incoming, _PIECE):
-            for batch in frames.feed(received):
-                batches.put(batch)
+            for message in frames.feed(received):
+                if isinstance(message, Heard):
+                    HEARD.put(message.content)
+                else:
+                    batches.put(message)
     except BaseException:  # noqa: BLE001 - the parent sees that this process ends
         traceback.print_exc()
         os._exit(1)
@@ -123,8 +149,9 @@ def _receive(incoming: int, batches: queue.SimpleQueue[Batch]) -> None:
 def _send(outgoing: int, message: object) -> None:
     """Write a whole message."""
     rest = memoryview(frame(message))
-    while rest:
-        rest = rest[os.write(outgoing, rest) :]
+    with _sending:
+        while rest:
+            rest = rest[os.write(outgoing, rest) :]
 
 
 def _process(batch: Batch, outgoing: int) -> None:

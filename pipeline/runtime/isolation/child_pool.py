@@ -37,10 +37,17 @@ def start_failure(detail: str, stderr: str, work: str = "models buildings") -> s
     return f"the process that {work} died {FRUITLESS_STARTS} times in a row before it began: {detail}{output}"
 
 
-class _ChildPool:
-    """The children of this process, idle or borrowed."""
+class ChildPool:
+    """The children of this process, idle or borrowed.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    stderr : int, optional
+        A descriptor that is the standard error of all children; by default each child has a file of its own.
+    """
+
+    def __init__(self, stderr: int | None = None) -> None:
+        self._stderr = stderr
         self._lock = threading.Lock()
         self._idle: list[SupervisedChild] = []
         self._all: set[SupervisedChild] = set()
@@ -53,7 +60,10 @@ class _ChildPool:
     def borrowed(
         self, cancelled: Callable[[], bool], *, fresh: bool, loads: Sequence[str] | None
     ) -> Iterator[SupervisedChild]:
-        """A ready child, with `fresh` one that has not begun any item; ended if its work breaks off."""
+        """A ready child, with `fresh` one that has not begun any item; ended if its work breaks off.
+
+        Raises the errors of `borrowed_child`.
+        """
         child = self._ready_child(cancelled, fresh=fresh, loads=_LOADS if loads is None else loads)
         try:
             yield child
@@ -144,11 +154,14 @@ class _ChildPool:
         server = self._serving(loads) if forked else None
         if server is not None:
             try:
-                return SupervisedChild(lambda stderr: server.fork(loads, stderr))
+                return SupervisedChild(lambda own: server.fork(loads, self._stderr_or(own)))
             except OSError as error:
                 LOG.warning("no process can be forked: %s", error)
                 self._retire()
-        return SupervisedChild(lambda stderr: SpawnedChild(loads, stderr))
+        return SupervisedChild(lambda own: SpawnedChild(loads, self._stderr_or(own)))
+
+    def _stderr_or(self, own: int) -> int:
+        return own if self._stderr is None else self._stderr
 
     def _serving(self, loads: Sequence[str]) -> ForkServer | None:
         """The server, started if necessary; None if children have to be spawned."""
@@ -176,7 +189,7 @@ class _ChildPool:
             self._all.discard(child)
 
 
-_pool = _ChildPool()
+_pool = ChildPool()
 
 
 def borrowed_child(
@@ -226,7 +239,7 @@ def kill_children() -> None:
 def _forget_children() -> None:
     """Leave the children to the original process after a fork."""
     global _pool  # noqa: PLW0603 - one pool per process
-    _pool = _ChildPool()
+    _pool = ChildPool()
 
 
 os.register_at_fork(after_in_child=_forget_children)

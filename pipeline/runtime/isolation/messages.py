@@ -5,6 +5,8 @@ supervisor                          child
     Batch(function, items) ──────▶
                            ◀──────  Ready                    once, after loading
                            ◀──────  Begun(index)             before an item begins: the one to blame if the child dies
+                           ◀──────  Said(content)            what a long item reports meanwhile
+    Heard(content)         ──────▶                           an answer to it, or a request to end
                            ◀──────  Finished(index, result)  at once, so no finished item is lost
                            ◀──────  OutOfMemory(index)       the item raised MemoryError; the child is not used again
                            ◀──────  Raised(index, error)     the function raised: a fault of the run, not of the item
@@ -67,6 +69,20 @@ class Finished:
 
     index: int
     result: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Said:
+    """Something that an item says while it is worked on (`child_main.say`)."""
+
+    content: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Heard:
+    """Something for the item that is worked on (`child_main.HEARD`)."""
+
+    content: Any
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,8 +17,20 @@ from typing import Any
 
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.isolation.forked_child import read_by_children
-from pipeline.runtime.isolation.messages import Batch, Begun, Finished, Frames, OutOfMemory, Raised, Ready, frame
+from pipeline.runtime.isolation.messages import (
+    Batch,
+    Begun,
+    Finished,
+    Frames,
+    Heard,
+    OutOfMemory,
+    Raised,
+    Ready,
+    Said,
+    frame,
+)
 from pipeline.runtime.isolation.spawned_child import ChildProcess
+from pipeline.runtime.monitoring.events import never
 
 _PIECE = 2**20
 _TICK_S = 0.05
@@ -93,6 +105,11 @@ class SupervisedChild:
         return self._process.poll() is None
 
     @property
+    def return_code(self) -> int | None:
+        """The return code of the process, negative for a signal; None while it runs."""
+        return self._process.poll()
+
+    @property
     def memory_bytes(self) -> int:
         """Its resident memory without the pages shared with files; 0 if it is gone."""
         info = self._psutil("memory_info")
@@ -132,7 +149,7 @@ class SupervisedChild:
                 return None
             if time.monotonic() > deadline:
                 return f"it was not ready after {timeout_s:g} s"
-        return self._how_it_ended()
+        return self.how_it_ended()
 
     def work(
         self,
@@ -152,7 +169,7 @@ class SupervisedChild:
         with contextlib.suppress(BrokenPipeError):  # its end is handled below
             self._write(frame(batch))
         allowed = f"the {memory_bytes / 2**30:g} GiB that a {one} may take"
-        kills = _system_kills()
+        kills = system_kills()
         left = len(items)
         at_work: int | None = None
         began = time.monotonic()
@@ -197,11 +214,38 @@ class SupervisedChild:
                             EndCause.TIME, f"it took longer than {timeout_s:g} s, the limit that protects a run"
                         )
                         return
-        detail = self._how_it_ended()
-        if self._process.poll() == -signal.SIGKILL and _system_kills() > kills:
+        detail = self.how_it_ended()
+        if self._process.poll() == -signal.SIGKILL and system_kills() > kills:
             yield ended(EndCause.MEMORY, "the system ran out of memory and ended its process")
         else:
             yield ended(EndCause.DIED, detail)
+
+    def converse(self, function: Callable[[Any], Any], item: object, *, data_limit_bytes: int | None) -> Iterator[Any]:
+        """Work on one item that talks while it is worked on.
+
+        Yields the content of each `Said`, the `Finished` or `OutOfMemory` of the item, and None every tick; ends when
+        the process is gone. Limits are the caller's, who may `answer`, and end the process.
+
+        Raises the exception of the function, as it was pickled.
+        """
+        batch = Batch(function=function, items=[(0, item)], data_limit_bytes=data_limit_bytes)
+        with contextlib.suppress(BrokenPipeError):  # the caller sees its end
+            self._write(frame(batch))
+        for message in self._messages(never):
+            match message:
+                case Said():
+                    yield message.content
+                case Raised():
+                    raise message.error
+                case Begun():
+                    self.begun += 1
+                case _:
+                    yield message
+
+    def answer(self, content: object) -> None:
+        """Send something to the item that talks; harmless if the process is gone."""
+        with contextlib.suppress(BrokenPipeError):
+            self._write(frame(Heard(content)))
 
     def kill(self) -> None:
         """Kill the process and all that it started; harmless if it is gone."""
@@ -249,7 +293,7 @@ class SupervisedChild:
                 if cancelled():
                     raise RunCancelledError("the run was cancelled")
 
-    def _how_it_ended(self) -> str:
+    def how_it_ended(self) -> str:
         """Signal or exit code of a process whose pipe is closed."""
         self._look_at_cpu()  # until it is waited for, the system remembers
         if self._nonsense:
@@ -265,12 +309,17 @@ class SupervisedChild:
             name = "no name"
         return f"its process was ended by signal {-code} ({name})"
 
+    def show_trace(self) -> None:
+        """Let the child write a traceback to its standard error, and go on; harmless if it is gone."""
+        if self._process.pid is not None and self.alive:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._process.pid, signal.SIGUSR1)
+
     def _ask_for_trace(self) -> None:
         """Let the child write a traceback; faulthandler does so even while a building holds the interpreter."""
         before = os.fstat(self._stderr.fileno()).st_size
         deadline = time.monotonic() + _TRACE_WAIT_S
-        assert self._process.pid is not None
-        os.kill(self._process.pid, signal.SIGUSR1)
+        self.show_trace()
         while time.monotonic() < deadline:
             if os.fstat(self._stderr.fileno()).st_size > before and not self._poll.poll(_TICK_S * 1e3):
                 return
@@ -305,7 +354,7 @@ class SupervisedChild:
         return self._end_of_stderr().decode("utf-8", errors="replace").strip()
 
 
-def _system_kills() -> int:
+def system_kills() -> int:
     """Number of processes that Linux has ended for lack of memory since it started; 0 if unknown."""
     try:
         counts = dict(line.split() for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines())

@@ -16,6 +16,7 @@ import io
 import math
 import mmap
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -44,6 +45,11 @@ POINT = np.dtype(
 _CANCELLED = "cancelled"
 ATTEMPTS = "attempts"
 """Folder with the mark of the attempt at a run that works in scratch which outlives its runs."""
+PULSE = "pulse"
+"""File whose time of change says when a task of a run last got somewhere, in scratch that outlives its runs."""
+_BEAT_S = 1.0
+_beaten_s: dict[str, float] = {}
+"""When this process last wrote it, by the folder of scratch."""
 _LONGEST_HEADER_BYTES = 256
 """Enough for the arrays stored here, numbers of up to three dimensions."""
 
@@ -183,12 +189,27 @@ class Scratch:
         return self.has(_CANCELLED) or not self.has(".")
 
     def check_cancelled(self) -> None:
-        """Raise `RunCancelledError` in a task of a run that was cancelled, `RunOverError` where its mark is gone."""
+        """Raise as `check_mark` in a task of a run that is over; a task that goes on has got somewhere."""
+        self.check_mark()
+        self.beat()
+
+    def check_mark(self) -> None:
+        """Raise `RunCancelledError` if the run was cancelled, `RunOverError` where its mark is gone. No progress."""
         if not self.cancelled:
             return
         if not self.attempt and self.has(_CANCELLED):
             raise RunCancelledError("the run was cancelled")
         raise RunOverError(f"the run in {self.root} is over: it was cancelled, or the folder was removed")
+
+    def beat(self) -> None:
+        """Note that a task got somewhere, where others may watch for that: at most once a second per process."""
+        now_s = time.monotonic()
+        if self.attempt and now_s - _beaten_s.get(self.root, -_BEAT_S) >= _BEAT_S:
+            _beaten_s.clear()
+            _beaten_s[self.root] = now_s
+            # a beat that is missed is noted a second later; scratch that is gone needs none
+            with contextlib.suppress(OSError):
+                Path(self.root, PULSE).touch()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -203,6 +203,7 @@ def run_and_store(work: OutcomeTask[Task, Result, Brief]) -> StoredOutcome[Brief
 
     Raises RunError if scratch or results cannot be read or written; earlier outcomes stay.
     """
+    work.scratch.beat()
     try:
         result = work.function(work.task)
         brief = work.brief(result)

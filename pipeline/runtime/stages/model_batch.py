@@ -242,6 +242,7 @@ def _in_child(task: BatchTask, sites: Sequence[CandidateSite], limits: Isolation
         found = _lost(common, sites[index], model, limits, cancelled) if isinstance(model, Loss) else model
         if index in retried:
             found = dataclasses.replace(found, modelled=dataclasses.replace(found.modelled, retried=retried[index]))
+        task.scratch.beat()
         yield index, found
 
 
@@ -257,7 +258,7 @@ def _loads(task: BatchTask) -> tuple[str, ...]:
 
 
 def _cancelled(task: BatchTask) -> bool:
-    task.scratch.check_cancelled()  # its error says more than a yes would
+    task.scratch.check_mark()  # its error says more than a yes would; waiting for a building is no progress
     return False
 
 

@@ -68,6 +68,7 @@ const REMEDIES: Record<string, string> = {
   refused: "Cut the tile into smaller ones, or ask the operator of this service to allow it.",
   cluster: "The computers that do the work were away. Try again; ask the operator of this service if it fails once more.",
   lost: "The work ended the program several times, mostly for lack of memory. Try a smaller rectangle or tile, or ask the operator of this service for more memory.",
+  stalled: "The work stood still, or ended its own program, several times. Ask the operator of this service to look at it: only an operator can try it again.",
   "no-space": "Remove jobs that you no longer need, then try again.",
   internal: "Try again once. If it fails once more, send the operator of this service the message above.",
 };

@@ -1,0 +1,263 @@
+"""The process of one attempt: it does the work of the job, talks to its driver, and is ended alone.
+
+It has no connection to the database and holds no lease: it says what happens, and hears when it must end.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import ClusterError, GableworkError
+from pipeline.runtime.cluster.dask_executor import Cluster
+from pipeline.runtime.cluster.serial_executor import Executor
+from pipeline.runtime.isolation import child_main
+from pipeline.runtime.monitoring import tracing
+from pipeline.runtime.monitoring.events import Event
+from service import traces
+from service.driver.attempt import AttemptParts, perform
+from service.driver.failures import has_no_space
+from service.driver.leased_job import LOG
+from service.driver.logs import configure
+from service.driver.messages import Scrubber
+from service.errors import NoSpaceError, NoSuchUploadError, ServiceError, UnexpectedError
+from service.files import StateFolder
+from service.jobs import Job, LogLevel, Upload
+from service.settings import ServiceSettings
+
+LOADS = ("service.driver.attempt_child:load",)
+"""What the process loads before it is forked, as in `isolation.child_main`."""
+_FLUSH_MS = 2000
+"""Milliseconds for sending the last spans."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Order:
+    """What the process must do."""
+
+    job: Job
+    settings: ServiceSettings
+    place: Path
+    """The folder in which the attempt works."""
+    uploads: Mapping[str, Upload]
+    """The uploads of the job that exist, by id."""
+    driver: str
+    """Name of the driver."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Note:
+    """A line for the job's log, from the process."""
+
+    message: str
+    level: LogLevel
+    facts: Mapping[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Name:
+    """A name that replaces a path in messages, from the process."""
+
+    path: str
+    name: str
+
+
+@dataclasses.dataclass(frozen=True)
+class WorkersWanted:
+    """The process is ready for the workers; the answer is `Lent`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Lent:
+    """The scheduler of the workers, for the process."""
+
+    address: str
+    embedded: bool
+    """Whether the workers belong to the driver, which mends them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WorkersMissing:
+    """The process sees fewer workers than there should be."""
+
+    present: int
+
+
+@dataclasses.dataclass(frozen=True)
+class End:
+    """The attempt must end, for the process."""
+
+
+class KnownUploads:
+    """The uploads that the order names; as the store's."""
+
+    def __init__(self, uploads: Mapping[str, Upload]) -> None:
+        self._uploads = uploads
+
+    def upload(self, upload_id: str, *, owner: str | None = None) -> Upload:
+        """One upload.
+
+        Raises
+        ------
+        NoSuchUploadError
+            It did not exist when the attempt began.
+        """
+        del owner
+        found = self._uploads.get(upload_id)
+        if found is None:
+            raise NoSuchUploadError(f"there is no upload {upload_id[:64]!r} (any more)")
+        return found
+
+
+class _NamingScrubber(Scrubber):
+    """Names paths for the driver, too."""
+
+    def name(self, path: str, name: str) -> None:
+        super().name(path, name)
+        child_main.say(Name(path, name))
+
+
+class ChildJob:
+    """The job, in the process of its attempt; see `service.driver.attempt.Held`."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.scrub: Scrubber = _NamingScrubber()
+        self._stopped = threading.Event()
+        self._lent: Lent | None = None
+        self._answered = threading.Event()
+        threading.Thread(target=self._hear, name="driver", daemon=True).start()
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """Additional fields of a log line."""
+        return {"job": self.job.job_id, "attempt": self.job.attempt}
+
+    def cancelled(self) -> bool:
+        """Whether the attempt must end."""
+        return self._stopped.is_set()
+
+    def wait(self, seconds: float) -> bool:
+        """Wait, at most until the attempt must end; returns whether it must."""
+        return self._stopped.wait(seconds)
+
+    def record(self, event: Event) -> None:
+        """Send an event of the run to the driver."""
+        child_main.say(event)
+
+    def note(self, message: str, *, level: LogLevel = LogLevel.INFO, **facts: Any) -> None:
+        """Send a line for the job's log to the driver."""
+        child_main.say(Note(message, level, facts))
+
+    def lent(self) -> Lent:
+        """The workers, as soon as the driver has some. It ends this process if it has none before the job must end."""
+        child_main.say(WorkersWanted())
+        self._answered.wait()
+        assert self._lent is not None
+        return self._lent
+
+    def _hear(self) -> None:
+        while True:
+            word = child_main.HEARD.get()
+            if isinstance(word, Lent):
+                self._lent = word
+                self._answered.set()
+            elif isinstance(word, End):
+                self._stopped.set()
+
+
+class LentCluster(Cluster):
+    """The workers of the driver: it mends them, not the process that uses them."""
+
+    _MEND_S = 5.0
+
+    def __init__(self, lent: Lent, settings: ServiceSettings) -> None:
+        super().__init__(scheduler=lent.address, tls=settings.resources.tls)
+        self._is_embedded = lent.embedded
+        self._said_s = 0.0
+
+    @property
+    def embedded(self) -> bool:
+        """Whether scheduler and workers belong to the driver of this process."""
+        return self._is_embedded
+
+    def mend(self, workers: int) -> None:
+        """Let the driver restart workers that died during their start."""
+        if self._is_embedded and time.monotonic() - self._said_s >= self._MEND_S:
+            self._said_s = time.monotonic()
+            child_main.say(WorkersMissing(workers))
+
+
+class _DriversWorkers:
+    """Stands for `SharedCluster` in this process."""
+
+    def __init__(self, settings: ServiceSettings) -> None:
+        self._settings = settings
+
+    def executor(self, held: ChildJob) -> Executor:
+        """An executor for the run of the job, as soon as the driver has workers."""
+        # jobs are interactive: they go before batch runs on the same scheduler
+        return LentCluster(held.lent(), self._settings).executor(held.job.priority)
+
+
+def load() -> None:
+    """Load what an attempt needs, before the process is forked; nothing here may start a thread."""
+    import dask
+    import distributed.client
+    import pyarrow.parquet
+
+    import pipeline.export.tile
+    import pipeline.io.las
+    import pipeline.runtime.digest
+    import pipeline.runtime.stages.publish
+    import service.preflight  # noqa: F401
+
+    del dask, distributed, pyarrow, pipeline
+
+
+def attend(order: Order) -> tuple[str, dict[str, Any]]:
+    """Do the work of a job in this process; see `service.driver.attempt.perform`.
+
+    Raises
+    ------
+    GableworkError, ServiceError
+        As `perform`; any other exception is logged here, and becomes an `UnexpectedError`.
+    """
+    configure(as_json=order.settings.log_json)
+    held = ChildJob(order.job)
+    parts = AttemptParts(
+        settings=order.settings,
+        folder=StateFolder(order.settings.state.resolve(), order.settings.reserve_bytes),
+        place=order.place,
+        uploads=KnownUploads(order.uploads),
+        workers=_DriversWorkers(order.settings),
+    )
+    try:
+        with traces.attempt(order.job, order.driver):
+            return perform(held, parts)
+    except MemoryError:
+        raise
+    except Exception as error:  # noqa: BLE001 - only what travels between processes reaches the driver
+        raise _plain(error, held) from None
+    finally:
+        if tracing.is_on():
+            tracing.provider().force_flush(_FLUSH_MS)
+
+
+def _plain(error: Exception, held: ChildJob) -> Exception:
+    """The error as the driver can receive and judge it, without its causes, which do not travel."""
+    if isinstance(error, ClusterError):
+        return error
+    if has_no_space(error):
+        return NoSpaceError(f"the disk is full ({type(error).__name__})")
+    if isinstance(error, GableworkError | ServiceError):
+        return error
+    LOG.error("an unexpected fault: %s", error, extra=held.facts, exc_info=error)
+    plain = UnexpectedError(type(error).__name__)
+    plain.add_note("".join(traceback.format_exception(error)))
+    return plain

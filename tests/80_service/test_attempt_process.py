@@ -1,0 +1,144 @@
+"""Attempts in processes of their own: whatever one does, its slot is free again and the others go on."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hostile_attempts
+import pytest
+from driver_bench import Bench
+from processes import LONG_S, wait_for
+
+from service.jobs import Fault, JobStatus
+from service.store.policies import MAX_OUTSIDE_ENDS
+
+pytestmark = pytest.mark.slow
+
+STALL_S = 1.5
+
+
+@pytest.fixture
+def apart(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """A bench whose attempts are processes that find the tests' modules."""
+    paths = [str(Path(hostile_attempts.__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    bench.settings = bench.settings.model_copy(update={"stall_s": STALL_S, "stop_s": 0.5, "max_attempts": 2})
+    return bench
+
+
+@pytest.mark.parametrize(
+    ("work", "words"),
+    [
+        (hostile_attempts.loop_for_ever, "made no progress for 1.5 s"),
+        (hostile_attempts.keep_the_interpreter, "made no progress for 1.5 s"),
+        (hostile_attempts.stop_itself, "made no progress for 1.5 s"),
+        (hostile_attempts.wait_for_itself, "made no progress for 1.5 s"),
+        (hostile_attempts.crash, "SIGSEGV"),
+        (hostile_attempts.eat_memory_at_once, "asked for more than"),
+    ],
+)
+def test_an_attempt_that_ends_by_itself_is_tried_again_and_then_the_job_fails(
+    apart: Bench, work: Callable[..., Any], words: str
+) -> None:
+    apart.work = work
+    job = apart.submit()
+    apart.driver()
+    done = apart.over(job)
+    assert (done.status, done.attempt, done.own_ends, done.own_end_stage) == (JobStatus.FAILED, 2, 2, "plan")
+    assert done.failure is not None
+    assert done.failure.fault is Fault.STALLED
+    assert words in done.failure.detail
+    assert "2 attempts in a row ended by themselves at stage plan" in done.failure.detail
+    assert done.lost_attempts == 0
+
+
+def test_a_process_that_takes_too_much_memory_is_ended(apart: Bench) -> None:
+    apart.work = hostile_attempts.eat_memory
+    job = apart.submit()
+    apart.driver(attempt_memory_bytes=2**30, max_attempts=1)
+    failure = apart.over(job).failure
+    assert failure is not None
+    assert (failure.fault, "GABLEWORK_ATTEMPT_MEMORY_BYTES" in failure.detail) == (Fault.STALLED, True)
+
+
+def test_other_slots_go_on_while_one_stands_still(apart: Bench) -> None:
+    apart.work = hostile_attempts.loop_unless_urgent
+    stuck = apart.submit()
+    apart.driver(driver_jobs=2, stall_s=LONG_S)
+    wait_for(lambda: apart.store.get(stuck.job_id).stage == "plan", "the loop")
+    for _ in range(3):
+        assert apart.over(apart.submit(priority=1)).status is JobStatus.SUCCESSFUL
+    assert apart.store.get(stuck.job_id).status is JobStatus.RUNNING
+    apart.store.dismiss(stuck.job_id)
+    assert apart.over(stuck).status is JobStatus.DISMISSED
+
+
+def test_a_dismissed_job_ends_although_its_process_does_not_hear(apart: Bench) -> None:
+    apart.work = hostile_attempts.keep_the_interpreter
+    job = apart.submit()
+    apart.driver(stall_s=LONG_S)
+    wait_for(lambda: apart.store.get(job.job_id).stage == "plan", "the loop")
+    apart.store.dismiss(job.job_id)
+    assert apart.over(job).status is JobStatus.DISMISSED
+    assert not apart.folder.job(job.job_id).exists()
+
+
+@pytest.mark.parametrize("work", [hostile_attempts.stop_when_asked, hostile_attempts.stop_never_then_work])
+def test_a_driver_that_ends_hands_the_attempt_back_and_the_next_one_goes_on(
+    apart: Bench, work: Callable[..., Any]
+) -> None:
+    apart.work = work
+    job = apart.submit()
+    driver = apart.driver(drain_s=0.0, stall_s=LONG_S)
+    wait_for(lambda: apart.store.get(job.job_id).stage in {"split", "plan"}, "the work")
+    driver.stop()
+    apart.join()
+    assert apart.codes == [0]
+    waiting = apart.store.get(job.job_id)
+    assert (waiting.status, waiting.attempt, waiting.lost_attempts) == (JobStatus.ACCEPTED, 1, 0)
+    apart.driver()
+    done = apart.over(job)
+    assert (done.status, done.attempt, done.message) == (JobStatus.SUCCESSFUL, 2, "done in attempt-1")
+    wait_for(lambda: [path.name for path in apart.folder.job(job.job_id).iterdir()] == ["attempt-2"], "one folder")
+    assert (apart.folder.attempt(job.job_id, 2) / "left").read_text() == "1"
+
+
+def test_honest_work_that_takes_long_is_not_ended(apart: Bench) -> None:
+    apart.work = hostile_attempts.work_slowly
+    job = apart.submit()
+    apart.driver()
+    done = apart.over(job)
+    assert (done.status, done.attempt) == (JobStatus.SUCCESSFUL, 1)
+    assert done.summary is not None
+    assert done.summary["pid"] != os.getpid()
+
+
+def test_a_refusal_travels_whole_from_the_process(apart: Bench) -> None:
+    apart.work = hostile_attempts.refuse
+    job = apart.submit()
+    apart.driver()
+    failure = apart.over(job).failure
+    assert failure is not None
+    assert (failure.fault, failure.detail) == (Fault.INPUT, "tile.laz: is truncated. Send it again")
+    apart.end()
+    apart.work = hostile_attempts.refuse_the_request
+    job = apart.submit()
+    apart.driver()
+    failure = apart.over(job).failure
+    assert failure is not None
+    assert (failure.fault, failure.detail) == (Fault.INPUT, "the first fault; the second fault")
+
+
+def test_a_process_killed_from_outside_does_not_count_as_the_jobs_own_end(apart: Bench) -> None:
+    apart.work = hostile_attempts.be_killed
+    job = apart.submit()
+    apart.driver()
+    wait_for(lambda: apart.store.get(job.job_id).attempt >= 4, "further attempts")
+    found = apart.store.get(job.job_id)
+    assert (found.own_ends, found.lost_attempts) == (0, 0)
+    assert found.outside_ends >= 3
+    done = apart.over(job)
+    assert done.outside_ends == MAX_OUTSIDE_ENDS
+    assert done.failure is not None
+    assert (done.failure.fault, "killed from outside" in done.failure.detail) == (Fault.STALLED, True)
