@@ -25,9 +25,10 @@ from pipeline.runtime.run_context import RunContext, run_context
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
 from pipeline.runtime.scratch.location import resumable_scratch
+from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.runtime.stages.ground import find_ground
-from pipeline.runtime.stages.ingest import ingest
+from pipeline.runtime.stages.ingest import ingest, part_of
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.label import LabelTask, SitesNear, label, neighbourhood
@@ -179,9 +180,11 @@ def classify(
         roof = request.settings.building.roof
         joined = join(context, request.settings.scene, roof, splits, footprints, outlines=False)
         tiles = sorted(splits.places)
-        _label_all(context, request.settings, tiles, joined, ingested, given=footprints is not None)
-        files = _write_all(context, paths, ingested, out)
-        rasters = _draw_all(context, tiles, ingested, cell, out) if request.rasters else []
+        # everything that the stages below read: an attempt that resumes repeats none of their tasks
+        seen = key_of([found.parts for found in ingested], splits.keys, joined.keys, request.settings)
+        _label_all(context, request.settings, tiles, joined, ingested, given=footprints is not None, seen=seen)
+        files = _write_all(context, paths, ingested, out, seen)
+        rasters = _draw_all(context, tiles, ingested, cell, out, seen) if request.rasters else []
     return _summary(progress, out, files, rasters, joined.candidates, began)
 
 
@@ -225,13 +228,14 @@ def _label_all(
     ingested: Sequence[Ingested],
     *,
     given: bool,
+    seen: str,
 ) -> None:
     """The classes of all tiles' points, in scratch; buildings may be `given` by footprints."""
     grid = context.plan.grid
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
     sites = SitesNear.of(joined)
-    tasks = [
-        LabelTask(
+    tasks = {
+        Place("classify", tile.key, key_of(seen, tile, given)): LabelTask(
             tile=tile,
             grid=grid,
             settings=settings.scene,
@@ -243,16 +247,16 @@ def _label_all(
         )
         for tile in tiles
         for near in [tuple(grid.tiles_over(neighbourhood(tile, grid, settings.scene)))]
-    ]
-    context.map("classify", label, tasks)
+    }
+    context.map_stored("classify", label, tasks, whole)
 
 
 def _write_all(
-    context: RunContext, paths: Sequence[str], ingested: Sequence[Ingested], out: Path
+    context: RunContext, paths: Sequence[str], ingested: Sequence[Ingested], out: Path, seen: str
 ) -> list[ClassifiedFile]:
     """All files, in the inputs' order."""
-    tasks = [
-        ClassifiedTask(
+    tasks = {
+        Place("write", part_of(path), key_of(seen, path, str(out))): ClassifiedTask(
             parts=found.parts,
             path=path,
             used=sum(found.points_by_tile.values()),
@@ -263,8 +267,8 @@ def _write_all(
             scratch=context.scratch,
         )
         for path, found in zip(paths, ingested, strict=True)
-    ]
-    return sorted(context.map("write", write_classified, tasks), key=lambda file: file.source)
+    }
+    return sorted(context.map_stored("write", write_classified, tasks, whole).values(), key=lambda file: file.source)
 
 
 def _draw_all(
@@ -273,14 +277,15 @@ def _draw_all(
     ingested: Sequence[Ingested],
     cell: float,
     out: Path,
+    seen: str,
 ) -> list[str]:
     """All rasters, each one mosaic of the tiles; their paths."""
     reference = context.plan.reference
     boxes = [tuple(v / MM for v in found.bounds_mm) for found in ingested if found.bounds_mm is not None]
     lattice = RasterLattice.over(_bounds_of_boxes(boxes), cell, reference.horizontal_unit_m)
     drawn = with_neighbours(set(tiles))
-    tasks = [
-        RasterTask(
+    tasks = {
+        Place("rasters", tile.key, key_of(seen, tile, lattice)): RasterTask(
             tile=tile,
             grid=context.plan.grid,
             lattice=lattice,
@@ -288,15 +293,15 @@ def _draw_all(
             vertical_unit_m=reference.vertical_unit_m,
         )
         for tile in drawn
-    ]
-    context.map("rasters", draw_tile, tasks)
-    mosaics = [
-        MosaicTask(
+    }
+    context.map_stored("rasters", draw_tile, tasks, whole)
+    mosaics = {
+        Place("mosaics", name, key_of(seen, lattice, str(out))): MosaicTask(
             name=name, tiles=tuple(drawn), lattice=lattice, scratch=context.scratch, out=str(out), reference=reference
         )
         for name in RASTERS
-    ]
-    return sorted(context.map("mosaics", write_mosaic, mosaics))
+    }
+    return sorted(context.map_stored("mosaics", write_mosaic, mosaics, whole).values())
 
 
 def _bounds_of_boxes(boxes: Sequence[tuple[float, ...]]) -> tuple[float, float, float, float]:

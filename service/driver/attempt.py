@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 import secrets
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from pipeline import __version__
 from pipeline.errors import GableworkError, RunCancelledError
@@ -42,6 +43,8 @@ from service.outputs import write_classification_outputs, write_comparison_outpu
 from service.outputs.kinds import RASTERS
 from service.outputs.published import publish
 from service.settings import ServiceSettings
+
+Done = TypeVar("Done")
 
 _NAMED = 10
 """Inputs that the log of a job names."""
@@ -229,6 +232,24 @@ class AttemptParts:
         """The outputs."""
         return self.place / "outputs"
 
+    @property
+    def done(self) -> Path:
+        """What the parts of the work found that are done: an attempt that resumes does not repeat them."""
+        return self.place / "done"
+
+    def once(self, name: str, work: Callable[[], Done]) -> Done:
+        """The result of a part of the work, which is stored; that of an attempt before, by the same version, if any."""
+        path = self.done / f"{name}-{__version__}"
+        if path.exists():
+            before: Done = pickle.loads(path.read_bytes())  # noqa: S301 - from a folder of the service's own
+            return before
+        found = work()
+        self.done.mkdir(exist_ok=True)
+        new = path.with_name(f".{path.name}")
+        new.write_bytes(pickle.dumps(found))
+        new.rename(path)
+        return found
+
 
 def perform(held: Held, parts: AttemptParts) -> tuple[str, dict[str, Any]]:
     """Do all the work of a job.
@@ -270,7 +291,8 @@ def perform(held: Held, parts: AttemptParts) -> tuple[str, dict[str, Any]]:
     held.record(Event(kind="stage", stage="plan"))
     done = work(executor)
     _check(held)
-    shutil.rmtree(parts.inputs, ignore_errors=True)
+    for folder in (parts.inputs, parts.done):
+        shutil.rmtree(folder, ignore_errors=True)
     return done
 
 
@@ -311,10 +333,8 @@ def _reconstruct(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
     request = run_request(job.request, files, parts.run, parts.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
-        summary = parts.tools.run(request, held.record, executor, held.cancelled)
-        # an attempt before may have left a part of them
-        shutil.rmtree(out_dir, ignore_errors=True)
-        problems = _published(held, parts)
+        summary = parts.once("run", lambda: parts.tools.run(request, held.record, executor, held.cancelled))
+        problems = parts.once("formats", lambda: _published(held, parts))
         begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
             parts.tools.write_outputs(Path(request.out), out_dir, job.request.outputs, begin)
@@ -327,6 +347,8 @@ def _reconstruct(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
 def _published(held: Held, parts: AttemptParts) -> dict[str, str]:
     """Write the further formats of a job, if it wants any; why some could not be made, for clients."""
     request = held.job.request
+    # an attempt before may have left a part of them
+    shutil.rmtree(parts.outputs, ignore_errors=True)
     if not request.publish:
         return {}
     on_progress = _begun(held, "formats")
@@ -360,7 +382,7 @@ def _compare(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
     request = compare_request(job.request, files, place, parts.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
-        summary = parts.tools.compare(request, held.record, executor, held.cancelled)
+        summary = parts.once("compare", lambda: parts.tools.compare(request, held.record, executor, held.cancelled))
         shutil.rmtree(out_dir, ignore_errors=True)
         begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
@@ -376,7 +398,7 @@ def _classify(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
     request = classify_request(job.request, files, parts.run, parts.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
-        summary = parts.tools.classify(request, held.record, executor, held.cancelled)
+        summary = parts.once("classify", lambda: parts.tools.classify(request, held.record, executor, held.cancelled))
         shutil.rmtree(out_dir, ignore_errors=True)
         begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):

@@ -75,7 +75,7 @@ WORDS = MappingProxyType(
 
 _LAST = 99
 _START_S = 60.0
-"""Seconds for the starts of the processes that model a building, on a busy machine."""
+"""Seconds for the start of processes, on a busy machine with cold caches."""
 
 
 def percent(stage: str, done: int, total: int, weights: Mapping[str, int] = WEIGHTS) -> int:
@@ -114,7 +114,7 @@ def step_s(stage: str, *, stall_s: float, building_timeout_s: float) -> float:
     Parameters
     ----------
     stage : str
-        The stage; an unknown one is like most.
+        The stage; an unknown one is like most, and an empty one is the start of the process.
     stall_s : float
         Limit of most stages: of one task, one file, one building.
     building_timeout_s : float
@@ -129,4 +129,4 @@ def step_s(stage: str, *, stall_s: float, building_timeout_s: float) -> float:
     """
     if stage == "reconstruct":
         return max(stall_s, 3.0 * building_timeout_s + _START_S)
-    return stall_s
+    return stall_s if stage else max(stall_s, 2.0 * _START_S)

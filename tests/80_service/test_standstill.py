@@ -59,8 +59,8 @@ def test_the_failure_says_what_happened_where_and_who_can_help() -> None:
     assert failure.fault is Fault.STALLED
     assert failure.detail == (
         "3 attempts in a row ended by themselves at stage split: the last one made no progress for 600 s, so the job "
-        "is not tried again. Its inputs are kept for 30 days. Ask the operator for the driver's log; only an operator's "
-        "key, with the scope admin, may retry the job"
+        "is not tried again. Its inputs are kept for 30 days. Ask the operator for the driver's log; only an "
+        "operator's key, with the scope admin, may retry the job"
     )
 
 
