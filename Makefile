@@ -96,7 +96,7 @@ $(VENV)/.site-stamp: requirements-site.lock $(VENV)/.build-stamp $(wildcard $(VE
 	$(UV) pip install --quiet --python $(BIN)/python --require-hashes -r requirements-site.lock
 	@touch $@
 
-build/docs/site/index.html: $(VENV)/.site-stamp README.md CONTRIBUTING.md $(shell find docs -type f)
+build/docs/site/index.html: $(VENV)/.site-stamp README.md CONTRIBUTING.md THIRD_PARTY_NOTICES.md $(shell find docs -type f)
 	$(BIN)/python docs/site.py
 	@touch $@
 
@@ -163,6 +163,7 @@ ruler: $(VENV)/.warm-stamp
 
 docs: $(VENV)/.run-stamp
 	$(BIN)/python docs/generate.py
+	$(BIN)/python docs/notices.py
 
 format: $(VENV)/.test-stamp
 	$(BIN)/ruff check --fix .

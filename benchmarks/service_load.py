@@ -41,8 +41,9 @@ REST_S = 5.0
 @contextlib.contextmanager
 def serving(state: Path, *options: str) -> Iterator[tuple[str, int]]:
     """URL and process id of a service."""
-    # all clients share an address here: the limit of one client's requests is not what is measured
-    environment = os.environ | {"GABLEWORK_RATE_LIMIT": "1000000/minute", "GABLEWORK_DRAIN_S": "0"}
+    # all clients share an address here: the limits of one address are not what is measured
+    limits = {"GABLEWORK_RATE_LIMIT": "1000000/minute", "GABLEWORK_MAX_CONNECTIONS_PER_ADDRESS": "10000"}
+    environment = os.environ | limits | {"GABLEWORK_DRAIN_S": "0"}
     command = [sys.executable, "-m", "service.cli", "serve", "--json", "--port", "0", "--state", str(state), *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout is not None

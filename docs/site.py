@@ -1,8 +1,8 @@
 """Builds the documentation as web pages into build/docs/site by Zensical; `make site` runs it.
 
-The pages are those of docs/, the README as the first one and CONTRIBUTING. docs/index.md is the navigation: a section
-per heading, a group per list item that begins with its name and a colon, and all pages that are linked there. A broken
-link, a broken anchor or a page that the index does not list ends the build.
+The pages are those of docs/, the README as the first one, CONTRIBUTING and the notices. docs/index.md is the
+navigation: a section per heading, a group per list item that begins with its name and a colon, and all pages that are
+linked there. A broken link, a broken anchor or a page that the index does not list ends the build.
 """
 
 from __future__ import annotations
@@ -23,7 +23,12 @@ BUILD = ROOT / "build" / "docs"
 """The pages with links of the site in `docs/`, the built site in `site/`."""
 SETTINGS = "zensical.yml"
 """Zensical's settings, written as JSON, which is YAML."""
-MOVED = {"README.md": "index.md", "docs/index.md": "pages.md", "CONTRIBUTING.md": "contributing.md"}
+MOVED = {
+    "README.md": "index.md",
+    "docs/index.md": "pages.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "THIRD_PARTY_NOTICES.md": "notices.md",
+}
 """Pages of the repository with another name on the site."""
 FIRST = ("index.md", "pages.md")
 LAST = ("contributing.md",)

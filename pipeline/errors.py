@@ -10,6 +10,8 @@ GableworkError
 ├── SettingsError         one or more settings are out of range: lists all faults at once
 ├── RunError              a run directory, in a folder or an object store, that cannot be written, read or resumed
 │   ├── RunCancelledError        the user cancelled the run
+│   │   └── RunOverError             a task finds no mark of its run: it was cancelled, or its folder is gone
+│   ├── FolderLostError          a folder of the run was removed while it was going, or another run took it
 │   └── ClusterError             the scheduler does not answer, or was lost while the run was under way
 │       └── VersionMismatchError     client, scheduler and workers do not run the same versions
 ├── RemoteError           a service elsewhere: no answer, a refusal, or a job of it that failed
@@ -127,6 +129,17 @@ class RunError(GableworkError):
 
 class RunCancelledError(RunError):
     """The user cancelled the run; do not use the content of the run directory."""
+
+
+class RunOverError(RunCancelledError):
+    """The scratch of a task's run is gone, or belongs to another run. The driver knows whether this was its own doing.
+
+    Tasks end without a word. A driver that cancelled nothing raises FolderLostError in its place.
+    """
+
+
+class FolderLostError(RunError):
+    """A folder that a run works in was removed while the run was going, or another run took it over."""
 
 
 class ClusterError(RunError):

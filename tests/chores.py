@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, supervise
+from pipeline.runtime.scratch.folder import Scratch
 
 DEADLINE_S = 120.0
 
@@ -73,6 +74,11 @@ def say(words: str) -> int:
     """Say something to standard error; the process's number."""
     print(words, file=sys.stderr, flush=True)
     return os.getpid()
+
+
+def look_at_scratch(scratch: Scratch) -> None:
+    """Raise the error of a task whose scratch is gone."""
+    scratch.check_cancelled()
 
 
 def fail(message: str) -> None:

@@ -171,6 +171,8 @@ def run(
         Settings are out of range.
     RunError
         The run directory cannot be used, or workers died again and again on one task.
+    FolderLostError
+        Its scratch or its run directory was removed while it was going.
     RunCancelledError
         `cancelled` ended the run; its scratch is gone, and `run.json` says so.
     ClusterError
@@ -229,7 +231,7 @@ def run_variants(
     progress.timings["plan"] = time.perf_counter() - began
     with contextlib.ExitStack() as locks:
         for one in runs:
-            locks.enter_context(locked_results(one.run_dir))
+            one.check_same = locks.enter_context(locked_results(one.run_dir))
             # the process that held it a moment ago may have left something
             check_out(one.run_dir, overwrite=request.overwrite, work=work)
         context = locks.enter_context(
@@ -250,12 +252,13 @@ def run_variants(
         for path in outdated:
             path.unlink(missing_ok=True)
         try:
-            found = _find_candidates(context, settings, paths, footprints)
-            if request.overrides is not None:
-                found = _override(context, settings, found, overrides, runs)
-            _model(context, request, found, guides, runs)
-            for one in runs:
-                one.find_digest(context, found.joined)
+            with context.blaming_lost_scratch():
+                found = _find_candidates(context, settings, paths, footprints)
+                if request.overrides is not None:
+                    found = _override(context, settings, found, overrides, runs)
+                _model(context, request, found, guides, runs)
+                for one in runs:
+                    one.find_digest(context, found.joined)
         except BaseException as error:
             context.scratch.cancel()
             for one in runs:
@@ -391,6 +394,8 @@ class _VariantRun:
     progress: Progress
     keeps_work: bool
     """Whether the work folder outlives the run; one in which an interrupted run resumes does not."""
+    check_same: Callable[[], None] = dataclasses.field(init=False)
+    """Raises FolderLostError if the run directory was removed since it was locked."""
     models: Models = dataclasses.field(init=False)
     published: Mapping[Place, Published] = dataclasses.field(init=False)
     without_points: tuple[str, ...] = ()
@@ -479,7 +484,7 @@ class _VariantRun:
         return tuple(outcome.tile.key for outcome in self.published.values() if outcome.error)
 
     def find_digest(self, context: RunContext, joined: Joined) -> None:
-        """The digest of all that was published."""
+        """The digest of all that was published; raises FolderLostError if it was removed meanwhile."""
         began, watch = time.perf_counter(), self.progress.watch
         if self.failed_tiles:
             content = (self.run_dir, _with_tables(self.run_dir, joined, self.models, list(self.published.values())))
@@ -488,6 +493,7 @@ class _VariantRun:
             places = [place for place, outcome in self.published.items() if outcome.has_tables]
             self.digest = content_digest(context.executor, context.scratch, places, watch)
         self.progress.timings[DIGEST] = time.perf_counter() - began
+        self.check_same()
 
     def finish(
         self, context: RunContext, found: _Candidates, inputs: tuple[InputFile, ...], began: float | None

@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from pipeline.errors import FolderLostError, RunOverError
 from pipeline.runtime.cluster.dispatch import TICK_S
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.engine import executor_for
@@ -74,6 +75,36 @@ class RunContext:
     """Limits of the child processes that model buildings; None models buildings in the workers themselves."""
     kept: KeptFiles = dataclasses.field(default_factory=KeptFiles)
     """Files of earlier runs that no task of this one has read yet."""
+
+    @contextlib.contextmanager
+    def blaming_lost_scratch(self) -> Iterator[None]:
+        """Blame what goes wrong within the block on the loss of the scratch folder where that is the cause.
+
+        No task can know why it lost its folder: for most, the run is over. The driver knows that it is not.
+
+        Raises
+        ------
+        FolderLostError
+            The folder was removed, or another run took it over, and this run was not cancelled.
+        """
+        try:
+            yield
+        except FolderLostError:
+            raise
+        except Exception as fault:
+            if self.progress.watch.cancelled():
+                raise
+            if not self.scratch.has("."):
+                raise FolderLostError(
+                    f"{self.scratch.root} was removed while the run was going: leave it in place until the run ends. "
+                    "Run again"
+                ) from fault
+            if isinstance(fault, RunOverError):
+                raise FolderLostError(
+                    f"{self.scratch.root} was changed while the run was going, by another run or by removals: give "
+                    "each run a folder of its own and leave it in place, then run again"
+                ) from fault
+            raise
 
     def map(self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
         """The results of a stage's tasks, as they come."""
@@ -235,6 +266,8 @@ def run_context(
     ------
     InputError
         The largest task does not fit into a worker.
+    FolderLostError
+        The scratch folder was removed meanwhile.
     RunCancelledError, ClusterError, RunError
         No executor came up, or the scratch cannot be used.
     """
@@ -245,14 +278,21 @@ def run_context(
         # the driver of a service has a span already
         traced = tracing.span("run") if tracing.current() is None else contextlib.nullcontext()
         with traced, about(run=opened.name), _watching(opened, cancelled) as was_cancelled, engine:
-            progress.watch = Watch(cancelled=was_cancelled, stop=opened.cancel, listener=progress.listener)
+            progress.watch = Watch(
+                cancelled=was_cancelled,
+                check_scratch=opened.check_mark,
+                stop=opened.cancel,
+                listener=progress.listener,
+            )
             engine.prepare("plan", progress.watch)
             progress.timings["start workers"] = time.perf_counter() - starting
             check_memory(plan, engine.memory_limit_bytes)
+            context = RunContext(
+                plan=plan, progress=progress, executor=engine, scratch=opened, isolation=resources.isolation
+            )
             try:
-                yield RunContext(
-                    plan=plan, progress=progress, executor=engine, scratch=opened, isolation=resources.isolation
-                )
+                with context.blaming_lost_scratch():
+                    yield context
             except BaseException:
                 opened.cancel()
                 raise

@@ -10,6 +10,8 @@ export default defineConfig(({ command }) => ({
     assetsInlineLimit: 0,
     modulePreload: { polyfill: false },
     chunkSizeWarningLimit: 800,
+    // the licences of the packages in the bundle ask for it
+    license: { fileName: "third_party_licenses.md" },
   },
   worker: { format: "es" as const },
   experimental: {

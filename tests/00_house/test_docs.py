@@ -21,6 +21,7 @@ from pipeline.roof.settings import RoofSettings, RoofTypeSettings
 from pipeline.ruler.epochs.settings import DiffSettings, read_settings
 from pipeline.runtime.overrides.overrides_file import overrides_of
 from pipeline.settings import RunSettings
+from service.settings import ServiceSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -236,3 +237,12 @@ def test_a_command_of_the_docs_is_one_that_exists(generator: ModuleType, page: s
 def test_the_readme_says_the_two_commands_first() -> None:
     lines = [line for page, line in shell_lines() if page == "README.md"]
     assert lines[:2] == ["make demo", "make test"]
+
+
+def test_every_variable_in_the_docs_is_read_somewhere() -> None:
+    settings = {f"GABLEWORK_{name.upper()}" for name in ServiceSettings.model_fields}
+    named = {name for page in PAGES for name in re.findall(r"\bGABLEWORK_[A-Z][A-Z_]*[A-Z]\b", page.read_text())}
+    assert len(named & settings) > 30
+    sources = [path for folder in ("pipeline", "service", "tests") for path in (ROOT / folder).rglob("*.py")]
+    text = "\n".join(path.read_text() for path in [*sources, ROOT / "docker" / "entrypoint.py"])
+    assert {name for name in named - settings if f'"{name}"' not in text} == set()

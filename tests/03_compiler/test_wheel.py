@@ -142,7 +142,7 @@ def test_a_wheel_with_kernels_compiles_nothing_in_any_process_also_where_nothing
     for name in ("pipeline", "service"):
         ignored = shutil.ignore_patterns("__pycache__", "node_modules", "viewer", "compiled")
         shutil.copytree(ROOT / name, source / name, ignore=ignored)
-    for name in ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE", "THIRD_PARTY_NOTICES.md"):
         shutil.copy(ROOT / name, source / name)
     page = source / "service" / "viewer" / "dist"
     page.mkdir(parents=True)

@@ -14,7 +14,7 @@ import pytest
 from distributed import Client, Status
 from processes import LONG_S, wait_for
 
-from pipeline.errors import ClusterError, RunCancelledError, RunError, VersionMismatchError
+from pipeline.errors import ClusterError, RunCancelledError, RunError, RunOverError, VersionMismatchError
 from pipeline.runtime.cluster import dispatch, worker_setup
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.dispatch import ClusterMonitor
@@ -26,6 +26,7 @@ from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.monitoring.measurement import Measured, measure_packed, pack_tasks
 from pipeline.runtime.monitoring.versions import ENGINE, differences, fingerprint, versions_here, versions_of
 from pipeline.runtime.resources import Resources
+from pipeline.runtime.scratch.folder import Scratch
 
 
 def worked_off(cluster: Cluster, stage: str, function: Callable[[Any], Any], tasks: Iterable[Any]) -> list[Any]:
@@ -222,6 +223,21 @@ def test_a_cancelled_run_stops_its_tasks_and_waits_for_them(cluster: Cluster, tm
     assert begun < len(tasks)
     assert worked_off(cluster, "double", chores.double, [4]) == [8]
     assert len(list(tmp_path.glob("started-*"))) == begun, "a task of the run that was cancelled began later"
+
+
+def test_scratch_that_only_a_worker_misses_is_not_shared_and_one_that_all_miss_is_gone(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    ours, theirs = Scratch(str(tmp_path / "ours"), attempt="mine"), Scratch(str(tmp_path / "theirs"), attempt="mine")
+    ours.create()
+    watch = Watch(check_scratch=ours.check_cancelled)
+    with cluster.executor() as executor:
+        with pytest.raises(RunError, match="a worker does not see the run's scratch folder"):
+            list(executor.map("look", chores.look_at_scratch, [theirs], watch))
+        # as when a removal has reached the mark of the run, but not the folder itself
+        ours.cancel()
+        with pytest.raises(RunOverError, match="ours is over"):
+            list(executor.map("look", chores.look_at_scratch, [ours], watch))
 
 
 def test_tasks_of_a_map_that_is_closed_do_not_begin(cluster: Cluster, tmp_path: Path) -> None:

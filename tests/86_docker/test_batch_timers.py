@@ -14,6 +14,7 @@ import yaml
 from container_files import NO_RIGHTS
 
 from pipeline import __version__
+from pipeline.runtime.cluster.dispatch import SETTLE_S
 from pipeline.schedule import Cron, Missed, Overlap
 from service.schedules import OUTCOMES, Definition
 from service.settings import ServiceSettings
@@ -85,6 +86,8 @@ def test_the_timer_starts_its_unit_also_after_the_machine_was_off(root: Path, pa
     assert service["Service"]["Type"] == "oneshot"
     # a batch takes as long as it takes
     assert service["Service"]["TimeoutStartSec"] == "infinity"
+    # and as long to stop as its tasks may take to end
+    assert 60.0 * float(service["Service"]["TimeoutStopSec"].removesuffix("min")) >= SETTLE_S + 30.0
     assert "Install" not in service
     words = shlex.split(service["Service"]["ExecStart"])
     assert (Path(words[0]).name, words[1:3]) == ("gablework", ["batch", "run"])

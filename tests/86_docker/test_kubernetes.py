@@ -13,6 +13,7 @@ import yaml
 from container_files import NO_RIGHTS, Image
 
 from pipeline import __version__
+from pipeline.runtime.cluster.dispatch import SETTLE_S
 from pipeline.runtime.cluster.tls import VARIABLES
 from service.cli import app
 from service.settings import ServiceSettings
@@ -203,9 +204,18 @@ def test_every_secret_is_made_by_a_command_of_the_page() -> None:
 
 def test_a_pod_has_as_long_to_stop_as_it_may_take() -> None:
     (service,) = (one["data"] for one in of_kind("ConfigMap") if one["metadata"]["name"] == "gablework-service")
-    pods = dict(PODS)
-    for name in ("worker", "driver"):
-        assert pods[name]["terminationGracePeriodSeconds"] > float(service["GABLEWORK_DRAIN_S"])
+    assert "GABLEWORK_DRAIN_S" not in service  # so the default is what counts
+    settings, pods = ServiceSettings.model_fields, dict(PODS)
+    grace_s = {name: spec["terminationGracePeriodSeconds"] for name, spec in PODS}
+    assert settings["drain_s"].default + 30.0 <= grace_s["driver"] <= settings["drain_s"].default + 60.0
+    assert grace_s["worker"] >= settings["building_timeout_s"].default + 30.0
+    batches = [spec["terminationGracePeriodSeconds"] for name, spec in PODS if name == "gablework-batch"]
+    assert len(batches) == 2
+    assert min(batches) >= SETTLE_S + 30.0
+    rows = dict(re.findall(r"^\| (\w+) \| (\d+)", PAGE.split("## Ending")[1], re.MULTILINE))
+    named = {row: "gablework-batch" if row == "batch" else row for row in rows}
+    assert set(rows) == {"worker", "driver", "api", "batch", "postgres"}
+    assert {row: float(seconds) for row, seconds in rows.items()} == {row: grace_s[named[row]] for row in rows}
     hooks = {name: container["lifecycle"] for name, container in CONTAINERS if "lifecycle" in container}
     assert set(hooks) == {"api", "postgres"}
     assert float(hooks["api"]["preStop"]["exec"]["command"][1]) < pods["api"]["terminationGracePeriodSeconds"]

@@ -360,6 +360,7 @@ class Dispatch(Generic[Task, Result]):
                 self.monitor.check()
                 return
             if isinstance(error, RunCancelledError) and not self.watch.cancelled():
+                self.watch.check_scratch()
                 raise RunError(_NOT_SHARED) from error
             if not isinstance(error, KilledWorker):
                 raise error

@@ -47,7 +47,7 @@ def never() -> bool:
 
 
 def nothing() -> None:
-    """Stop nothing."""
+    """Stop nothing, miss nothing."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,6 +56,8 @@ class Watch:
 
     cancelled: Callable[[], bool] = never
     """Whether the run was cancelled; polled several times a second."""
+    check_scratch: Callable[[], None] = nothing
+    """Raises RunOverError where this process misses the run's scratch, too, when a task did."""
     stop: Callable[[], None] = nothing
     """Asks the tasks in flight to end, because their results are not needed any more."""
     listener: Listener = ignore

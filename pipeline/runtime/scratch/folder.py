@@ -25,7 +25,7 @@ from uuid import uuid4
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import RunCancelledError
+from pipeline.errors import RunCancelledError, RunOverError
 
 POINT = np.dtype(
     [
@@ -95,7 +95,7 @@ class Scratch:
             (folder / self.attempt).touch()
 
     def path(self, *parts: str) -> Path:
-        """A path inside; its folder exists afterwards. Raises RunCancelledError if scratch, and the run, is gone."""
+        """A path inside; its folder exists afterwards. Raises RunOverError if scratch, and the run, is gone."""
         path = os.path.join(self.root, *parts)  # noqa: PTH118 - a Path takes longer
         folder = os.path.dirname(path)  # noqa: PTH120
         if not os.path.isdir(folder):  # noqa: PTH112
@@ -108,7 +108,7 @@ class Scratch:
             for above in reversed(Path(folder, "any").relative_to(self.root).parents[:-1]):
                 Path(self.root, above).mkdir(exist_ok=True)
         except FileNotFoundError:
-            raise RunCancelledError(f"{self.root} is gone: the run is over") from None
+            raise RunOverError(f"{self.root} is gone: the run is over") from None
 
     def put_arrays(self, name: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
         """Store arrays, one file each under the folder `name`, so that they can be mapped."""
@@ -189,10 +189,17 @@ class Scratch:
         return self.has(_CANCELLED) or not self.has(".")
 
     def check_cancelled(self) -> None:
-        """Raise `RunCancelledError` in a task of a run that was cancelled; a task that goes on has got somewhere."""
-        if self.cancelled:
-            raise RunCancelledError("the run was cancelled")
+        """Raise as `check_mark` in a task of a run that is over; a task that goes on has got somewhere."""
+        self.check_mark()
         self.beat()
+
+    def check_mark(self) -> None:
+        """Raise `RunCancelledError` if the run was cancelled, `RunOverError` where its mark is gone. No progress."""
+        if not self.cancelled:
+            return
+        if not self.attempt and self.has(_CANCELLED):
+            raise RunCancelledError("the run was cancelled")
+        raise RunOverError(f"the run in {self.root} is over: it was cancelled, or the folder was removed")
 
     def beat(self) -> None:
         """Note that a task got somewhere, where others may watch for that: at most once a second per process."""

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from uuid import uuid4
 
-from pipeline.errors import RunError
+from pipeline.errors import FolderLostError, RunError
 from pipeline.io.urls import is_url
 
 _NAME = re.compile(r"\.?[0-9a-f]{32}")
@@ -61,14 +62,15 @@ def _made(parent: Path) -> tuple[Path, int]:
 
 
 @contextlib.contextmanager
-def locked_results(run_dir: str) -> Iterator[None]:
+def locked_results(run_dir: str) -> Iterator[Callable[[], None]]:
     """Lock a run directory while it is written, so that no other run on this file system writes it too.
 
-    The lock needs no file in it. Object stores, and file systems that cannot lock folders, are not locked. Raises
-    RunError if another run has locked the directory.
+    The lock needs no file in it. Object stores, and file systems that cannot lock folders, are not locked. Yields a
+    check that raises FolderLostError if the directory was removed or replaced meanwhile: what is written later makes it
+    again, without what it held. Raises RunError if another run has locked the directory.
     """
     if is_url(run_dir):
-        yield
+        yield lambda: None
         return
     handle = os.open(run_dir, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -78,9 +80,22 @@ def locked_results(run_dir: str) -> Iterator[None]:
             raise RunError(f"{run_dir} is being written by another run: wait for it, or give another --out") from None
         except OSError:
             pass  # NFS locks files alone
-        yield
+        yield functools.partial(_check_same, run_dir, handle)
     finally:
         os.close(handle)
+
+
+def _check_same(folder: str, handle: int) -> None:
+    """Raise FolderLostError if a path leads elsewhere than when the folder was opened."""
+    try:
+        if os.path.samestat(os.stat(folder), os.fstat(handle)):  # noqa: PTH116 - not worth a path
+            return
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    raise FolderLostError(
+        f"{folder} was removed while the run was going, with what had been written: leave it in place until the run "
+        "ends. Run again"
+    )
 
 
 def remove_abandoned(parent: Path) -> list[str]:

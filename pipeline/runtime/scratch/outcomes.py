@@ -33,7 +33,7 @@ from typing import Any, BinaryIO, Generic, TypeVar
 import numpy as np
 import shapely
 
-from pipeline.errors import RunCancelledError, RunError
+from pipeline.errors import RunError, RunOverError
 from pipeline.runtime.monitoring.versions import fingerprint
 from pipeline.runtime.scratch.folder import Scratch
 
@@ -247,7 +247,7 @@ def result_of(scratch: Scratch, place: Place) -> Any:
 
     Raises
     ------
-    RunCancelledError
+    RunOverError
         The outcome is gone, and the run with it.
     DamagedError
         It is not as it was written.
@@ -322,7 +322,7 @@ def _opened(scratch: Scratch, place: Place) -> Iterator[BinaryIO]:
         stream = Path(scratch.root, place.name).open("rb")  # noqa: SIM115 - closed below
     except FileNotFoundError:
         scratch.check_cancelled()
-        raise RunCancelledError(f"{place.name} is gone from {scratch.root}: another run works there") from None
+        raise RunOverError(f"{place.name} is gone from {scratch.root}: another run works there") from None
     with stream:
         yield stream
 
