@@ -86,7 +86,7 @@ def _source_of(path: Path) -> str:
     where = path.resolve().as_posix()
     head = first_bytes(path)
     if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
-        _refuse_links(path)
+        refuse_links(path)
         return f"{GEOJSON}{where}"
     driver = next((name for magic, name in DRIVERS.items() if head.startswith(magic)), None)
     if driver is None:
@@ -94,8 +94,11 @@ def _source_of(path: Path) -> str:
     return f"{driver}{where}"
 
 
-def _refuse_links(path: Path) -> None:
-    """Refuse GeoJSON that names its CRS by a link: GDAL would fetch it from whatever server that is."""
+def refuse_links(path: Path) -> None:
+    """Refuse GeoJSON that names its CRS by a link: GDAL would fetch it from whatever server that is.
+
+    Raises UnreadableInputError.
+    """
     with path.open("rb") as stream:
         content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     for found in _CRS.finditer(content):
