@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-from pipeline.errors import RunCancelledError
+from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.isolation.child_pool import ChildPool
 from pipeline.runtime.isolation.messages import Finished, OutOfMemory
 from pipeline.runtime.isolation.supervision import SupervisedChild, system_kills
@@ -46,6 +46,8 @@ from service.store import JobStore
 
 _LOOK_S = 0.5
 """Seconds between two looks at the memory of the process, and at the pulse of its workers."""
+_AGAIN_S = 5.0
+"""Seconds before the next attempt if no process could be started."""
 _NEAR = 0.9
 """Share of the limit from which a process that was killed counts as out of memory."""
 _PULSES = tuple(Path(folder, "scratch", PULSE) for folder in ("run/scratch", "comparison/scratch"))
@@ -150,7 +152,15 @@ class InOwnProcess:
             uploads=_uploads(self._shop.store, held),
             driver=self._name,
         )
-        with self._pool.borrowed(held.cancelled, fresh=True, loads=LOADS) as child:
+        with contextlib.ExitStack() as stack:
+            try:
+                child = stack.enter_context(self._pool.borrowed(held.cancelled, fresh=True, loads=LOADS))
+            except RunCancelledError:
+                raise
+            except RunError as error:
+                # this machine has no room for a process now, for which the job is not to blame
+                held.wait(_AGAIN_S)
+                raise AttemptEndedError(f"could not begin: {error}", is_own=False) from error
             try:
                 return _Attended(held, child, order, self._shop.cluster).result(self._work)
             finally:

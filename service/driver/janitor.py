@@ -94,12 +94,15 @@ def tidy_jobs(store: JobStore, folder: StateFolder, stalled_days: float = 0.0) -
     Folders are listed before the database is read, and a job is in the database before it has a folder. A folder that
     the database does not know therefore belongs to a job that was removed.
     """
-    found = sorted(path.name for path in _entries(folder.jobs) if is_id(path.name))
+    entries = _entries(folder.jobs)
+    # renamed to be removed, by a process that died
+    doomed = [path for path in entries if path.name.startswith(".") and _is_old(path, _DOOMED_S)]
+    found = sorted(path.name for path in entries if is_id(path.name))
     known = store.attempts(found)
     if found and not known and sum(store.counts().values()) == 0:
         LOG.warning("the database has no jobs, but %s has: they are kept, it may be the wrong database", folder.jobs)
         return []
-    removed = []
+    removed = doomed
     for job_id in found:
         if job_id not in known or known[job_id][0] is JobStatus.DISMISSED:
             removed.append(folder.job(job_id))

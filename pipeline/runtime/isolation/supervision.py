@@ -355,9 +355,24 @@ class SupervisedChild:
 
 
 def system_kills() -> int:
-    """Number of processes that Linux has ended for lack of memory since it started; 0 if unknown."""
+    """Number of processes that Linux has ended for lack of memory since it started; 0 if unknown.
+
+    Those of this process's control group, whoever set its limit; without one, those of the machine.
+    """
+    for path in (*_events_of_group(), Path("/proc/vmstat")):
+        with contextlib.suppress(OSError, ValueError):
+            counts = dict(line.split() for line in path.read_text(encoding="ascii").splitlines())
+            if "oom_kill" in counts:
+                return int(counts["oom_kill"])
+    return 0
+
+
+def _events_of_group() -> list[Path]:
+    """The file in which the control group of this process counts what befell its memory, if it has one."""
     try:
-        counts = dict(line.split() for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines())
+        groups = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
     except OSError:
-        return 0
-    return int(counts.get("oom_kill", 0))
+        return []
+    # of the unified hierarchy; in a container its path begins at the container's own group
+    own = [line.removeprefix("0::/") for line in groups if line.startswith("0::/")]
+    return [Path("/sys/fs/cgroup", name, "memory.events") for name in own]
