@@ -5,7 +5,7 @@
 - hosts: for each temper of `tests/hostile_host.py` a job whose tile is at such a host (a byte a second), and the
   seconds until it has ended and a job that waited for its slot runs. The driver has one slot.
 - cancel: the same, but the job is dismissed by DELETE a few seconds after it began.
-- clients: connections that send a head, a body or nothing, or read an answer, a byte a second; and an upload with 2 kB
+- clients: connections that send a head or a body with a byte a second, or nothing, or stop; and an upload with 2 kB
   per second, which must live.
 - flood: more connections than the service takes, half of them in the middle of a body, and how long /healthz takes.
 

@@ -53,7 +53,7 @@ def listen(settings: ServiceSettings) -> tuple[socket.socket, str]:
     listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     # The system ends a connection whose client takes nothing of what was sent: also an event stream, between events.
     if hasattr(socket, "TCP_USER_TIMEOUT"):
-        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, math.ceil(settings.slow_s * 1000.0))
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, math.ceil(settings.unread_s * 1000.0))
     host = f"[{settings.host}]" if family is socket.AF_INET6 else settings.host
     return listening, f"http://{host}:{listening.getsockname()[1]}"
 
@@ -98,11 +98,11 @@ class TimedConnection(H11Protocol):
         super().__init__(*args, **values)
         self._settings = settings
         self._crowd = crowd
-        self._look_s = look_s(settings.max_head_s, settings.silent_s, settings.slow_s)
+        self._look_s = look_s(settings.max_head_s, settings.silent_s, settings.slow_s, settings.unread_s)
         self._next_look: asyncio.TimerHandle | None = None
         self._awaited = Awaited.NOTHING
         self._since_s = self._heard_s = 0.0
-        self._pace = Pace.of(settings, 0.0)
+        self._pace = Pace(settings.min_bytes_per_s, settings.slow_s, 0.0)
         self._reading: Pace | None = None
         """The pace at which the client reads, while an answer waits for it."""
         self._unread = 0
@@ -133,7 +133,7 @@ class TimedConnection(H11Protocol):
         """Watch the client while it does not read."""
         super().pause_writing()
         self._unread = self._outstanding()
-        self._reading = Pace.of(self._settings, self.loop.time())
+        self._reading = Pace(self._settings.min_bytes_per_s, self._settings.unread_s, self.loop.time())
 
     def resume_writing(self) -> None:
         """Watch no longer."""
@@ -157,7 +157,7 @@ class TimedConnection(H11Protocol):
         if self._awaited is not before:
             self._since_s = self.loop.time()
             self._heard_s = max(self._heard_s, self._since_s)
-            self._pace = Pace.of(self._settings, self._since_s)
+            self._pace = Pace(self._settings.min_bytes_per_s, self._settings.slow_s, self._since_s)
         if self.conn.their_state is h11.IDLE:
             self._crowd.idles(self)
         else:

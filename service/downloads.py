@@ -152,7 +152,7 @@ class _Watch:
         self._until_s = now_s + settings.max_fetch_s
         self._look_s = min(LOOK_S, look_s(settings.slow_s, settings.max_fetch_s))
         self._reported_s = now_s
-        self.pace = Pace.of(settings, now_s)
+        self.pace = Pace(settings.min_bytes_per_s, settings.slow_s, now_s)
 
     async def over(self, work: Coroutine[Any, Any, Result]) -> Result:
         """The result of the work, which is cancelled if this watch ends it."""

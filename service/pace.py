@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from service.settings import ServiceSettings
-
 MOST_LOOKS = 20
 """Looks at a wait within its shortest limit: it ends at most a twentieth later."""
 
@@ -37,11 +35,6 @@ class Pace:
         self._have = 0
         self.total_bytes = 0
         """All bytes so far."""
-
-    @classmethod
-    def of(cls, settings: ServiceSettings, now_s: float) -> Pace:
-        """The pace that the settings ask for."""
-        return cls(settings.min_bytes_per_s, settings.slow_s, now_s)
 
     def took(self, count: int, now_s: float) -> bool:
         """Add bytes that have arrived; whether they complete a share."""

@@ -153,8 +153,14 @@ class ServiceSettings(BaseSettings):
         default=60.0,
         gt=0.0,
         le=3600.0,
-        description="Seconds over which this rate is measured; a client that takes no byte of an answer for so long is "
-        "gone.",
+        description="Seconds over which the rate of a host, or of a client that sends, is measured.",
+    )
+    unread_s: float = Field(
+        default=120.0,
+        gt=0.0,
+        le=3600.0,
+        description="The same of a client that reads; if it takes no byte of an answer for so long, it is gone. It is "
+        "longer because systems take bytes in large steps.",
     )
     silent_s: float = Field(
         default=30.0,

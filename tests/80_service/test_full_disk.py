@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import os
@@ -23,7 +24,7 @@ from processes import wait_for
 from store_contract import submit
 
 from service.disk import Ballast, Disk
-from service.downloads import _stream_to
+from service.downloads import _stream_to, _Watch, ignore_bytes
 from service.driver import finished_work
 from service.driver.janitor import tidy_jobs
 from service.errors import NoSpaceError, StoreError, StoreFullError
@@ -189,13 +190,18 @@ def test_uploads_of_a_key_have_a_limit_together(starting: Any) -> None:
 def test_a_fetched_input_leaves_the_reserve(free: Free, tmp_path: Path) -> None:
     settings = ServiceSettings(state=tmp_path, reserve_bytes=free.bytes - 100)
     url = httpx.URL("https://example.org/a.laz")
+
+    def stream_to(answer: httpx.Response) -> None:
+        watch = _Watch(url, settings, lambda: False, ignore_bytes)
+        asyncio.run(_stream_to(tmp_path / "a.laz", url, answer, settings, watch))
+
     for headers in ({"content-length": "101"}, {}):
         answer = httpx.Response(200, headers=headers, stream=httpx.ByteStream(bytes(101)))
         with pytest.raises(NoSpaceError, match=r"a\.laz"):
-            _stream_to(tmp_path / "a.laz", url, answer, settings, lambda: False)
+            stream_to(answer)
     assert not (tmp_path / "a.laz").exists()
     answer = httpx.Response(200, stream=httpx.ByteStream(bytes(100)))
-    _stream_to(tmp_path / "a.laz", url, answer, settings, lambda: False)
+    stream_to(answer)
 
 
 def test_the_disk_of_a_folder_that_is_not_there_yet_is_that_of_its_parent(tmp_path: Path) -> None:

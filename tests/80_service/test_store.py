@@ -116,5 +116,9 @@ def test_a_database_that_cannot_serve_is_refused(url: str) -> None:
 
 def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with JobStore(f"sqlite:///{tmp_path / 'file' / 'a.db'}") as store, pytest.raises(StoreError, match=r"a\.db"):
+    place = tmp_path / "file" / "a.db"
+    with (
+        JobStore(f"sqlite:///{place}") as store,
+        pytest.raises(StartUpError, match=rf"cannot be {place}: .* not a folder"),
+    ):
         store.migrate()
