@@ -16,7 +16,7 @@ from service.compression import Compressed
 from service.features.runs import published_runs
 from service.files import StateFolder
 from service.guard import Guard
-from service.input_policy import check_hosts
+from service.input_policy import check_hosts, check_roots
 from service.methods import HeadAsGet, check_query
 from service.metrics import Measured, Metrics
 from service.rate_limits import RateLimiter
@@ -132,13 +132,14 @@ def start(settings: ServiceSettings, store: JobStore) -> None:
     Raises
     ------
     StartUpError
-        Other machines can reach the address, and there are no keys; or a listed host is not a host name; or a
-        published run cannot be read.
+        Other machines can reach the address, and there are no keys; or a listed host is not a host name; or the state
+        folder cannot be used, or a folder of inputs is a file; or a published run cannot be read.
     StoreError
         The database does not answer.
     """
     check_hosts(settings)
-    StateFolder(settings.state).make()
+    check_roots(settings)
+    StateFolder(settings.state).prepare()
     if settings.publish:
         from service.features.tables import check_published  # loads Arrow
 

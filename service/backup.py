@@ -23,7 +23,7 @@ from pipeline import __version__
 from pipeline.errors import RunError
 from service import migrations
 from service.errors import StartUpError
-from service.files import SO_FAR, StateFolder, is_id, make_private_file
+from service.files import SO_FAR, StateFolder, folder_fault, is_id, make_private_file
 from service.resumable import PREFIX, copy_unfinished
 from service.store import JobStore
 
@@ -302,9 +302,11 @@ def _check_target(folder: StateFolder, target: Path) -> None:
     if place == root or root in place.parents or place in root.parents:
         raise StartUpError(f"the backup would go to {target}, and the state folder is {folder.root}: keep them apart")
     if not folder.root.is_dir():
-        raise StartUpError(f"the state folder {folder.root} does not exist: give that of the service with --state")
-    if target.exists() and not target.is_dir():
-        raise StartUpError(f"{target} is not a folder: name a new one")
+        fault = "is not a folder" if folder.root.exists() else "does not exist"
+        raise StartUpError(f"the state folder {folder.root} {fault}: give that of the service with --state")
+    target_fault = folder_fault(target)
+    if target_fault is not None:
+        raise StartUpError(f"the backup cannot go to {target}: {target_fault}. Name another folder with --to")
     if target.is_dir() and not (target / MARK).exists() and any(target.iterdir()):
         raise StartUpError(f"{target} holds other files, and no backup: name an empty folder, or one of a backup")
 
@@ -356,7 +358,10 @@ def _report(source: Path) -> Report:
 
 
 def _check_is_new(store: JobStore, folder: StateFolder, source: Path) -> None:
-    """Refuse to restore over a service."""
+    """Refuse to restore over a service, or into something that cannot be a folder."""
+    fault = folder_fault(folder.root)
+    if fault is not None:
+        raise StartUpError(f"the service cannot be restored into {folder.root}: {fault}. Name another one with --state")
     if store.path is not None and store.path.exists():
         raise StartUpError(f"there is a database {store.path}: restore into a new state folder, or move this one away")
     if store.path is None:

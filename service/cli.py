@@ -200,6 +200,7 @@ def drive(
     """Run the jobs of a service: the driver alone, for an API that runs elsewhere."""
     with Console(), _service_errors():
         from service.driver import run_driver
+        from service.files import StateFolder
 
         _log_to_stderr()
         settings = _settings(
@@ -211,6 +212,7 @@ def drive(
             tls_cert=tls_cert,
             tls_key=tls_key,
         )
+        StateFolder(settings.state).prepare()
         if with_parent:
             os.nice(_NICENESS)
         code = run_driver(settings, name=name, parent_pipe=_STANDARD_INPUT if with_parent else None)
@@ -277,7 +279,8 @@ def _opened(state: str | None, database_url: str | None) -> Iterator[JobStore]:
     from service.store import JobStore
 
     settings = _settings(state=state, database_url=database_url)
-    StateFolder(settings.state).make()
+    if settings.database_url is None:
+        StateFolder(settings.state).prepare()
     with JobStore(settings.database) as store:
         store.migrate()
         yield store

@@ -10,7 +10,7 @@ from typing import Literal, Protocol
 from pipeline.errors import InputError
 from pipeline.io.area_of_use import location_of
 from pipeline.io.formats import POINT_SUFFIXES
-from service.downloads import Cancel, download, name_of
+from service.downloads import Cancel, OnBytes, download, ignore_bytes, name_of
 from service.errors import (
     InputRefusedError,
     NoSuchUploadError,
@@ -204,11 +204,32 @@ def gather(
     settings: ServiceSettings,
     target: Path,
     cancelled: Cancel,
+    progress: OnBytes = ignore_bytes,
 ) -> JobFiles:
-    """The inputs of a job on this machine's disk, within the limits; raises as `materialise`."""
+    """The inputs of a job on this machine's disk, within the limits; raises as `materialise`.
+
+    `progress` gets the bytes of all inputs that were fetched so far, as `download` reports them.
+    """
+    before, seen = 0, 0
 
     def fetched(source: InputReference) -> Fetched:
-        return materialise(source, store=store, folder=folder, settings=settings, target=target, cancelled=cancelled)
+        nonlocal before
+        found = materialise(
+            source,
+            store=store,
+            folder=folder,
+            settings=settings,
+            target=target,
+            cancelled=cancelled,
+            progress=on_bytes,
+        )
+        before = seen
+        return found
+
+    def on_bytes(so_far: int) -> None:
+        nonlocal seen
+        seen = before + so_far
+        progress(seen)
 
     tiles, points = [], 0
     for tile in dict.fromkeys(request.tiles):
@@ -227,8 +248,9 @@ def materialise(
     settings: ServiceSettings,
     target: Path,
     cancelled: Cancel,
+    progress: OnBytes = ignore_bytes,
 ) -> Fetched:
-    """One input on this machine's disk, checked again and examined; `cancelled` is called often.
+    """One input on this machine's disk, checked again and examined; `cancelled` and `progress` as in `download`.
 
     The owner of an upload was checked when the job was submitted.
 
@@ -254,6 +276,8 @@ def materialise(
     elif reference.kind == "path":
         path = checked_path(reference.value, settings)
     else:
-        path, digest = download(reference.value, settings=settings, target=target, cancelled=cancelled)
+        path, digest = download(
+            reference.value, settings=settings, target=target, cancelled=cancelled, progress=progress
+        )
     facts = preflight(path, settings.max_points)
     return Fetched(reference=reference, path=path, points=int(facts.get("pointCount") or 0), sha256=digest)

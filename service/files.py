@@ -10,6 +10,7 @@ import stat
 from pathlib import Path
 
 from service.disk import Disk
+from service.errors import StartUpError
 
 SO_FAR = "so-far"
 """Name of the folder of an attempt with the buildings that it has modelled so far."""
@@ -69,6 +70,25 @@ class StateFolder:
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
             keep_private(path)
 
+    def prepare(self) -> None:
+        """Make the folders when a process starts.
+
+        Raises
+        ------
+        StartUpError
+            They cannot be made or written.
+        """
+        fix = "name a folder with --state, or GABLEWORK_STATE"
+        for path in (self.root, self.uploads, self.jobs):
+            fault = folder_fault(path)
+            if fault is not None:
+                raise StartUpError(f"the state folder {self.root} cannot be used: {fault}. Change that, or {fix}")
+        try:
+            self.make()
+        except OSError as error:
+            what = f"{error.filename}: {error.strerror}"
+            raise StartUpError(f"the state folder {self.root} cannot be made ({what}): {fix}") from error
+
     def upload(self, upload_id: str) -> Path:
         """Folder of one upload; holds one file under its cleaned name."""
         return self.uploads / _checked(upload_id)
@@ -100,6 +120,22 @@ class StateFolder:
     def outputs(self, job_id: str, attempt: int) -> Path:
         """The outputs, assembled for download."""
         return self.attempt(job_id, attempt) / "outputs"
+
+
+def folder_fault(path: Path) -> str | None:
+    """Why a path cannot be a folder that this account writes, in a few words; None if it can, as far as is known.
+
+    >>> folder_fault(Path("/dev/null/state"))
+    '/dev/null is not a folder'
+    """
+    place = path.absolute()
+    while not os.path.lexists(place) and place != place.parent:
+        place = place.parent
+    if not place.is_dir():
+        return f"{place} leads nowhere" if place.is_symlink() and not place.exists() else f"{place} is not a folder"
+    if not os.access(place, os.W_OK | os.X_OK):
+        return f"this account (user {os.geteuid()}) may not write into {place}"
+    return None
 
 
 def keep_private(path: Path) -> None:

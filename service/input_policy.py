@@ -83,6 +83,19 @@ def check_hosts(settings: ServiceSettings) -> None:
             origin_of(entry, setting)
 
 
+def check_roots(settings: ServiceSettings) -> None:
+    """Check the entries of `input_roots` when a process starts; a folder may be mounted later.
+
+    Raises
+    ------
+    StartUpError
+        One of them is not a folder.
+    """
+    for root in settings.input_roots:
+        if root.exists() and not root.is_dir():
+            raise StartUpError(f"input_roots has {root}, which is not a folder: name the folder that holds the inputs")
+
+
 def origin_of(entry: str, setting: str = "input_hosts") -> Origin:
     """The origin of an entry of a setting.
 

@@ -49,7 +49,7 @@ class RateLimiter:
         TooManyRequestsError
             The client has used up its requests; the error says when the next one is accepted.
         """
-        client = _counted_as(client)
+        client = counted_as(client)
         for limit in self._limits:
             with self._counting:
                 is_within = self._strategy.hit(limit, client)
@@ -61,10 +61,10 @@ class RateLimiter:
                 )
 
 
-def _counted_as(client: str) -> str:
+def counted_as(client: str) -> str:
     """The client as it is counted: an IPv6 address by its network, since one client has 2^64 addresses.
 
-    >>> _counted_as("2001:db8::1234"), _counted_as("192.0.2.1"), _counted_as("::ffff:192.0.2.1")
+    >>> counted_as("2001:db8::1234"), counted_as("192.0.2.1"), counted_as("::ffff:192.0.2.1")
     ('2001:db8::/64', '192.0.2.1', '192.0.2.1')
     """
     try:

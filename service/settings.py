@@ -128,6 +128,52 @@ class ServiceSettings(BaseSettings):
         default="6000/minute", description="Request limit of one key or address, in the notation of the library limits."
     )
     max_event_streams: int = Field(default=200, gt=0, description="Maximum number of open event streams.")
+    max_connections: int = Field(
+        default=1000,
+        gt=0,
+        description="Maximum number of open connections, and never more than half of the files that the process may "
+        "open. Beyond it idle ones are closed first; then only /healthz is answered, all else is 503.",
+    )
+    max_connections_per_address: int = Field(
+        default=400,
+        gt=0,
+        description="Maximum number of open connections of one address; more are answered 503. All clients behind a "
+        "proxy have its address.",
+    )
+
+    # slow and silent peers
+    min_bytes_per_s: float = Field(
+        default=1000.0,
+        gt=0.0,
+        allow_inf_nan=False,
+        description="Bytes per second below which a host of inputs, a client that sends, or one that reads is too "
+        "slow: its transfer ends.",
+    )
+    slow_s: float = Field(
+        default=60.0,
+        gt=0.0,
+        le=3600.0,
+        description="Seconds over which this rate is measured; a client that takes no byte of an answer for so long is "
+        "gone.",
+    )
+    silent_s: float = Field(
+        default=30.0,
+        gt=0.0,
+        le=3600.0,
+        description="Seconds without a byte after which a host of inputs, or a client that sends, counts as gone.",
+    )
+    max_head_s: float = Field(
+        default=20.0,
+        gt=0.0,
+        le=3600.0,
+        description="Maximum seconds for the head of a request, from the connection or from its first byte on.",
+    )
+    max_fetch_s: float = Field(
+        default=3600.0,
+        gt=0.0,
+        allow_inf_nan=False,
+        description="Maximum seconds to fetch one input by URL, with all redirects, pauses and attempts.",
+    )
 
     # webhooks
     webhook_hosts: tuple[str, ...] = Field(

@@ -87,7 +87,7 @@ def refuse_the_request(_order: Order) -> Done:
 def work_slowly(order: Order) -> Done:
     """Honest work: each step takes a part of what a step may take, all together several times as long."""
     _begin("split")
-    steps = 12
+    steps = 5
     for step in range(steps):
         time.sleep(order.settings.stall_s / 3.0)
         child_main.say(Event(kind="progress", stage="split", done=step + 1, total=steps))

@@ -84,7 +84,7 @@ def _compile(one: Listed) -> int:
 def ship(folder: Path) -> int:
     """Copy all compiled kernels of this version to a folder for a package; returns the number of files.
 
-    Raises RunError if no kernel is compiled: numba is unknown or switched off.
+    Raises RunError if no kernel is compiled: numba is unknown or switched off; or if the folder cannot be written.
     """
     from pipeline.compiler.signatures import kernel_named
 
@@ -95,7 +95,10 @@ def ship(folder: Path) -> int:
             return False
         return isinstance(kernel, Kernel) and kernel.fingerprint == fingerprint
 
-    shipped = store.ship(folder, is_current)
+    try:
+        shipped = store.ship(folder, is_current)
+    except OSError as error:
+        raise RunError(f"{folder} cannot be written: {error.strerror or error}. Give another --into") from error
     if not shipped:
         raise RunError(
             f"{store.folder_of_kernels()} has no compiled kernel: warm up with the numba of the locks and without "

@@ -9,12 +9,29 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from pipeline.io.wkb import geometries_of
+
 BATCH = 16_384
 """Features that are looked at together."""
+CELLS_LIMIT = 100_000_000
+"""Maximum number of values, features times columns, that are read of a layer: a value takes some 60 bytes of memory."""
+CELLS_OF_SMALL = 20_000_000
+"""The same of a small file. In some formats an absent value takes no byte of the file, so 400 kB can hold millions."""
+CELLS_PER_BYTE = 4
+"""The same per byte of larger files, up to `CELLS_LIMIT`; real ones have fewer than one."""
 
 Boxes = Callable[[str | None], npt.NDArray[np.float64] | None]
 """From a layer's CRS, as the file has it, to boxes in that CRS, (k, 4) float64: xmin, ymin, xmax, ymax. None where
 they cannot be computed there."""
+
+
+def cells_limit(size_bytes: int) -> int:
+    """How many values may be read of a file of a size.
+
+    >>> cells_limit(1000), cells_limit(10_000_000), cells_limit(10**10)
+    (20000000, 40000000, 100000000)
+    """
+    return min(CELLS_LIMIT, max(CELLS_OF_SMALL, CELLS_PER_BYTE * size_bytes))
 
 
 class Shape(NamedTuple):
@@ -59,7 +76,7 @@ class Nearby:
         near = np.ones(len(geometry_bytes), np.bool_)
         if self._tree is None or len(near) == 0:
             return near
-        geometries = np.asarray(shapely.from_wkb(geometry_bytes, on_invalid="ignore"), object)
+        geometries = geometries_of(geometry_bytes)
         placed = np.isfinite(shapely.bounds(geometries)).all(axis=-1)
         near[placed] = False
         near[np.flatnonzero(placed)[np.unique(self._tree.query(geometries[placed])[0])]] = True

@@ -20,9 +20,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from pipeline.errors import UnreadableInputError
+from pipeline.io import urls
 from pipeline.io.readable import FileStatus, Readable
 from pipeline.io.retries import POLICY, GaveUpError, RetryPolicy, ShortReadError, persistently
-from pipeline.io.urls import filesystem_of, is_url, name_in, shown
+from pipeline.io.urls import filesystem_of, is_url, name_in, range_options, shown
 
 BLOCK_BYTES = 1 << 18
 """Read at least, and kept together."""
@@ -90,7 +91,7 @@ class RemoteFile:
         return self._status
 
     def _asked(self) -> RemoteStatus:
-        info = self._tried(lambda: self._filesystem.info(self.url))
+        info = self._tried(lambda: self._filesystem.info(self.url, timeout=urls.REQUEST_S))
         if info.get("type", "file") != "file":
             raise UnreadableInputError(str(self), "a folder, not a file", "End its name with / to take what is in it")
         sent = info.get("size")
@@ -153,9 +154,8 @@ class RemoteFile:
             try:
                 if self._handle is None:
                     size = self.stat().st_size
-                    self._handle = self._filesystem.open(
-                        self.url, "rb", block_size=BLOCK_BYTES, cache_type="none", size=size
-                    )
+                    options = {"block_size": BLOCK_BYTES, "cache_type": "none", "size": size}
+                    self._handle = self._filesystem.open(self.url, "rb", **options, **range_options(self.url))
                 self._handle.seek(begin)
                 content: bytes = self._handle.read(end - begin)
             except ValueError:  # what fsspec says of servers that send the whole file, whatever they are asked for
@@ -188,7 +188,7 @@ class RemoteFile:
 
     def _download(self, target: Path) -> None:
         """The whole file by one request."""
-        self._tried(lambda: self._filesystem.get_file(self.url, str(target)))
+        self._tried(lambda: self._filesystem.get_file(self.url, str(target), timeout=urls.WHOLE_S))
 
     def fetch(self, target: Path, check: Callable[[], None] = lambda: None) -> None:
         """Write the whole file to a path of this machine, in an existing folder, piece by piece.

@@ -21,6 +21,10 @@ CONNECT_S = 10.0
 """A server that does not take a connection within so long is not there."""
 READ_S = 60.0
 """One that says nothing for so long will say nothing any more: a request moves 16 MiB at most."""
+REQUEST_S = 3600.0
+"""Seconds for one request in all, however often a byte comes."""
+WHOLE_S = 86_400.0
+"""The same for a whole file, from a server that does not send parts."""
 
 
 def _s3_options() -> dict[str, Any]:
@@ -37,12 +41,20 @@ def _s3_options() -> dict[str, Any]:
 
 
 def _http_options() -> dict[str, Any]:
-    """How fsspec's HTTP is to behave: no limit on a whole download, but on each silence."""
+    """How fsspec's HTTP is to behave: a generous limit on a whole download, and one on each silence."""
+    # proxies as everywhere: HTTPS_PROXY, NO_PROXY
+    return {"client_kwargs": {"timeout": _http_timeout(WHOLE_S), "trust_env": True}, "use_listings_cache": False}
+
+
+def _http_timeout(total_s: float) -> Any:
     import aiohttp
 
-    timeout = aiohttp.ClientTimeout(total=None, sock_connect=CONNECT_S, sock_read=READ_S)
-    # proxies as everywhere: HTTPS_PROXY, NO_PROXY
-    return {"client_kwargs": {"timeout": timeout, "trust_env": True}, "use_listings_cache": False}
+    return aiohttp.ClientTimeout(total=total_s, sock_connect=CONNECT_S, sock_read=READ_S)
+
+
+def range_options(url: str) -> dict[str, Any]:
+    """Options of fsspec's `open` by which each request for a part of the file has its own limit of time."""
+    return {"timeout": _http_timeout(REQUEST_S)} if url.lower().startswith("http") else {}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

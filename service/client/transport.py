@@ -18,6 +18,8 @@ import anyio
 import anyio.to_thread
 import httpx
 
+from pipeline.errors import causes
+
 Result = TypeVar("Result")
 
 CONNECT_S = 10.0
@@ -25,6 +27,8 @@ READ_S = 60.0
 """Seconds without a byte after which an answer counts as lost; event streams send one at least every 15 s."""
 LAST_BYTES_S = 600.0
 """The same for the answer to the last bytes of an upload: the service hashes the file, and examines it in its turn."""
+SLOW_S, SLOW_BYTES = 60.0, 60_000
+"""Seconds in which so many bytes of an answer must arrive, unless it ends before."""
 PIECE_BYTES = 1 << 20
 
 
@@ -111,9 +115,16 @@ class OpenAnswer:
     """The body, once; raises LostError if it breaks off."""
 
     async def whole(self) -> Answer:
-        """The same, when all of it has arrived."""
-        body = b"".join([piece async for piece in self.pieces])
-        return Answer(status=self.status, headers=self.headers, body=body)
+        """The same, when all of it has arrived; raises LostError also if it comes too slowly."""
+        body, at_bytes, at_s = bytearray(), 0, time.monotonic()
+        async for piece in self.pieces:
+            body += piece
+            now_s = time.monotonic()
+            if len(body) - at_bytes >= SLOW_BYTES:
+                at_bytes, at_s = len(body), now_s
+            elif now_s - at_s > SLOW_S:
+                raise LostError(f"the answer came with less than {SLOW_BYTES} bytes in {SLOW_S:g} s")
+        return Answer(status=self.status, headers=self.headers, body=bytes(body))
 
 
 class Transport(Protocol):
@@ -247,11 +258,9 @@ def _losses() -> Iterator[None]:
 
 def _certificate_fault(error: BaseException) -> str | None:
     """Why a certificate is not trusted; None if that is not the cause."""
-    seen: BaseException | None = error
-    while seen is not None:
-        if isinstance(seen, ssl.SSLCertVerificationError):
-            return f"its certificate is not trusted ({seen.verify_message})"
-        if isinstance(seen, ssl.SSLError) and "WRONG_VERSION_NUMBER" in str(seen):
+    for cause in causes(error):
+        if isinstance(cause, ssl.SSLCertVerificationError):
+            return f"its certificate is not trusted ({cause.verify_message})"
+        if isinstance(cause, ssl.SSLError) and "WRONG_VERSION_NUMBER" in str(cause):
             return "it does not speak TLS at this port: begin the URL with http://, or use the port for https"
-        seen = seen.__cause__ or seen.__context__
     return None

@@ -6,6 +6,7 @@ import dataclasses
 import pickle
 import secrets
 import shutil
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -46,6 +47,7 @@ from service.settings import ServiceSettings
 
 Done = TypeVar("Done")
 
+_MOMENT_S = 1.0
 _NAMED = 10
 """Inputs that the log of a job names."""
 
@@ -89,6 +91,7 @@ class Gather(Protocol):
         settings: ServiceSettings,
         target: Path,
         cancelled: Callable[[], bool],
+        progress: Callable[[int], None],
     ) -> JobFiles:
         """Fetch all inputs to this machine's disk."""
 
@@ -187,6 +190,9 @@ class Held(Protocol):
 
     def record(self, event: Event) -> None:
         """Take an event of the run."""
+
+    def move(self) -> None:
+        """Note that the attempt got somewhere."""
 
     def note(self, message: str, *, level: LogLevel = LogLevel.INFO, **facts: Any) -> None:
         """Add a line to the job's log."""
@@ -309,6 +315,8 @@ def _gathered(held: Held, parts: AttemptParts) -> JobFiles:
         settings=parts.settings,
         target=parts.inputs,
         cancelled=held.cancelled,
+        # bytes that come at a useful rate
+        progress=lambda _bytes: held.move(),
     )
     note_gathered(parts.inputs, files)
     return files
@@ -414,7 +422,9 @@ def _echo(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
     asked = held.job.request.echo or {}
 
     def work(_executor: Executor) -> tuple[str, dict[str, Any]]:
-        held.wait(asked["delay"])
+        until_s = time.monotonic() + asked["delay"]
+        while (left_s := until_s - time.monotonic()) > 0.0 and not held.wait(min(left_s, _MOMENT_S)):
+            held.move()
         _begun(held, "outputs")
         shutil.rmtree(parts.outputs, ignore_errors=True)
         write_echo(asked["message"], parts.outputs)

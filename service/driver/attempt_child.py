@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ClusterError, GableworkError
-from pipeline.runtime.cluster.dask_executor import Cluster
+from pipeline.runtime.cluster.dask_executor import Cluster, load_dask
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.isolation import child_main
 from pipeline.runtime.monitoring import tracing
@@ -65,6 +65,11 @@ class Name:
 
     path: str
     name: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Moved:
+    """The attempt got somewhere, which no event says."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,6 +155,10 @@ class ChildJob:
         """Send an event of the run to the driver."""
         child_main.say(event)
 
+    def move(self) -> None:
+        """Let the driver know that the attempt got somewhere."""
+        child_main.say(Moved())
+
     def note(self, message: str, *, level: LogLevel = LogLevel.INFO, **facts: Any) -> None:
         """Send a line for the job's log to the driver."""
         child_main.say(Note(message, level, facts))
@@ -207,17 +216,9 @@ class _DriversWorkers:
 
 def load() -> None:
     """Load what an attempt needs, before the process is forked; nothing here may start a thread."""
-    import dask
-    import distributed.client
-    import pyarrow.parquet
-
-    import pipeline.export.tile
-    import pipeline.io.las
-    import pipeline.runtime.digest
-    import pipeline.runtime.stages.publish
     import service.preflight  # noqa: F401
 
-    del dask, distributed, pyarrow, pipeline
+    load_dask()
 
 
 def attend(order: Order) -> tuple[str, dict[str, Any]]:

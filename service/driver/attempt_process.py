@@ -24,7 +24,18 @@ from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.scratch.folder import PULSE
 from service import traces
 from service.driver.attempt import AttemptParts, Tools, perform
-from service.driver.attempt_child import LOADS, End, Lent, Name, Note, Order, WorkersMissing, WorkersWanted, attend
+from service.driver.attempt_child import (
+    LOADS,
+    End,
+    Lent,
+    Moved,
+    Name,
+    Note,
+    Order,
+    WorkersMissing,
+    WorkersWanted,
+    attend,
+)
 from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.driver.shared_cluster import SharedCluster
 from service.errors import AttemptEndedError, NoSuchUploadError
@@ -200,6 +211,8 @@ class _Attended:
         match word:
             case Event():
                 self._held.record(word)
+            case Moved():
+                self._held.move()
             case Note():
                 self._held.note(word.message, level=word.level, **word.facts)
             case Name():

@@ -18,7 +18,7 @@ from sqlalchemy.engine import URL, Connection, Engine
 from service import migrations
 from service.disk import Ballast, Disk
 from service.errors import StartUpError, StoreBusyError, StoreError, StoreFullError, StoreNewerError
-from service.files import keep_private, make_private_file
+from service.files import folder_fault, keep_private, make_private_file
 from service.store.patience import CURRENT
 
 _EPOCH = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
@@ -205,12 +205,15 @@ class Database:
 
         Raises
         ------
+        StartUpError
+            The place of a SQLite database cannot be used.
         StoreError
             The database does not answer, or is of a newer version.
         """
         if self.is_sqlite and self._url.database is not None:
             with self._faults_in_our_words():
                 path = Path(self._url.database)
+                _check_place(path)
                 path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
                 make_private_file(path)
                 # SQLite makes them with the mode of the database
@@ -336,6 +339,15 @@ def _parsed(url: str) -> URL:
     if parsed.database in {None, "", ":memory:"} or "mode=memory" in str(parsed):
         raise StartUpError("a SQLite database in memory is lost with its process: name a file, sqlite:////path/file.db")
     return parsed
+
+
+def _check_place(path: Path) -> None:
+    """Refuse a place at which no SQLite database can be."""
+    fault = f"{path} is a folder" if path.is_dir() else folder_fault(path.parent)
+    if fault is not None:
+        raise StartUpError(
+            f"the SQLite database cannot be {path}: {fault}. Name a file in a folder that can be written"
+        )
 
 
 def _limit(connection: Connection, left_ms: int) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.compiler import Kernel, store, warm_up
 from pipeline.compiler.signatures import from_json, kernel_named, to_json
+from pipeline.errors import RunError
 
 
 class Pair(NamedTuple):
@@ -83,3 +84,15 @@ def test_kernels_are_compiled_in_other_processes_with_progress_and_never_again(
     before = times()
     assert warm_up.compile_kernels(lightest, processes=2) == 3
     assert times() == before
+
+
+def test_a_folder_of_kernels_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def ship(folder: Path, _is_current: object) -> int:
+        folder.mkdir(exist_ok=True)
+        return 1
+
+    monkeypatch.setattr(store, "ship", ship)
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(RunError, match=rf"{file} cannot be written: File exists\. Give another --into"):
+        warm_up.ship(file)

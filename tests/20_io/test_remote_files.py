@@ -5,10 +5,11 @@ import os
 import laspy
 import numpy as np
 import pytest
+from hostile_host import hostile_host
 from one_file_site import CONTENT, one_file_site
 
 from pipeline.errors import UnreadableInputError
-from pipeline.io import ReadOptions, open_source
+from pipeline.io import ReadOptions, open_source, urls
 from pipeline.io.remote_file import BLOCK_BYTES, BLOCKS_KEPT, RemoteFile, file_at, on_this_machine
 from pipeline.io.retries import RetryPolicy
 
@@ -92,6 +93,15 @@ def test_what_cannot_be_fetched_is_reported_by_url_status_and_fix_without_its_se
 def test_a_server_that_is_not_there_is_reported():
     with pytest.raises(UnreadableInputError, match="the connection broke at all of 3 attempts"):
         RemoteFile("http://127.0.0.1:9/a.laz", QUICK).stat()
+
+
+@pytest.mark.parametrize("temper", ["status", "headers", "body"])
+def test_a_request_ends_in_time_however_often_a_byte_comes(temper, monkeypatch):
+    monkeypatch.setattr(urls, "REQUEST_S", 0.5)
+    with hostile_host(pause_s=0.02) as host:
+        file = RemoteFile(f"http://{host.origin}/{temper}/a.laz", RetryPolicy(attempts=1))
+        with pytest.raises(UnreadableInputError, match="no answer in time"):
+            file.read_at(0, 1000)
 
 
 def test_a_file_that_changes_once_is_fetched_again_and_one_that_never_rests_is_refused(site, tmp_path):

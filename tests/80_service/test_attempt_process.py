@@ -56,7 +56,7 @@ def test_an_attempt_that_ends_by_itself_is_tried_again_and_then_the_job_fails(
 def test_a_process_that_takes_too_much_memory_is_ended(apart: Bench) -> None:
     apart.work = hostile_attempts.eat_memory
     job = apart.submit()
-    apart.driver(attempt_memory_bytes=2**30, max_attempts=1)
+    apart.driver(attempt_memory_bytes=2**30, max_attempts=1, stall_s=LONG_S)
     failure = apart.over(job).failure
     assert failure is not None
     assert (failure.fault, "GABLEWORK_ATTEMPT_MEMORY_BYTES" in failure.detail) == (Fault.STALLED, True)
@@ -107,7 +107,7 @@ def test_a_driver_that_ends_hands_the_attempt_back_and_the_next_one_goes_on(
 def test_honest_work_that_takes_long_is_not_ended(apart: Bench) -> None:
     apart.work = hostile_attempts.work_slowly
     job = apart.submit()
-    apart.driver()
+    apart.driver(stall_s=4.0)
     done = apart.over(job)
     assert (done.status, done.attempt) == (JobStatus.SUCCESSFUL, 1)
     assert done.summary is not None

@@ -295,7 +295,7 @@ json_values = st.recursive(
 
 @given(json_values, st.booleans(), st.integers(1, 9))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_brackets_are_counted_as_a_parser_does_wherever_blocks_end(
+def test_brackets_arecounted_as_a_parser_does_wherever_blocks_end(
     tmp_path: Path, value: object, ascii_only: bool, block: int
 ) -> None:
     text = json.dumps({"a": value}, ensure_ascii=ascii_only).encode("utf-8", "replace")

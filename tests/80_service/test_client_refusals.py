@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import trustme
 from client_site import Site
+from hostile_host import hostile_host
 from live_service import POINTS
 
 from pipeline.errors import SettingsError
@@ -163,6 +164,17 @@ def test_a_service_that_never_answered_is_given_up_soon(monkeypatch: pytest.Monk
         Client("http://127.0.0.1:1", notify=[].append).jobs()
     assert "127.0.0.1:1" in str(caught.value)
     assert sum(pauses) == pytest.approx(5.0)
+
+
+def test_an_answer_that_trickles_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.client.transport.SLOW_S", 0.2)
+    said = r"the answer came with less than 60000 bytes in 0\.2 s"
+    with (
+        hostile_host(pause_s=0.02) as host,
+        Client(f"http://{host.origin}", patience_s=0.0) as client,
+        pytest.raises(api.UnreachableError, match=said),
+    ):
+        client.request("GET", "/body/a.laz")
 
 
 def test_keys_and_scopes_that_are_missing_are_explained(site: Site) -> None:

@@ -51,7 +51,7 @@ def test_the_head_of_an_answer_is_that_of_get_without_its_body(url: str, path: s
         assert client.get("/healthz").json()["status"] == "ok"
 
 
-def test_the_head_of_an_event_stream_ends_and_is_not_counted_as_an_open_stream(tmp_path: Path) -> None:
+def test_the_head_of_an_event_stream_ends_and_is_notcounted_as_an_open_stream(tmp_path: Path) -> None:
     settings = settings_in(tmp_path, max_event_streams=1)
     with serving(settings) as url:
         form = {"tile": ("points.xyz", POINTS)}

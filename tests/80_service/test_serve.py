@@ -23,6 +23,7 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from pipeline.runtime.isolation.isolated_items import MIN_MEMORY_BYTES
+from service import supervisor as supervisor_module
 from service.cli import app
 from service.connections import listen
 from service.settings import ServiceSettings
@@ -260,6 +261,35 @@ def test_a_supervised_process_is_asked_to_end_once_however_often_that_is_wanted(
     supervisor.end(LONG_S)
     assert asked.read_text() == "once"
     assert dead == []
+
+
+def test_a_driver_without_a_sign_of_life_is_killed_and_one_with_signs_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor_module, "SILENT_S", 1.0)
+    dead: list[str] = []
+    frozen, beats = tmp_path / "frozen", tmp_path / "beats"
+    # it gives signs until the test wants it to stand still
+    living = (
+        "import os, pathlib, time\n"
+        f"while not pathlib.Path({str(frozen)!r}).exists():\n"
+        "    os.write(0, b'.')\n"
+        f"    with open({str(beats)!r}, 'a') as stream:\n"
+        "        stream.write('.')\n"
+        "    time.sleep(0.1)\n"
+        "time.sleep(900)\n"
+    )
+    supervisor = Supervisor([sys.executable, "-c", living], os.environ, dead.append)
+    supervisor.start()
+    first = supervisor.pid
+    # far longer than the silence that is allowed
+    wait_for(lambda: beats.exists() and len(beats.read_text()) > 30, "signs of life")
+    assert (dead, supervisor.pid) == ([], first)
+    frozen.touch()
+    wait_for(lambda: dead, "the end of the silent process")
+    frozen.unlink()
+    wait_for(lambda: supervisor.pid != first and supervisor.status() == "running", "another process")
+    supervisor.end(0.1)
 
 
 # --- keys

@@ -166,7 +166,7 @@ def test_only_a_folder_that_was_handed_back_is_taken_over(folder: StateFolder) -
     first, second, third = (job(attempt=number) for number in (1, 2, 3))
     place, is_resumed = workplace.take(folder, first)
     assert (place, is_resumed) == (folder.attempt(first.job_id, 1), False)
-    # its driver died: nobody knows what still writes there
+    # its driver died: something may still write there
     other, is_resumed = workplace.take(folder, second)
     assert (other, is_resumed) == (folder.attempt(first.job_id, 2), False)
     workplace.hand_back(other, second)

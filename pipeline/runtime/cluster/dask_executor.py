@@ -46,6 +46,14 @@ class _CancelledErrors(logging.Filter):
 _CANCELLED_ERRORS = _CancelledErrors()
 
 
+def load_dask() -> None:
+    """Load what connects to a cluster, before a process is forked."""
+    import dask
+    import distributed  # noqa: F401
+
+    del dask
+
+
 class Cluster:
     """Workers for any number of runs, also concurrent ones in several threads; a context manager.
 
