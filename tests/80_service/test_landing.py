@@ -125,7 +125,7 @@ def test_the_page_of_the_api_names_every_path_and_loads_nothing_from_elsewhere(l
 def test_a_service_that_works_is_alive_and_ready(local_service) -> None:
     assert local_service.client.get("/healthz").json() == {"status": "ok"}
     checks = local_service.client.get("/readyz").json()["checks"]
-    assert checks == {"database": "ok", "state": "ok", "disk": "ok", "driver": "elsewhere"}
+    assert checks == {"database": "ok", "state": "ok", "disk": "ok", "driver": "elsewhere", "slots": "ok"}
 
 
 def test_a_service_without_its_state_folder_is_alive_but_not_ready(local_service) -> None:
