@@ -43,7 +43,17 @@ ODD_NUMBERS = (
     *("1e400", "-1e400", "nan", "inf", "-inf", "-0", "1e308", "-1", "0", "4294967296", "9223372036854775808"),
     *("0x10", "1_000", "1e-400", "", "abc", "9" * DIGITS, "0." + "3" * DIGITS, "1e9999999999"),
 )
-ODD_BYTES = (b"\xff\xfe", b"\xe9", b"\xc3", b"\x00", b"\x1b[2J", b"\xed\xa0\x80", b"\xf4\x90\x80\x80", b"\xef\xbb\xbf", b"\r")
+ODD_BYTES = (
+    b"\xff\xfe",
+    b"\xe9",
+    b"\xc3",
+    b"\x00",
+    b"\x1b[2J",
+    b"\xed\xa0\x80",
+    b"\xf4\x90\x80\x80",
+    b"\xef\xbb\xbf",
+    b"\r",
+)
 ODD_VALUES: tuple[Any, ...] = (
     *(None, True, 0, -1, 1e308, 2**64, 10**30, "", "x", "\0", "x" * 70_000, [], {}, [[]], [None], {"": None}),
     *([1, 2, 3, 4, 5], [[1e308, -1e308]], {"type": "Point"}, "Polygon", "GeometryCollection", "2026-02-30"),
@@ -224,10 +234,34 @@ def odd_value(draw: random.Random, data: bytes) -> bytes:
 def odd_token(draw: random.Random, data: bytes) -> bytes:
     """TOML with a value of another type, or a key under another name."""
     places = [found.span(1) for found in re.finditer(rb"= *([^\n]+)\n", data)]
-    values = ("true", "-1", "1e308", "nan", "inf", "2026-01-01", '""', '"\\u0000"', "[]", "{}", "[[[]]]", '"' + "x" * 70_000 + '"')
-    values += ("9" * DIGITS, "[1, 'a', {}]", "07:32:00", "'''\n'''", '"../../../x"', '"C:\\\\x"', "{ file = 1, id = [] }")
+    values = (
+        "true",
+        "-1",
+        "1e308",
+        "nan",
+        "inf",
+        "2026-01-01",
+        '""',
+        '"\\u0000"',
+        "[]",
+        "{}",
+        "[[[]]]",
+        '"' + "x" * 70_000 + '"',
+    )
+    values += (
+        "9" * DIGITS,
+        "[1, 'a', {}]",
+        "07:32:00",
+        "'''\n'''",
+        '"../../../x"',
+        '"C:\\\\x"',
+        "{ file = 1, id = [] }",
+    )
     if draw.random() < 0.3:
-        places, values = [found.span() for found in re.finditer(rb"[a-z_]+(?= *=)", data)], ("x", "path", "''", "a.b.c", "settings")
+        places, values = (
+            [found.span() for found in re.finditer(rb"[a-z_]+(?= *=)", data)],
+            ("x", "path", "''", "a.b.c", "settings"),
+        )
     first, end = draw.choice(places)
     return data[:first] + draw.choice(values).encode() + data[end:]
 
@@ -239,13 +273,17 @@ def odd_cell(draw: random.Random, data: bytes) -> bytes:
         base.text_factory = bytes
         for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
             base.execute(f'DROP TRIGGER "{name.decode()}"')
-        query = "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite%' AND name NOT LIKE 'rtree%'"
+        query = (
+            "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite%' AND name NOT LIKE 'rtree%'"
+        )
         tables = [name.decode() for (name,) in base.execute(query).fetchall()]
         table = draw.choice([*tables, *tables[-3:] * 3])
         columns = [row[1].decode() for row in base.execute(f'PRAGMA table_info("{table}")').fetchall()]
         column = draw.choice(columns)
         if draw.random() < 0.1:
-            base.execute(draw.choice((f'DROP TABLE "{table}"', f'ALTER TABLE "{table}" RENAME COLUMN "{column}" TO "other"')))
+            base.execute(
+                draw.choice((f'DROP TABLE "{table}"', f'ALTER TABLE "{table}" RENAME COLUMN "{column}" TO "other"'))
+            )
         else:
             rows = base.execute(f'SELECT rowid, "{column}" FROM "{table}"').fetchall()
             if not rows:
@@ -254,7 +292,9 @@ def odd_cell(draw: random.Random, data: bytes) -> bytes:
             odd: list[Any] = [None, -1, 2**62, 1e308, "", "x" * 70_000, b"\0", "0", float("inf")]
             if isinstance(value, bytes) and value:
                 odd += [draw.choice((flipped_bits, extreme_number, truncated, odd_text))(draw, value) for _ in odd]
-            update = f'UPDATE OR IGNORE "{table}" SET "{column}" = {draw.choice(("?", "CAST(? AS TEXT)"))} WHERE rowid = ?'
+            update = (
+                f'UPDATE OR IGNORE "{table}" SET "{column}" = {draw.choice(("?", "CAST(? AS TEXT)"))} WHERE rowid = ?'
+            )
             with contextlib.suppress(sqlite3.IntegrityError):
                 base.execute(update, (draw.choice(odd), row))
         base.commit()
@@ -278,7 +318,9 @@ def odd_table(draw: random.Random, data: bytes) -> bytes:
             whole[row] = draw.choice((flipped_bits, extreme_number, truncated))(draw, whole[row])
             column = pa.array(whole, pa.binary())
         elif draw.random() < 0.5:
-            column = draw.choice((pa.array([1.5, float("nan")]), pa.array([[1], []]), pa.nulls(2), pa.array([{"a": 1}, None])))
+            column = draw.choice(
+                (pa.array([1.5, float("nan")]), pa.array([[1], []]), pa.nulls(2), pa.array([{"a": 1}, None]))
+            )
         table = table.set_column(at, table.column_names[at], column)
     made = io.BytesIO()
     pq.write_table(table, made)

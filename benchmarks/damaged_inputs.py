@@ -108,7 +108,9 @@ class Outcome:
     def __str__(self) -> str:
         """A line."""
         last = " | ".join(self.detail.strip().splitlines()[-3:])
-        return f"{self.case.kind.name} {self.case.number} ({self.case.file}, {self.damage}): {self.result}: {last[-400:]}"
+        return (
+            f"{self.case.kind.name} {self.case.number} ({self.case.file}, {self.damage}): {self.result}: {last[-400:]}"
+        )
 
 
 def command(case: Case, folder: Path) -> list[str]:
@@ -156,7 +158,9 @@ def faults_of(run_dir: Path) -> list[str]:
         return []
     rows = read_table(str(run_dir), "buildings").to_pylist()
     found = [
-        f"internal: {row['building_id']} {row['reason']}: {row['detail']}" for row in rows if row["reason"] in FAULTS
+        f"internal: {row['building_id']} {row['reason']}: {row['reason_detail']}"
+        for row in rows
+        if row["reason"] in FAULTS
     ]
     for model in read_run(run_dir).models:
         codes = [code for solid in model.solids for code in check_solid(solid)]
@@ -291,7 +295,9 @@ def main(words: Sequence[str] | None = None) -> int:
             found = [outcome for share in pool.map(_run_share, shares, chunksize=1) for outcome in share]
     bad = [one for one in found if one.result not in GOOD]
     for kind in arguments.kinds:
-        for outcome in [one for one in (found if arguments.verbose else bad) if one.case.kind.name == kind.name][: arguments.shown]:
+        for outcome in [one for one in (found if arguments.verbose else bad) if one.case.kind.name == kind.name][
+            : arguments.shown
+        ]:
             print(outcome)
     print(table_of(found))
     return 1 if bad else 0

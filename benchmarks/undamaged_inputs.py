@@ -132,7 +132,14 @@ KINDS: tuple[Kind, ...] = (
     ),
     Kind(
         name="shapefile",
-        files=("footprints.shp", "footprints.shp", "footprints.dbf", "footprints.shx", "footprints.prj", "footprints.cpg"),
+        files=(
+            "footprints.shp",
+            "footprints.shp",
+            "footprints.dbf",
+            "footprints.shx",
+            "footprints.prj",
+            "footprints.cpg",
+        ),
         arguments=_run("tile.laz", "--footprints", "footprints.shp"),
     ),
     Kind(
@@ -186,8 +193,14 @@ def write_inputs(folder: Path) -> None:
     copc_of(folder / "tile.copc.laz", las, CRS)
     _write_ply(folder, xyz)
     outlines = [shapely.affinity.translate(shapely.box(*house), *ORIGIN) for house in HOUSES]
-    for name, driver in (("footprints.gpkg", "GPKG"), ("footprints.shp", "ESRI Shapefile"), ("footprints.geojson", "GeoJSON")):
-        _write_vector(folder / name, driver, outlines, "Polygon", id=["gable", "flat"], street=["Aalstraße 5", "Dorfplatz"])
+    for name, driver in (
+        ("footprints.gpkg", "GPKG"),
+        ("footprints.shp", "ESRI Shapefile"),
+        ("footprints.geojson", "GeoJSON"),
+    ):
+        _write_vector(
+            folder / name, driver, outlines, "Polygon", id=["gable", "flat"], street=["Aalstraße 5", "Dorfplatz"]
+        )
     lines = [
         shapely.affinity.translate(shapely.LineString(line), *ORIGIN)
         for line in (((5.0, 10.0), (17.0, 10.0)), ((22.0, 10.0), (34.0, 10.0)), ((22.0, 10.0), (22.0, 22.0)))

@@ -110,7 +110,7 @@ def test_a_toml_file_and_the_command_line_meet(tmp_path: Path) -> None:
 def test_a_settings_file_that_is_no_toml_is_named(tmp_path: Path) -> None:
     path = tmp_path / "run.toml"
     path.write_text("classes = trust")
-    with pytest.raises(SettingsError, match=r"run.toml is no TOML"):
+    with pytest.raises(SettingsError, match=r"run.toml is not TOML"):
         RunSettings.from_toml(str(path), {})
 
 

@@ -22,6 +22,7 @@ from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
 from pipeline.io.records import Share
 from pipeline.io.remote_file import RemoteFile, file_at
 from pipeline.io.storage import sha256_of
+from pipeline.io.strays import MOST_STRAYS
 from pipeline.model import IntArray, PointCloud
 from pipeline.runtime.plan import is_fetched_by_nodes, shares_of
 from pipeline.runtime.run_context import RunContext
@@ -38,6 +39,9 @@ _CHUNK_POINTS = 250_000
 _LINE_SPREAD_M = 0.05
 """Points that stray less from one line make no surface. Not a setting: the noise of a scanner is of this size."""
 _TWO_BYTES = 2**16
+_MANY_TILES, _FEW_POINTS = 100, 4
+"""Points are scattered if more than `MOST_STRAYS` of them lie in tiles with fewer than so many points, and these are more
+than so many. Not settings: a survey fills its tiles, except for some at its border."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -223,7 +227,7 @@ def _ingested(task: IngestTask) -> Ingested:
         histogram = np.bincount(records["classification"])
         classes.update({int(c): int(histogram[c]) for c in np.flatnonzero(histogram)})
         multiple = multiple or bool((records["return_count"] > 1).any())
-        counts.update(_append_by_tile(records, x, y, task, suffix, content))
+        counts.update(_append_by_tile(records, x, y, task, suffix, content, counts))
     sha256 = "" if is_url(task.path) else _digest_of(task)
     _check_unchanged(task)
     for tile in counts:
@@ -258,8 +262,12 @@ def _append_by_tile(
     task: IngestTask,
     suffix: str,
     content: dict[Tile, ZoneSums],
+    before: Counter[Tile],
 ) -> Counter[Tile]:
-    """Append a chunk to the parts of its tiles, and its content to that of the file; the chunk's points by tile."""
+    """Append a chunk to the parts of its tiles, and its content to that of the file; the chunk's points by tile.
+
+    `before` has the points of the chunks before. Raises InconsistentInputError for points scattered over the Earth.
+    """
     columns, rows = task.grid.columns_rows(x_mm, y_mm)
     west, south = int(columns.min()), int(rows.min())
     height = int(rows.max()) - south + 1
@@ -269,16 +277,35 @@ def _append_by_tile(
     order = np.argsort(number.astype(np.uint16) if n_tiles <= _TWO_BYTES else number, kind="stable")
     ordered, number = np.take(records, order), number[order]
     starts = np.flatnonzero(np.diff(number, prepend=-1))
-    counts: Counter[Tile] = Counter()
-    for start, stop in zip(starts, [*starts[1:], len(ordered)], strict=True):
-        column, row = divmod(int(number[start]), height)
-        tile = Tile(west + column, south + row)
+    stops = [*starts[1:].tolist(), len(ordered)]
+    tiles = [Tile(west + place // height, south + place % height) for place in number[starts].tolist()]
+    counts = Counter({tile: stop - start for tile, start, stop in zip(tiles, starts.tolist(), stops, strict=True)})
+    _refuse_scattered(task, before + counts if len(counts) > _MANY_TILES else counts)
+    for tile, start, stop in zip(tiles, starts.tolist(), stops, strict=True):
         with task.scratch.path("points", tile.key, f"{task.part}{suffix}").open("ab") as part:
             ordered[start:stop].tofile(part)
         sums = _content_of(ordered[start:stop], tile, task.grid)
         content[tile] = content[tile] + sums if tile in content else sums
-        counts[tile] += int(stop - start)
     return counts
+
+
+def _refuse_scattered(task: IngestTask, counts: Counter[Tile]) -> None:
+    """Refuse points of which many lie alone in their tiles: each tile would cost files and tasks.
+
+    Raises InconsistentInputError. Single strays are left to the outlier filter.
+    """
+    if len(counts) <= _MANY_TILES:
+        return
+    alone = [count for count in counts.values() if count < _FEW_POINTS]
+    points = sum(counts.values())
+    if len(alone) > _MANY_TILES and sum(alone) > MOST_STRAYS * points:
+        size_m = task.grid.size_mm / MM
+        raise InconsistentInputError(
+            shown(task.path),
+            f"{sum(alone)} of the first {points} points lie scattered over {len(alone)} tiles of {size_m:g} m, with "
+            f"fewer than {_FEW_POINTS} points each",
+            "Check the scale, the columns and the file itself: its coordinates look damaged",
+        )
 
 
 def _content_of(points: npt.NDArray[np.void], tile: Tile, grid: TileGrid) -> ZoneSums:
