@@ -26,7 +26,7 @@ Damage = Callable[[random.Random, bytes], bytes]
 HEAD_BYTES = 700
 """The bytes at the start that half of all damage hits: a header is small, and most faults are in it."""
 DEEP = 100_000
-DIGITS = 4_000
+DIGITS = 5_000
 
 FLOATS = (float("nan"), float("inf"), float("-inf"), 0.0, -0.0, 1e-320, 1e300, -1e300, 1e9, -1.0, 1e17)
 WHOLE = (0, 1, 2, 7, 127, 128, 255, 256, 32767, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**53, 2**63 - 1, 2**64 - 1)
@@ -43,6 +43,23 @@ ODD_NUMBERS = (
     *("1e400", "-1e400", "nan", "inf", "-inf", "-0", "1e308", "-1", "0", "4294967296", "9223372036854775808"),
     *("0x10", "1_000", "1e-400", "", "abc", "9" * DIGITS, "0." + "3" * DIGITS, "1e9999999999"),
 )
+WKT_RECORD = 2112
+ODD_CRS = (
+    'GEOGCS["x",DATUM["x",SPHEROID["x",6378137,298.257223563]],PRIMEM["Greenwich",0],UNIT["degree",1]]',
+    'GEOCCS["x",DATUM["x",SPHEROID["x",6378137,298]],PRIMEM["Greenwich",0],UNIT["m",1]]',
+    'VERT_CS["x",VERT_DATUM["x",2005],UNIT["m",1]]',
+    'LOCAL_CS["x",UNIT["m",0]]',
+    'LOCAL_CS["x",UNIT["m",-1]]',
+    'LOCAL_CS["x",UNIT["m",1e308]]',
+    'ENGCRS["x",EDATUM["x"],CS[Cartesian,1],AXIS["x",east],LENGTHUNIT["metre",1]]',
+    'ENGCRS["x",EDATUM["x"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1e-300]]',
+    'TIMECRS["x",TDATUM["x"],CS[temporal,1],AXIS["x",future],TIMEUNIT["day",86400]]',
+    'COMPD_CS["x",LOCAL_CS["x",UNIT["m",1]],VERT_CS["x",VERT_DATUM["x",2005],UNIT["m",0.001]]]',
+    "EPSG:25832",
+    "+proj=utm +zone=32",
+    "[",
+)
+"""Systems that are no place for points, or hardly one, and what is not WKT."""
 ODD_BYTES = (
     b"\xff\xfe",
     b"\xe9",
@@ -152,6 +169,22 @@ def las_record(draw: random.Random, data: bytes) -> bytes:
     for _ in range(draw.choice((1, 1, 2, 8))):
         _write(draw, made, *draw.choice(places))
     return bytes(made)
+
+
+def las_crs(draw: random.Random, data: bytes) -> bytes:
+    """Another CRS in the WKT of a LAS header, or odd numbers and bytes in it; of the same length."""
+    at = data.find(b"LASF_Projection") - 2
+    if at < 0:
+        return las_record(draw, data)
+    size = struct.unpack_from("<H", data, at + 20)[0]
+    text = data[at + 54 : at + 54 + size].rstrip(b"\0")
+    if struct.unpack_from("<H", data, at + 18)[0] != WKT_RECORD:
+        made = las_record(draw, data)
+    else:
+        change = draw.choice((odd_number, odd_number, odd_text, deep_nesting, removed_block, None))
+        other = draw.choice(ODD_CRS).encode() if change is None else change(draw, text)
+        made = data[: at + 54] + other[:size].ljust(size, b"\0") + data[at + 54 + size :]
+    return made
 
 
 def _write(draw: random.Random, made: bytearray, at: int, form: str) -> None:
@@ -331,22 +364,37 @@ BINARY: tuple[Damage, ...] = (
     *(flipped_bits, other_bytes, overwritten_run, truncated, inserted_block, removed_block, swapped_blocks),
     extreme_number,
 )
-LAS: tuple[Damage, ...] = (*BINARY, las_field, las_field, las_field, las_record, las_record, las_record)
+LAS: tuple[Damage, ...] = (
+    *BINARY,
+    las_field,
+    las_field,
+    las_field,
+    las_record,
+    las_record,
+    las_record,
+    las_crs,
+    las_crs,
+)
 TEXT: tuple[Damage, ...] = (*BINARY, *[odd_number, odd_text] * 3, *[moved_lines, deep_nesting] * 2)
 JSON: tuple[Damage, ...] = (*TEXT, *[odd_value] * 8)
 TOML: tuple[Damage, ...] = (*TEXT, *[odd_token] * 10)
 GEOPACKAGE: tuple[Damage, ...] = (*BINARY, *[odd_cell] * 8)
 PARQUET: tuple[Damage, ...] = (*BINARY, *[odd_table] * 8)
 BY_SUFFIX = {
-    **{".las": LAS, ".laz": LAS, ".ply": TEXT},
-    **{".geojson": JSON, ".toml": TOML, ".gpkg": GEOPACKAGE, ".parquet": PARQUET},
+    ".las": LAS,
+    ".laz": LAS,
+    ".ply": TEXT,
+    ".geojson": JSON,
+    ".toml": TOML,
+    ".gpkg": GEOPACKAGE,
+    ".parquet": PARQUET,
 }
 """The kinds of damage of some formats; all others are binary."""
 
 
 def damaged(name: str, data: bytes, seed: str) -> tuple[str, bytes]:
     """A damaged copy of a file that differs from it, and the name of the damage; some have two kinds of damage."""
-    draw = random.Random(seed)  # noqa: S311 - nothing secret
+    draw = random.Random(seed)
     kinds = BY_SUFFIX.get(Path(name).suffix, BINARY)
     while True:
         some = [draw.choice(kinds)]

@@ -1,4 +1,4 @@
-"""Small whole inputs of every kind, to be damaged by `damaged_inputs.py`: two houses on 40 by 30 m, some 2,000 points."""
+"""Small whole inputs of every kind, to be damaged by `damaged_inputs.py`: two houses on 40 by 30 m, 2,120 points."""
 
 from __future__ import annotations
 
@@ -214,8 +214,8 @@ def write_inputs(folder: Path) -> None:
 
 def _write_ply(folder: Path, xyz: FloatArray) -> None:
     """The points as PLY, binary and as text."""
-    head = "ply\nformat {}\ncomment two houses\nelement vertex {}\nproperty double x\nproperty double y\nproperty double z\n"
-    head += "property uchar classification\nend_header\n"
+    head = "ply\nformat {}\ncomment two houses\nelement vertex {}\n"
+    head += "property double x\nproperty double y\nproperty double z\nproperty uchar classification\nend_header\n"
     table = np.zeros(len(xyz), [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("classification", "u1")])
     for axis, name in enumerate("xyz"):
         table[name] = xyz[:, axis]

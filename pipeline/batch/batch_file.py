@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import SettingsError
 from pipeline.export.mesh_kinds import MESHES
+from pipeline.io.reading import INPUT_TIMEOUT_S
 from pipeline.parameters import Parameters, build, is_finite_number, parameter, quoted, read_toml
 from pipeline.runtime.cluster.tls import given_tls
 from pipeline.runtime.isolation.isolated_items import IsolationLimits
@@ -90,6 +91,13 @@ class ClusterTable(Parameters):
         0, "Port of 127.0.0.1 for the run's figures in the format of Prometheus; 0 for none.", minimum=0, maximum=65535
     )
     isolate: bool = parameter(True, "Model buildings in supervised child processes: a bad building costs only itself.")
+    input_timeout_s: float = parameter(
+        INPUT_TIMEOUT_S,
+        "Most seconds within which some more of an input must be read.",
+        unit="s",
+        minimum=1.0,
+        maximum=86_400.0,
+    )
     building_timeout_s: float = parameter(
         IsolationLimits.timeout_s,
         "Most seconds per building in its child process.",
@@ -223,6 +231,7 @@ class Batch:
                 performance_report=given(self.cluster.performance_report),
                 work=self.work_folder,
                 isolate=None if self.cluster.isolate else False,
+                input_timeout_s=self.cluster.input_timeout_s,
                 building_timeout_s=self.cluster.building_timeout_s,
                 building_memory_bytes=round(self.cluster.building_memory_gib * 2**30),
             ),

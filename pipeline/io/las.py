@@ -32,6 +32,7 @@ from pipeline.io.laz_chunks import (
 )
 from pipeline.io.laz_decoder import DECODING_ERRORS, decoding
 from pipeline.io.readable import Readable
+from pipeline.io.reading import moved
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Share, Window
 from pipeline.io.remote_file import bytes_of
 from pipeline.io.strays import typical_bounds
@@ -272,6 +273,7 @@ class LasFile:
 
     def _to_records(self, raw: npt.NDArray[np.uint8]) -> PointRecords:
         """Arrays of the fields that are used."""
+        moved()
         packed = PackedPointRecord.from_buffer(raw, self._header.point_format)
         array = packed.array
         xyz = np.empty((len(array), 3), dtype=np.float64)

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from pipeline.errors import InconsistentInputError, UnreadableInputError
 from pipeline.io.laz_decoder import DECODING_ERRORS, decoding
 from pipeline.io.readable import Readable
+from pipeline.io.reading import moved
 
 if TYPE_CHECKING:
     from pipeline.io.las_header import HeaderBlock
@@ -187,6 +188,7 @@ def _check_layers(path: Readable, stream: BinaryIO, block: HeaderBlock, table: C
     """Point formats 6 and above: the layers and counts of all chunks, and the header's count."""
     held = 0
     for chunk in np.flatnonzero(table.counts).tolist():
+        moved()
         stream.seek(int(table.offsets[chunk]))
         held += check_chunk(path, stream.read(_layers_end(block)), block, table, chunk)
     if held != block.point_count:

@@ -72,6 +72,8 @@ class RunContext:
     """Holds the intermediate results."""
     isolation: IsolationLimits | None = None
     """Limits of the child processes that model buildings; None models buildings in the workers themselves."""
+    reading: IsolationLimits | None = None
+    """Limits of the child processes that read inputs; None reads them in the workers themselves."""
     kept: KeptFiles = dataclasses.field(default_factory=KeptFiles)
     """Files of earlier runs that no task of this one has read yet."""
 
@@ -251,7 +253,12 @@ def run_context(
             check_memory(plan, engine.memory_limit_bytes)
             try:
                 yield RunContext(
-                    plan=plan, progress=progress, executor=engine, scratch=opened, isolation=resources.isolation
+                    plan=plan,
+                    progress=progress,
+                    executor=engine,
+                    scratch=opened,
+                    isolation=resources.isolation,
+                    reading=resources.reading,
                 )
             except BaseException:
                 opened.cancel()

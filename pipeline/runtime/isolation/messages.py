@@ -5,6 +5,7 @@ supervisor                          child
     Batch(function, items) ──────▶
                            ◀──────  Ready                    once, after loading
                            ◀──────  Begun(index)             before an item begins: the one to blame if the child dies
+                           ◀──────  Progressed(index)        now and then, from items that say that they go on
                            ◀──────  Finished(index, result)  at once, so no finished item is lost
                            ◀──────  OutOfMemory(index)       the item raised MemoryError; the child is not used again
                            ◀──────  Raised(index, error)     the function raised: a fault of the run, not of the item
@@ -57,6 +58,13 @@ class Ready:
 @dataclasses.dataclass(frozen=True)
 class Begun:
     """An item begins."""
+
+    index: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Progressed:
+    """The item goes on: its time limit begins anew."""
 
     index: int
 

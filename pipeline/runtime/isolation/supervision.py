@@ -17,7 +17,17 @@ from typing import Any
 
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.isolation.forked_child import read_by_children
-from pipeline.runtime.isolation.messages import Batch, Begun, Finished, Frames, OutOfMemory, Raised, Ready, frame
+from pipeline.runtime.isolation.messages import (
+    Batch,
+    Begun,
+    Finished,
+    Frames,
+    OutOfMemory,
+    Progressed,
+    Raised,
+    Ready,
+    frame,
+)
 from pipeline.runtime.isolation.spawned_child import ChildProcess
 
 _PIECE = 2**20
@@ -146,7 +156,7 @@ class SupervisedChild:
     ) -> Iterator[Finished | ChildEnd]:
         """Process items; yields each result as it comes, and finally a `ChildEnd` if the child died or was ended.
 
-        `one` is the word for an item in messages.
+        `one` is the word for an item in messages. An item that reports progress has its whole time again.
         """
         batch = Batch(function=function, items=items, data_limit_bytes=memory_bytes + _DATA_MARGIN_BYTES)
         with contextlib.suppress(BrokenPipeError):  # its end is handled below
@@ -173,6 +183,8 @@ class SupervisedChild:
                 case Begun():
                     at_work, began, peak_bytes = message.index, time.monotonic(), 0
                     self.begun += 1
+                case Progressed():
+                    began = time.monotonic()
                 case Finished():
                     at_work = None
                     left -= 1

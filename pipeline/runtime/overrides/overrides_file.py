@@ -20,6 +20,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.errors import InputError, SettingsError
 from pipeline.io.crs import LARGEST_COORDINATE, SpatialReference
 from pipeline.io.footprints import Footprints, read_footprints
+from pipeline.io.reading import one_input
 from pipeline.methods import ReconstructSettings, method_named
 from pipeline.parameters import is_finite_number, quoted, read_toml
 from pipeline.settings import RunSettings
@@ -264,7 +265,8 @@ class _Reading:
         key = (str(path), value.get("layer"), value.get("id_column"))
         try:
             if key not in self._files:
-                self._files[key] = read_footprints(path, self._reference, layer=key[1], id_column=key[2])
+                with one_input(str(path)):
+                    self._files[key] = read_footprints(path, self._reference, layer=key[1], id_column=key[2])
         except InputError as error:
             faults.append(f"footprint: {error}")
             return None

@@ -7,6 +7,7 @@ at once, each a share of it.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import shutil
 from collections import Counter
@@ -19,11 +20,14 @@ import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, UnreadableInputError
 from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
+from pipeline.io.reading import heard_by, moved, one_input, stalled
 from pipeline.io.records import Share
 from pipeline.io.remote_file import RemoteFile, file_at
 from pipeline.io.storage import sha256_of
 from pipeline.io.strays import MOST_STRAYS
-from pipeline.model import IntArray, PointCloud
+from pipeline.model import IntArray, PointCloud, Reason
+from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
+from pipeline.runtime.isolation.progress_reports import report_progress
 from pipeline.runtime.plan import is_fetched_by_nodes, shares_of
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
@@ -40,8 +44,8 @@ _LINE_SPREAD_M = 0.05
 """Points that stray less from one line make no surface. Not a setting: the noise of a scanner is of this size."""
 _TWO_BYTES = 2**16
 _MANY_TILES, _FEW_POINTS = 100, 4
-"""Points are scattered if more than `MOST_STRAYS` of them lie in tiles with fewer than so many points, and these are more
-than so many. Not settings: a survey fills its tiles, except for some at its border."""
+"""Points are scattered if more than `MOST_STRAYS` of them lie in tiles with too few points, and these are too many tiles.
+Not settings: a survey fills its tiles, except for some at its border."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,6 +66,13 @@ class IngestTask:
     """Header facts from the plan."""
     share: Share | None = None
     """The share; None for the whole file."""
+    limits: IsolationLimits | None = None
+    """Limits of the child process that reads it; None reads it in the process that runs the task."""
+
+    @property
+    def supervises(self) -> bool:
+        """Whether it is read in a child process of the process that runs the task."""
+        return self.limits is not None
 
 
 def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
@@ -85,6 +96,7 @@ def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
                 scratch=context.scratch,
                 known=file,
                 share=share,
+                limits=context.reading,
             )
             key = key_of(path, file.file_size, written, task.options, task.grid, share)
             tasks[Place("ingest", task.part, key)] = task
@@ -164,9 +176,41 @@ def to_records(cloud: PointCloud) -> npt.NDArray[np.void]:
 def ingest_file(task: IngestTask) -> Ingested:
     """Read one file, or a share of it, and bucket its points by tile; a file behind a URL is fetched meanwhile.
 
-    The points are in scratch under `points/<tile>/<part>.bin`. Raises InputError if the file cannot be used.
+    With limits it is read in a supervised child process: a decoder that hangs, crashes or takes all memory ends that
+    process alone. The points are in scratch under `points/<tile>/<part>.bin`. Raises InputError if the file cannot be
+    used, or reading it breaks the limits.
     """
     task.scratch.check_cancelled()
+    if task.limits is None:
+        with one_input(shown(task.path)):
+            return _ingest_here(task)
+    cancelled = functools.partial(_cancelled, task.scratch)
+    ((_, found),) = supervise(_ingest_watched, [task], task.limits, cancelled, loads=(), one="reader")
+    if isinstance(found, Loss):
+        raise _lost(task, found, task.limits)
+    return found
+
+
+def _cancelled(scratch: Scratch) -> bool:
+    return scratch.cancelled
+
+
+def _lost(task: IngestTask, loss: Loss, limits: IsolationLimits) -> InputError:
+    """The error for a file whose reading ended its process."""
+    name = shown(task.path)
+    if loss.reason is Reason.TIMED_OUT:
+        return stalled(name, limits.timeout_s)
+    return UnreadableInputError(name, f"it cannot be read: {loss.detail}", "Get the file again, or write it again")
+
+
+def _ingest_watched(task: IngestTask) -> Ingested:
+    """As `ingest_file`, in the child process."""
+    with heard_by(report_progress):
+        return _ingest_here(task)
+
+
+def _ingest_here(task: IngestTask) -> Ingested:
+    """As `ingest_file`, in this process."""
     if not is_url(task.path):
         return _ingested(task)
     if task.known is not None and is_fetched_by_nodes(task.known, task.options):
@@ -175,7 +219,7 @@ def ingest_file(task: IngestTask) -> Ingested:
     copy = task.scratch.path("fetched", uuid4().hex, f"points{file.suffix}")
     try:
         known = task.known if task.known is not None and task.known.is_of(file) else None
-        file.fetch(copy, task.scratch.check_cancelled)
+        file.fetch(copy, functools.partial(_between_pieces, task.scratch))
         if known is not None:
             now = copy.stat()
             same = (now.st_size, file.stat().st_mtime_ns) == (known.file_size, known.modified_ns)
@@ -186,6 +230,12 @@ def ingest_file(task: IngestTask) -> Ingested:
         raise fault.of(shown(task.path), str(copy)) from None
     finally:
         shutil.rmtree(copy.parent, ignore_errors=True)
+
+
+def _between_pieces(scratch: Scratch) -> None:
+    """Between two pieces of a file that is fetched."""
+    moved()
+    scratch.check_cancelled()
 
 
 def _check_unchanged(task: IngestTask) -> None:
