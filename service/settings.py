@@ -197,7 +197,7 @@ class ServiceSettings(BaseSettings):
         default=600.0,
         gt=0.0,
         allow_inf_nan=False,
-        description="Seconds within which some more of an input must be read; then the job fails with a fault of that input.",
+        description="Seconds within which some more of an input must be read; else the job fails.",
     )
     building_timeout_s: float = Field(
         default=600.0, gt=0.0, allow_inf_nan=False, description="Seconds after which a building's work is stopped."

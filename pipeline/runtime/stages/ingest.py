@@ -44,8 +44,8 @@ _LINE_SPREAD_M = 0.05
 """Points that stray less from one line make no surface. Not a setting: the noise of a scanner is of this size."""
 _TWO_BYTES = 2**16
 _MANY_TILES, _FEW_POINTS = 100, 4
-"""Points are scattered if more than `MOST_STRAYS` of them lie in tiles with too few points, and these are too many tiles.
-Not settings: a survey fills its tiles, except for some at its border."""
+"""Points are scattered if more than `MOST_STRAYS` of them lie in tiles with too few, and these are too many tiles. Not
+settings: a survey fills its tiles, except for some at its border."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
