@@ -1,6 +1,7 @@
 """Ingest: every point lands in its own tile, once, also when a task runs twice."""
 
 import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -151,6 +152,7 @@ def test_a_reader_that_hangs_crashes_or_takes_all_memory_refuses_its_file(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(chores.__file__).parent), prepend=os.pathsep)
     monkeypatch.setattr("pipeline.runtime.stages.ingest._ingest_watched", chore)
     job = dataclasses.replace(task(tmp_path / "a.laz", tmp_path), limits=limits)
     with pytest.raises(UnreadableInputError, match=rf"a\.laz: {words}"):

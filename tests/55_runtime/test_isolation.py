@@ -412,6 +412,9 @@ def test_every_fault_harms_only_its_building_and_leaves_record_and_bundle(
 
 
 @pytest.mark.slow
-def test_an_item_that_reports_progress_may_take_longer_than_the_limit(bare: None) -> None:
+def test_an_item_that_reports_progress_may_take_longer_than_the_limit(
+    bare: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(chores.__file__).parent), prepend=os.pathsep)
     limits = IsolationLimits(timeout_s=5.0, memory_bytes=2**30)
     assert list(supervise(chores.go_on, [6], limits)) == [(0, 6)]
