@@ -19,7 +19,7 @@ GableworkError
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -28,6 +28,26 @@ if TYPE_CHECKING:
 
 _NAMED = 9
 """Inputs at fault that are named beside the first one; the others are counted."""
+
+
+def causes(error: BaseException) -> Iterator[BaseException]:
+    """An error, its cause, the cause of that one, and so on, each once.
+
+    The cause is the stated one (`raise … from`), else the error that was being handled. Circles end the walk: any code,
+    of libraries too, can make one by raising an error that it caught before. Read the links nowhere else.
+
+    >>> try:
+    ...     raise ValueError("outer") from KeyError("inner")
+    ... except ValueError as error:
+    ...     print([type(link).__name__ for link in causes(error)])
+    ['ValueError', 'KeyError']
+    """
+    seen: set[int] = set()
+    at: BaseException | None = error
+    while at is not None and id(at) not in seen:
+        seen.add(id(at))
+        yield at
+        at = at.__cause__ or at.__context__
 
 
 class GableworkError(Exception):
@@ -54,9 +74,12 @@ class InputError(GableworkError):
         super().__init__(f"{self.path}: {problem}. {fix}")
 
     def of(self, path: str, copy: str) -> InputError:
-        """The same of a file by the name that the user knows, in place of that of a copy of it."""
-        if path == copy:
-            return self
+        """The same of a file by the name that the user knows, in place of that of a copy of it; always a new error.
+
+        >>> fault = UnreadableInputError("a.laz", "no such file", "Check the path")
+        >>> fault.of("a.laz", "a.laz") is fault
+        False
+        """
         return type(self)(path, self.problem.replace(copy, path), self.fix.replace(copy, path))
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:

@@ -17,8 +17,9 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
-from pipeline.io.crs import SpatialReference
+from pipeline.io.crs import LARGEST_COORDINATE, SpatialReference
 from pipeline.io.placed_features import boxes_around, in_metres
+from pipeline.io.repairs import Repairs, crossings
 from pipeline.io.urls import shown
 from pipeline.io.vector_layer import VectorLayer, read_layer
 
@@ -49,9 +50,12 @@ PROBLEMS = {
     "outside_crs": "outside the run's CRS",
     "no_area": "invalid and without area",
     "invalid": "invalid",
+    "tangled": "invalid with too many crossings to be repaired",
     "bad_value": "with an attribute that cannot be used",
 }
 """What can be wrong with a footprint, and how a message counts it."""
+AREA_CROSSINGS = 1_000_000
+"""Maximum number of crossings between the edges of an area of interest; uniting more takes a minute and gigabytes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -148,8 +152,9 @@ def read_footprints(
         return None if area is None else boxes_around(area, own if crs is None else crs, reference, name)
 
     found = read_layer(path, layer, None if area is None else boxes)
+    warnings += found.warnings
     problems: dict[int, tuple[str, str]] = {}
-    repairs: dict[int, str] = {}
+    actions: dict[int, str] = {}
     geometries = _polygons_only(found, problems)
     kept = np.flatnonzero(~shapely.is_missing(geometries))
     if len(kept) == 0 and not found.elsewhere:
@@ -157,12 +162,12 @@ def read_footprints(
         raise EmptyInputError(name, lost, "Give polygons of buildings")
     polygons = shapely.force_2d(geometries[kept])
     polygons = in_metres(name, "footprints", polygons, found.crs if crs is None else crs, reference, warnings)
-    whole = np.isfinite(shapely.bounds(polygons)).all(axis=1)
+    whole = (np.abs(shapely.bounds(polygons)) <= LARGEST_COORDINATE).all(axis=1)
     for row in kept[~whole].tolist():
         problems[row] = ("outside_crs", "it cannot be reprojected to the run's CRS")
     polygons, kept = polygons[whole], kept[whole]
     places = {int(row): tuple(bounds) for row, bounds in zip(kept, shapely.bounds(polygons).tolist(), strict=True)}
-    polygons = _repaired(polygons, kept, problems, repairs)
+    polygons = _repaired(polygons, kept, problems, actions)
     solid = ~shapely.is_empty(polygons)
     polygons, kept = polygons[solid], kept[solid]
     if len(kept) == 0 and not found.elsewhere:
@@ -175,7 +180,7 @@ def read_footprints(
             source_id=ids_of_all[row],
             problem=problem,
             detail=detail,
-            action=repairs.get(row, "left out"),
+            action=actions.get(row, "left out"),
             bounds_m=places.get(row),
         )
         for row, (problem, detail) in sorted(problems.items())
@@ -206,8 +211,10 @@ def _polygons_only(layer: VectorLayer, problems: dict[int, tuple[str, str]]) -> 
             problems[row] = ("not_polygon", f"it is a {geometries[row].geom_type}")
     for row in np.flatnonzero(polygonal & shapely.is_empty(geometries)).tolist():
         problems[row] = ("empty", "its polygon is empty")
-    finite = np.isfinite(shapely.bounds(geometries)).all(axis=-1)
-    for row in np.flatnonzero(polygonal & ~finite).tolist():
+    coordinates, owners = shapely.get_coordinates(geometries, return_index=True)
+    not_finite = np.zeros(len(geometries), np.bool_)  # bounds do not show it: they pass over NaN
+    not_finite[owners[~np.isfinite(coordinates).all(axis=1)]] = True
+    for row in np.flatnonzero(polygonal & not_finite).tolist():
         problems.setdefault(row, ("not_finite", "it has coordinates that are NaN or infinite"))
     geometries[list(problems)] = None
     return geometries
@@ -230,20 +237,26 @@ def _repaired(
     polygons: npt.NDArray[np.object_],
     rows: npt.NDArray[np.int64],
     problems: dict[int, tuple[str, str]],
-    repairs: dict[int, str],
+    actions: dict[int, str],
 ) -> npt.NDArray[np.object_]:
-    """Valid polygons; what a repair leaves of lines and points is left out, and what has no area is empty."""
+    """Valid polygons; what a repair leaves of lines and points is left out, and what cannot be repaired is empty."""
     repaired = polygons.copy()
+    repairs = Repairs()
     for at in np.flatnonzero(~shapely.is_valid(polygons)).tolist():
-        parts = shapely.get_parts(shapely.get_parts(shapely.make_valid(polygons[at])))
-        areas = [part for part in parts if isinstance(part, Polygon) and part.area > 0.0]
-        repaired[at] = areas[0] if len(areas) == 1 else MultiPolygon(areas)
+        areas = repairs.of(polygons[at])
+        repaired[at] = areas[0] if areas and len(areas) == 1 else MultiPolygon(areas or [])
         row = int(rows[at])
         fault = str(shapely.is_valid_reason(polygons[at]))
-        if areas:
+        if areas is None:
+            corners = int(shapely.get_num_coordinates(polygons[at]))
+            problems[row] = (
+                "tangled",
+                f"{fault}; the edges between its {corners} corners cross too often to repair it",
+            )
+        elif areas:
             problems[row] = ("invalid", fault)
             shape = "one polygon" if len(areas) == 1 else f"{len(areas)} polygons"
-            repairs[row] = f"repaired to {shape} of {repaired[at].area:.1f} m2"
+            actions[row] = f"repaired to {shape} of {repaired[at].area:.1f} m2"
         else:
             problems[row] = ("no_area", f"{fault}; no area is left of it")
     return repaired
@@ -311,6 +324,13 @@ def _plain(value: Any) -> Any:
 def read_area(path: str | Path, reference: SpatialReference) -> Polygon | MultiPolygon:
     """The area of interest that the polygons of a vector file cover together, in the units of the run's CRS."""
     polygons = list(read_footprints(path, reference).polygons)
+    count = crossings(shapely.get_rings(shapely.get_parts(polygons)))
+    if count is None or count.crossings > AREA_CROSSINGS:
+        raise InconsistentInputError(
+            shown(str(path)),
+            f"its {len(polygons)} polygons cross each other in more than {AREA_CROSSINGS} places",
+            "Dissolve them into one area first",
+        )
     united = shapely.union_all(polygons)
     if reference.horizontal_unit_m != 1.0:
         united = shapely.transform(united, lambda xy: xy / reference.horizontal_unit_m)

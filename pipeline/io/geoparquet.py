@@ -17,7 +17,10 @@ import numpy.typing as npt
 import shapely
 
 from pipeline.errors import UnreadableInputError
-from pipeline.io.nearby import BATCH, POLYGONS, Boxes, Nearby, Shape
+from pipeline.io.library_faults import in_our_words, shortened
+from pipeline.io.nearby import BATCH, CELLS_LIMIT, POLYGONS, Boxes, Nearby, Shape
+from pipeline.io.vector_text import Texts
+from pipeline.io.wkb import EncodedLayer
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,6 +29,10 @@ DEFAULT_CRS = "OGC:CRS84"
 """What a geometry column without `crs` is in."""
 DEPTHS = {"polygon": 2, "multipolygon": 3}
 """Levels of lists above the coordinates, by the encodings of polygons beside WKB."""
+
+DECODED_LIMIT = 10_000_000_000
+"""Maximum number of values, rows times columns, that are decoded to find those near the points. A few bytes of Parquet
+can promise as many as they like; the buildings of a continent have fewer."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -69,56 +76,52 @@ def geometry_column(path: Path, schema: pa.Schema, column: str | None = None) ->
 
 def read_geoparquet(
     path: Path, column: str | None, boxes: Boxes | None = None, shape: Shape = POLYGONS
-) -> tuple[str | None, npt.NDArray[np.int64], npt.NDArray[np.object_], dict[str, Sequence[Any]], int]:
-    """CRS, row numbers, geometries and attributes of a file, and how many of its polygons were passed over.
+) -> EncodedLayer:
+    """The layer of a file: all its columns but other geometries and what only covers one, as plain Python values.
 
-    Features are wanted in `boxes`, as in `pipeline.io.vector_layer.read_layer`. Raises UnreadableInputError if the file
-    is not Parquet, has no geometry, or encodes it in a way that is not supported.
-
-    Returns
-    -------
-    str or None
-        CRS as a code or PROJJSON; None where the file says that it is unknown.
-    (n,) array of int64
-        The rows' numbers in the file.
-    (n,) array of bytes
-        ISO WKB, None where there is no geometry.
-    dict
-        All other columns as plain Python values; other geometries and columns that only cover one are left out.
-    int
-        Polygons, or what `shape` says, off the boxes.
+    Features are wanted in `boxes`, as in `pipeline.io.vector_layer.read_layer`. Their ids are their rows in the file.
+    Raises UnreadableInputError if the file is not Parquet, has no geometry, encodes it in a way that is not supported,
+    or has too many rows or values.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    try:
-        with pq.ParquetFile(path) as file:
-            about = geometry_column(path, file.schema_arrow, column)
-            name = about.name
-            nearby = Nearby(None if boxes is None else boxes(about.crs), shape)
-            rows, batches, geometries = [np.empty(0, np.int64)], [], [np.empty(0, object)]
-            first = 0
-            for batch in file.iter_batches(BATCH, columns=about.wanted):
-                wkb = _wkb_of(path, batch.column(batch.schema.names.index(name)), about.encoding)
-                near = nearby.of(wkb)
-                rows.append(first + np.flatnonzero(near))
-                geometries.append(wkb[near])
-                # a filter copies: of what is passed over nothing is held
-                batches.append(batch if near.all() else batch.filter(pa.array(near)))
-                first += len(near)
-            table = pa.Table.from_batches(batches) if batches else file.read_row_groups([], columns=about.wanted)
-    except (pa.ArrowException, OSError) as fault:
-        raise UnreadableInputError(str(path), f"cannot be read as Parquet ({str(fault)[:160]})", "Write it anew") from (
-            fault
+    with in_our_words(path, "Parquet", "Write it again"), pq.ParquetFile(path) as file:
+        about = geometry_column(path, file.schema_arrow, column)
+        _check_size(path, "values, rows times columns", file.metadata.num_rows * len(about.wanted), DECODED_LIMIT)
+        nearby = Nearby(None if boxes is None else boxes(about.crs), shape)
+        rows, batches, geometries = [np.empty(0, np.int64)], [], [np.empty(0, object)]
+        first, cells = 0, 0
+        for batch in file.iter_batches(BATCH, columns=about.wanted):
+            wkb = _wkb_of(path, batch.column(batch.schema.names.index(about.name)), about.encoding)
+            near = nearby.of(wkb)
+            rows.append(first + np.flatnonzero(near))
+            geometries.append(wkb[near])
+            # a filter copies: of what is passed over nothing is held
+            batches.append(batch if near.all() else batch.filter(pa.array(near)))
+            first += len(near)
+            cells += len(rows[-1]) * len(about.wanted)
+            _check_size(path, "values near the points, rows times columns", cells, CELLS_LIMIT)
+        table = pa.Table.from_batches(batches) if batches else file.read_row_groups([], columns=about.wanted)
+        numbers, texts = np.concatenate(rows), Texts()
+        attributes: dict[str, Sequence[Any]] = {}
+        for field, values in zip(table.column_names, table.columns, strict=True):
+            if field != about.name and field not in attributes:  # of two columns of one name the first
+                attributes[field] = _values(values, field, numbers, texts)
+    return EncodedLayer(about.crs, numbers, np.concatenate(geometries), attributes, nearby.elsewhere, texts.warnings)
+
+
+def _check_size(path: Path, what: str, count: int, limit: int) -> None:
+    """Refuse more values than are read."""
+    if count > limit:
+        raise UnreadableInputError(
+            str(path),
+            f"it has {count} {what}: more than {limit}",
+            "Cut out the area of the points, or leave out columns",
         )
-    attributes: dict[str, Sequence[Any]] = {}
-    for field, values in zip(table.column_names, table.columns, strict=True):
-        if field != name and field not in attributes:  # of two columns of one name the first
-            attributes[field] = _values(values)
-    return about.crs, np.concatenate(rows), np.concatenate(geometries), attributes, nearby.elsewhere
 
 
-def _values(column: pa.ChunkedArray) -> list[Any]:
+def _values(column: pa.ChunkedArray, name: str, rows: npt.NDArray[np.int64], texts: Texts) -> list[Any]:
     """A column as Python values; None for those that Python cannot hold, such as years beyond 9999."""
     import pyarrow as pa
 
@@ -134,7 +137,15 @@ def _values(column: pa.ChunkedArray) -> list[Any]:
     try:
         return list(column.to_pylist())
     except not_held:
-        return [value(scalar) for scalar in column]
+        if pa.types.is_dictionary(column.type):
+            column = column.cast(column.type.value_type)
+        if not (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)):
+            return [value(scalar) for scalar in column]
+        where = f"the text in column {shortened(name)!r} of row"
+        return [
+            None if raw is None else texts.of_bytes(raw, f"{where} {row}")
+            for raw, row in zip(column.cast(pa.large_binary()).to_pylist(), rows.tolist(), strict=True)
+        ]
 
 
 def _geo_of(path: Path, metadata: Mapping[bytes, bytes]) -> dict[str, Any]:
@@ -145,7 +156,7 @@ def _geo_of(path: Path, metadata: Mapping[bytes, bytes]) -> dict[str, Any]:
     try:
         geo = json.loads(metadata[b"geo"])
         sane = isinstance(geo["primary_column"], str) and all(isinstance(c, dict) for c in geo["columns"].values())
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         sane = False
     if not sane:
         raise UnreadableInputError(str(path), "its `geo` metadata name no geometry column", fix)

@@ -87,6 +87,7 @@ def read_guides(
     name = shown(str(path))
     warnings: list[str] = []
     found = read_layer(path, None, lambda own: boxes_around(area, own, reference, name), LINES)
+    warnings += found.warnings
     if kind_column not in found.columns and kind_column != KIND_COLUMN:
         there = ", ".join(found.columns) or "(none)"
         raise UnreadableInputError(

@@ -9,8 +9,13 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from pipeline.io.wkb import geometries_of
+
 BATCH = 16_384
 """Features that are looked at together."""
+CELLS_LIMIT = 100_000_000
+"""Maximum number of values, features times columns, that are read of a layer. A value takes 8 bytes at least, and in
+some formats an absent one takes none in the file."""
 
 Boxes = Callable[[str | None], npt.NDArray[np.float64] | None]
 """From a layer's CRS, as the file has it, to boxes in that CRS, (k, 4) float64: xmin, ymin, xmax, ymax. None where
@@ -59,7 +64,7 @@ class Nearby:
         near = np.ones(len(geometry_bytes), np.bool_)
         if self._tree is None or len(near) == 0:
             return near
-        geometries = np.asarray(shapely.from_wkb(geometry_bytes, on_invalid="ignore"), object)
+        geometries = geometries_of(geometry_bytes)
         placed = np.isfinite(shapely.bounds(geometries)).all(axis=-1)
         near[placed] = False
         near[np.flatnonzero(placed)[np.unique(self._tree.query(geometries[placed])[0])]] = True

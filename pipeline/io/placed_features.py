@@ -31,8 +31,11 @@ def boxes_around(
     if own is not None and target is not None and not own.equals(target, ignore_axis_order=True):
         import pyproj
 
-        project = pyproj.Transformer.from_crs(target, own, always_xy=True).transform_bounds
-        boxes = np.array([project(x0, y0, x1, y1, 21) for x0, y0, x1, y1 in boxes.tolist()]).reshape(-1, 4)
+        try:
+            project = pyproj.Transformer.from_crs(target, own, always_xy=True).transform_bounds
+            boxes = np.array([project(x0, y0, x1, y1, 21) for x0, y0, x1, y1 in boxes.tolist()]).reshape(-1, 4)
+        except pyproj.exceptions.ProjError:
+            return None
         # a box across the antimeridian comes with its sides swapped
         if not np.isfinite(boxes).all() or (boxes[:, :2] > boxes[:, 2:]).any():
             return None
@@ -77,7 +80,14 @@ def _reprojected(
     """The geometries in another CRS, with a word on how well that can be done."""
     import pyproj
 
-    transformer = pyproj.Transformer.from_crs(own, target, always_xy=True)
+    try:
+        transformer = pyproj.Transformer.from_crs(own, target, always_xy=True)
+    except pyproj.exceptions.ProjError as fault:
+        raise CrsError(
+            name,
+            f"the {what} cannot be reprojected from {own.name!r} to {target.name!r}: PROJ knows of no operation",
+            f"Check the CRS of the {what} and that of the points",
+        ) from fault
 
     def project(xy: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         return np.column_stack(transformer.transform(xy[:, 0], xy[:, 1]))

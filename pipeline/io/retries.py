@@ -11,11 +11,11 @@ import errno
 import random
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-from pipeline.errors import GableworkError
+from pipeline.errors import GableworkError, causes
 
 Result = TypeVar("Result")
 
@@ -208,16 +208,6 @@ class GaveUpError(Exception):
         return f"{self.cause.words}{tries} ({self.detail})"
 
 
-def _chain(error: BaseException) -> Iterator[BaseException]:
-    """An error and its causes."""
-    at: BaseException | None = error
-    seen: set[int] = set()
-    while at is not None and id(at) not in seen:
-        seen.add(id(at))
-        yield at
-        at = at.__cause__ or at.__context__
-
-
 def _answer(error: BaseException) -> tuple[str, int]:
     """Code and status of the answer in an error; empty and 0 without one."""
     response: Any = getattr(error, "response", None)
@@ -234,7 +224,7 @@ def cause_of(error: BaseException) -> Cause:
     >>> cause_of(TimeoutError()).again, cause_of(PermissionError()).again, cause_of(ValueError("x")).words
     (True, False, 'it failed')
     """
-    chain = list(_chain(error))
+    chain = list(causes(error))
     answers = [_answer(link) for link in chain]
     for code, _ in answers:
         if code in CODES:
@@ -268,7 +258,7 @@ def without_secrets(text: str) -> str:
 
 def detail_of(error: BaseException) -> str:
     """An error's text in one line, without secrets, with the status of the answer if it has one."""
-    deepest = next((link for link in _chain(error) if _answer(link) != ("", 0)), error)
+    deepest = next((link for link in causes(error) if _answer(link) != ("", 0)), error)
     status = _answer(deepest)[1]
     text = " ".join(without_secrets(str(deepest)).split()) or type(deepest).__name__
     detail = text if not status or str(status) in text else f"status {status}: {text}"

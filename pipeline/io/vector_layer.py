@@ -17,17 +17,12 @@ import shapely
 
 from pipeline.errors import InputError, UnreadableInputError
 from pipeline.io.formats import first_bytes
-from pipeline.io.nearby import BATCH, POLYGONS, Boxes, Nearby, Shape
+from pipeline.io.gdal_layer import read_by_gdal
+from pipeline.io.nearby import POLYGONS, Boxes, Shape
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.urls import is_url, shown
+from pipeline.io.wkb import geometries_of
 
-VALID = (
-    "Valid are GeoPackage (.gpkg), GeoJSON (.geojson, .json), Shapefile (.shp with .shx and .dbf) "
-    "and GeoParquet (.parquet)"
-)
-DRIVERS = {b"SQLi": "GPKG:", b"\0\0\x27\x0a": ""}
-"""The format that GDAL gets, by a file's first bytes; text in braces is GeoJSON. Left to itself GDAL goes by content,
-and there are formats that name other files and servers to read. Shapefiles have no such prefix and no such twins."""
 PARQUET_MAGIC = b"PAR1"
 
 
@@ -47,6 +42,8 @@ class VectorLayer:
     """All columns but the geometry, by name."""
     elsewhere: int = 0
     """Features of the wanted shape that were passed over, since they lie off the boxes."""
+    warnings: tuple[str, ...] = ()
+    """What is odd but usable, one sentence each."""
 
 
 def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None, shape: Shape = POLYGONS) -> VectorLayer:
@@ -77,91 +74,20 @@ def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None, 
 
 def _read(path: Path, layer: str | None, boxes: Boxes | None, shape: Shape) -> VectorLayer:
     """The layer of a file of this machine."""
-    head = first_bytes(path)
-    if head.startswith(PARQUET_MAGIC):
+    if first_bytes(path).startswith(PARQUET_MAGIC):
         from pipeline.io.geoparquet import read_geoparquet
 
-        crs, feature_ids, geometry_bytes, columns, elsewhere = read_geoparquet(path, layer, boxes, shape)
+        found = read_geoparquet(path, layer, boxes, shape)
     else:
-        crs, feature_ids, geometry_bytes, columns, elsewhere = _by_gdal(
-            path, _driver_of(path, head), layer, boxes, shape
-        )
-    geometries: npt.NDArray[np.object_] = np.asarray(shapely.from_wkb(geometry_bytes, on_invalid="ignore"), object)
-    there = np.array([data is not None for data in geometry_bytes], np.bool_)
+        found = read_by_gdal(path, layer, boxes, shape)
+    geometries = geometries_of(found.wkb)
+    there = np.array([data is not None for data in found.wkb], np.bool_)
     return VectorLayer(
-        crs=crs,
-        feature_ids=feature_ids,
+        crs=found.crs,
+        feature_ids=found.feature_ids,
         geometries=geometries,
         unreadable=there & shapely.is_missing(geometries),
-        columns=columns,
-        elsewhere=elsewhere,
+        columns=found.columns,
+        elsewhere=found.elsewhere,
+        warnings=found.warnings,
     )
-
-
-def _driver_of(path: Path, head: bytes) -> str:
-    """The path as GDAL is given it: with the one format that it may be."""
-    where = path.resolve().as_posix()
-    if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
-        return f"GeoJSON:{where}"
-    driver = next((name for magic, name in DRIVERS.items() if head.startswith(magic)), None)
-    if driver is None:
-        raise UnreadableInputError(str(path), f"cannot be read as vector data: it begins with {head[:8]!r}", VALID)
-    return f"{driver}{where}"
-
-
-def _by_gdal(
-    path: Path, source: str, layer: str | None, boxes: Boxes | None, shape: Shape
-) -> tuple[str | None, npt.NDArray[np.int64], npt.NDArray[np.object_], dict[str, Sequence[Any]], int]:
-    """CRS, feature ids, WKB and columns of a layer, and how many of its polygons were passed over."""
-    import pyogrio
-    from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
-
-    try:
-        layers = {str(name): kind for name, kind in pyogrio.list_layers(source)}
-        if layer is None:
-            # The kind is None for tables without geometry and "Unknown" where a layer does not say.
-            found = [name for name, kind in layers.items() if kind and (shape.word in kind or "Unknown" in kind)]
-            found = found or [name for name, kind in layers.items() if kind]
-        else:
-            found = [name for name in layers if name == layer]
-        if len(found) != 1:
-            raise UnreadableInputError(
-                str(path),
-                f"layer {layer!r} is not there" if layer else f"{len(found)} layers could be the {shape.named}",
-                f"Name one of the layers {', '.join(sorted(layers)) or '(there are none)'}",
-            )
-        near, elsewhere = (None, 0) if boxes is None else _near(source, found[0], boxes, shape)
-        none = near is not None and len(near) == 0
-        meta, feature_ids, geometry_bytes, columns = pyogrio.raw.read(
-            source,
-            layer=found[0],
-            return_fids=True,
-            fids=None if none else near,
-            max_features=1 if none else None,  # without any feature GDAL gives no columns
-        )
-    except (DataSourceError, DataLayerError, FeatureError, FieldError, GeometryError, OSError) as fault:
-        raise UnreadableInputError(str(path), f"cannot be read as vector data ({str(fault)[:160]})", VALID) from fault
-    kept = slice(0, 0) if none else slice(None)
-    named = {str(field): column[kept] for field, column in zip(meta["fields"], columns, strict=True)}
-    return meta["crs"], feature_ids[kept].astype(np.int64), geometry_bytes[kept], named, elsewhere
-
-
-def _near(source: str, layer: str, boxes: Boxes, shape: Shape) -> tuple[npt.NDArray[np.int64] | None, int]:
-    """The ids of the features near the boxes, None where all are; and how many polygons are not."""
-    import pyogrio
-
-    with pyogrio.raw.open_arrow(
-        source, layer=layer, columns=[], batch_size=BATCH, return_fids=True, use_pyarrow=True
-    ) as (meta, reader):
-        nearby = Nearby(boxes(meta["crs"]), shape)
-        if nearby.all:
-            return None, 0
-        geometry = meta["geometry_name"] or "wkb_geometry"
-        number = next(name for name in reader.schema.names if name != geometry)
-        kept = [np.empty(0, np.int64)]
-        passed_over = 0
-        for batch in reader:
-            near = nearby.of(np.array([*batch.column(geometry).to_pylist(), None], dtype=object)[:-1])
-            kept.append(np.asarray(batch.column(number), dtype=np.int64)[near])
-            passed_over += int(np.count_nonzero(~near))
-    return (np.concatenate(kept) if passed_over else None), nearby.elsewhere

@@ -18,6 +18,8 @@ import anyio
 import anyio.to_thread
 import httpx
 
+from pipeline.errors import causes
+
 Result = TypeVar("Result")
 
 CONNECT_S = 10.0
@@ -247,11 +249,9 @@ def _losses() -> Iterator[None]:
 
 def _certificate_fault(error: BaseException) -> str | None:
     """Why a certificate is not trusted; None if that is not the cause."""
-    seen: BaseException | None = error
-    while seen is not None:
-        if isinstance(seen, ssl.SSLCertVerificationError):
-            return f"its certificate is not trusted ({seen.verify_message})"
-        if isinstance(seen, ssl.SSLError) and "WRONG_VERSION_NUMBER" in str(seen):
+    for cause in causes(error):
+        if isinstance(cause, ssl.SSLCertVerificationError):
+            return f"its certificate is not trusted ({cause.verify_message})"
+        if isinstance(cause, ssl.SSLError) and "WRONG_VERSION_NUMBER" in str(cause):
             return "it does not speak TLS at this port: begin the URL with http://, or use the port for https"
-        seen = seen.__cause__ or seen.__context__
     return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from pipeline.errors import ClusterError, InputError, RunError, SettingsError, VersionMismatchError
+from pipeline.errors import ClusterError, InputError, RunError, SettingsError, VersionMismatchError, causes
 from service.disk import FULL
 from service.errors import (
     InputRefusedError,
@@ -44,12 +44,10 @@ def is_tried_again(error: BaseException, job: Job, max_attempts: int) -> bool:
 
 def has_no_space(error: BaseException) -> bool:
     """Whether a full disk is the error, or its cause."""
-    seen: BaseException | None = error
-    while seen is not None:
-        if isinstance(seen, NoSpaceError) or (isinstance(seen, OSError) and seen.errno in FULL):
-            return True
-        seen = seen.__cause__ or seen.__context__
-    return False
+    return any(
+        isinstance(cause, NoSpaceError) or (isinstance(cause, OSError) and cause.errno in FULL)
+        for cause in causes(error)
+    )
 
 
 def failure_of(error: BaseException, *, scrub: Callable[[str], str], reference: str, attempts: int) -> JobFailure:

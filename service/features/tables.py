@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import logging
 import threading
 import time
@@ -13,7 +14,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.fs as pafs
 
-from pipeline.errors import RunError
+from pipeline.errors import RunError, causes
 from pipeline.export.records import SCHEMAS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
 from pipeline.io import arrow_at, is_url
@@ -254,7 +255,8 @@ def check_published(runs: Mapping[str, ServedRun]) -> None:
         try:
             open_run(run)
         except (NoSuchCollectionError, ResultNotReadyError) as error:
-            raise StartUpError(f"the run {run.place} cannot be published: {error.__cause__ or error}") from error
+            behind = next(itertools.islice(causes(error), 1, None), error)
+            raise StartUpError(f"the run {run.place} cannot be published: {behind}") from error
 
 
 def layers() -> Iterator[Layer]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import itertools
 import logging
 import signal
 import time
@@ -19,7 +20,7 @@ from distributed import Nanny, Security, Worker
 from distributed.core import Status
 from distributed.worker_memory import parse_memory_limit
 
-from pipeline.errors import ClusterError, SettingsError
+from pipeline.errors import ClusterError, SettingsError, causes
 from pipeline.runtime.cluster import worker_setup
 from pipeline.runtime.cluster.memory_needs import RESOURCE
 from pipeline.runtime.cluster.tls import TlsFiles, check_address, explain_failure
@@ -190,9 +191,9 @@ async def _start(nanny: Any, options: WorkerOptions) -> None:
     except OSError:
         raise
     except (RuntimeError, ValueError, TypeError) as error:
-        cause = error.__cause__ or error
+        cause = next(itertools.islice(causes(error), 1, None), error)
         if isinstance(cause, OSError):
-            raise cause from error
+            raise ConnectionError(str(cause)) from error
         # TLS reports a scheduler without TLS by many kinds of errors
         why = await asyncio.to_thread(explain_failure, options.scheduler, options.tls)
         if why:
