@@ -255,7 +255,7 @@ def table_of(outcomes: Sequence[Outcome]) -> str:
     for name in [*names, "all"]:
         some = [one for one in outcomes if name in {one.case.kind.name, "all"}]
         counts = Counter(one.result for one in some)
-        slowest = max(one.seconds for one in some)
+        slowest = max((one.seconds for one in some), default=0.0)
         rows.append([name, str(len(some)), *(str(counts[result]) for result in OUTCOMES), f"{slowest:.1f}"])
     return markdown_table(["kind", "files", *OUTCOMES, "slowest, s"], rows)
 

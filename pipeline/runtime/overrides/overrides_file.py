@@ -18,8 +18,8 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import InputError, SettingsError
-from pipeline.io.crs import LARGEST_COORDINATE, SpatialReference
-from pipeline.io.footprints import Footprints, read_footprints
+from pipeline.io.crs import SpatialReference
+from pipeline.io.footprints import LARGEST_OUTLINE_M, Footprints, read_footprints
 from pipeline.io.reading import one_input
 from pipeline.methods import ReconstructSettings, method_named
 from pipeline.parameters import is_finite_number, quoted, read_toml
@@ -291,10 +291,12 @@ class _Reading:
         if not geometry.is_valid:
             faults.append(f"footprint {text[:60]!r} is invalid: {shapely.is_valid_reason(geometry)}")
             return None
-        if max(map(abs, geometry.bounds)) > LARGEST_COORDINATE:
-            faults.append(f"footprint {text[:60]!r} has coordinates beyond {LARGEST_COORDINATE:g}: no CRS has any")
-            return None
         unit = self._reference.horizontal_unit_m
+        west, south, east, north = geometry.bounds
+        side = max(east - west, north - south) * unit
+        if side > LARGEST_OUTLINE_M:
+            faults.append(f"footprint {text[:60]!r} is {side:.6g} m wide or long: use at most {LARGEST_OUTLINE_M:g} m")
+            return None
         if unit == 1.0:
             return geometry
         scaled = shapely.transform(geometry, lambda xy: xy * unit)
