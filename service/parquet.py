@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io.geoparquet import DEPTHS, geometry_column
+from pipeline.io.library_faults import in_our_words
 from service.errors import TooLargeError
 from service.input_policy import checked_crs
 
@@ -46,34 +47,30 @@ def parquet_facts(path: Path) -> tuple[int, str, dict[str, Any] | None, tuple[st
     CrsError
         Its CRS is a text that PROJ must not search for.
     """
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
     _check_footer(path)
-    try:
-        with pq.ParquetFile(path) as file:
-            about = geometry_column(path, file.schema_arrow)
-            if about.encoding != "WKB" and about.encoding not in DEPTHS:
-                raise UnreadableInputError(str(path), f"its geometries are encoded as {about.encoding[:40]!r}", FIX)
-            crs = None if about.crs is None else _crs_of(path, about.crs)
-            rows = file.metadata.num_rows
-            if rows == 0:
-                raise EmptyInputError(str(path), "it has no rows", "Give polygons of buildings, or lines of roofs")
-            if rows > ROWS_LIMIT:
+    with in_our_words(path, "Parquet", FIX, passing=(TooLargeError,)), pq.ParquetFile(path) as file:
+        about = geometry_column(path, file.schema_arrow)
+        if about.encoding != "WKB" and about.encoding not in DEPTHS:
+            raise UnreadableInputError(str(path), f"its geometries are encoded as {about.encoding[:40]!r}", FIX)
+        crs = None if about.crs is None else _crs_of(path, about.crs)
+        rows = file.metadata.num_rows
+        if rows == 0:
+            raise EmptyInputError(str(path), "it has no rows", "Give polygons of buildings, or lines of roofs")
+        if rows > ROWS_LIMIT:
+            raise TooLargeError(
+                f"{path.name} has {rows} rows, footprints or guides may have {ROWS_LIMIT}: cut out the area"
+            )
+        decoded, found = 0, 0
+        for batch in file.iter_batches(ROWS_AT_ONCE, columns=about.wanted, use_threads=False):
+            found += batch.num_rows
+            decoded += sum(max(_plain(path, column).nbytes, len(column)) for column in batch.columns)
+            if decoded > DECODED_LIMIT:
                 raise TooLargeError(
-                    f"{path.name} has {rows} rows, footprints or guides may have {ROWS_LIMIT}: cut out the area"
+                    f"{path.name} holds more than {DECODED_LIMIT} bytes when decoded: cut out the area of "
+                    "the points, or leave columns out"
                 )
-            decoded, found = 0, 0
-            for batch in file.iter_batches(ROWS_AT_ONCE, columns=about.wanted, use_threads=False):
-                found += batch.num_rows
-                decoded += sum(_plain(path, column).nbytes for column in batch.columns)
-                if decoded > DECODED_LIMIT:
-                    raise TooLargeError(
-                        f"{path.name} holds more than {DECODED_LIMIT} bytes when decoded: cut out the area of "
-                        "the points, or leave columns out"
-                    )
-    except (pa.ArrowException, OSError, OverflowError, ValueError) as fault:
-        raise UnreadableInputError(str(path), f"cannot be read as Parquet ({str(fault)[:160]})", FIX) from fault
     if found != rows:
         raise UnreadableInputError(str(path), f"its footer promises {rows} rows, it holds {found}", FIX)
     return rows, about.name, crs, about.types

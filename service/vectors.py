@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import re
 import sqlite3
 from collections.abc import Iterator
@@ -20,6 +21,8 @@ import numpy as np
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io.crs import parse_crs
+from pipeline.io.gdal_layer import refuse_links
+from pipeline.io.library_faults import in_our_words, shortened
 from service.errors import TooLargeError
 from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES, PARQUET_SUFFIXES
 
@@ -130,12 +133,9 @@ def _facts(
 
 def _geopackage(path: Path) -> dict[str, Any]:
     """A GeoPackage, by its own tables of contents, read only and with a limit on the engine's work."""
-    try:
-        with contextlib.closing(_opened(path)) as database:
-            _refuse_programs(path, database)
-            return _contents(path, database)
-    except (sqlite3.Error, ValueError, TypeError, OverflowError) as fault:
-        raise UnreadableInputError(str(path), f"cannot be read as a GeoPackage ({str(fault)[:160]})", FIX) from fault
+    with in_our_words(path, "a GeoPackage", FIX), contextlib.closing(_opened(path)) as database:
+        _refuse_programs(path, database)
+        return _contents(path, database)
 
 
 def _opened(path: Path) -> sqlite3.Connection:
@@ -211,6 +211,7 @@ def _geojson(path: Path, head: bytes) -> dict[str, Any]:
     member = MEMBER.search(text)
     if member is None:
         raise UnreadableInputError(str(path), "no GeoJSON object in its first 64 KiB", FIX)
+    refuse_links(path)
     depth, count = 0, 0
     for levels, features in _levels(path):
         low, high, last = levels
@@ -237,13 +238,17 @@ def _geojson(path: Path, head: bytes) -> dict[str, Any]:
 def _shapes_within(path: Path) -> tuple[str, ...]:
     """What GeoJSON holds; refuses what is not JSON, or has neither. Its depth is known to be small."""
 
-    def refuse(word: str) -> None:
-        raise ValueError(f"{word} is not a number of JSON")
+    def number(word: str) -> float:
+        value = float(word)
+        if not math.isfinite(value):
+            problem = f"cannot be read as JSON: {shortened(word)} is not a number that can be held"
+            raise UnreadableInputError(str(path), problem, FIX)
+        return value
 
-    try:
-        document = json.loads(path.read_bytes(), parse_constant=refuse)
-    except ValueError as fault:
-        raise UnreadableInputError(str(path), f"cannot be read as JSON ({str(fault)[:160]})", FIX) from fault
+    # text that is not UTF-8 is looked at by the reader
+    text = path.read_bytes().decode("utf-8-sig", errors="replace")
+    with in_our_words(path, "JSON", FIX):
+        document = json.loads(text, parse_constant=number, parse_float=number, parse_int=number)
     found = document["features"] if isinstance(document.get("features"), list) else [document]
     shapes = _shapes(*(any(_holds(one, shape) for one in found) for shape in ("Polygon", "LineString")))
     if not shapes:
@@ -278,8 +283,7 @@ def _is_line(places: Any, fewest: int = 2) -> bool:
     if not isinstance(places, list) or len(places) < fewest:
         return False
     return all(
-        isinstance(place, list) and len(place) >= 2 and all(type(value) in {int, float} for value in place)
-        for place in places
+        isinstance(place, list) and len(place) >= 2 and all(type(value) is float for value in place) for place in places
     )
 
 

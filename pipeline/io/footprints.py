@@ -55,7 +55,7 @@ PROBLEMS = {
     "bad_value": "with an attribute that cannot be used",
 }
 """What can be wrong with a footprint, and how a message counts it."""
-LARGEST_OUTLINE_M = 10_000.0
+LARGEST_OUTLINE_M = 20_000.0
 """Longest side of an outline. Not a setting: the longest buildings have 3 km, and a wrong coordinate makes an outline
 that reaches over thousands of tiles."""
 AREA_CROSSINGS = 1_000_000
@@ -166,7 +166,7 @@ def read_footprints(
         raise EmptyInputError(name, lost, "Give polygons of buildings")
     polygons = shapely.force_2d(geometries[kept])
     polygons = in_metres(name, "footprints", polygons, found.crs if crs is None else crs, reference, warnings)
-    whole = (np.abs(shapely.bounds(polygons)) <= LARGEST_COORDINATE).all(axis=1)
+    whole = _within(polygons, LARGEST_COORDINATE)
     for row in kept[~whole].tolist():
         problems[row] = ("outside_crs", "it cannot be reprojected to the run's CRS")
     polygons, kept = polygons[whole], kept[whole]
@@ -177,7 +177,8 @@ def read_footprints(
     solid = ~shapely.is_empty(polygons)
     polygons, kept = polygons[solid], kept[solid]
     if len(kept) == 0 and not found.elsewhere:
-        raise EmptyInputError(name, "no polygon has an area", "Give polygons of buildings")
+        size = f" of at most {LARGEST_OUTLINE_M:g} m" if len(small) > small.sum() else ""
+        raise EmptyInputError(name, f"no polygon{size} has an area", "Give polygons of buildings")
     table = {field: [_plain(value) for value in column] for field, column in found.columns.items()}
     ids, ids_of_all = _ids(name, table, found.feature_ids, kept, id_column)
     issues = tuple(
@@ -230,13 +231,18 @@ def _polygons_only(layer: VectorLayer, problems: dict[int, tuple[str, str]]) -> 
             problems[row] = ("not_polygon", f"it is a {geometries[row].geom_type}")
     for row in np.flatnonzero(polygonal & shapely.is_empty(geometries)).tolist():
         problems[row] = ("empty", "its polygon is empty")
-    coordinates, owners = shapely.get_coordinates(geometries, return_index=True)
-    not_finite = np.zeros(len(geometries), np.bool_)  # bounds do not show it: they pass over NaN
-    not_finite[owners[~np.isfinite(coordinates).all(axis=1)]] = True
-    for row in np.flatnonzero(polygonal & not_finite).tolist():
+    for row in np.flatnonzero(polygonal & ~_within(geometries, np.finfo(np.float64).max)).tolist():
         problems.setdefault(row, ("not_finite", "it has coordinates that are NaN or infinite"))
     geometries[list(problems)] = None
     return geometries
+
+
+def _within(geometries: npt.NDArray[np.object_], largest: float) -> npt.NDArray[np.bool_]:
+    """(n,) bool, whether all coordinates are numbers up to the largest; bounds do not show it, they pass over NaN."""
+    xy, owners = shapely.get_coordinates(geometries, return_index=True)
+    within = np.ones(len(geometries), np.bool_)
+    within[owners[~(np.abs(xy) <= largest).all(axis=1)]] = False
+    return within
 
 
 def _summary(issues: Sequence[FootprintIssue]) -> list[str]:

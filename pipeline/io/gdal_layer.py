@@ -16,7 +16,7 @@ import numpy.typing as npt
 from pipeline.errors import UnreadableInputError
 from pipeline.io.formats import first_bytes
 from pipeline.io.library_faults import in_our_words
-from pipeline.io.nearby import BATCH, CELLS_LIMIT, Boxes, Nearby, Shape
+from pipeline.io.nearby import BATCH, Boxes, Nearby, Shape, cells_limit
 from pipeline.io.vector_text import BYTES, Texts, without_controls
 from pipeline.io.wkb import EncodedLayer
 
@@ -40,15 +40,15 @@ _CRS_BYTES = 4096
 _FETCHED = frozenset({"link", "url"})
 """Types of a CRS that GDAL would fetch from a server."""
 _NAME_IT = 'Name the CRS: "crs": { "type": "name", "properties": { "name": "EPSG:28992" } }'
-_SMALL_BYTES = 300_000
+_SMALL_BYTES = 150_000
 """GeoJSON of this size cannot have too many values: a feature takes 54 bytes, a column 12. Other formats count."""
 
 
 def read_by_gdal(path: Path, layer: str | None, boxes: Boxes | None, shape: Shape) -> EncodedLayer:
     """The layer, as `pipeline.io.vector_layer.read_layer` describes it.
 
-    Raises UnreadableInputError if the file cannot be read, has not the layer, has more than `CELLS_LIMIT` values near
-    the boxes, or names a server that knows its CRS.
+    Raises UnreadableInputError if the file cannot be read, has not the layer, has too many values near the
+    boxes, or names a server that knows its CRS.
     """
     import pyogrio
 
@@ -86,7 +86,7 @@ def _source_of(path: Path) -> str:
     where = path.resolve().as_posix()
     head = first_bytes(path)
     if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
-        _refuse_links(path)
+        refuse_links(path)
         return f"{GEOJSON}{where}"
     driver = next((name for magic, name in DRIVERS.items() if head.startswith(magic)), None)
     if driver is None:
@@ -94,8 +94,11 @@ def _source_of(path: Path) -> str:
     return f"{driver}{where}"
 
 
-def _refuse_links(path: Path) -> None:
-    """Refuse GeoJSON that names its CRS by a link: GDAL would fetch it from whatever server that is."""
+def refuse_links(path: Path) -> None:
+    """Refuse GeoJSON that names its CRS by a link: GDAL would fetch it from whatever server that is.
+
+    Raises UnreadableInputError.
+    """
     with path.open("rb") as stream:
         content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     for found in _CRS.finditer(content):
@@ -146,14 +149,17 @@ def _check_cells(path: Path, source: str, layer: str, near: npt.NDArray[np.int64
     """Refuse a layer with so many values that holding the empty ones is too much."""
     import pyogrio
 
-    if source.startswith(GEOJSON) and path.stat().st_size <= _SMALL_BYTES:
+    size_bytes = path.stat().st_size
+    if source.startswith(GEOJSON) and size_bytes <= _SMALL_BYTES:
         return  # it would be parsed once more
     about = pyogrio.read_info(source, layer=layer, encoding=BYTES, force_feature_count=near is None)
     features = about["features"] if near is None else len(near)
-    if features * len(about["fields"]) > CELLS_LIMIT:
+    limit = cells_limit(size_bytes)
+    columns = len(about["fields"])
+    if features * columns > limit:
         raise UnreadableInputError(
             str(path),
-            f"it has {features} features with {len(about['fields'])} columns each: more than {CELLS_LIMIT} values",
+            f"it has {features} features with {columns} columns each: more than {limit} values for its size",
             "Leave out columns, or cut out the area of the points",
         )
 

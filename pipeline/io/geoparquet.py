@@ -18,7 +18,7 @@ import shapely
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io.library_faults import in_our_words, shortened
-from pipeline.io.nearby import BATCH, CELLS_LIMIT, POLYGONS, Boxes, Nearby, Shape
+from pipeline.io.nearby import BATCH, POLYGONS, Boxes, Nearby, Shape, cells_limit
 from pipeline.io.vector_text import Texts
 from pipeline.io.wkb import EncodedLayer
 
@@ -101,7 +101,7 @@ def read_geoparquet(
             batches.append(batch if near.all() else batch.filter(pa.array(near)))
             first += len(near)
             cells += len(rows[-1]) * len(about.wanted)
-            _check_size(path, "values near the points, rows times columns", cells, CELLS_LIMIT)
+            _check_size(path, "values near the points, rows times columns", cells, cells_limit(path.stat().st_size))
         table = pa.Table.from_batches(batches) if batches else file.read_row_groups([], columns=about.wanted)
         numbers, texts = np.concatenate(rows), Texts()
         attributes: dict[str, Sequence[Any]] = {}

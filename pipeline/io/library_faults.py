@@ -10,6 +10,7 @@ import contextlib
 import json
 import logging
 import re
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,6 +22,8 @@ TOO_LARGE = "a part of it claims more memory than there is for reading it"
 
 _log = logging.getLogger("gablework.io")
 
+_LOGGED = 10
+"""Warnings of libraries that are logged."""
 _SHOWN = 24
 """Characters of a value that are shown."""
 _BY_TEXT = tuple(
@@ -29,6 +32,9 @@ _BY_TEXT = tuple(
         (r"\b[mc]?(?:re)?alloc|out of memory|bad_alloc|cannot allocate|too large to allocate", TOO_LARGE),
         (r"unrecognized number:? *(\S+)", "{0} is not a number that can be held"),
         (r"unable to open .*\.(shx|dbf)\b", "its .{0} file is missing or cannot be opened"),
+        (r"\bdbf file|\.dbf\b", "its .dbf file is damaged or cut off"),
+        (r"\.shx file|(?:offset|length) for entity", "its .shx file is damaged or cut off"),
+        (r"^missing [,\[\]]", "its coordinate reference system is damaged"),
         (r"at line (\d+), character (\d+)", "its JSON is damaged at line {0}, character {1}"),
         (r"no such (table|column): *(\S+)", "its database has no {0} {1}"),
         (r"database disk image|not a database|malformed|sqlite3?_", "its database is damaged"),
@@ -37,7 +43,7 @@ _BY_TEXT = tuple(
         (r"nest|recursion|too deep", "it is nested too deep"),
         (
             r"\b(month|day|hour|minute|second|year)\b.*(?:must be|out of range)",
-            "it has a date or time with the {0} wrong",
+            "it has a date with the {0} wrong",
         ),
         (r"magic bytes|thrift|footer", "its footer is damaged or cut off"),
         (r"\beof\b|unexpected end|end of (?:file|stream)|truncated", "it is cut off"),
@@ -48,7 +54,7 @@ _BY_TEXT = tuple(
 
 @contextlib.contextmanager
 def in_our_words(path: str | Path, what: str, fix: str, passing: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Raise what a library raises in the block as UnreadableInputError.
+    """Raise what a library raises in the block as UnreadableInputError; its warnings go to the log.
 
     Only calls of libraries belong into the block. Any error counts: readers raise whatever a damaged file leads to.
 
@@ -64,7 +70,11 @@ def in_our_words(path: str | Path, what: str, fix: str, passing: tuple[type[Exce
         Errors that are raised on purpose and pass as they are, beside those of `pipeline.errors`.
     """
     try:
-        yield
+        with warnings.catch_warnings(record=True) as noted:
+            warnings.simplefilter("default", RuntimeWarning)
+            yield
+        for warning in noted[:_LOGGED]:
+            _log.info("%s: %s", path, warning.message)
     except Exception as error:
         if isinstance(error, (GableworkError, *passing)):
             raise

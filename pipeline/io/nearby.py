@@ -14,12 +14,24 @@ from pipeline.io.wkb import geometries_of
 BATCH = 16_384
 """Features that are looked at together."""
 CELLS_LIMIT = 100_000_000
-"""Maximum number of values, features times columns, that are read of a layer. A value takes 8 bytes at least, and in
-some formats an absent one takes none in the file."""
+"""Maximum number of values, features times columns, that are read of a layer: a value takes some 60 bytes of memory."""
+CELLS_OF_SMALL = 20_000_000
+"""The same of a small file. In some formats an absent value takes no byte of the file, so 400 kB can hold millions."""
+CELLS_PER_BYTE = 4
+"""The same per byte of larger files, up to `CELLS_LIMIT`; real ones have fewer than one."""
 
 Boxes = Callable[[str | None], npt.NDArray[np.float64] | None]
 """From a layer's CRS, as the file has it, to boxes in that CRS, (k, 4) float64: xmin, ymin, xmax, ymax. None where
 they cannot be computed there."""
+
+
+def cells_limit(size_bytes: int) -> int:
+    """How many values may be read of a file of a size.
+
+    >>> cells_limit(1000), cells_limit(10_000_000), cells_limit(10**10)
+    (20000000, 40000000, 100000000)
+    """
+    return min(CELLS_LIMIT, max(CELLS_OF_SMALL, CELLS_PER_BYTE * size_bytes))
 
 
 class Shape(NamedTuple):

@@ -145,10 +145,12 @@ def test_attributes_that_python_cannot_hold_stop_nothing(tmp_path):
         "name": pa.array([b"\xff", b"Dam"]).view(pa.string()),
     }
     path = by_hand(tmp_path / "a.parquet", columns, encoding="WKB", crs=None)
-    assert read_footprints(path, reference()).attributes == (
-        {"late": None, "somewhere": None, "name": None},
+    found = read_footprints(path, reference())
+    assert found.attributes == (
+        {"late": None, "somewhere": None, "name": "ÿ"},
         {"late": "1970-01-01T00:00:00", "somewhere": None, "name": "Dam"},
     )
+    assert "the text in column 'name' of row 0 is not UTF-8 and is read as Windows-1252 ('ÿ')" in found.warnings
     table = pa.Table.from_arrays([wkb(), pa.array([1, 2]), pa.array([3, 4])], names=["geometry", "year", "year"])
     pq.write_table(table.replace_schema_metadata(pq.read_schema(path).metadata), path)
     assert [row["year"] for row in read_footprints(path, reference()).attributes] == [1, 2]
