@@ -292,7 +292,7 @@ def main(words: Sequence[str] | None = None) -> int:
     else:
         shares = [(cases[k :: arguments.processes], arguments.keep, limits) for k in range(arguments.processes)]
         with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
-            found = [outcome for share in pool.map(_run_share, shares, chunksize=1) for outcome in share]
+            found = [outcome for share in pool.imap(_run_share, shares) for outcome in share]
     bad = [one for one in found if one.result not in GOOD]
     for kind in arguments.kinds:
         for outcome in [one for one in (found if arguments.verbose else bad) if one.case.kind.name == kind.name][
