@@ -7,8 +7,10 @@ metadata serves validation and the reference docs.
 from __future__ import annotations
 
 import dataclasses
-import math
+import reprlib
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, dataclass_transform
 
@@ -93,6 +95,54 @@ def parameter(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def read_toml(path: str | Path, what: str) -> dict[str, Any]:
+    """The tables of a TOML file; `what` names the file in messages, such as `settings file`.
+
+    Raises SettingsError if it cannot be read, is not TOML, or is nested or has a number beyond what can be read.
+    """
+    import tomllib  # most commands read no such file
+
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingsError([f"{what} {path} cannot be read: {error.strerror or error}"]) from error
+    except UnicodeDecodeError as error:
+        fault = f"byte {error.start} is not UTF-8: save it as UTF-8"
+        raise SettingsError([f"{what} {path} is not TOML: {fault}"]) from error
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError([f"{what} {path} is not TOML: {error}"]) from error
+    except ValueError as error:
+        raise SettingsError([f"{what} {path} cannot be read: a number has thousands of digits"]) from error
+    except RecursionError as error:
+        raise SettingsError([f"{what} {path} is not TOML: its brackets are nested too deeply"]) from error
+
+
+def is_finite_number(value: Any) -> bool:
+    """Whether a value of a file is a number that a float can hold; true and false are not.
+
+    Whole numbers of a file have any number of digits, and `math.isfinite` raises for large ones.
+
+    >>> [is_finite_number(value) for value in (2, -0.5, float("nan"), 10**400, True, "2")]
+    [True, True, False, False, False, False]
+    """
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+_QUOTING = reprlib.Repr()
+_QUOTING.maxstring = _QUOTING.maxother = 200
+_QUOTING.maxlong = 40
+_QUOTING.maxlist = _QUOTING.maxtuple = _QUOTING.maxdict = 20
+
+
+def quoted(value: Any) -> str:
+    """A value of a file for a message, as Python writes it; long ones are shortened.
+
+    >>> quoted("a"), quoted(10**400)
+    ("'a'", '100000000000000000...0000000000000000000')
+    """
+    return _QUOTING.repr(value)
+
+
 def _fault(name: str, value: Any, field: dataclasses.Field[Any]) -> str | None:
     """The fault of a value that its field does not allow, or None."""
     meta = field.metadata
@@ -100,19 +150,19 @@ def _fault(name: str, value: Any, field: dataclasses.Field[Any]) -> str | None:
         return None
     default, choices = field.default, meta["choices"]
     if choices is not None:
-        return None if value in choices else f"{name} is {value!r}: use one of {', '.join(choices)}"
+        return None if value in choices else f"{name} is {quoted(value)}: use one of {', '.join(choices)}"
     if isinstance(default, tuple):
         low, high = meta["minimum"], meta["maximum"]
         if isinstance(value, tuple) and all(type(v) is int and low <= v <= high for v in value):
             return None
-        return f"{name} is {value!r}: use a list of whole numbers from {low:g} to {high:g}"
+        return f"{name} is {quoted(value)}: use a list of whole numbers from {low:g} to {high:g}"
     if isinstance(default, bool):
-        return None if isinstance(value, bool) else f"{name} is {value!r}: use true or false"
+        return None if isinstance(value, bool) else f"{name} is {quoted(value)}: use true or false"
     if isinstance(default, int | float):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            return f"{name} is {value!r}: use a finite number"
+        if not is_finite_number(value):
+            return f"{name} is {quoted(value)}: use a finite number"
         if isinstance(default, int) and not isinstance(value, int):
-            return f"{name} is {value!r}: use a whole number"
+            return f"{name} is {quoted(value)}: use a whole number"
         low, high, unit = meta["minimum"], meta["maximum"], meta["unit"]
         if (low is not None and value < low) or (high is not None and value > high):
             low_text = "any" if low is None else f"{low:g}"
@@ -122,9 +172,9 @@ def _fault(name: str, value: Any, field: dataclasses.Field[Any]) -> str | None:
         low, high = meta["minimum"], meta["maximum"]
         if value == default or (type(value) is int and low <= value <= high):
             return None
-        return f"{name} is {value!r}: use {default!r} or a whole number from {low:g} to {high:g}"
+        return f"{name} is {quoted(value)}: use {default!r} or a whole number from {low:g} to {high:g}"
     if isinstance(default, str) and not isinstance(value, str):
-        return f"{name} is {value!r}: use a text in quotes"
+        return f"{name} is {quoted(value)}: use a text in quotes"
     return None
 
 
@@ -217,8 +267,8 @@ def build(
     for name, value in values.items():
         if name in names:
             # TOML writes 2 where a float is meant
-            wants_float = isinstance(names[name].default, float) and isinstance(value, int)
-            given[name] = float(value) if wants_float and not isinstance(value, bool) else value
+            wants_float = isinstance(names[name].default, float) and is_finite_number(value)
+            given[name] = float(value) if wants_float else value
             if isinstance(names[name].default, tuple) and isinstance(value, list):
                 given[name] = tuple(value)
     try:

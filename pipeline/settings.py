@@ -6,14 +6,12 @@ import dataclasses
 import hashlib
 import itertools
 import json
-import tomllib
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from pipeline.errors import SettingsError
 from pipeline.methods import LODS, METHODS, OVERHANGS, PRESETS, ReconstructSettings, method_named
-from pipeline.parameters import Parameters, build, parameter
+from pipeline.parameters import Parameters, build, parameter, read_toml
 from pipeline.roof.settings import ArrangementSettings, FootprintSettings, GuideSettings, RoofSettings, RoofTypeSettings
 from pipeline.terrain.class_codes import ClassCodeSettings
 from pipeline.terrain.scene_settings import SceneSettings
@@ -248,12 +246,9 @@ def read_table(path: str | None) -> dict[str, Any]:
     """
     if path is None:
         return {}
-    try:
-        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError([f"settings file {path} cannot be read: {error.strerror or error}"]) from error
-    except tomllib.TOMLDecodeError as error:
-        raise SettingsError([f"settings file {path} is no TOML: {error}"]) from error
+    document = read_toml(path, "settings file")
+    if not isinstance(document.get("settings", {}), Mapping):
+        raise SettingsError([f"settings file {path} has settings that are not a table: write [settings]"])
     table = dict(document.get("settings", {}))
     if not table and document:
         raise SettingsError([f"settings file {path} has no [settings] table; it has {', '.join(document)}"])

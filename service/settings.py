@@ -276,6 +276,12 @@ class ServiceSettings(BaseSettings):
         "handed back, and their next attempt resumes finished stages.",
     )
     log_json: bool = Field(default=False, description="Log one JSON object per line instead of plain lines.")
+    input_timeout_s: float = Field(
+        default=600.0,
+        gt=0.0,
+        allow_inf_nan=False,
+        description="Seconds within which some more of an input must be read; else the job fails.",
+    )
     building_timeout_s: float = Field(
         default=600.0, gt=0.0, allow_inf_nan=False, description="Seconds after which a building's work is stopped."
     )
@@ -333,6 +339,7 @@ class ServiceSettings(BaseSettings):
             workers=None if self.workers == "auto" else self.workers,
             scheduler=self.scheduler,
             tls=given_tls(self.tls_ca, self.tls_cert, self.tls_key),
+            input_timeout_s=self.input_timeout_s,
             building_timeout_s=self.building_timeout_s,
             building_memory_bytes=self.building_memory_bytes,
         )

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, supervise
+from pipeline.runtime.isolation.progress_reports import report_progress
 from pipeline.runtime.scratch.folder import Scratch
 
 DEADLINE_S = 120.0
@@ -110,3 +111,27 @@ def family(_: object) -> tuple[int, int, int]:
     ((_, found),) = supervise(eval, ["__import__('os').getppid()"], IsolationLimits(), loads=())
     assert isinstance(found, int)
     return os.getppid(), os.getpid(), found
+
+
+def go_on(count: int) -> int:
+    """Take longer than the limit of an item in this test's supervisor, and report each step."""
+    for _ in range(count):
+        time.sleep(1.1)
+        report_progress()
+    return count
+
+
+def never_end(_: object) -> None:
+    """Read nothing more."""
+    while True:
+        time.sleep(0.05)
+
+
+def end_by_signal(_: object) -> None:
+    """Crash as a decoder does."""
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def ask_for_too_much(_: object) -> None:
+    """Ask for memory as a header that lies does."""
+    raise MemoryError

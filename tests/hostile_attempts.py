@@ -15,7 +15,7 @@ from service.errors import RequestError
 Done = tuple[str, dict[str, Any]]
 
 
-def _begin(stage: str = "plan") -> None:
+def _begin(stage: str = "split") -> None:
     child_main.say(Event(kind="stage", stage=stage))
 
 

@@ -17,14 +17,14 @@ Paths are relative to the file's folder. All faults are reported at once.
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import SettingsError
 from pipeline.export.mesh_kinds import MESHES
-from pipeline.parameters import Parameters, build, parameter
+from pipeline.io.reading import INPUT_TIMEOUT_S
+from pipeline.parameters import Parameters, build, is_finite_number, parameter, quoted, read_toml
 from pipeline.runtime.cluster.tls import given_tls
 from pipeline.runtime.isolation.isolated_items import IsolationLimits
 from pipeline.schedule import Cron, Missed, Overlap, Rules
@@ -91,6 +91,13 @@ class ClusterTable(Parameters):
         0, "Port of 127.0.0.1 for the run's figures in the format of Prometheus; 0 for none.", minimum=0, maximum=65535
     )
     isolate: bool = parameter(True, "Model buildings in supervised child processes: a bad building costs only itself.")
+    input_timeout_s: float = parameter(
+        INPUT_TIMEOUT_S,
+        "Most seconds within which some more of an input must be read.",
+        unit="s",
+        minimum=1.0,
+        maximum=86_400.0,
+    )
     building_timeout_s: float = parameter(
         IsolationLimits.timeout_s,
         "Most seconds per building in its child process.",
@@ -224,6 +231,7 @@ class Batch:
                 performance_report=given(self.cluster.performance_report),
                 work=self.work_folder,
                 isolate=None if self.cluster.isolate else False,
+                input_timeout_s=self.cluster.input_timeout_s,
                 building_timeout_s=self.cluster.building_timeout_s,
                 building_memory_bytes=round(self.cluster.building_memory_gib * 2**30),
             ),
@@ -237,12 +245,7 @@ class Batch:
 def read_batch(path: str | Path) -> Batch:
     """Read a batch file; raises SettingsError if it cannot be read or parsed, or for all its faults."""
     file = Path(path).resolve()
-    try:
-        document = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError([f"batch file {path} cannot be read: {error.strerror or error}"]) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise SettingsError([f"batch file {path} is not TOML: {error}"]) from error
+    document = read_toml(path, "batch file")
     faults: list[str] = []
     known = (*TABLES, "settings")
     faults.extend(
@@ -252,7 +255,7 @@ def read_batch(path: str | Path) -> Batch:
     )
     tables = {name: document.get(name, {}) for name in known}
     faults.extend(
-        f"{name} is {table!r}: use a table" for name, table in tables.items() if not isinstance(table, Mapping)
+        f"{name} is {quoted(table)}: use a table" for name, table in tables.items() if not isinstance(table, Mapping)
     )
     tables = {name: table if isinstance(table, Mapping) else {} for name, table in tables.items()}
     inputs = dict(tables["inputs"])
@@ -306,7 +309,7 @@ def _times_faults(table: ScheduleTable | None) -> list[str]:
 def _paths(value: Any, faults: list[str]) -> tuple[str, ...]:
     if isinstance(value, list) and value and all(isinstance(entry, str) and entry for entry in value):
         return tuple(value)
-    shown = "missing" if value is None else repr(value)
+    shown = "missing" if value is None else quoted(value)
     faults.append(f'[inputs] paths is {shown}: give a list of files, folders or patterns, such as ["tiles/*.laz"]')
     return ()
 
@@ -314,9 +317,9 @@ def _paths(value: Any, faults: list[str]) -> tuple[str, ...]:
 def _bbox(value: Any, faults: list[str]) -> tuple[float, float, float, float] | None:
     if value is None:
         return None
-    numbers = isinstance(value, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+    numbers = isinstance(value, list) and all(is_finite_number(v) for v in value)
     if numbers and len(value) == 4:
         x_min, y_min, x_max, y_max = (float(v) for v in value)
         return x_min, y_min, x_max, y_max
-    faults.append(f"[inputs] bbox is {value!r}: use [x_min, y_min, x_max, y_max]")
+    faults.append(f"[inputs] bbox is {quoted(value)}: use [x_min, y_min, x_max, y_max]")
     return None

@@ -24,6 +24,7 @@ KEYS: Mapping[str, str] = {
     "--tls-ca": "[cluster] tls_ca",
     "--tls-cert": "[cluster] tls_cert",
     "--tls-key": "[cluster] tls_key",
+    "--input-timeout": "[cluster] input_timeout_s",
     "--building-timeout": "[cluster] building_timeout_s",
     "--building-memory": "[cluster] building_memory_gib",
 }

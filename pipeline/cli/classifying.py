@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipeline.cli.options import (
+    INPUT_TIMEOUT_S,
     AllowOutside,
     AsJson,
     Classes,
     Crs,
     Footprints,
+    InputTimeout,
     Quiet,
     Scheduler,
     SettingsFile,
@@ -52,6 +54,7 @@ def classify(
     tls_ca: TlsCa = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
+    input_timeout: InputTimeout = INPUT_TIMEOUT_S,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -79,7 +82,12 @@ def classify(
             allow_outside_area_of_use=allow_outside_area_of_use,
             rasters=rasters,
             raster_cell=raster_cell,
-            resources=Resources(workers=workers, scheduler=scheduler, tls=given_tls(tls_ca, tls_cert, tls_key)),
+            resources=Resources(
+                workers=workers,
+                scheduler=scheduler,
+                tls=given_tls(tls_ca, tls_cert, tls_key),
+                input_timeout_s=input_timeout,
+            ),
             overwrite=overwrite,
         )
         summary = classify_files(request, console.on_event)

@@ -152,6 +152,11 @@ BuildingTimeout = Annotated[
 BuildingMemory = Annotated[
     float, typer.Option(metavar="GIB", help="Memory that a building's child process may take, in GiB.")
 ]
+InputTimeout = Annotated[
+    float, typer.Option(metavar="S", help="Seconds within which some more of an input must be read.")
+]
+INPUT_TIMEOUT_S = 600.0
+"""Default of `pipeline.io.reading`."""
 BUILDING_TIMEOUT_S, BUILDING_MEMORY_GIB = 600.0, 4.0
 """Defaults of `pipeline.runtime.isolation.isolated_items.IsolationLimits`, which is too slow to import for `--help`."""
 

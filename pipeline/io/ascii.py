@@ -18,6 +18,7 @@ import numpy.typing as npt
 from pipeline.errors import EmptyInputError, InconsistentInputError, SettingsError, UnreadableInputError
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.readable import Readable
+from pipeline.io.reading import moved
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
 from pipeline.io.strays import thinned, typical_bounds
 from pipeline.model import FloatArray
@@ -113,6 +114,7 @@ class AsciiFile:
                 stream.readline(LINE_LIMIT)
             line_number = self._header_lines
             while lines := _some_lines(stream, rows_wanted * BYTES_A_ROW):
+                moved()
                 rows = self._parse(lines, line_number)
                 if len(rows):
                     yield line_number, rows

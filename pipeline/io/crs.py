@@ -34,6 +34,8 @@ EPSG_UNITS_M = {9001: 1.0, 9002: INTERNATIONAL_FOOT_M, 9003: US_SURVEY_FOOT_M}
 """Metres per unit, by the EPSG codes that GeoTIFF keys use."""
 
 
+SMALLEST_UNIT_M, LARGEST_UNIT_M = 1e-4, 1e4
+"""Units that a CRS can have: from a tenth of a millimetre to ten kilometres."""
 LARGEST_COORDINATE = 1e12
 """Bound of coordinates, far beyond every CRS; keeps differences finite."""
 
@@ -143,7 +145,18 @@ def horizontal_unit_of(crs: pyproj.CRS, *, path: str) -> float:
     units = {float(axis.unit_conversion_factor) for axis in plane.axis_info[:2]}
     if len(units) != 1:
         raise CrsError(path, f"CRS {crs.name!r} has axes in different units, {sorted(units)} m", reproject)
-    return units.pop()
+    return _usable_unit(units.pop(), crs, path)
+
+
+def _usable_unit(unit_m: float, crs: pyproj.CRS, path: str) -> float:
+    """A unit of a CRS, in metres; raises CrsError for one that no coordinates are in, such as 0."""
+    if not SMALLEST_UNIT_M <= unit_m <= LARGEST_UNIT_M:
+        raise CrsError(
+            path,
+            f"CRS {crs.name!r} has a unit of {unit_m:g} m",
+            "Give --crs EPSG:n with the right one, or mend the file",
+        )
+    return unit_m
 
 
 @functools.lru_cache(maxsize=64)
@@ -197,8 +210,8 @@ def resolve_reference(
         return SpatialReference(horizontal_unit_m=horizontal_m, vertical_unit_m=vertical_m), tuple(warnings)
 
     horizontal_m = horizontal_unit_of(chosen, path=path)
-    if vertical_m is None:
-        vertical_m = vertical_unit_of(chosen)
+    if vertical_m is None and (vertical_m := vertical_unit_of(chosen)) is not None:
+        vertical_m = _usable_unit(vertical_m, chosen, path)
     if vertical_m is None and crs is None:
         vertical_m = header_vertical_unit_m
     assumed = vertical_m is None

@@ -48,12 +48,16 @@ PROBLEMS = {
     "empty": "empty",
     "not_finite": "with coordinates that are NaN or infinite",
     "outside_crs": "outside the run's CRS",
+    "too_large": "larger than any building",
     "no_area": "invalid and without area",
     "invalid": "invalid",
     "tangled": "invalid with too many crossings to be repaired",
     "bad_value": "with an attribute that cannot be used",
 }
 """What can be wrong with a footprint, and how a message counts it."""
+LARGEST_OUTLINE_M = 20_000.0
+"""Longest side of an outline. Not a setting: the longest buildings have 3 km, and a wrong coordinate makes an outline
+that reaches over thousands of tiles."""
 AREA_CROSSINGS = 1_000_000
 """Maximum number of crossings between the edges of an area of interest; uniting more takes a minute and gigabytes."""
 
@@ -166,12 +170,15 @@ def read_footprints(
     for row in kept[~whole].tolist():
         problems[row] = ("outside_crs", "it cannot be reprojected to the run's CRS")
     polygons, kept = polygons[whole], kept[whole]
+    small = _small_enough(polygons, kept, problems)
+    polygons, kept = polygons[small], kept[small]
     places = {int(row): tuple(bounds) for row, bounds in zip(kept, shapely.bounds(polygons).tolist(), strict=True)}
     polygons = _repaired(polygons, kept, problems, actions)
     solid = ~shapely.is_empty(polygons)
     polygons, kept = polygons[solid], kept[solid]
     if len(kept) == 0 and not found.elsewhere:
-        raise EmptyInputError(name, "no polygon has an area", "Give polygons of buildings")
+        size = f" of at most {LARGEST_OUTLINE_M:g} m" if len(small) > small.sum() else ""
+        raise EmptyInputError(name, f"no polygon{size} has an area", "Give polygons of buildings")
     table = {field: [_plain(value) for value in column] for field, column in found.columns.items()}
     ids, ids_of_all = _ids(name, table, found.feature_ids, kept, id_column)
     issues = tuple(
@@ -195,6 +202,19 @@ def read_footprints(
         issues=issues,
         elsewhere=found.elsewhere,
     )
+
+
+def _small_enough(
+    polygons: npt.NDArray[np.object_], rows: npt.NDArray[np.int64], problems: dict[int, tuple[str, str]]
+) -> npt.NDArray[np.bool_]:
+    """(n,) bool, whether polygons can be outlines of buildings by their size; the others are entered as problems."""
+    bounds = shapely.bounds(polygons).reshape(-1, 4)
+    sides = (bounds[:, 2:] - bounds[:, :2]).max(axis=1, initial=0.0)
+    wide = sides > LARGEST_OUTLINE_M
+    for row, side in zip(rows[wide].tolist(), sides[wide].tolist(), strict=True):
+        problems[row] = ("too_large", f"it is {side:.6g} m wide or long, more than {LARGEST_OUTLINE_M:g} m")
+    small: npt.NDArray[np.bool_] = ~wide
+    return small
 
 
 def _polygons_only(layer: VectorLayer, problems: dict[int, tuple[str, str]]) -> npt.NDArray[np.object_]:

@@ -41,6 +41,8 @@ def first_bytes(path: Readable) -> bytes:
         If it has no bytes.
     """
     try:
+        if isinstance(path, Path) and (path.is_fifo() or path.is_char_device() or path.is_socket()):
+            raise UnreadableInputError(str(path), "a pipe or a device, not a file", "Write it to a file first")
         with path.open("rb") as stream:
             head = stream.read(SNIFF_BYTES)
     except FileNotFoundError:

@@ -23,14 +23,16 @@ from pipeline.io import copc
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.las_header import REWRITE, header_crs, read_header_block
 from pipeline.io.laz_chunks import (
-    CHUNK_SIZE_LIMIT,
     LAYERED_FORMAT,
     ChunkTable,
     check_chunk,
     check_chunks,
+    decodable_record,
     read_chunk_table,
 )
+from pipeline.io.laz_decoder import DECODING_ERRORS, decoding
 from pipeline.io.readable import Readable
+from pipeline.io.reading import moved
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Share, Window
 from pipeline.io.remote_file import bytes_of
 from pipeline.io.strays import typical_bounds
@@ -52,7 +54,8 @@ USED_FIELDS = (
 )
 """What is decompressed of point formats 6 and above; the older ones know no selection."""
 
-DECODING_ERRORS = (lazrs.LazrsError, laspy.LaspyException, OSError, ValueError, struct.error)
+PIECE_BYTES = 2**27
+"""Most bytes of records that are decoded at once, however long a record is."""
 
 
 class LasFile:
@@ -95,6 +98,7 @@ class LasFile:
         With a share only its stretch of them: whole compressed chunks or nodes. Raises UnreadableInputError if the
         data end or break before the promised count.
         """
+        chunk_size = max(1, min(chunk_size, PIECE_BYTES // self._block.point_size))
         if self._chunks is not None and (share is not None or (window is not None and self._copc is not None)):
             yield from self._chunk_records(chunk_size, window, share)
             return
@@ -103,6 +107,7 @@ class LasFile:
 
     def whole_records(self, chunk_size: int) -> Iterator[tuple[npt.NDArray[np.uint8], PointRecords]]:
         """As `records`, without a window, but each piece also as its bytes with every field."""
+        chunk_size = max(1, min(chunk_size, PIECE_BYTES // self._block.point_size))
         for raw in self._raw(chunk_size, lazrs.SELECTIVE_DECOMPRESS_ALL, None):
             yield raw, self._to_records(raw)
 
@@ -125,7 +130,7 @@ class LasFile:
         """
         table = self._chunks
         assert table is not None
-        if table.largest > CHUNK_SIZE_LIMIT:
+        if table.is_large:
             # such chunks are never decoded at once, so the first share is the whole file
             yield from () if share is not None and share.number else self.records(chunk_size, None)
             return
@@ -193,9 +198,10 @@ class LasFile:
     def _read_laszip_record(self) -> bytes:
         """The LAZ VLR, which describes the compression."""
         try:
-            return bytes(self._header.vlrs[self._header.vlrs.index("LasZipVlr")].record_data)
+            record = bytes(self._header.vlrs[self._header.vlrs.index("LasZipVlr")].record_data)
         except ValueError as fault:
             raise UnreadableInputError(str(self._path), "the file is compressed but has no LAZ VLR", REWRITE) from fault
+        return decodable_record(record)
 
     def _check_room(self) -> None:
         """Hold the promised count against the bytes of an uncompressed file."""
@@ -220,10 +226,10 @@ class LasFile:
             stream.seek(first * self._block.point_size, io.SEEK_CUR)
             return stream
         # The parallel one makes room for a whole chunk, so chunks without measure go to the sequential one.
-        parallel = self._chunks.largest <= CHUNK_SIZE_LIMIT
-        make = lazrs.ParLasZipDecompressor if parallel else lazrs.LasZipDecompressor
+        make = lazrs.LasZipDecompressor if self._chunks.is_large else lazrs.ParLasZipDecompressor
         try:
-            return make(stream, self._laszip_record, lazrs.DecompressionSelection(fields))
+            with decoding():
+                return make(stream, self._laszip_record, lazrs.DecompressionSelection(fields))
         except DECODING_ERRORS as fault:
             raise self._broken(fault, "at the start") from fault
 
@@ -232,7 +238,8 @@ class LasFile:
         raw = np.empty(count * self._block.point_size, dtype=np.uint8)
         try:
             if self._chunks is not None:
-                decoder.decompress_many(raw)
+                with decoding():
+                    decoder.decompress_many(raw)
             else:
                 read_exactly(decoder, raw)
         except (*DECODING_ERRORS, EOFError) as fault:
@@ -253,7 +260,8 @@ class LasFile:
         raw = np.empty(count * self._block.point_size, dtype=np.uint8)
         try:
             fields = lazrs.DecompressionSelection(USED_FIELDS)
-            lazrs.decompress_points_with_chunk_table(packed, self._laszip_record, raw, [(count, size)], fields)
+            with decoding():
+                lazrs.decompress_points_with_chunk_table(packed, self._laszip_record, raw, [(count, size)], fields)
         except DECODING_ERRORS as fault:
             raise self._broken(fault, f"in the chunk at byte {offset}") from fault
         return raw
@@ -265,6 +273,7 @@ class LasFile:
 
     def _to_records(self, raw: npt.NDArray[np.uint8]) -> PointRecords:
         """Arrays of the fields that are used."""
+        moved()
         packed = PackedPointRecord.from_buffer(raw, self._header.point_format)
         array = packed.array
         xyz = np.empty((len(array), 3), dtype=np.float64)
@@ -283,27 +292,30 @@ class LasFile:
 
     def _sample(self) -> PointRecords:
         """Points from some places spread over the file, in file order; of COPC the coarsest node."""
-        pieces = []
+        pieces, most = [], max(1, min(SAMPLE_SIZE, PIECE_BYTES // SAMPLE_PLACES // self._block.point_size))
         with self._path.open("rb") as stream:
             root = self._root_chunk(stream)
             if self._chunks is not None and root is not None:
                 return self._to_records(self._decode_chunk(stream, root, int(self._chunks.counts[root])))
             if self._chunks is None:
-                last = max(self._block.point_count - SAMPLE_SIZE, 0)
+                last = max(self._block.point_count - most, 0)
                 for start in _places(last):
                     stream.seek(self._block.offset_to_points + start * self._block.point_size)
-                    count = min(SAMPLE_SIZE, self._block.point_count - start)
+                    count = min(most, self._block.point_count - start)
                     pieces.append(self._decode(stream, count, start))
+            elif self._chunks.pointwise:
+                count = min(most, self._block.point_count)
+                pieces.append(self._decode(self._decoder(stream, USED_FIELDS, 0), count, 0))
             else:
                 filled = np.flatnonzero(self._chunks.counts)
                 for chunk in filled[_places(len(filled) - 1)].tolist():
-                    count = min(SAMPLE_SIZE, int(self._chunks.counts[chunk]))
+                    count = min(most, int(self._chunks.counts[chunk]))
                     pieces.append(self._decode_chunk(stream, chunk, count))
         return self._to_records(np.concatenate(pieces))
 
     def _root_chunk(self, stream: io.BufferedReader) -> int | None:
         """The chunk of an octree's root; None without one, or where it is damaged: the file can still be read whole."""
-        if self._copc is None:
+        if self._copc is None or self._chunks is None or self._chunks.is_large:
             return None
         try:
             root = self._chunks_of(copc.root_node(self._path, stream, self._copc, self._block.file_size))

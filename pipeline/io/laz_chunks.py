@@ -1,5 +1,7 @@
 """The chunk table of LAZ: how many compressed pieces a file has, where they are and how many points they hold.
 
+A file of LASzip 1 (compressor 1, point by point) has no chunks, and counts as one that is never decoded at once.
+
 The table is what a header's claim can be held against before anything is decoded. Source: M. Isenburg, LASzip:
 lossless compression of LiDAR data, 2013, and the LASzip VLR (record 22204).
 """
@@ -15,13 +17,19 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import InconsistentInputError, UnreadableInputError
+from pipeline.io.laz_decoder import DECODING_ERRORS, decoding
 from pipeline.io.readable import Readable
+from pipeline.io.reading import moved
 
 if TYPE_CHECKING:
     from pipeline.io.las_header import HeaderBlock
 
 CHUNK_SIZE_LIMIT = 4_000_000
 """Points a chunk beyond which chunks are not decoded at once: writers use 50,000, COPC some 100,000."""
+CHUNK_BYTES_LIMIT = 2**29
+"""The same in bytes: a record may have 65,535, and a chunk of equal records compresses to nearly nothing."""
+POINTWISE = 1
+"""The compressor of LASzip 1: one stream of points, without chunks and without a table of them."""
 LAYERED_FORMAT = 6
 """The first point format whose chunks have layers."""
 LAYERS = {6: (30, 9), 7: (36, 10), 8: (38, 11), 9: (59, 10), 10: (67, 12)}
@@ -45,6 +53,20 @@ class ChunkTable:
     """Points that a decoder makes room for: the fixed chunk size, or the largest count."""
     variable: bool
     """True where each chunk has a count of its own (COPC)."""
+    pointwise: bool = False
+    """True where the file is one stream without chunks, which can only be decoded from its first point on."""
+
+    @property
+    def is_large(self) -> bool:
+        """Whether a chunk is too large to be decoded at once."""
+        return self.largest > CHUNK_SIZE_LIMIT or self.largest * self.item_size > CHUNK_BYTES_LIMIT
+
+
+def decodable_record(laszip_record: bytes) -> bytes:
+    """The LAZ VLR as lazrs understands it: some files of LASzip 1 have a chunk size of 0, which means none there."""
+    if len(laszip_record) < 16 or struct.unpack_from("<H", laszip_record)[0] != POINTWISE:
+        return laszip_record
+    return laszip_record[:12] + struct.pack("<I", 1) + laszip_record[16:]
 
 
 def read_chunk_table(path: Readable, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes) -> ChunkTable:
@@ -59,15 +81,18 @@ def read_chunk_table(path: Readable, stream: BinaryIO, block: HeaderBlock, laszi
     """
     name, start = str(path), block.offset_to_points
     try:
-        vlr = lazrs.LazVlr(laszip_record)
-        item_size, chunk_size = int(vlr.item_size()), int(vlr.chunk_size())
-        variable = bool(vlr.uses_variable_size_chunks())
-    except (lazrs.LazrsError, ValueError) as fault:
+        with decoding():
+            vlr = lazrs.LazVlr(laszip_record)
+            item_size, chunk_size = int(vlr.item_size()), int(vlr.chunk_size())
+            variable = bool(vlr.uses_variable_size_chunks())
+    except DECODING_ERRORS as fault:
         raise UnreadableInputError(name, f"the LAZ record in the header is damaged ({fault})", FIX) from fault
     if item_size != block.point_size:
         raise InconsistentInputError(
             name, f"the header has {block.point_size} bytes per point, its LAZ record {item_size}", FIX
         )
+    if struct.unpack_from("<H", laszip_record)[0] == POINTWISE:
+        return _one_stream(block, item_size)
     table_at = _table_offset(stream, block)
     if not start + 8 < table_at <= block.file_size - 8:
         raise UnreadableInputError(
@@ -93,8 +118,9 @@ def read_chunk_table(path: Readable, stream: BinaryIO, block: HeaderBlock, laszi
         )
     stream.seek(start)
     try:
-        rows = np.array(lazrs.read_chunk_table(stream, vlr), dtype=np.int64).reshape(-1, 2)
-    except (lazrs.LazrsError, OSError, ValueError) as fault:
+        with decoding():
+            rows = np.array(lazrs.read_chunk_table(stream, vlr), dtype=np.int64).reshape(-1, 2)
+    except DECODING_ERRORS as fault:
         raise UnreadableInputError(name, f"the table of compressed chunks is damaged ({fault})", FIX) from fault
     counts, sizes = rows[:, 0].copy(), rows[:, 1]
     # Some writers of COPC end with an empty chunk.
@@ -113,6 +139,19 @@ def read_chunk_table(path: Readable, stream: BinaryIO, block: HeaderBlock, laszi
     largest = int(counts.max()) if variable else chunk_size
     return ChunkTable(
         counts=counts, sizes=sizes, offsets=offsets, item_size=item_size, largest=largest, variable=variable
+    )
+
+
+def _one_stream(block: HeaderBlock, item_size: int) -> ChunkTable:
+    """The table of a file without one: a single chunk that is never decoded at once."""
+    return ChunkTable(
+        counts=np.array([block.point_count]),
+        sizes=np.array([block.file_size - block.offset_to_points]),
+        offsets=np.array([block.offset_to_points]),
+        item_size=item_size,
+        largest=2**62,
+        variable=False,
+        pointwise=True,
     )
 
 
@@ -136,14 +175,20 @@ def check_chunks(path: Readable, stream: BinaryIO, block: HeaderBlock, laszip_re
     """
     if block.point_format >= LAYERED_FORMAT:
         _check_layers(path, stream, block, table)
-    elif not table.variable and table.counts[-1] <= CHUNK_SIZE_LIMIT:
+    elif not (table.variable or table.pointwise) and not last_is_large(table):
         _check_last_chunk(path, stream, block, laszip_record, table)
+
+
+def last_is_large(table: ChunkTable) -> bool:
+    """Whether the last chunk is too large to be decoded at once."""
+    return dataclasses.replace(table, largest=int(table.counts[-1])).is_large
 
 
 def _check_layers(path: Readable, stream: BinaryIO, block: HeaderBlock, table: ChunkTable) -> None:
     """Point formats 6 and above: the layers and counts of all chunks, and the header's count."""
     held = 0
     for chunk in np.flatnonzero(table.counts).tolist():
+        moved()
         stream.seek(int(table.offsets[chunk]))
         held += check_chunk(path, stream.read(_layers_end(block)), block, table, chunk)
     if held != block.point_count:
@@ -208,14 +253,10 @@ def _check_last_chunk(
 def _decodes(chunk: bytes, count: int, laszip_record: bytes, item_size: int) -> bool:
     """Whether so many points can be decoded from the bytes of a chunk."""
     out = np.empty(count * item_size, dtype=np.uint8)
+    selection = lazrs.DecompressionSelection(lazrs.SELECTIVE_DECOMPRESS_ALL)
     try:
-        lazrs.decompress_points_with_chunk_table(
-            chunk,
-            laszip_record,
-            out,
-            [(count, len(chunk))],
-            lazrs.DecompressionSelection(lazrs.SELECTIVE_DECOMPRESS_ALL),
-        )
-    except lazrs.LazrsError:
+        with decoding():
+            lazrs.decompress_points_with_chunk_table(chunk, laszip_record, out, [(count, len(chunk))], selection)
+    except DECODING_ERRORS:
         return False
     return True

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.readable import Readable
+from pipeline.io.reading import moved
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
 from pipeline.io.strays import thinned, typical_bounds
 
@@ -111,6 +112,7 @@ class PlyFile:
         tables = self._binary_tables(chunk_size) if self._byte_order else self._ascii_tables(chunk_size)
         begin = 0
         for table in tables:
+            moved()
             records = self._to_records(table)
             finite = np.isfinite(records.xyz).all(axis=1)
             if not finite.all():

@@ -22,6 +22,7 @@ from typing import Any, Literal
 from pipeline.errors import UnreadableInputError
 from pipeline.io import urls
 from pipeline.io.readable import FileStatus, Readable
+from pipeline.io.reading import moved
 from pipeline.io.retries import POLICY, GaveUpError, RetryPolicy, ShortReadError, persistently
 from pipeline.io.urls import filesystem_of, is_url, name_in, range_options, shown
 
@@ -188,7 +189,13 @@ class RemoteFile:
 
     def _download(self, target: Path) -> None:
         """The whole file by one request."""
-        self._tried(lambda: self._filesystem.get_file(self.url, str(target), timeout=urls.WHOLE_S))
+        from fsspec.callbacks import Callback  # loaded with its file systems
+
+        class Moved(Callback):  # type: ignore[misc]
+            def call(self, *_: Any, **__: Any) -> None:
+                moved()
+
+        self._tried(lambda: self._filesystem.get_file(self.url, str(target), timeout=urls.WHOLE_S, callback=Moved()))
 
     def fetch(self, target: Path, check: Callable[[], None] = lambda: None) -> None:
         """Write the whole file to a path of this machine, in an existing folder, piece by piece.

@@ -18,6 +18,7 @@ from pipeline.io.crs import SpatialReference, resolve_reference
 from pipeline.io.formats import recognise_format
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.io.readable import Readable
+from pipeline.io.reading import one_input
 from pipeline.io.records import DivisibleFile, FileFacts, PointFile, PointRecords, Share, Window
 from pipeline.io.remote_file import RemoteFile, etag_of, file_at
 from pipeline.io.strays import MOST_STRAYS, off_earth, without_strays
@@ -389,7 +390,10 @@ def open_source(
         The CRS is geographic or not understood.
     """
     file = file_at(path) if isinstance(path, str | Path) else path
-    return Source(file, options or ReadOptions(), known)
+    if isinstance(file, RemoteFile):  # requests have limits of their own
+        return Source(file, options or ReadOptions(), known)
+    with one_input(str(file)):
+        return Source(file, options or ReadOptions(), known)
 
 
 def _info_of(path: Readable, file: PointFile, options: ReadOptions) -> SourceInfo:

@@ -20,6 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import Protocol
 
 from pipeline.errors import RunError
+from pipeline.io.reading import moved
 
 BLOCK_BYTES = 1 << 20
 _SYNCED_AT_ONCE = 8
@@ -32,6 +33,7 @@ def sha256_of(path: str | Path) -> str:
     digest = hashlib.sha256()
     with Path(path).open("rb") as stream:
         while block := stream.read(BLOCK_BYTES):
+            moved()
             digest.update(block)
     return digest.hexdigest()
 

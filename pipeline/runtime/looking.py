@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from pipeline.errors import InputError, all_at_fault
 from pipeline.io import ReadOptions, SourceInfo, is_url
+from pipeline.io.reading import set_input_timeout
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring.events import Watch
 from pipeline.runtime.plan import looked_at, usable
@@ -32,6 +33,8 @@ class LookTask:
     """The inputs."""
     options: ReadOptions
     """How they are read."""
+    timeout_s: float
+    """Seconds within which some more of each must be read."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -70,7 +73,10 @@ def look_at_all(
     if looking is None:
         return looked_at(paths, options)
     groups = [tuple(paths[k : k + _FILES_PER_TASK]) for k in range(0, len(paths), _FILES_PER_TASK)]
-    tasks = [LookTask(number=k, paths=group, options=options) for k, group in enumerate(groups)]
+    tasks = [
+        LookTask(number=k, paths=group, options=options, timeout_s=resources.input_timeout_s)
+        for k, group in enumerate(groups)
+    ]
     watch = watch or Watch()
     with looking:
         looking.prepare("plan", watch)
@@ -97,5 +103,6 @@ def _executor(resources: Resources) -> Executor | None:
 
 def look(task: LookTask) -> Looked:
     """Look at some inputs, whatever is wrong with one of them."""
+    set_input_timeout(task.timeout_s)
     sources, faults = usable(task.paths, task.options)
     return Looked(number=task.number, sources=tuple(sources), faults=tuple(faults))

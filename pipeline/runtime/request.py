@@ -8,9 +8,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import shapely
+from shapely import MultiPolygon, Polygon
 
-from pipeline.io import ReadOptions, find_inputs, is_url, open_source, sha256_of, shown
+from pipeline.io import ReadOptions, SpatialReference, find_inputs, is_url, open_source, sha256_of, shown
 from pipeline.io.footprints import read_area
+from pipeline.io.reading import one_input, set_input_timeout
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.tile_index import TileIndex
 from pipeline.runtime.cluster.serial_executor import Executor
@@ -82,6 +84,7 @@ def plan_inputs(
 
     Raises InputError if an input cannot be used; RunCancelledError or ClusterError while tasks look at many of them.
     """
+    set_input_timeout(request.resources.input_timeout_s)
     options = ReadOptions(
         crs=request.crs,
         vertical_unit=request.vertical_unit,
@@ -94,7 +97,7 @@ def plan_inputs(
         if request.bbox is None and request.aoi is None:
             return index.locations
         reference = open_source(index.locations[0], options).info.reference
-        area = None if request.aoi is None else read_area(request.aoi, reference)
+        area = None if request.aoi is None else _area(request.aoi, reference)
         if request.bbox is not None:
             box = shapely.box(*request.bbox)
             area = box if area is None else box & area
@@ -103,7 +106,7 @@ def plan_inputs(
     paths = find_inputs(request.inputs, only_files=request.only_files, cut=cut)
     if request.aoi is not None:
         reference = open_source(paths[0], options).info.reference
-        options = dataclasses.replace(options, aoi=read_area(request.aoi, reference))
+        options = dataclasses.replace(options, aoi=_area(request.aoi, reference))
     watch = Watch(cancelled=cancelled, listener=progress.listener)
     look = functools.partial(look_at_all, resources=request.resources, watch=watch, executor=executor)
     plan = make_plan(paths, options, request.settings, look)
@@ -115,6 +118,12 @@ def plan_inputs(
     if not any(info.has_returns for info in plan.sources):
         progress.warn("plan", "the inputs have one return per pulse: vegetation is recognized by its roughness alone")
     return plan, paths
+
+
+def _area(path: str, reference: SpatialReference) -> Polygon | MultiPolygon:
+    """The area of interest, read within the time limit of an input."""
+    with one_input(shown(path)):
+        return read_area(path, reference)
 
 
 def input_file(name: str) -> InputFile:

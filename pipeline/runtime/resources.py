@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
+from pipeline.errors import SettingsError
+from pipeline.io.reading import INPUT_TIMEOUT_S
 from pipeline.runtime.cluster.priorities import Traffic
 from pipeline.runtime.cluster.tls import TlsFiles
 from pipeline.runtime.isolation.isolated_items import IsolationLimits
+
+READING_MEMORY_BYTES = 4 * 2**30
+"""Memory of a process that reads an input. Not a setting: readers hold pieces, and the largest take a tenth of this."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -27,6 +33,8 @@ class Resources:
     """Wall-clock seconds that one isolated building may take."""
     building_memory_bytes: int = IsolationLimits.memory_bytes
     """Memory that the process of one isolated building may take."""
+    input_timeout_s: float = INPUT_TIMEOUT_S
+    """Wall-clock seconds within which some more of an input must be read."""
     scratch: str | None = None
     """A folder for intermediate results that all workers see; by default the run directory, or a temporary folder of
     this machine where that is a URL."""
@@ -39,6 +47,11 @@ class Resources:
     performance_report: str | None = None
     """File for a page about the workers' time; None writes none."""
 
+    def __post_init__(self) -> None:
+        """Refuse a time limit that no input can keep."""
+        if not 0.0 < self.input_timeout_s < math.inf:
+            raise SettingsError([f"the time-out of an input is {self.input_timeout_s:g} s: use more than 0"])
+
     @property
     def isolation(self) -> IsolationLimits | None:
         """Limits of the supervised child processes; None models buildings in the workers themselves."""
@@ -46,6 +59,13 @@ class Resources:
         if self.isolate is False or (self.isolate is None and serial):
             return None
         return IsolationLimits(timeout_s=self.building_timeout_s, memory_bytes=self.building_memory_bytes)
+
+    @property
+    def reading(self) -> IsolationLimits | None:
+        """Limits of the child processes that read inputs; None reads them in the workers themselves."""
+        if self.isolation is None:
+            return None
+        return IsolationLimits(timeout_s=self.input_timeout_s, memory_bytes=READING_MEMORY_BYTES)
 
 
 SERIAL = Resources(workers=0)

@@ -73,6 +73,8 @@ class RunContext:
     """Holds the intermediate results."""
     isolation: IsolationLimits | None = None
     """Limits of the child processes that model buildings; None models buildings in the workers themselves."""
+    reading: IsolationLimits | None = None
+    """Limits of the child processes that read inputs; None reads them in the workers themselves."""
     kept: KeptFiles = dataclasses.field(default_factory=KeptFiles)
     """Files of earlier runs that no task of this one has read yet."""
 
@@ -288,7 +290,12 @@ def run_context(
             progress.timings["start workers"] = time.perf_counter() - starting
             check_memory(plan, engine.memory_limit_bytes)
             context = RunContext(
-                plan=plan, progress=progress, executor=engine, scratch=opened, isolation=resources.isolation
+                plan=plan,
+                progress=progress,
+                executor=engine,
+                scratch=opened,
+                isolation=resources.isolation,
+                reading=resources.reading,
             )
             try:
                 with context.blaming_lost_scratch():

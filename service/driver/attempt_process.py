@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.isolation.child_pool import ChildPool
-from pipeline.runtime.isolation.messages import Finished, OutOfMemory
+from pipeline.runtime.isolation.messages import Finished, OutOfMemory, Progressed
 from pipeline.runtime.isolation.supervision import SupervisedChild, system_kills
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.scratch.folder import PULSE
@@ -221,7 +221,7 @@ class _Attended:
         match word:
             case Event():
                 self._held.record(word)
-            case Moved():
+            case Moved() | Progressed():
                 self._held.move()
             case Note():
                 self._held.note(word.message, level=word.level, **word.facts)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 import math
 import os
@@ -23,7 +22,7 @@ from service.driver.disk_watch import LOOK_S, DiskWatch
 from service.driver.janitor import tidy
 from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.driver.logs import configure, quieten
-from service.driver.progress import step_s
+from service.driver.progress import StepLimits
 from service.driver.shared_cluster import SharedCluster
 from service.driver.webhooks import Sender
 from service.errors import LeaseLostError, StoreError
@@ -285,7 +284,9 @@ class Driver:
             lease_s=settings.lease_s,
             poll_s=settings.poll_s,
             claimed_s=claimed_s,
-            step_s=functools.partial(step_s, stall_s=settings.stall_s, building_timeout_s=settings.building_timeout_s),
+            step_s=StepLimits(
+                stall_s=settings.stall_s, input_s=settings.input_timeout_s, building_s=settings.building_timeout_s
+            ).of,
         )
         with self._lock:
             self._held[job.job_id] = held

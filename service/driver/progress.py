@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -74,6 +75,7 @@ WORDS = MappingProxyType(
 """Descriptions of stages. Those without a weight belong to a comparison and are short."""
 
 _LAST = 99
+_READING = frozenset({"inputs", "plan", "ingest"})
 _START_S = 60.0
 """Seconds for the start of processes, on a busy machine with cold caches."""
 
@@ -108,25 +110,28 @@ def percent(stage: str, done: int, total: int, weights: Mapping[str, int] = WEIG
     return min(_LAST, int(before + weights[stage] * share))
 
 
-def step_s(stage: str, *, stall_s: float, building_timeout_s: float) -> float:
-    """Seconds that one step of a stage may take: an attempt that says nothing for longer stands still.
-
-    Parameters
-    ----------
-    stage : str
-        The stage; an unknown one is like most, and an empty one is the start of the process.
-    stall_s : float
-        Limit of most stages: of one task, one file, one building.
-    building_timeout_s : float
-        Limit of a building. One that ends its process is tried again, and its points are saved.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StepLimits:
+    """How long one step of a stage may take: an attempt that says nothing for longer stands still.
 
     Examples
     --------
-    >>> step_s("split", stall_s=600.0, building_timeout_s=600.0)
-    600.0
-    >>> step_s("reconstruct", stall_s=600.0, building_timeout_s=600.0)
-    1860.0
+    >>> limits = StepLimits(stall_s=600.0, input_s=600.0, building_s=600.0)
+    >>> limits.of("split"), limits.of("ingest"), limits.of("reconstruct")
+    (600.0, 660.0, 1860.0)
     """
-    if stage == "reconstruct":
-        return max(stall_s, 3.0 * building_timeout_s + _START_S)
-    return stall_s if stage else max(stall_s, 2.0 * _START_S)
+
+    stall_s: float
+    """Seconds of most stages: of one task."""
+    input_s: float
+    """Seconds after which an input of which nothing more can be read is refused by its name, which comes first."""
+    building_s: float
+    """Seconds after which a building's process is ended. It is then tried again, and its points are saved."""
+
+    def of(self, stage: str) -> float:
+        """Seconds of a stage; an unknown one is like most, and an empty one is the start of the process."""
+        if stage == "reconstruct":
+            return max(self.stall_s, 3.0 * self.building_s + _START_S)
+        if stage in _READING:
+            return max(self.stall_s, self.input_s + _START_S)
+        return self.stall_s if stage else max(self.stall_s, 2.0 * _START_S)

@@ -176,3 +176,12 @@ def test_degrees_without_a_crs_are_not_taken_for_metres(tmp_path):
     # A small scene at the origin in metres is not mistaken.
     np.savetxt(tmp_path / "b.xyz", (degrees - degrees[0]) * [5e3, 1e4, 1.0], fmt="%.4f")
     assert open_source(tmp_path / "b.xyz").info.point_count == 500
+
+
+@pytest.mark.parametrize("unit", ["0", "1e308", "1e-300"])
+def test_a_unit_that_no_coordinates_are_in_is_refused(unit: str) -> None:
+    plane = f'LOCAL_CS["site",UNIT["own",{unit}]]'
+    standing = 'VERT_CS["up",VERT_DATUM["x",2005],UNIT["own",{}]]'
+    for wkt in (plane, f'COMPD_CS["site",LOCAL_CS["site",UNIT["m",1]],{standing.format(unit)}]'):
+        with pytest.raises(CrsError, match=r"a\.laz: CRS 'site' has a unit of .* m\. Give --crs"):
+            resolve_reference(path="a.laz", header_crs=pyproj.CRS.from_wkt(wkt))

@@ -68,7 +68,7 @@ def test_shares_hold_the_points_of_the_file_in_its_order(written, name, of, box)
 
 def test_a_file_with_too_large_chunks_is_its_first_share(written, monkeypatch):
     path = written("laz.6")
-    monkeypatch.setattr("pipeline.io.las.CHUNK_SIZE_LIMIT", 10_000)
+    monkeypatch.setattr("pipeline.io.laz_chunks.CHUNK_SIZE_LIMIT", 10_000)
     source = open_source(path)
     whole, _ = read_whole(source)
     first, second = read_in_shares(source, 2)[0]

@@ -1,15 +1,22 @@
 """Ingest: every point lands in its own tile, once, also when a task runs twice."""
 
+import dataclasses
+import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import chores
 import laspy
 import numpy as np
 import pytest
+from las_files import write_las
 
+from pipeline.errors import InconsistentInputError, UnreadableInputError
 from pipeline.io import ReadOptions
 from pipeline.io.las import LasFile
 from pipeline.io.records import PointRecords
+from pipeline.runtime.isolation.isolated_items import IsolationLimits
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.ingest import IngestTask, ingest_file
 from pipeline.runtime.stages.ingested import spread_m
@@ -106,3 +113,65 @@ def test_one_stray_point_does_not_put_all_points_on_one_line(
     found = ingest_file(task(tmp_path / "a.xyz", tmp_path / "scratch"))
     assert spread_m([found]) > 5.0
     assert sum(found.points_by_tile.values()) == 2000 + (stray[0] == 5e7)
+
+
+LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
+
+
+@pytest.mark.slow
+def test_a_file_read_in_a_process_of_its_own_is_the_same(suburb: Path, tmp_path: Path) -> None:
+    here = ingest_file(task(suburb, tmp_path / "here"))
+    there = ingest_file(dataclasses.replace(task(suburb, tmp_path / "there"), limits=LIMITS))
+    assert there == here
+    mine, others = stored(tmp_path / "here"), stored(tmp_path / "there")
+    assert mine.keys() == others.keys()
+    assert all((points == others[key]).all() for key, points in mine.items())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("chore", "limits", "words"),
+    [
+        (chores.never_end, dataclasses.replace(LIMITS, timeout_s=1.0), r"nothing more of it could be read for 1 s"),
+        (
+            chores.end_by_signal,
+            LIMITS,
+            r"it cannot be read: its process was ended by signal 11 \(SIGSEGV\), also alone",
+        ),
+        (
+            chores.ask_for_too_much,
+            LIMITS,
+            r"it cannot be read: it asked for more than the 1 GiB that a reader may take",
+        ),
+    ],
+)
+def test_a_reader_that_hangs_crashes_or_takes_all_memory_refuses_its_file(
+    chore: Callable[[object], None],
+    limits: IsolationLimits,
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(chores.__file__).parent), prepend=os.pathsep)
+    monkeypatch.setattr("pipeline.runtime.stages.ingest._ingest_watched", chore)
+    job = dataclasses.replace(task(tmp_path / "a.laz", tmp_path), limits=limits)
+    with pytest.raises(UnreadableInputError, match=rf"a\.laz: {words}"):
+        ingest_file(job)
+
+
+@pytest.mark.parametrize(("alone", "refused"), [(300, True), (90, False)])
+def test_points_scattered_over_the_earth_are_refused_before_each_tile_has_files(
+    tmp_path: Path, alone: int, refused: bool
+) -> None:
+    draw = np.random.default_rng(2)
+    house = draw.uniform(0.0, 30.0, (2000, 3))
+    far = np.column_stack([draw.uniform(1e3, 2e6, (alone, 2)), np.zeros(alone)])
+    job = task(write_las(tmp_path / "a.las", np.concatenate([house, far])), tmp_path)
+    if not refused:
+        assert sum(ingest_file(job).points_by_tile.values()) == 2000 + alone
+        return
+    with pytest.raises(
+        InconsistentInputError, match=r"a\.las: 300 of the first 2300 points lie scattered over 300 tiles"
+    ):
+        ingest_file(job)
+    assert not list(tmp_path.glob("points/*"))

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import chores
 import psutil
 import pytest
 from faults.asked import environment
@@ -408,3 +409,12 @@ def test_every_fault_harms_only_its_building_and_leaves_record_and_bundle(
     for name in lost - {victims["crash_gather"]}:
         assert hurt[name]["geometry"] is not None, "its place is known"
         assert hurt[name]["input_hash"] == good[name]["input_hash"]
+
+
+@pytest.mark.slow
+def test_an_item_that_reports_progress_may_take_longer_than_the_limit(
+    bare: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(chores.__file__).parent), prepend=os.pathsep)
+    limits = IsolationLimits(timeout_s=5.0, memory_bytes=2**30)
+    assert list(supervise(chores.go_on, [6], limits)) == [(0, 6)]

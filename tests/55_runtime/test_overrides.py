@@ -299,8 +299,8 @@ def test_given_footprints_are_overridden_by_their_own_id(plain: Any, overridden:
             r"\[kmeans\] cannot .* use roof, plan, roof-type, guides, arrangement",
         ),
         ("[[building]]\nbuilding_id = 'a'\nsettings.roof.colour = 1", r"\[roof\] colour is not a setting"),
-        ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POLYGO ((0 0))'", "is no WKT"),
-        ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POINT (0 0)'", "is no polygon: use POLYGON"),
+        ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POLYGO ((0 0))'", "is not WKT"),
+        ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POINT (0 0)'", "is not a polygon: use POLYGON"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POLYGON ((0 0, 1 1, 1 0, 0 1, 0 0))'", "Self-intersection"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = 5", "footprint is neither WKT nor a table"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = {file = 'none.gpkg', id = 1}", "no such file"),
@@ -324,7 +324,7 @@ def test_all_faults_are_reported_at_once_and_before_anything_is_touched(
     with pytest.raises(SettingsError, match="cannot be read"):
         read_overrides(tmp_path / "none.toml", METRES, RunSettings())
     (tmp_path / "bad.toml").write_text("[[building")
-    with pytest.raises(SettingsError, match="is no TOML"):
+    with pytest.raises(SettingsError, match="is not TOML"):
         read_overrides(tmp_path / "bad.toml", METRES, RunSettings())
 
 

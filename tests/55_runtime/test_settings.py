@@ -110,7 +110,7 @@ def test_a_toml_file_and_the_command_line_meet(tmp_path: Path) -> None:
 def test_a_settings_file_that_is_no_toml_is_named(tmp_path: Path) -> None:
     path = tmp_path / "run.toml"
     path.write_text("classes = trust")
-    with pytest.raises(SettingsError, match=r"run.toml is no TOML"):
+    with pytest.raises(SettingsError, match=r"run.toml is not TOML"):
         RunSettings.from_toml(str(path), {})
 
 
@@ -122,3 +122,23 @@ def test_an_old_name_of_a_setting_is_rejected_with_the_new_one(old: str, new: st
     for table in tables:
         with pytest.raises(SettingsError, match=rf"\[{table}\] {old} is not a setting: it is called {new} now"):
             RunSettings.from_mapping({table: {old: 1}})
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"[settings]\nmethod = " + b"[" * 5000 + b"]" * 5000, "is not TOML: its brackets are nested too deeply"),
+        (b"[settings]\nhalo_m = " + b"9" * 5000, "cannot be read: a number has thousands of digits"),
+        (b"[settings]\nhalo_m = " + b"9" * 400, r"halo_m is 9+\.\.\.9+: use a finite number"),
+        (b"[settings]\nlattice_x_m = -" + b"9" * 400, r"lattice_x_m is -9+\.\.\.9+: use a finite number"),
+        (b"settings = 3", "has settings that are not a table"),
+        (b"[settings]\nmethod = '\xe9'", "is not TOML: byte 21 is not UTF-8: save it as UTF-8"),
+        (b"[settings]\nmethod = '" + b"x" * 70_000 + b"'", r"method is 'x+\.\.\.x+'"),
+    ],
+)
+def test_whatever_a_settings_file_holds_is_refused_in_a_line(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "run.toml"
+    path.write_bytes(content)
+    with pytest.raises(SettingsError, match=words) as refusal:
+        RunSettings.from_toml(str(path), {})
+    assert len(str(refusal.value)) < 2000

@@ -45,11 +45,11 @@ def test_an_attempt_that_ends_by_itself_is_tried_again_and_then_the_job_fails(
     job = apart.submit()
     apart.driver()
     done = apart.over(job)
-    assert (done.status, done.attempt, done.own_ends, done.own_end_stage) == (JobStatus.FAILED, 2, 2, "plan")
+    assert (done.status, done.attempt, done.own_ends, done.own_end_stage) == (JobStatus.FAILED, 2, 2, "split")
     assert done.failure is not None
     assert done.failure.fault is Fault.STALLED
     assert words in done.failure.detail
-    assert "2 attempts in a row ended by themselves at stage plan" in done.failure.detail
+    assert "2 attempts in a row ended by themselves at stage split" in done.failure.detail
     assert done.lost_attempts == 0
 
 
@@ -66,7 +66,7 @@ def test_other_slots_go_on_while_one_stands_still(apart: Bench) -> None:
     apart.work = hostile_attempts.loop_unless_urgent
     stuck = apart.submit()
     apart.driver(driver_jobs=2, stall_s=LONG_S)
-    wait_for(lambda: apart.store.get(stuck.job_id).stage == "plan", "the loop")
+    wait_for(lambda: apart.store.get(stuck.job_id).stage == "split", "the loop")
     for _ in range(3):
         assert apart.over(apart.submit(priority=1)).status is JobStatus.SUCCESSFUL
     assert apart.store.get(stuck.job_id).status is JobStatus.RUNNING
@@ -78,7 +78,7 @@ def test_a_dismissed_job_ends_although_its_process_does_not_hear(apart: Bench) -
     apart.work = hostile_attempts.keep_the_interpreter
     job = apart.submit()
     apart.driver(stall_s=LONG_S)
-    wait_for(lambda: apart.store.get(job.job_id).stage == "plan", "the loop")
+    wait_for(lambda: apart.store.get(job.job_id).stage == "split", "the loop")
     apart.store.dismiss(job.job_id)
     assert apart.over(job).status is JobStatus.DISMISSED
     assert not apart.folder.job(job.job_id).exists()
@@ -91,7 +91,7 @@ def test_a_driver_that_ends_hands_the_attempt_back_and_the_next_one_goes_on(
     apart.work = work
     job = apart.submit()
     driver = apart.driver(drain_s=0.0, stall_s=LONG_S)
-    wait_for(lambda: apart.store.get(job.job_id).stage in {"split", "plan"}, "the work")
+    wait_for(lambda: apart.store.get(job.job_id).stage == "split", "the work")
     driver.stop()
     apart.join()
     assert apart.codes == [0]

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from pipeline.errors import SettingsError
-from pipeline.parameters import Parameters, build, parameter
+from pipeline.parameters import Parameters, build, parameter, read_toml
 
 TABLE = "diff"
 """The table of the settings file."""
@@ -98,12 +96,7 @@ def read_settings(path: str | None, options: Mapping[str, Any]) -> DiffSettings:
     """
     table: dict[str, Any] = {}
     if path is not None:
-        try:
-            document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError) as error:
-            raise SettingsError([f"settings file {path} cannot be read: {error}"]) from error
-        except tomllib.TOMLDecodeError as error:
-            raise SettingsError([f"settings file {path} is no TOML: {error}"]) from error
+        document = read_toml(path, "settings file")
         found = document.get(TABLE)
         if not isinstance(found, dict):
             held = ", ".join(document) or "nothing"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import faulthandler
+import functools
 import importlib
 import os
 import pickle
@@ -30,11 +31,13 @@ from pipeline.runtime.isolation.messages import (
     Frames,
     Heard,
     OutOfMemory,
+    Progressed,
     Raised,
     Ready,
     Said,
     frame,
 )
+from pipeline.runtime.isolation.progress_reports import item_begins
 from pipeline.runtime.isolation.start_up import start_own_process
 
 NAME = "gablework-child"
@@ -164,6 +167,7 @@ def _process(batch: Batch, outgoing: int) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (wanted, hard))
     for index, item in batch.items:
         _send(outgoing, Begun(index))
+        item_begins(functools.partial(_send, outgoing, Progressed(index)))
         try:
             _send(outgoing, Finished(index, batch.function(item)))
         except MemoryError as error:

@@ -86,6 +86,7 @@ def supervise(
     second_chance: bool = True,
     on_second_chance: Callable[[int, str], None] = lambda _index, _detail: None,
     loads: Sequence[str] | None = None,
+    one: str = "building",
 ) -> Iterator[tuple[int, Result | Loss]]:
     """Call a function on items in a child process and survive the death of the child.
 
@@ -100,6 +101,8 @@ def supervise(
         Whether an item that killed its process is tried once more, alone in a fresh one, before it is given up.
     on_second_chance : callable
         Gets the index of such an item and what happened to its process.
+    one : str
+        The word for an item in messages.
 
     Raises
     ------
@@ -117,7 +120,12 @@ def supervise(
         end: ChildEnd | None = None
         with borrowed_child(cancelled, fresh=alone, loads=loads) as child:
             for message in child.work(
-                function, lot, timeout_s=limits.timeout_s, memory_bytes=limits.memory_bytes, cancelled=cancelled
+                function,
+                lot,
+                timeout_s=limits.timeout_s,
+                memory_bytes=limits.memory_bytes,
+                cancelled=cancelled,
+                one=one,
             ):
                 if isinstance(message, ChildEnd):
                     end = message

@@ -7,6 +7,7 @@ supervisor                          child
                            ◀──────  Begun(index)             before an item begins: the one to blame if the child dies
                            ◀──────  Said(content)            what a long item reports meanwhile
     Heard(content)         ──────▶                           an answer to it, or a request to end
+                           ◀──────  Progressed(index)        now and then, from items that say that they go on
                            ◀──────  Finished(index, result)  at once, so no finished item is lost
                            ◀──────  OutOfMemory(index)       the item raised MemoryError; the child is not used again
                            ◀──────  Raised(index, error)     the function raised: a fault of the run, not of the item
@@ -59,6 +60,13 @@ class Ready:
 @dataclasses.dataclass(frozen=True)
 class Begun:
     """An item begins."""
+
+    index: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Progressed:
+    """The item goes on: its time limit begins anew."""
 
     index: int
 

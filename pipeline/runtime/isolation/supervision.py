@@ -24,6 +24,7 @@ from pipeline.runtime.isolation.messages import (
     Frames,
     Heard,
     OutOfMemory,
+    Progressed,
     Raised,
     Ready,
     Said,
@@ -163,7 +164,7 @@ class SupervisedChild:
     ) -> Iterator[Finished | ChildEnd]:
         """Process items; yields each result as it comes, and finally a `ChildEnd` if the child died or was ended.
 
-        `one` is the word for an item in messages.
+        `one` is the word for an item in messages. An item that reports progress has its whole time again.
         """
         batch = Batch(function=function, items=items, data_limit_bytes=memory_bytes + _DATA_MARGIN_BYTES)
         with contextlib.suppress(BrokenPipeError):  # its end is handled below
@@ -190,6 +191,8 @@ class SupervisedChild:
                 case Begun():
                     at_work, began, peak_bytes = message.index, time.monotonic(), 0
                     self.begun += 1
+                case Progressed():
+                    began = time.monotonic()
                 case Finished():
                     at_work = None
                     left -= 1

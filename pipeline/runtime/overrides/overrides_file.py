@@ -10,8 +10,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import math
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,8 +19,10 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import InputError, SettingsError
 from pipeline.io.crs import SpatialReference
-from pipeline.io.footprints import Footprints, read_footprints
+from pipeline.io.footprints import LARGEST_OUTLINE_M, Footprints, read_footprints
+from pipeline.io.reading import one_input
 from pipeline.methods import ReconstructSettings, method_named
+from pipeline.parameters import is_finite_number, quoted, read_toml
 from pipeline.settings import RunSettings
 
 ACTIONS = ("accept", "reject")
@@ -140,12 +140,7 @@ def read_overrides(path: str | Path, reference: SpatialReference, base: RunSetti
     `point` and WKT are in the coordinates of the run's CRS. Raises SettingsError if the file cannot be read or parsed,
     or holds faults: all of them at once.
     """
-    try:
-        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise SettingsError([f"overrides file {path} cannot be read: {error}"]) from error
-    except tomllib.TOMLDecodeError as error:
-        raise SettingsError([f"overrides file {path} is no TOML: {error}"]) from error
+    document = read_toml(path, "overrides file")
     return overrides_of(document, reference, base, source=str(path), folder=Path(path).parent)
 
 
@@ -190,20 +185,20 @@ def _entry_faults(entry: Mapping[str, Any]) -> list[str]:
         faults.append(f"does nothing: give one of {', '.join(_EFFECTS)}")
     action = entry.get("action")
     if "action" in entry and action not in ACTIONS:
-        faults.append(f"action is {action!r}: use one of {', '.join(ACTIONS)}")
+        faults.append(f"action is {quoted(action)}: use one of {', '.join(ACTIONS)}")
     besides = [key for key in _EFFECTS if key in entry and key != "action"]
     if action == "reject" and besides:
         faults.append(f"rejects and gives {', '.join(besides)}: what is no building is not modelled")
     faults.extend(
-        f"{key} is {entry[key]!r}: use text"
+        f"{key} is {quoted(entry[key])}: use text"
         for key in ("building_id", "method", "preset", "note")
         if key in entry and (not isinstance(entry[key], str) or (key != "note" and not entry[key]))
     )
     source_id = entry.get("source_id", "")
     if "source_id" in entry and (isinstance(source_id, bool) or not isinstance(source_id, int | str)):
-        faults.append(f"source_id is {source_id!r}: use text or a whole number")
+        faults.append(f"source_id is {quoted(source_id)}: use text or a whole number")
     if "point" in entry and not _is_point(entry["point"]):
-        faults.append(f"point is {entry['point']!r}: use [easting, northing] in the CRS's units")
+        faults.append(f"point is {quoted(entry['point'])}: use [easting, northing] in the CRS's units")
     settings = entry.get("settings", {})
     if not isinstance(settings, Mapping) or not all(isinstance(table, Mapping) for table in settings.values()):
         faults.append(f"settings are no tables: write [{TABLE}.settings.roof], or the method's name for roof")
@@ -211,11 +206,7 @@ def _entry_faults(entry: Mapping[str, Any]) -> list[str]:
 
 
 def _is_point(value: Any) -> bool:
-    return (
-        isinstance(value, list)
-        and len(value) == 2
-        and all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value)
-    )
+    return isinstance(value, list) and len(value) == 2 and all(is_finite_number(v) for v in value)
 
 
 def _modelling_faults(override: Override, base: RunSettings) -> list[str]:
@@ -264,11 +255,18 @@ class _Reading:
         if not isinstance(value, Mapping) or not {"file", "id"} <= set(value) <= set(names):
             faults.append('footprint is neither WKT nor a table such as { file = "outlines.gpkg", id = "12" }')
             return None
-        path = self._folder / str(value["file"])
+        wrong = [
+            name for name, one in value.items() if not isinstance(one, str) and (name != "id" or type(one) is not int)
+        ]
+        if wrong:
+            faults.extend(f"footprint has the {name} {quoted(value[name])}: use text" for name in wrong)
+            return None
+        path = self._folder / value["file"]
         key = (str(path), value.get("layer"), value.get("id_column"))
         try:
             if key not in self._files:
-                self._files[key] = read_footprints(path, self._reference, layer=key[1], id_column=key[2])
+                with one_input(str(path)):
+                    self._files[key] = read_footprints(path, self._reference, layer=key[1], id_column=key[2])
         except InputError as error:
             faults.append(f"footprint: {error}")
             return None
@@ -276,7 +274,7 @@ class _Reading:
         wanted = str(value["id"])
         if wanted not in found.ids:
             lost = [f"{issue.problem}: {issue.detail}" for issue in found.issues if issue.source_id == wanted]
-            problem = lost[0] if lost else f"none of its {len(found)} polygons has the id {wanted!r}"
+            problem = lost[0] if lost else f"none of its {len(found)} polygons has the id {quoted(wanted)}"
             faults.append(f"footprint: {path}: {problem}")
             return None
         return found.polygons[found.ids.index(wanted)]
@@ -285,15 +283,20 @@ class _Reading:
         try:
             geometry = shapely.force_2d(shapely.from_wkt(text))
         except shapely.errors.ShapelyError as error:
-            faults.append(f"footprint {text[:60]!r} is no WKT ({error})")
+            faults.append(f"footprint {text[:60]!r} is not WKT ({error})")
             return None
         if not isinstance(geometry, Polygon | MultiPolygon) or geometry.is_empty:
-            faults.append(f"footprint {text[:60]!r} is no polygon: use POLYGON or MULTIPOLYGON")
+            faults.append(f"footprint {text[:60]!r} is not a polygon: use POLYGON or MULTIPOLYGON")
             return None
         if not geometry.is_valid:
             faults.append(f"footprint {text[:60]!r} is invalid: {shapely.is_valid_reason(geometry)}")
             return None
         unit = self._reference.horizontal_unit_m
+        west, south, east, north = geometry.bounds
+        side = max(east - west, north - south) * unit
+        if side > LARGEST_OUTLINE_M:
+            faults.append(f"footprint {text[:60]!r} is {side:.6g} m wide or long: use at most {LARGEST_OUTLINE_M:g} m")
+            return None
         if unit == 1.0:
             return geometry
         scaled = shapely.transform(geometry, lambda xy: xy * unit)

@@ -13,6 +13,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.errors import SettingsError, UnreadableInputError
 from pipeline.io import shown
 from pipeline.io.footprints import FootprintIssue, Footprints, read_footprints
+from pipeline.io.reading import one_input
 from pipeline.model import GivenHeights
 from pipeline.roof.given_heights import given_heights
 from pipeline.roof.settings import FootprintSettings
@@ -62,7 +63,8 @@ def footprints_of_run(path: str | None, plan: Plan, settings: FootprintSettings)
     and SettingsError if columns are named, but no file.
     """
     if path is not None:
-        return _given_footprints(path, plan, settings)
+        with one_input(shown(path)):
+            return _given_footprints(path, plan, settings)
     if settings.columns:
         names = ", ".join(settings.columns)
         raise SettingsError([f"[footprints] {names} name columns of given footprints, and none are given: give them"])

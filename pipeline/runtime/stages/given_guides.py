@@ -10,6 +10,7 @@ import shapely
 
 from pipeline.io import shown
 from pipeline.io.guides import read_guides
+from pipeline.io.reading import one_input
 from pipeline.model import Guide
 from pipeline.roof.settings import GUIDE_REACH_M
 from pipeline.runtime.plan import Plan
@@ -51,7 +52,8 @@ def given_guides(path: str, plan: Plan, kind_column: str) -> GivenGuides:
     Raises InputError if the file cannot be used.
     """
     area = data_area(plan)
-    found = read_guides(path, plan.reference, kind_column=kind_column, area=area)
+    with one_input(shown(path)):
+        found = read_guides(path, plan.reference, kind_column=kind_column, area=area)
     shapely.prepare(area)
     inside = [guide for guide in found.guides if area.intersects(guide.line)]
     warnings = [*found.warnings, *(str(issue) for issue in found.issues[:_ISSUES_NAMED])]

@@ -7,6 +7,7 @@ at once, each a share of it.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import shutil
 from collections import Counter
@@ -19,10 +20,14 @@ import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, UnreadableInputError
 from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
+from pipeline.io.reading import heard_by, moved, one_input, stalled
 from pipeline.io.records import Share
 from pipeline.io.remote_file import RemoteFile, file_at
 from pipeline.io.storage import sha256_of
-from pipeline.model import IntArray, PointCloud
+from pipeline.io.strays import MOST_STRAYS
+from pipeline.model import IntArray, PointCloud, Reason
+from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
+from pipeline.runtime.isolation.progress_reports import report_progress
 from pipeline.runtime.plan import is_fetched_by_nodes, shares_of
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
@@ -38,6 +43,9 @@ _CHUNK_POINTS = 250_000
 _LINE_SPREAD_M = 0.05
 """Points that stray less from one line make no surface. Not a setting: the noise of a scanner is of this size."""
 _TWO_BYTES = 2**16
+_MANY_TILES, _FEW_POINTS = 100, 4
+"""Points are scattered if more than `MOST_STRAYS` of them lie in tiles with too few, and these are too many tiles. Not
+settings: a survey fills its tiles, except for some at its border."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,6 +66,13 @@ class IngestTask:
     """Header facts from the plan."""
     share: Share | None = None
     """The share; None for the whole file."""
+    limits: IsolationLimits | None = None
+    """Limits of the child process that reads it; None reads it in the process that runs the task."""
+
+    @property
+    def supervises(self) -> bool:
+        """Whether it is read in a child process of the process that runs the task."""
+        return self.limits is not None
 
 
 def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
@@ -81,6 +96,7 @@ def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
                 scratch=context.scratch,
                 known=file,
                 share=share,
+                limits=context.reading,
             )
             key = key_of(path, file.file_size, written, task.options, task.grid, share)
             tasks[Place("ingest", task.part, key)] = task
@@ -160,9 +176,41 @@ def to_records(cloud: PointCloud) -> npt.NDArray[np.void]:
 def ingest_file(task: IngestTask) -> Ingested:
     """Read one file, or a share of it, and bucket its points by tile; a file behind a URL is fetched meanwhile.
 
-    The points are in scratch under `points/<tile>/<part>.bin`. Raises InputError if the file cannot be used.
+    With limits it is read in a supervised child process: a decoder that hangs, crashes or takes all memory ends that
+    process alone. The points are in scratch under `points/<tile>/<part>.bin`. Raises InputError if the file cannot be
+    used, or reading it breaks the limits.
     """
     task.scratch.check_cancelled()
+    if task.limits is None:
+        with one_input(shown(task.path)):
+            return _ingest_here(task)
+    cancelled = functools.partial(_cancelled, task.scratch)
+    ((_, found),) = supervise(_ingest_watched, [task], task.limits, cancelled, loads=(), one="reader")
+    if isinstance(found, Loss):
+        raise _lost(task, found, task.limits)
+    return found
+
+
+def _cancelled(scratch: Scratch) -> bool:
+    return scratch.cancelled
+
+
+def _lost(task: IngestTask, loss: Loss, limits: IsolationLimits) -> InputError:
+    """The error for a file whose reading ended its process."""
+    name = shown(task.path)
+    if loss.reason is Reason.TIMED_OUT:
+        return stalled(name, limits.timeout_s)
+    return UnreadableInputError(name, f"it cannot be read: {loss.detail}", "Get the file again, or write it again")
+
+
+def _ingest_watched(task: IngestTask) -> Ingested:
+    """As `ingest_file`, in the child process."""
+    with heard_by(report_progress):
+        return _ingest_here(task)
+
+
+def _ingest_here(task: IngestTask) -> Ingested:
+    """As `ingest_file`, in this process."""
     if not is_url(task.path):
         return _ingested(task)
     if task.known is not None and is_fetched_by_nodes(task.known, task.options):
@@ -171,7 +219,7 @@ def ingest_file(task: IngestTask) -> Ingested:
     copy = task.scratch.path("fetched", uuid4().hex, f"points{file.suffix}")
     try:
         known = task.known if task.known is not None and task.known.is_of(file) else None
-        file.fetch(copy, task.scratch.check_cancelled)
+        file.fetch(copy, functools.partial(_between_pieces, task.scratch))
         if known is not None:
             now = copy.stat()
             same = (now.st_size, file.stat().st_mtime_ns) == (known.file_size, known.modified_ns)
@@ -182,6 +230,12 @@ def ingest_file(task: IngestTask) -> Ingested:
         raise fault.of(shown(task.path), str(copy)) from None
     finally:
         shutil.rmtree(copy.parent, ignore_errors=True)
+
+
+def _between_pieces(scratch: Scratch) -> None:
+    """Between two pieces of a file that is fetched."""
+    moved()
+    scratch.check_cancelled()
 
 
 def _check_unchanged(task: IngestTask) -> None:
@@ -223,7 +277,7 @@ def _ingested(task: IngestTask) -> Ingested:
         histogram = np.bincount(records["classification"])
         classes.update({int(c): int(histogram[c]) for c in np.flatnonzero(histogram)})
         multiple = multiple or bool((records["return_count"] > 1).any())
-        counts.update(_append_by_tile(records, x, y, task, suffix, content))
+        counts.update(_append_by_tile(records, x, y, task, suffix, content, counts))
     sha256 = "" if is_url(task.path) else _digest_of(task)
     _check_unchanged(task)
     for tile in counts:
@@ -258,8 +312,12 @@ def _append_by_tile(
     task: IngestTask,
     suffix: str,
     content: dict[Tile, ZoneSums],
+    before: Counter[Tile],
 ) -> Counter[Tile]:
-    """Append a chunk to the parts of its tiles, and its content to that of the file; the chunk's points by tile."""
+    """Append a chunk to the parts of its tiles, and its content to that of the file; the chunk's points by tile.
+
+    `before` has the points of the chunks before. Raises InconsistentInputError for points scattered over the Earth.
+    """
     columns, rows = task.grid.columns_rows(x_mm, y_mm)
     west, south = int(columns.min()), int(rows.min())
     height = int(rows.max()) - south + 1
@@ -269,16 +327,35 @@ def _append_by_tile(
     order = np.argsort(number.astype(np.uint16) if n_tiles <= _TWO_BYTES else number, kind="stable")
     ordered, number = np.take(records, order), number[order]
     starts = np.flatnonzero(np.diff(number, prepend=-1))
-    counts: Counter[Tile] = Counter()
-    for start, stop in zip(starts, [*starts[1:], len(ordered)], strict=True):
-        column, row = divmod(int(number[start]), height)
-        tile = Tile(west + column, south + row)
+    stops = [*starts[1:].tolist(), len(ordered)]
+    tiles = [Tile(west + place // height, south + place % height) for place in number[starts].tolist()]
+    counts = Counter({tile: stop - start for tile, start, stop in zip(tiles, starts.tolist(), stops, strict=True)})
+    _refuse_scattered(task, before + counts if len(counts) > _MANY_TILES else counts)
+    for tile, start, stop in zip(tiles, starts.tolist(), stops, strict=True):
         with task.scratch.path("points", tile.key, f"{task.part}{suffix}").open("ab") as part:
             ordered[start:stop].tofile(part)
         sums = _content_of(ordered[start:stop], tile, task.grid)
         content[tile] = content[tile] + sums if tile in content else sums
-        counts[tile] += int(stop - start)
     return counts
+
+
+def _refuse_scattered(task: IngestTask, counts: Counter[Tile]) -> None:
+    """Refuse points of which many lie alone in their tiles: each tile would cost files and tasks.
+
+    Raises InconsistentInputError. Single strays are left to the outlier filter.
+    """
+    if len(counts) <= _MANY_TILES:
+        return
+    alone = [count for count in counts.values() if count < _FEW_POINTS]
+    points = sum(counts.values())
+    if len(alone) > _MANY_TILES and sum(alone) > MOST_STRAYS * points:
+        size_m = task.grid.size_mm / MM
+        raise InconsistentInputError(
+            shown(task.path),
+            f"{sum(alone)} of the first {points} points lie scattered over {len(alone)} tiles of {size_m:g} m, with "
+            f"fewer than {_FEW_POINTS} points each",
+            "Check the scale, the columns and the file itself: its coordinates look damaged",
+        )
 
 
 def _content_of(points: npt.NDArray[np.void], tile: Tile, grid: TileGrid) -> ZoneSums:
