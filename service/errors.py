@@ -5,8 +5,8 @@ ServiceError
 ├── NoSuchJobError, NoSuchProcessError, NoSuchUploadError, NoSuchBuildingError, NoSuchOutputError, NoSuchScheduleError
 ├── NoSuchWebhookError, NoSuchDeliveryError, NoSuchCollectionError, NoSuchFeatureError
 ├── ResultNotReadyError      the job is not over yet, or was dismissed
-├── RequestError             inputs that do not fit the process: lists all faults at once
-├── OutsideAreaError         tiles far outside the area of use of their CRS: lists them all
+├── RequestError             inputs that do not fit the process: lists the faults together
+├── OutsideAreaError         tiles far outside the area of use of their CRS: lists them together
 ├── InputRefusedError        an input that is not allowed: a path outside the roots, a host that is not listed
 ├── TargetRefusedError       a URL to which webhooks are not sent
 ├── LimitError               more than this service takes
@@ -39,7 +39,49 @@ ServiceError
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+
+MOST_FAULTS = 20
+"""Faults that an answer names; further ones are counted."""
+
+
+class Further(str):
+    """The last entry of a list of faults: how many there are beyond those that are named.
+
+    >>> Further(79_980)
+    'and 79,980 more'
+    """
+
+    number: int
+
+    def __new__(cls, number: int) -> Further:
+        """The entry for a number of faults."""
+        found = super().__new__(cls, f"and {number:,} more")
+        found.number = number
+        return found
+
+
+def few(faults: Iterable[str]) -> tuple[str, ...]:
+    """The first faults, and the number of the others.
+
+    >>> few(["a"] * 22)[19:]
+    ('a', 'and 2 more')
+    """
+    named: list[str] = []
+    number = 0
+    for fault in faults:
+        if isinstance(fault, Further):
+            number += fault.number
+        elif len(named) < MOST_FAULTS:
+            named.append(fault)
+        else:
+            number += 1
+    return (*named, Further(number)) if number else tuple(named)
+
+
+def within(place: str, faults: Iterable[str]) -> list[str]:
+    """Faults of a part of a request, with its name before each."""
+    return [fault if isinstance(fault, Further) else f"{place}: {fault}" for fault in faults]
 
 
 class ServiceError(Exception):
@@ -95,7 +137,7 @@ class ResultNotReadyError(ServiceError):
 
 
 class RequestError(ServiceError):
-    """Inputs that do not fit the process; the message lists every fault.
+    """Inputs that do not fit the process; the message lists the first faults and counts the others.
 
     Parameters
     ----------
@@ -104,12 +146,12 @@ class RequestError(ServiceError):
     """
 
     def __init__(self, faults: Sequence[str]) -> None:
-        self.faults = tuple(faults)
+        self.faults = few(faults)
         super().__init__("; ".join(self.faults))
 
 
 class OutsideAreaError(ServiceError):
-    """Tiles that would lie far outside the area of use of their CRS; the message lists every one.
+    """Tiles that would lie far outside the area of use of their CRS; the message lists the first and counts the others.
 
     Parameters
     ----------
@@ -118,7 +160,7 @@ class OutsideAreaError(ServiceError):
     """
 
     def __init__(self, faults: Sequence[str]) -> None:
-        self.faults = tuple(faults)
+        self.faults = few(faults)
         super().__init__("; ".join(self.faults))
 
 

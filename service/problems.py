@@ -38,6 +38,9 @@ OWN = "urn:gablework:problem:"
 MEDIA_TYPE = "application/problem+json"
 """Media type of problem documents."""
 
+LONGEST_DETAIL = 20_000
+"""Maximum number of characters of a text in a problem document: twenty faults with long lists of what is allowed."""
+
 RETRY_AFTER_S = 30
 """Seconds after which a client may try again, if nothing better is known."""
 
@@ -148,6 +151,9 @@ FOREIGN = Kind(status=403, type_uri=f"{OWN}foreign-origin", title="The request c
 ENCODED = Kind(status=415, type_uri="about:blank", title=HTTPStatus(415).phrase)
 """A body that is compressed on the way."""
 
+AMBIGUOUS = Kind(status=400, type_uri="about:blank", title=HTTPStatus(400).phrase)
+"""A body whose length is given in two ways."""
+
 FAILURES: Mapping[Fault, Kind] = {
     Fault.INPUT: Kind(status=422, type_uri=f"{OWN}job-failed-input", title="An input could not be used"),
     Fault.SETTINGS: Kind(status=422, type_uri=f"{OWN}job-failed-settings", title="The settings could not be used"),
@@ -197,7 +203,8 @@ def document(
 
 
 def _encodable(text: str) -> str:
-    """The text without lone surrogates, which JSON can hold and UTF-8 cannot."""
+    """The text without lone surrogates, which JSON can hold and UTF-8 cannot; not all of one without end."""
+    text = text if len(text) <= LONGEST_DETAIL else f"{text[: LONGEST_DETAIL - 3]}..."
     return text.encode("utf-8", "replace").decode("utf-8")
 
 
@@ -228,13 +235,14 @@ def answer_error(error: Exception, instance: str) -> Response:
     if kind.retry:
         after = getattr(error, "retry_after_s", RETRY_AFTER_S)
         headers["Retry-After"] = str(max(1, math.ceil(after)))
-    faults = [as_inputs(fault) for fault in getattr(error, "faults", ())]
+    faults = errors.few([as_inputs(fault) for fault in getattr(error, "faults", ())])
     if kind is _AWAY or isinstance(error, errors.StoreError):
         _log.error("%s", error)
         return answer(kind, _STORE[kind.word], instance, (), headers)
     if kind is INTERNAL:
         return answer(kind, "The service has logged the fault; please report it.", instance)
-    return answer(kind, as_inputs(str(error)) or kind.title, instance, faults, headers, getattr(error, "members", None))
+    detail = as_inputs("; ".join(errors.few(error.faults)) if isinstance(error, SettingsError) else str(error))
+    return answer(kind, detail or kind.title, instance, faults, headers, getattr(error, "members", None))
 
 
 def install(app: FastAPI, routes: Sequence[BaseRoute]) -> None:

@@ -18,6 +18,9 @@ from pydantic import (
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
 from starlette.responses import Response
 
+from service.errors import MOST_FAULTS
+from service.wire.faults import FURTHER
+
 RELATIONS = "http://www.opengis.net/def/rel/ogc/1.0/"
 """Prefix of the standard's link relations."""
 
@@ -113,11 +116,23 @@ class Request(BaseModel):
     @model_validator(mode="wrap")
     @classmethod
     def _explained(cls, given: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        known, further = cls._without_most_unknown(cls.prepared(given))
         try:
-            return handler(cls.prepared(given))
+            return handler(known)
         except ValidationError as error:
             faults = [cls._explanation(fault) for fault in error.errors(include_url=False)]
+            if further:
+                count = PydanticCustomError(FURTHER, "further unknown members", {"number": further})
+                faults.append(InitErrorDetails(type=count, loc=(), input=None))
             raise ValidationError.from_exception_data(cls.__name__, faults) from None
+
+    @classmethod
+    def _without_most_unknown(cls, given: Any) -> tuple[Any, int]:
+        """The document with the first unknown members only, and the number of the others: each costs an error."""
+        if not isinstance(given, dict) or len(given) <= len(cls.model_fields) + MOST_FAULTS:
+            return given, 0
+        left = set([name for name in given if name not in cls.model_fields][MOST_FAULTS:])
+        return {name: value for name, value in given.items() if name not in left}, len(left)
 
     @classmethod
     def _explanation(cls, fault: Any) -> InitErrorDetails:

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, Wit
 from pipeline.errors import CrsError
 from pipeline.io.crs import LARGEST_COORDINATE, UNITS_M, horizontal_unit_of
 from service.drafts import Draft, Inline
-from service.errors import RequestError
+from service.errors import RequestError, within
 from service.input_policy import checked_crs
 from service.outputs.kinds import FORMATS
 from service.outputs.published import formats_of
@@ -143,7 +143,7 @@ def _completed(settings: dict[str, Any], info: ValidationInfo, *names: str) -> d
         if settings.get(name, word) != word
     ]
     completed = settings | given
-    faults += [f"settings: {fault}" for fault in settings_faults(completed)]
+    faults += within("settings", settings_faults(completed))
     if faults:
         raise FaultsError(faults)
     return completed

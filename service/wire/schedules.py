@@ -9,7 +9,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_va
 
 from pipeline.errors import SettingsError
 from pipeline.schedule import Cron
-from service.errors import RequestError
+from service.errors import RequestError, within
 from service.wire.base import Answer, Link, OneOf, Request, Time, ZonedTime, optional_members
 from service.wire.execute import Execute
 from service.wire.faults import FaultsError
@@ -124,7 +124,7 @@ class SchedulePatch(Request):
             try:
                 execute.draft(info.data["processID"] or likely)
             except RequestError as error:
-                raise FaultsError([f"execute: {fault}" for fault in error.faults]) from error
+                raise FaultsError(within("execute", error.faults)) from error
         return execute
 
 
