@@ -1,21 +1,25 @@
 """Documents in JSON that clients send: measured before anything looks at their content.
 
-While a large document is read no other Python code runs, for milliseconds, and its objects take many times its bytes.
-Therefore large ones are read in one thread, one after the other, and what no client has reason to send is refused
-here, before it is validated: at a cost that does not grow with the number of its faults.
+While a large document is read nothing else happens in the process, for milliseconds, and its objects take many times
+its bytes. Therefore large ones are read one after the other, each in a turn of the event loop of its own, and what no
+client has reason to send is refused here, before it is validated: at a cost that does not grow with its faults. A
+thread would not help: it would take its milliseconds again and again while the event loop waits for sockets.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
+
+import anyio
+from anyio.lowlevel import RunVar
+from pydantic_core import from_json
 
 from service.errors import RequestError
 
 SMALL_BYTES = 8_192
-"""Largest document that is read in the event loop: a thread would take longer."""
+"""Largest document that is read at once."""
 MAX_MEMBERS = 1_000
 """Largest number of members of an object. Most have the attributes of a building, and tables have hundreds of columns
 at most."""
@@ -25,15 +29,16 @@ BYTES_PER_VALUE, BYTES_PER_LIST = 4, 16
 """Bytes of the largest body per value, and per list or object, that a document may have. A pair of coordinates takes
 more; an empty list takes three bytes as text and sixty in memory."""
 
-_reading = ThreadPoolExecutor(max_workers=1, thread_name_prefix="bodies")
+_TOO_DEEP = f"the body is nested more than {MAX_DEPTH} levels deep: no input needs that"
+_turns: RunVar[anyio.Lock] = RunVar("_turns")
 
 
-async def read(text: bytes | str, max_bytes: int) -> Any:
+async def read(text: str, max_bytes: int) -> Any:
     """The document.
 
     Parameters
     ----------
-    text : bytes or str
+    text : str
         The JSON.
     max_bytes : int
         Bytes of the largest body that the service takes.
@@ -45,34 +50,37 @@ async def read(text: bytes | str, max_bytes: int) -> Any:
     ValueError
         It is not JSON.
     """
-    return await _apart(_read, text, max_bytes)
+    await check(text.encode("utf-8", "replace"), max_bytes)
+    return json.loads(text)
 
 
 async def check(text: bytes, max_bytes: int) -> None:
-    """Refuse what `read` refuses. The document is gone when this returns; what is not JSON is left to the framework."""
-    await _apart(_check, text, max_bytes)
-
-
-async def _apart(function: Any, text: bytes | str, max_bytes: int) -> Any:
+    """Refuse what `read` refuses. The document is gone when this returns; what is not JSON is left to the caller."""
     if len(text) <= SMALL_BYTES:
-        return function(text, max_bytes)
-    return await asyncio.get_running_loop().run_in_executor(_reading, function, text, max_bytes)
+        _check(text, max_bytes)
+        return
+    async with _turn():
+        _check(text, max_bytes)
+        await asyncio.sleep(0.0)
+
+
+def _turn() -> anyio.Lock:
+    """The lock of one event loop."""
+    try:
+        return _turns.get()
+    except LookupError:
+        made = anyio.Lock()
+        _turns.set(made)
+        return made
 
 
 def _check(text: bytes, max_bytes: int) -> None:
-    try:
-        _read(text, max_bytes)
-    except ValueError as fault:
-        if not isinstance(fault, json.JSONDecodeError | UnicodeDecodeError):
-            # the limit of Python's own, whose message names a function of Python
-            raise RequestError(["the body has a number of thousands of digits: no input needs that"]) from None
-
-
-def _read(text: bytes | str, max_bytes: int) -> Any:
-    raw = text.encode("utf-8", "replace") if isinstance(text, str) else text
     # those within texts count, too: no text has that many
-    commas, opened = raw.count(b","), raw.count(b"[") + raw.count(b"{")
-    for number, what, bytes_each in ((commas, "commas", BYTES_PER_VALUE), (opened, "lists and objects", BYTES_PER_LIST)):
+    commas, opened = text.count(b","), text.count(b"[") + text.count(b"{")
+    for number, what, bytes_each in (
+        (commas, "commas", BYTES_PER_VALUE),
+        (opened, "lists and objects", BYTES_PER_LIST),
+    ):
         if number > max_bytes // bytes_each:
             raise RequestError(
                 [
@@ -81,14 +89,12 @@ def _read(text: bytes | str, max_bytes: int) -> Any:
                 ]
             )
     try:
-        document = json.loads(text)
-    except RecursionError:
-        raise RequestError([_TOO_DEEP]) from None
+        document = from_json(text, cache_strings="none")
+    except ValueError as fault:
+        if "recursion limit" in str(fault):
+            raise RequestError([_TOO_DEEP]) from None
+        return
     _measure(document)
-    return document
-
-
-_TOO_DEEP = f"the body is nested more than {MAX_DEPTH} levels deep: no input needs that"
 
 
 def _measure(document: Any) -> None:

@@ -40,6 +40,7 @@ ServiceError
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Self
 
 MOST_FAULTS = 20
 """Faults that an answer names; further ones are counted."""
@@ -54,7 +55,7 @@ class Further(str):
 
     number: int
 
-    def __new__(cls, number: int) -> Further:
+    def __new__(cls, number: int) -> Self:
         """The entry for a number of faults."""
         found = super().__new__(cls, f"and {number:,} more")
         found.number = number

@@ -169,6 +169,7 @@ async def _whole_body(receive: Receive, headers: Headers, most: int) -> bytes | 
             raise _too_large(most)
         is_over = not message.get("more_body", False)
     whole = b"".join(held)
+    del held  # many bodies may wait for their turn
     if "json" in headers.get("content-type", "").lower():
         await bodies.check(whole, most)
     return whole

@@ -12,7 +12,7 @@ from fastapi import FastAPI, Request
 from starlette.routing import BaseRoute, Match, Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.errors import RequestError
+from service.errors import MOST_FAULTS, Further, RequestError
 from service.wire.faults import shortened
 
 
@@ -69,8 +69,10 @@ async def check_query(request: Request) -> None:
         return
     takes = f"use {', '.join(map(str, known))}" if known else "this path has no query parameters"
     given = Counter(name for name, _ in request.query_params.multi_items())
-    is_free = None in known  # the route knows the other names
-    faults = [f"query {shortened(name)} is not known: {takes}" for name in given if name not in known and not is_free]
+    unknown = [] if None in known else [name for name in given if name not in known]  # None: the route knows them
+    faults = [f"query {shortened(name)} is not known: {takes}" for name in unknown[:MOST_FAULTS]]
+    if len(unknown) > MOST_FAULTS:
+        faults.append(Further(len(unknown) - MOST_FAULTS))
     twice = [name for name, n in given.items() if n > 1 and known.get(name)]
     faults += [f"query {name} is given {given[name]} times: give it once" for name in twice]
     if faults:

@@ -94,7 +94,7 @@ def parse_crs(text: str, *, path: str) -> pyproj.CRS:
 
     try:
         return pyproj.CRS.from_user_input(text)
-    except pyproj.exceptions.CRSError as fault:
+    except (pyproj.exceptions.CRSError, RecursionError) as fault:  # PROJJSON may be nested without end
         raise CrsError(
             path,
             f"coordinate reference system {text[:80]!r} is not understood ({str(fault)[:120]})",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 from urllib.parse import urlencode
@@ -382,10 +383,9 @@ def _query(run: OpenRun, layer: Layer, asked: _Asked, given: Sequence[tuple[str,
     if unknown:
         known = f"{', '.join(sorted(_NAMES))}, or a property of its queryables"
         raise RequestError([f"query {name[:80]!r} is not known: use {known}" for name in dict.fromkeys(unknown)])
-    names = [name for name, _ in given]
-    twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
+    twice = {name: number for name, number in Counter(name for name, _ in given).items() if number > 1}
     if twice:
-        raise RequestError([f"query {name} is given {names.count(name)} times: give it once" for name in twice])
+        raise RequestError([f"query {name} is given {number} times: give it once" for name, number in twice.items()])
     filters: list[Filter] = [
         compiled(equality(name, value, layer.queryables), layer.queryables, filter_crs) for name, value in given
     ]

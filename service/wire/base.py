@@ -9,6 +9,7 @@ from urllib.parse import urlencode
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     ModelWrapValidatorHandler,
     PlainSerializer,
@@ -144,9 +145,20 @@ class Request(BaseModel):
             kind, message = "unknown", f"is not {cls.NOUN}: {fix}"
         elif kind in {"missing", "too_short", "too_long"} and len(fault["loc"]) == 1:
             context = context | {"fix": hint} if (hint := cls.HINTS.get(fault["loc"][0])) else context
-        if kind == "unknown" or "fix" in context:
+        if kind in {"unknown", FURTHER} or "fix" in context:
             kind = PydanticCustomError(kind, message, context)
         return InitErrorDetails(type=kind, loc=fault["loc"], input=fault["input"], ctx=context)
+
+
+def at_most(number: int) -> BeforeValidator:
+    """Refuses longer lists and objects before their entries are looked at: each bad one would cost an error."""
+
+    def check(given: Any) -> Any:
+        if isinstance(given, list | dict) and len(given) > number:
+            raise ValueError(f"use at most {number} entries")
+        return given
+
+    return BeforeValidator(check)
 
 
 class OneOf:

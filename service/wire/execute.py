@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError
 
@@ -12,7 +12,7 @@ from service.drafts import Draft
 from service.errors import RequestError
 from service.jobs import Subscriber
 from service.outputs import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, ECHO_OUTPUTS, OUTPUTS, OutputKind
-from service.wire.base import Request
+from service.wire.base import Request, at_most
 from service.wire.faults import FaultsError, sentences, shortened
 from service.wire.inputs import ClassifyInputs, CompareInputs, EchoInputs, JobInputs, ReconstructInputs
 from service.wire.webhooks import ReceiverUrl
@@ -32,6 +32,9 @@ KINDS: Mapping[str, Mapping[str, OutputKind]] = {
     "echo": ECHO_OUTPUTS,
 }
 """The outputs of every process."""
+
+MAX_OUTPUTS = 100
+"""Most outputs that a request may name; no process has as many."""
 
 EXAMPLE = {
     "inputs": {
@@ -106,7 +109,7 @@ class Retry(Request):
         description="Inputs that replace those of the job; null takes one away. Tables of `settings` are merged: "
         "settings that are not named stay, null takes one away.",
     )
-    outputs: dict[str, WantedOutput] | None = Field(
+    outputs: Annotated[dict[str, WantedOutput], at_most(MAX_OUTPUTS)] | None = Field(
         default=None, description="The wanted outputs; those of the job if it is left out."
     )
 
@@ -147,7 +150,7 @@ class Execute(Request):
         description="By the names that the process's description lists; each a value, a reference `{href}`, a value "
         "with a media type `{value, encoding, mediaType}`, or a list of these.",
     )
-    outputs: dict[str, WantedOutput] | None = Field(
+    outputs: Annotated[dict[str, WantedOutput], at_most(MAX_OUTPUTS)] | None = Field(
         default=None, description="The wanted outputs; all if it is left out."
     )
     mode: Literal["async", "auto"] = Field(default="async", description="Jobs run asynchronously.")
@@ -166,6 +169,9 @@ class Execute(Request):
         RequestError
             Naming every fault of inputs and outputs.
         """
+        tiles = self.inputs.get("tiles")
+        if max_inputs is not None and isinstance(tiles, list) and len(tiles) > max_inputs:
+            raise RequestError([f"tiles has {len(tiles)} entries: use at most {max_inputs}"])
         faults: list[str] = []
         kinds, outputs, inputs = KINDS[process_id], None, None
         try:
@@ -177,9 +183,6 @@ class Execute(Request):
             faults += [f"{shortened(name)} is not an output: use {', '.join(kinds)}" for name in unknown]
             outputs = tuple(name for name in kinds if name in self.outputs)
             faults += [fault for name in outputs for fault in self.outputs[name].faults(name, kinds[name])]
-        tiles = self.inputs.get("tiles")
-        if max_inputs is not None and isinstance(tiles, list) and len(tiles) > max_inputs:
-            faults.append(f"tiles has {len(tiles)} entries: use at most {max_inputs}")
         if inputs is None or faults:
             raise RequestError(faults)
         draft = inputs.draft(process_id, outputs)

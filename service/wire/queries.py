@@ -14,6 +14,9 @@ _MILLISECOND = dt.timedelta(microseconds=999)
 """The rest of the millisecond that a time in an answer names."""
 _LAST = dt.datetime.max.replace(tzinfo=dt.UTC)
 
+MAX_WORDS = 100
+"""Most words of one query parameter."""
+
 Limit = Annotated[int, Field(ge=1, le=1000, description="Maximum number of entries of the page.")]
 Offset = Annotated[int, Field(ge=0, le=2**31 - 1, description="Number of entries before the page.")]
 
@@ -25,6 +28,8 @@ def words(allowed: Sequence[str] = ()) -> Callable[[list[str] | None], list[str]
         if values is None:
             return None
         found = list(dict.fromkeys(word.strip() for value in values for word in value.split(",") if word.strip()))
+        if len(found) > MAX_WORDS:
+            raise ValueError(f"use at most {MAX_WORDS} words")
         if allowed and not set(found) <= set(allowed):
             raise ValueError(f"use one of {', '.join(allowed)}")
         return found
