@@ -2,8 +2,8 @@
 
     python -m benchmarks.bad_requests [--at-once 40] [--soak 10000] [--database-url URL]
 
-A server process of the API has a probe in its event loop, which notes how late it wakes, and how long the process itself
-worked meanwhile: on a busy machine others take the rest. First a burst of bodies with
+A server process of the API has a probe in its event loop, which notes how late it wakes, and how long the process
+itself worked meanwhile: on a busy machine others take the rest. First a burst of bodies with
 80,000 unknown inputs (869 kB) arrives, as often as `--repeat` says; another process asks for /healthz meanwhile. Then
 come the requests of the soak: a mixture of bodies, forms, queries and headers that are refused. Fails above the limits
 of the design: 50 ms, and a tenth more memory than before.
@@ -221,13 +221,13 @@ def _measure(process: subprocess.Popen[str], url: str, options: argparse.Namespa
         "machine": f"{os.cpu_count()} cores, {os.getloadavg()[0]:.1f} busy processes",
         "bursts": f"{options.repeat} of {options.at_once} bodies of {len(UNKNOWN)} bytes: {json.dumps(statuses)}",
         "event loop late at most": f"{', '.join(f'{1e3 * s:.0f}' for s in delays)} ms; median "
-        f"{1e3 * statistics.median(delays):.0f} ms; of it own work at most {1e3 * max(worked):.0f} ms",
+        f"{1e3 * statistics.median(delays):.0f} ms; of its own work at most {1e3 * max(worked):.0f} ms",
         "/healthz p50 / p99 / max": f"{1e3 * statistics.median(polls):.1f} / "
         f"{1e3 * statistics.quantiles(polls, n=100)[98]:.1f} / {1e3 * max(polls):.1f} ms",
         "memory before / after / peak": f"{before:.0f} / {after_bursts:.0f} / {peak:.0f} MiB",
         "soak": f"{options.soak} requests in {seconds:.0f} s: {json.dumps(soaked)}",
-        "memory after / peak": f"{after_soak:.0f} / {soak_peak:.0f} MiB; event loop late at most {1e3 * soak_late_s:.0f} ms, "
-        f"of it own work {1e3 * soak_worked_s:.0f} ms",
+        "memory after / peak": f"{after_soak:.0f} / {soak_peak:.0f} MiB",
+        "late at most": f"{1e3 * soak_late_s:.0f} ms, of its own work {1e3 * soak_worked_s:.0f} ms",
     }
     for name, value in figures.items():
         print(f"{name:28} {value}")

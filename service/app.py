@@ -17,7 +17,7 @@ from service.features.runs import published_runs
 from service.files import StateFolder
 from service.guard import Guard
 from service.input_policy import check_hosts
-from service.methods import HeadAsGet, check_query
+from service.methods import HeadAsGet, check_query, written_out
 from service.metrics import Measured, Metrics
 from service.rate_limits import RateLimiter
 from service.routes import (
@@ -114,6 +114,7 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     routes = [route for router in ROUTERS for route in router.routes]
     problems.install(app, routes)
     app.add_exception_handler(ReplayedError, replayed)
+    app.router.routes.extend(written_out(routes))
     for router in ROUTERS:
         app.include_router(router)
     if landing.VIEWER.is_dir():

@@ -15,7 +15,7 @@ ServiceError
 │   ├── QuotaError           the uploads of a key have too many bytes
 │   ├── QueueFullError       too many jobs wait
 │   ├── TooManySchedulesError a key has reached its limit of schedules
-│   ├── TooManyUploadsError  a key has reached its limit of unfinished uploads
+│   ├── TooManyUploadsError  a key has reached its limit of uploads, or of unfinished ones
 │   └── TooManyRequestsError too many requests of one client
 ├── UnauthorizedError        no key, or one that is not known
 ├── ForbiddenError           a key without the scope
@@ -26,6 +26,7 @@ ServiceError
 ├── ScheduleBusyError        a job of the schedule is under way, so it cannot be run now
 ├── KeyInUseError            a request with the same Idempotency-Key is under way
 ├── KeyReusedError           the Idempotency-Key was used for another request
+├── RemovedSinceError        the Idempotency-Key was used for something that was removed since
 ├── NotReplayableError       a delivery that is being sent, or whose webhook is gone
 ├── ChangedMeanwhileError    the record has changed since the client read it
 ├── LeaseLostError           a driver's claim on a job has passed to another
@@ -53,6 +54,7 @@ class Further(str):
     'and 79,980 more'
     """
 
+    __slots__ = ("number",)
     number: int
 
     def __new__(cls, number: int) -> Self:
@@ -210,7 +212,15 @@ class TooManySchedulesError(LimitError):
 
 
 class TooManyUploadsError(LimitError):
-    """A key has reached its limit of unfinished uploads."""
+    """A key has reached its limit of uploads, or of unfinished ones."""
+
+    @classmethod
+    def stored(cls, most: int) -> Self:
+        """The refusal of one more upload than `most`."""
+        return cls(
+            f"this key has {most:,} uploads, which is the limit: remove some, wait until old ones are removed, or "
+            "raise GABLEWORK_MAX_UPLOADS_PER_KEY"
+        )
 
 
 class TooManyRequestsError(LimitError):
@@ -270,6 +280,10 @@ class KeyInUseError(ServiceError):
 
 class KeyReusedError(ServiceError):
     """The Idempotency-Key was used for another request."""
+
+
+class RemovedSinceError(ServiceError):
+    """The request with this Idempotency-Key made something that was removed since."""
 
 
 class ChangedMeanwhileError(ServiceError):

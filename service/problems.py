@@ -92,6 +92,9 @@ KINDS: Mapping[type[Exception], Kind] = {
     errors.TooManySchedulesError: Kind(status=409, type_uri=f"{OWN}too-many-schedules", title="Too many schedules"),
     errors.KeyInUseError: Kind(status=409, type_uri=f"{OWN}key-in-use", title="The request is under way", retry=True),
     errors.KeyReusedError: Kind(status=422, type_uri=f"{OWN}key-reused", title="The key belongs to another request"),
+    errors.RemovedSinceError: Kind(
+        status=409, type_uri=f"{OWN}removed-since", title="What the request made was removed since"
+    ),
     errors.ChangedMeanwhileError: Kind(
         status=412, type_uri=f"{OWN}changed-meanwhile", title="It was changed in the meantime"
     ),
@@ -116,7 +119,7 @@ KINDS: Mapping[type[Exception], Kind] = {
     errors.OffsetError: Kind(status=409, type_uri=f"{OWN}wrong-offset", title="The bytes do not continue the upload"),
     errors.ChecksumError: Kind(status=460, type_uri=f"{OWN}wrong-checksum", title="The bytes arrived damaged"),
     errors.TooManyUploadsError: Kind(
-        status=429, type_uri=f"{OWN}too-many-uploads", title="Too many unfinished uploads", retry=True
+        status=429, type_uri=f"{OWN}too-many-uploads", title="Too many uploads", retry=True
     ),
     errors.StoreError: _AWAY,
     errors.QueueFullError: Kind(status=429, type_uri=f"{OWN}queue-full", title="Too many jobs wait", retry=True),
@@ -235,7 +238,9 @@ def answer_error(error: Exception, instance: str) -> Response:
     if kind.retry:
         after = getattr(error, "retry_after_s", RETRY_AFTER_S)
         headers["Retry-After"] = str(max(1, math.ceil(after)))
-    faults = errors.few([as_inputs(fault) for fault in getattr(error, "faults", ())])
+    faults = errors.few(
+        fault if isinstance(fault, errors.Further) else as_inputs(fault) for fault in getattr(error, "faults", ())
+    )
     if kind is _AWAY or isinstance(error, errors.StoreError):
         _log.error("%s", error)
         return answer(kind, _STORE[kind.word], instance, (), headers)

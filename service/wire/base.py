@@ -145,9 +145,15 @@ class Request(BaseModel):
             kind, message = "unknown", f"is not {cls.NOUN}: {fix}"
         elif kind in {"missing", "too_short", "too_long"} and len(fault["loc"]) == 1:
             context = context | {"fix": hint} if (hint := cls.HINTS.get(fault["loc"][0])) else context
-        if kind in {"unknown", FURTHER} or "fix" in context:
-            kind = PydanticCustomError(kind, message, context)
-        return InitErrorDetails(type=kind, loc=fault["loc"], input=fault["input"], ctx=context)
+        return raised_again({**fault, "type": kind, "msg": message, "ctx": context})
+
+
+def raised_again(fault: Any, *place: int | str) -> InitErrorDetails:
+    """A fault of pydantic's or of ours as one of an error that is raised in its place, below `place`."""
+    kind, context = fault["type"], fault.get("ctx", {})
+    if kind in {"unknown", FURTHER} or "fix" in context:
+        kind = PydanticCustomError(kind, fault["msg"], context)
+    return InitErrorDetails(type=kind, loc=(*place, *fault["loc"]), input=fault["input"], ctx=context)
 
 
 def at_most(number: int) -> BeforeValidator:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from service.drafts import Draft
 from service.errors import RequestError
@@ -141,9 +141,11 @@ def _merged_tables(before: Mapping[str, Any], changes: Mapping[str, Any]) -> dic
 
 
 class Execute(Request):
-    """A request for a job; other members are ignored."""
+    """A request for a job."""
 
-    model_config = ConfigDict(extra="ignore")
+    HINTS: ClassVar[Mapping[str, str]] = {
+        name: "it is an input, put it into inputs" for model in INPUTS.values() for name in model.model_fields
+    }
 
     inputs: dict[str, Any] = Field(
         default_factory=dict,

@@ -116,11 +116,11 @@ def test_more_streams_than_allowed_are_refused_and_counted_down_again(starting) 
     service = starting(max_event_streams=1)
     job_id = finished(service)
     streams = service.client.app.state.streams
-    streams.open(1)
+    streams.open(None, 1, 1)
     refused = streamed(service, job_id)
     assert refused.status_code == 429
     assert int(refused.headers["retry-after"]) >= 1
-    streams.close()
+    streams.close(None)
     for _ in range(3):
         assert streamed(service, job_id).status_code == 200
     assert streams.count == 0

@@ -367,7 +367,7 @@ def test_the_answer_of_a_full_queue_says_when_to_try_again(starting) -> None:
     ("href", "kind", "value"),
     [
         (f"/uploads/{'a' * 32}", "upload", "a" * 32),
-        (f"https://example.org/prefix/uploads/{'a' * 32}", "upload", "a" * 32),
+        (f"https://example.org/prefix/uploads/{'a' * 32}", "url", f"https://example.org/prefix/uploads/{'a' * 32}"),
         ("https://example.org/tile.laz", "url", "https://example.org/tile.laz"),
         ("file:///data/a%20b.laz", "path", "/data/a b.laz"),
         ("/data/tile.laz", "path", "/data/tile.laz"),
