@@ -29,6 +29,7 @@ from service.multipart import Form
 from service.resumable import find
 from service.routes.writing import Writer
 from service.store import JobStore, Patience
+from service.wire import patterns
 
 KEPT_HEADERS = (
     *("location", "etag", "cache-control", "content-type", "preference-applied"),
@@ -45,7 +46,7 @@ FREE_S = 1.0
 IdempotencyKey = Annotated[
     str | None,
     Header(
-        min_length=1,
+        json_schema_extra=patterns.stated(patterns.KEY),
         description="A text of your choice that names this request. Sent again with the same text, it makes nothing "
         "new and is answered as before.",
         examples=["8e03978e-40d5-43dd-bc93-6894a57f9324"],

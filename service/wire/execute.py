@@ -6,13 +6,13 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 from service.drafts import Draft
 from service.errors import RequestError
 from service.jobs import Subscriber
 from service.outputs import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, ECHO_OUTPUTS, OUTPUTS, OutputKind
-from service.wire.base import Request, at_most
+from service.wire.base import Request, at_most, optional_members
 from service.wire.faults import FaultsError, sentences, shortened
 from service.wire.inputs import ClassifyInputs, CompareInputs, EchoInputs, JobInputs, ReconstructInputs
 from service.wire.webhooks import ReceiverUrl
@@ -84,8 +84,15 @@ def wanted(names: Iterable[str]) -> dict[str, WantedOutput]:
     return {name: WantedOutput() for name in names}
 
 
+def _one_at_least(schema: dict[str, Any]) -> None:
+    optional_members(schema)
+    schema["minProperties"] = 1
+
+
 class SubscriberUris(Request):
     """Where to send news of the job; the page on webhooks shows bodies and signatures."""
+
+    model_config = ConfigDict(json_schema_extra=_one_at_least)
 
     successUri: ReceiverUrl | None = Field(None, description="Gets the results document when the job succeeds.")
     inProgressUri: ReceiverUrl | None = Field(

@@ -18,6 +18,7 @@ from service.input_policy import checked_crs
 from service.outputs.kinds import FORMATS
 from service.outputs.published import formats_of
 from service.run_settings import DEFAULTS, VARIANTS, choices, settings_faults, settings_schema
+from service.wire import patterns
 from service.wire.base import OneOf, Request, at_most
 from service.wire.faults import FaultsError, shortened
 from service.wire.files import Lines, Outlines, PointClouds
@@ -41,7 +42,9 @@ def _printable(text: str) -> str:
     return text
 
 
-Text = Annotated[str, Field(max_length=500), AfterValidator(_printable)]
+Text = Annotated[
+    str, Field(max_length=500, json_schema_extra=patterns.stated(patterns.TEXT)), AfterValidator(_printable)
+]
 """A text of the user."""
 
 

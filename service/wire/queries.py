@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field, WithJsonSchema
 
 from service.jobs import JobStatus
+from service.wire import patterns
 
 _MILLISECOND = dt.timedelta(microseconds=999)
 """The rest of the millisecond that a time in an answer names."""
@@ -27,7 +28,7 @@ def words(allowed: Sequence[str] = ()) -> Callable[[list[str] | None], list[str]
     def split(values: list[str] | None) -> list[str] | None:
         if values is None:
             return None
-        found = list(dict.fromkeys(word.strip() for value in values for word in value.split(",") if word.strip()))
+        found = list(dict.fromkeys(word for value in values for part in value.split(",") if (word := part.strip(" "))))
         if len(found) > MAX_WORDS:
             raise ValueError(f"use at most {MAX_WORDS} words")
         if allowed and not set(found) <= set(allowed):
@@ -35,6 +36,11 @@ def words(allowed: Sequence[str] = ()) -> Callable[[list[str] | None], list[str]
         return found
 
     return split
+
+
+def entry_of(allowed: Iterable[str]) -> WithJsonSchema:
+    """The schema of one value of such a parameter."""
+    return WithJsonSchema({"type": "string", **patterns.stated(patterns.any_of(allowed))})
 
 
 Words = Annotated[list[str] | None, AfterValidator(words())]
@@ -70,12 +76,14 @@ def _instant(text: str, *, is_open: bool) -> dt.datetime | None:
     """An RFC 3339 time in UTC; None for an open end."""
     if is_open and text in {"", ".."}:
         return None
+    if not patterns.fits(patterns.TIME, text):
+        raise ValueError("use a time such as 2026-03-01T09:30:00Z")
     try:
         # in a query an unescaped plus is a space
-        at = dt.datetime.fromisoformat(text.strip().replace(" ", "+") if "T" in text else text)
+        at = dt.datetime.fromisoformat(text.replace(" ", "+"))
         return (at if at.tzinfo is not None else at.replace(tzinfo=dt.UTC)).astimezone(dt.UTC)
     except (ValueError, OverflowError):
-        raise ValueError("use a time such as 2026-03-01T09:30:00Z") from None
+        raise ValueError("use a day that exists, as in 2026-03-01T09:30:00Z") from None
 
 
 def _is_interval(text: str | None) -> str | None:
@@ -98,7 +106,7 @@ class JobQuery(Page):
 
     type: Words = Field(None, description="The only type is `process`.")
     processID: Words = Field(None, description="Only jobs of these processes.")
-    status: Annotated[list[str] | None, AfterValidator(words([word.value for word in JobStatus]))] = Field(
+    status: Annotated[list[Annotated[str, entry_of(JobStatus)]] | None, AfterValidator(words([*JobStatus]))] = Field(
         None, description=f"Only jobs with these: {', '.join(JobStatus)}."
     )
     scheduleID: str | None = Field(None, description="Only jobs of this schedule.")
@@ -106,7 +114,9 @@ class JobQuery(Page):
         None, description="Only jobs with each of these words in title, id or process; case does not matter."
     )
     datetime: Annotated[str | None, AfterValidator(_is_interval)] = Field(
-        None, description="Time of creation: an RFC 3339 time, or `a/b`, `../b`, `a/..`."
+        None,
+        description="Time of creation: an RFC 3339 time, or `a/b`, `../b`, `a/..`.",
+        json_schema_extra=patterns.stated(patterns.INTERVAL),
     )
     minDuration: Seconds | None = None
     maxDuration: Seconds | None = None
