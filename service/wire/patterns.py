@@ -44,25 +44,22 @@ TEXT = (
 """A text that is not blank and has no control characters except tabs and ends of lines."""
 
 
-def _field(value: str, more: str = "") -> str:
-    item = f"([*](/[1-9][0-9]?)?|{value}(-{value}(/[1-9][0-9]?)?)?{more})"
-    return f"{item}(,{item})*"
+def _field(value: str, alone: str = "") -> str:
+    """A field of cron: values, ranges and steps with commas between them, or what has no place in a list."""
+    item = f"([*](/[1-9][0-9]?)?|{value}(-{value}(/[1-9][0-9]?)?)?)"
+    return f"({item}(,{item})*{alone})"
 
 
 _MONTHS = "JAN|FEB|MAR|APR|MAY|JUN|JUL|AUG|SEP|OCT|NOV|DEC"
 _DAYS = "SUN|MON|TUE|WED|THU|FRI|SAT"
-_DAY = f"([0-7]|{_DAYS}|{_DAYS.lower()})"
-CRON = "^({}) *$".format(
-    " +".join(
-        (
-            " *(@(hourly|daily|midnight|weekly|monthly|yearly|annually)|" + _field("[0-5]?[0-9]"),
-            _field("([01]?[0-9]|2[0-3])"),
-            _field("(0?[1-9]|[12][0-9]|3[01])", "|L|LW"),
-            _field(f"(0?[1-9]|1[0-2]|{_MONTHS}|{_MONTHS.lower()})"),
-            _field(_DAY, f"|{_DAY}(L|#[1-5])") + ")",
-        )
-    )
+_FIELDS = (
+    _field("[0-5]?[0-9]"),
+    _field("([01]?[0-9]|2[0-3])"),
+    _field("(0?[1-9]|[12][0-9]|3[01])", "|L|LW"),
+    _field(f"(0?[1-9]|1[0-2]|{_MONTHS}|{_MONTHS.lower()})"),
+    _field(f"([0-7]|{_DAYS}|{_DAYS.lower()})", "|[0-7](L|#[1-5])"),
 )
+CRON = f"^ *(@(hourly|daily|midnight|weekly|monthly|yearly|annually)|{' +'.join(_FIELDS)}) *$"
 """An expression of cron; that ranges go up, it does not say."""
 ZONE = "^[A-Za-z][A-Za-z0-9_+/-]*$"
 """The name of a time zone."""

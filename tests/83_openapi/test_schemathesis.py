@@ -22,7 +22,7 @@ from hypothesis import HealthCheck, Phase, given
 from live_service import POINTS
 from processes import postgres_server  # noqa: F401 - a fixture
 from schemathesis.generation import GenerationMode
-from schemathesis.specs.openapi.checks import positive_data_acceptance
+from schemathesis.specs.openapi.checks import negative_data_rejection, positive_data_acceptance
 
 from pipeline.schedule import Cron
 from service.schedules import Definition
@@ -50,10 +50,12 @@ MEANING = re.compile(
     r"^execute: |^\w+ is missing|is not an (in|out)put|^(settings|subscriber|crs)(:| is)|which is for 3D Tiles|"
     # numbers and words that fit together
     r"use an end that is not before|use a day that exists|lies (north|east) of|longitudes reach|no vertical axis|"
-    r"with a positive width and depth|a range goes up|this date never occurs|query filter|"
+    r"with a positive width and depth|or a property of its queryables|a range goes up|this date never occurs|"
+    r"query filter|"
     # the names and the content of files, and one of several parameters
     r"the file has no name|the file's name is|the digest is|Digest differ|the body is not a form|"
-    r"Upload-Metadata has no filename|sha256 in Upload-Metadata|write a name, a space"
+    r"Upload-Metadata has no filename|sha256 in Upload-Metadata|write a name, a space|"
+    r"Upload-Metadata has .* twice"
 )
 """Why a request may be refused that is valid by its schema. Other reasons are rules that the schema does not state."""
 CONTENT = {"unusable-input", "outside-area-of-use"}
@@ -208,8 +210,10 @@ class Interrogation:
                 for fault in unstated(response):
                     asked = f"{case.query} {case.headers} {case.body!r}"[:1500]
                     self.failures.setdefault(f"{label} {fault[:60]}", f"{label} is valid and refused: {fault}\n{asked}")
+            # tus demands 412 of a request without its version, which the check does not know as a refusal
+            excluded = [*EXCLUDED, *([negative_data_rejection] if response.status_code == 412 else [])]
             try:
-                case.validate_response(response, excluded_checks=EXCLUDED)
+                case.validate_response(response, excluded_checks=excluded)
             except BaseExceptionGroup as group:
                 for fault in group.exceptions:
                     self.failures.setdefault(f"{label}: {type(fault).__name__} {str(fault)[:160]}", str(group))
