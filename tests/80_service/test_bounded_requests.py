@@ -161,6 +161,7 @@ def test_large_bodies_wait_for_one_another_and_leave_the_loop_free_between_them(
     assert "read, read" not in ", ".join(turns)
 
 
+@pytest.mark.slow
 def test_forty_bodies_at_once_leave_no_memory_behind(tmp_path: Path) -> None:
     body = json.dumps({"inputs": names(MANY)}).encode()
 
