@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import AsyncIterator
 
 from fastapi import APIRouter, Depends, FastAPI
@@ -17,7 +18,7 @@ from service.features.runs import published_runs
 from service.files import StateFolder
 from service.guard import Guard
 from service.input_policy import check_hosts, check_roots
-from service.methods import HeadAsGet, check_query
+from service.methods import HeadAsGet, check_query, written_out
 from service.metrics import Measured, Metrics
 from service.rate_limits import RateLimiter
 from service.routes import (
@@ -80,8 +81,10 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     metrics = Metrics(kept, lambda: streams.count, folder.disk)
 
     @contextlib.asynccontextmanager
-    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+    async def lifespan(starting: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(start, settings, kept)
+        # the first query needs it, which takes a fifth of a second: no client waits for that, nor the start
+        threading.Thread(target=starting.openapi, name="openapi", daemon=True).start()
         try:
             yield
         finally:
@@ -114,6 +117,7 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     routes = [route for router in ROUTERS for route in router.routes]
     problems.install(app, routes)
     app.add_exception_handler(ReplayedError, replayed)
+    app.router.routes.extend(written_out(routes))
     for router in ROUTERS:
         app.include_router(router)
     if landing.VIEWER.is_dir():

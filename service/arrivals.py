@@ -30,7 +30,16 @@ from service.jobs import Upload
 from service.resumable import Promise, Unfinished
 from service.settings import ServiceSettings
 from service.store import JobStore
-from service.uploads import BLOCK_BYTES, WRITERS, check_digest, check_size, examined, make_way, remove_file
+from service.uploads import (
+    BLOCK_BYTES,
+    WRITERS,
+    check_digest,
+    check_number,
+    check_size,
+    examined,
+    make_way,
+    remove_file,
+)
 
 SILENT_S = 3.0
 """Seconds without a byte after which a client that sends counts as gone if another request wants the upload: longer
@@ -173,6 +182,8 @@ class Arrivals:
         quota = self._settings.max_upload_bytes_per_key
         room = quota - self._store.stored_bytes(promise.owner) if quota else None
         most = self._settings.max_unfinished_uploads
+        begun = sum(other.owner == promise.owner for other in resumable.unfinished(self._folder))
+        check_number(self._store, promise.owner, self._settings.max_uploads_per_key, begun)
         resumable.create(self._folder, promise, expires_at, most=most, room_bytes=room)
 
     async def state(self, upload_id: str, *, owner: str | None) -> State:

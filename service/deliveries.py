@@ -61,6 +61,8 @@ class Delivery(Generic[Made]):
     """Files of the request."""
     max_upload_bytes: int = 0
     """Maximum bytes of all uploads of their owner; 0 for any number."""
+    max_uploads: int = 0
+    """Maximum number of uploads of their owner; 0 for any number."""
     claim: Claim | None = None
     """The key of the request; None if it has none."""
     answer: Callable[[Made], StoredAnswer] | None = None

@@ -5,8 +5,8 @@ ServiceError
 ├── NoSuchJobError, NoSuchProcessError, NoSuchUploadError, NoSuchBuildingError, NoSuchOutputError, NoSuchScheduleError
 ├── NoSuchWebhookError, NoSuchDeliveryError, NoSuchCollectionError, NoSuchFeatureError
 ├── ResultNotReadyError      the job is not over yet, or was dismissed
-├── RequestError             inputs that do not fit the process: lists all faults at once
-├── OutsideAreaError         tiles far outside the area of use of their CRS: lists them all
+├── RequestError             inputs that do not fit the process: lists the faults together
+├── OutsideAreaError         tiles far outside the area of use of their CRS: lists them together
 ├── InputRefusedError        an input that is not allowed: a path outside the roots, a host that is not listed
 ├── TargetRefusedError       a URL to which webhooks are not sent
 ├── LimitError               more than this service takes
@@ -15,7 +15,7 @@ ServiceError
 │   ├── QuotaError           the uploads of a key have too many bytes
 │   ├── QueueFullError       too many jobs wait
 │   ├── TooManySchedulesError a key has reached its limit of schedules
-│   ├── TooManyUploadsError  a key has reached its limit of unfinished uploads
+│   ├── TooManyUploadsError  a key has reached its limit of uploads, or of unfinished ones
 │   └── TooManyRequestsError too many requests of one client
 ├── UnauthorizedError        no key, or one that is not known
 ├── ForbiddenError           a key without the scope
@@ -26,6 +26,7 @@ ServiceError
 ├── ScheduleBusyError        a job of the schedule is under way, so it cannot be run now
 ├── KeyInUseError            a request with the same Idempotency-Key is under way
 ├── KeyReusedError           the Idempotency-Key was used for another request
+├── RemovedSinceError        the Idempotency-Key was used for something that was removed since
 ├── NotReplayableError       a delivery that is being sent, or whose webhook is gone
 ├── ChangedMeanwhileError    the record has changed since the client read it
 ├── LeaseLostError           a driver's claim on a job has passed to another
@@ -40,7 +41,51 @@ ServiceError
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Self
+
+MOST_FAULTS = 20
+"""Faults that an answer names; further ones are counted."""
+
+
+class Further(str):
+    """The last entry of a list of faults: how many there are beyond those that are named.
+
+    >>> Further(79_980)
+    'and 79,980 more'
+    """
+
+    __slots__ = ("number",)
+    number: int
+
+    def __new__(cls, number: int) -> Self:
+        """The entry for a number of faults."""
+        found = super().__new__(cls, f"and {number:,} more")
+        found.number = number
+        return found
+
+
+def few(faults: Iterable[str]) -> tuple[str, ...]:
+    """The first faults, and the number of the others.
+
+    >>> few(["a"] * 22)[19:]
+    ('a', 'and 2 more')
+    """
+    named: list[str] = []
+    number = 0
+    for fault in faults:
+        if isinstance(fault, Further):
+            number += fault.number
+        elif len(named) < MOST_FAULTS:
+            named.append(fault)
+        else:
+            number += 1
+    return (*named, Further(number)) if number else tuple(named)
+
+
+def within(place: str, faults: Iterable[str]) -> list[str]:
+    """Faults of a part of a request, with its name before each."""
+    return [fault if isinstance(fault, Further) else f"{place}: {fault}" for fault in faults]
 
 
 class ServiceError(Exception):
@@ -108,7 +153,7 @@ class ResultNotReadyError(ServiceError):
 
 
 class RequestError(ServiceError):
-    """Inputs that do not fit the process; the message lists every fault.
+    """Inputs that do not fit the process; the message lists the first faults and counts the others.
 
     Parameters
     ----------
@@ -117,12 +162,12 @@ class RequestError(ServiceError):
     """
 
     def __init__(self, faults: Sequence[str]) -> None:
-        self.faults = tuple(faults)
+        self.faults = few(faults)
         super().__init__("; ".join(self.faults))
 
 
 class OutsideAreaError(ServiceError):
-    """Tiles that would lie far outside the area of use of their CRS; the message lists every one.
+    """Tiles that would lie far outside the area of use of their CRS; the message lists the first and counts the others.
 
     Parameters
     ----------
@@ -131,7 +176,7 @@ class OutsideAreaError(ServiceError):
     """
 
     def __init__(self, faults: Sequence[str]) -> None:
-        self.faults = tuple(faults)
+        self.faults = few(faults)
         super().__init__("; ".join(self.faults))
 
 
@@ -180,7 +225,15 @@ class TooManySchedulesError(LimitError):
 
 
 class TooManyUploadsError(LimitError):
-    """A key has reached its limit of unfinished uploads."""
+    """A key has reached its limit of uploads, or of unfinished ones."""
+
+    @classmethod
+    def stored(cls, most: int) -> Self:
+        """The refusal of one more upload than `most`."""
+        return cls(
+            f"this key has {most:,} uploads, which is the limit: remove some, wait until old ones are removed, or "
+            "raise GABLEWORK_MAX_UPLOADS_PER_KEY"
+        )
 
 
 class TooManyRequestsError(LimitError):
@@ -240,6 +293,10 @@ class KeyInUseError(ServiceError):
 
 class KeyReusedError(ServiceError):
     """The Idempotency-Key was used for another request."""
+
+
+class RemovedSinceError(ServiceError):
+    """The request with this Idempotency-Key made something that was removed since."""
 
 
 class ChangedMeanwhileError(ServiceError):

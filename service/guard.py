@@ -1,4 +1,4 @@
-"""Checks before all routes: host and origin of a request, encoding and size of its body; headers for browsers.
+"""Checks before all routes: host and origin of a request; encoding, size and shape of its body; headers for browsers.
 
 A service on loopback without keys trusts every client that reaches it, but must not trust web pages in a browser on
 the same machine. Therefore the `Host` must be one of ours (else a page could give its own name to this address, "DNS
@@ -8,15 +8,15 @@ rebinding"), and a request that changes anything must not come from another orig
 from __future__ import annotations
 
 import functools
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Mapping
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.errors import TooLargeError
-from service.problems import ENCODED, FOREIGN, KINDS, answer
+from service import bodies
+from service.errors import RequestError, TooLargeError
+from service.problems import AMBIGUOUS, ENCODED, FOREIGN, answer, answer_error
 from service.settings import ServiceSettings
 
 STREAMED = frozenset({("POST", "/jobs"), ("POST", "/uploads"), ("POST", "/uploads/tus"), ("PATCH", "/uploads/tus/*")})
@@ -76,6 +76,12 @@ class Guard:
         if refusal is not None:
             await answer(FOREIGN, refusal, scope["path"])(scope, receive, guarded_send)
             return
+        if "content-length" in headers and "transfer-encoding" in headers:
+            # another program on the way may believe the other one, and take the rest of the body for a request
+            both = "the request has Content-Length and Transfer-Encoding: send one of them"
+            refused = answer(AMBIGUOUS, both, scope["path"], headers={"Connection": "close"})
+            await refused(scope, receive, guarded_send)
+            return
         encoding = headers.get("content-encoding", "identity").strip().lower()
         if encoding != "identity":
             packed = f"Content-Encoding is {encoding[:40]!r}: send the body as it is"
@@ -84,13 +90,16 @@ class Guard:
         if not STREAMED.isdisjoint({(scope["method"], path), (scope["method"], f"{path.rpartition('/')[0]}/*")}):
             await self.app(scope, receive, guarded_send)
             return
-        most = self.settings.max_body_bytes
-        length = headers.get("content-length", "0")
-        if length.isdigit() and int(length) > most:
-            kind = KINDS[TooLargeError]
-            await answer(kind, _too_large(most), scope["path"])(scope, receive, guarded_send)
+        if headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers:
+            await self.app(scope, receive, guarded_send)
             return
-        await self.app(scope, _counted(receive, most), guarded_send)
+        try:
+            whole = await _whole_body(receive, headers, self.settings.max_body_bytes)
+        except (RequestError, TooLargeError) as fault:
+            await answer_error(fault, scope["path"])(scope, receive, guarded_send)
+            return
+        if whole is not None:
+            await self.app(scope, _again(whole, receive), guarded_send)
 
     def _foreign(self, method: str, scheme: str, headers: Headers) -> str | None:
         """Why a request is refused as one from another site; None if it is accepted."""
@@ -135,21 +144,48 @@ def _hostname(host: str) -> str:
         return ""
 
 
-def _counted(receive: Receive, most: int) -> Callable[[], Awaitable[Message]]:
-    """The body as it arrives, refused at the first byte too many."""
-    seen = 0
+async def _whole_body(receive: Receive, headers: Headers, most: int) -> bytes | None:
+    """The body of a request whose route does not count its bytes; None if the client has gone.
 
-    async def counting() -> Message:
-        nonlocal seen
+    Raises
+    ------
+    TooLargeError
+        It has more than `most` bytes.
+    RequestError
+        It is JSON with more in it than clients have reason to send.
+    """
+    length = headers.get("content-length", "0")
+    if length.isdigit() and int(length) > most:
+        raise _too_large(most)
+    held: list[bytes] = []
+    seen, is_over = 0, False
+    while not is_over:
         message = await receive()
-        seen += len(message.get("body", b""))
+        if message["type"] != "http.request":
+            return None
+        held.append(message.get("body", b""))
+        seen += len(held[-1])
         if seen > most:
-            # the framework's parser of bodies turns every exception except HTTPException into a 400
-            raise HTTPException(413, _too_large(most))
-        return message
+            raise _too_large(most)
+        is_over = not message.get("more_body", False)
+    whole = b"".join(held)
+    del held  # many bodies may wait for their turn
+    if "json" in headers.get("content-type", "").lower():
+        await bodies.check(whole, most)
+    return whole
 
-    return counting
+
+def _again(whole: bytes, receive: Receive) -> Receive:
+    """The body as one message, then what the server says."""
+    held = [whole]
+
+    async def received() -> Message:
+        return {"type": "http.request", "body": held.pop(), "more_body": False} if held else await receive()
+
+    return received
 
 
-def _too_large(most: int) -> str:
-    return f"the body has more than {most} bytes: send files to /uploads, or raise GABLEWORK_MAX_BODY_BYTES"
+def _too_large(most: int) -> TooLargeError:
+    return TooLargeError(
+        f"the body has more than {most} bytes: send files to /uploads, or raise GABLEWORK_MAX_BODY_BYTES"
+    )

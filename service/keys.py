@@ -9,7 +9,7 @@ Each scope includes those before it:
 |---|---|
 | read | see the service's own pages, and its own jobs, schedules, uploads, results and events |
 | submit | also send and remove its own uploads, submit, dismiss and remove its own jobs; its own schedules |
-| admin | all of this with the jobs, schedules and uploads of all keys; webhooks for all jobs |
+| admin | all of this with the jobs, schedules and uploads of all keys; webhooks for all jobs, metrics |
 
 Keys are made, listed and revoked on the machine itself (`gablework keys`), never over HTTP.
 """

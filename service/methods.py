@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from http import HTTPStatus
 from typing import Any
 
 import anyio
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, HTTPException, Request, Response
 from starlette.routing import BaseRoute, Match, Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.errors import RequestError
+from service.errors import MOST_FAULTS, Further, RequestError
 from service.wire.faults import shortened
 
 
@@ -45,12 +46,40 @@ class HeadAsGet:
 
 
 def allowed_methods(routes: Iterable[BaseRoute], scope: Scope) -> list[str]:
-    """The methods of all routes with the path of a request, sorted, for the header Allow."""
+    """The methods of all routes with the path of a request, sorted, for the header Allow.
+
+    A path that is written out, such as `/webhooks/secret`, has none of the methods of `/webhooks/{webhookID}`.
+    """
     found = {"OPTIONS"}
-    for route in routes:
-        if isinstance(route, Route) and route.matches(scope)[0] is not Match.NONE:
-            found |= route.methods or set()
+    matching = [route for route in routes if isinstance(route, Route) and route.matches(scope)[0] is not Match.NONE]
+    nearest = min(matching, key=lambda route: len(route.param_convertors)).path if matching else ""
+    for route in matching:
+        found |= (route.methods or set()) if route.path == nearest else set()
     return sorted(found | {"HEAD"} if "GET" in found else found)
+
+
+def written_out(routes: Sequence[BaseRoute]) -> list[BaseRoute]:
+    """Routes that refuse, at each path that is written out, the methods that only a path with a variable has.
+
+    They come before all others: else `DELETE /webhooks/secret` would remove the webhook `secret`.
+    """
+    known = [route for route in routes if isinstance(route, Route)]
+    refusing: list[BaseRoute] = []
+    for path in {route.path: None for route in known if not route.param_convertors}:
+        own = {method for route in known if route.path == path for method in route.methods or ()}
+        others = {
+            method
+            for route in known
+            if route.param_convertors and route.path_regex.match(path)
+            for method in route.methods or ()
+        }
+        if others - own - {"HEAD"}:
+            refusing.append(Route(path, _refuse, methods=sorted(others - own - {"HEAD"}), include_in_schema=False))
+    return refusing
+
+
+async def _refuse(_request: Request) -> Response:
+    raise HTTPException(HTTPStatus.METHOD_NOT_ALLOWED)
 
 
 async def check_query(request: Request) -> None:
@@ -69,8 +98,10 @@ async def check_query(request: Request) -> None:
         return
     takes = f"use {', '.join(map(str, known))}" if known else "this path has no query parameters"
     given = Counter(name for name, _ in request.query_params.multi_items())
-    is_free = None in known  # the route knows the other names
-    faults = [f"query {shortened(name)} is not known: {takes}" for name in given if name not in known and not is_free]
+    unknown = [] if None in known else [name for name in given if name not in known]  # None: the route knows them
+    faults = [f"query {shortened(name)} is not known: {takes}" for name in unknown[:MOST_FAULTS]]
+    if len(unknown) > MOST_FAULTS:
+        faults.append(Further(len(unknown) - MOST_FAULTS))
     twice = [name for name, n in given.items() if n > 1 and known.get(name)]
     faults += [f"query {name} is given {given[name]} times: give it once" for name in twice]
     if faults:

@@ -14,7 +14,7 @@ from fastapi.openapi.utils import get_openapi
 from pydantic.json_schema import models_json_schema
 
 from pipeline import __version__
-from service.routes.answers import problems
+from service.routes.answers import REQUIRED, problems
 from service.wire.buildings import CityJson, FeaturePage
 from service.wire.features import CollectionPage, JsonSchema
 from service.wire.jobs import JobForm, ServerSentEvent
@@ -81,6 +81,8 @@ def document(app: FastAPI) -> dict[str, Any]:
             for parameter in operation.get("parameters", ()):
                 # an optional parameter may be absent; a query cannot hold null
                 parameter["schema"].pop("nullable", None)
+                if parameter["schema"].pop(REQUIRED, False):
+                    parameter["required"] = True
         _made[described] = app.openapi_schema
     return app.openapi_schema
 

@@ -38,6 +38,9 @@ OWN = "urn:gablework:problem:"
 MEDIA_TYPE = "application/problem+json"
 """Media type of problem documents."""
 
+LONGEST_DETAIL = 20_000
+"""Maximum number of characters of a text in a problem document: twenty faults with long lists of what is allowed."""
+
 RETRY_AFTER_S = 30
 """Seconds after which a client may try again, if nothing better is known."""
 
@@ -89,6 +92,9 @@ KINDS: Mapping[type[Exception], Kind] = {
     errors.TooManySchedulesError: Kind(status=409, type_uri=f"{OWN}too-many-schedules", title="Too many schedules"),
     errors.KeyInUseError: Kind(status=409, type_uri=f"{OWN}key-in-use", title="The request is under way", retry=True),
     errors.KeyReusedError: Kind(status=422, type_uri=f"{OWN}key-reused", title="The key belongs to another request"),
+    errors.RemovedSinceError: Kind(
+        status=409, type_uri=f"{OWN}removed-since", title="What the request made was removed since"
+    ),
     errors.ChangedMeanwhileError: Kind(
         status=412, type_uri=f"{OWN}changed-meanwhile", title="It was changed in the meantime"
     ),
@@ -113,7 +119,7 @@ KINDS: Mapping[type[Exception], Kind] = {
     errors.OffsetError: Kind(status=409, type_uri=f"{OWN}wrong-offset", title="The bytes do not continue the upload"),
     errors.ChecksumError: Kind(status=460, type_uri=f"{OWN}wrong-checksum", title="The bytes arrived damaged"),
     errors.TooManyUploadsError: Kind(
-        status=429, type_uri=f"{OWN}too-many-uploads", title="Too many unfinished uploads", retry=True
+        status=429, type_uri=f"{OWN}too-many-uploads", title="Too many uploads", retry=True
     ),
     errors.StoreError: _AWAY,
     errors.QueueFullError: Kind(status=429, type_uri=f"{OWN}queue-full", title="Too many jobs wait", retry=True),
@@ -147,6 +153,9 @@ FOREIGN = Kind(status=403, type_uri=f"{OWN}foreign-origin", title="The request c
 
 ENCODED = Kind(status=415, type_uri="about:blank", title=HTTPStatus(415).phrase)
 """A body that is compressed on the way."""
+
+AMBIGUOUS = Kind(status=400, type_uri="about:blank", title=HTTPStatus(400).phrase)
+"""A body whose length is given in two ways."""
 
 FAILURES: Mapping[Fault, Kind] = {
     Fault.INPUT: Kind(status=422, type_uri=f"{OWN}job-failed-input", title="An input could not be used"),
@@ -198,7 +207,8 @@ def document(
 
 
 def _encodable(text: str) -> str:
-    """The text without lone surrogates, which JSON can hold and UTF-8 cannot."""
+    """The text without lone surrogates, which JSON can hold and UTF-8 cannot; not all of one without end."""
+    text = text if len(text) <= LONGEST_DETAIL else f"{text[: LONGEST_DETAIL - 3]}..."
     return text.encode("utf-8", "replace").decode("utf-8")
 
 
@@ -229,13 +239,16 @@ def answer_error(error: Exception, instance: str) -> Response:
     if kind.retry:
         after = getattr(error, "retry_after_s", RETRY_AFTER_S)
         headers["Retry-After"] = str(max(1, math.ceil(after)))
-    faults = [as_inputs(fault) for fault in getattr(error, "faults", ())]
+    faults = errors.few(
+        fault if isinstance(fault, errors.Further) else as_inputs(fault) for fault in getattr(error, "faults", ())
+    )
     if kind is _AWAY or isinstance(error, errors.StoreError):
         _log.error("%s", error)
         return answer(kind, _STORE[kind.word], instance, (), headers)
     if kind is INTERNAL:
         return answer(kind, "The service has logged the fault; please report it.", instance)
-    return answer(kind, as_inputs(str(error)) or kind.title, instance, faults, headers, getattr(error, "members", None))
+    detail = as_inputs("; ".join(errors.few(error.faults)) if isinstance(error, SettingsError) else str(error))
+    return answer(kind, detail or kind.title, instance, faults, headers, getattr(error, "members", None))
 
 
 def install(app: FastAPI, routes: Sequence[BaseRoute]) -> None:

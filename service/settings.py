@@ -107,6 +107,11 @@ class ServiceSettings(BaseSettings):
         description="Maximum bytes of all uploads of one key together, or of all uploads if keys are not used; "
         "0 for any number.",
     )
+    max_uploads_per_key: int = Field(
+        default=10_000,
+        gt=0,
+        description="Maximum number of uploads of one key, unfinished ones included, or in total if keys are not used.",
+    )
     reserve_bytes: int = Field(
         default=512 * 2**20,
         ge=0,
@@ -128,6 +133,9 @@ class ServiceSettings(BaseSettings):
         default="6000/minute", description="Request limit of one key or address, in the notation of the library limits."
     )
     max_event_streams: int = Field(default=200, gt=0, description="Maximum number of open event streams.")
+    max_event_streams_per_key: int = Field(
+        default=100, gt=0, description="Maximum number of open event streams of one key."
+    )
     max_connections: int = Field(
         default=1000,
         gt=0,

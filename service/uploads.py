@@ -21,7 +21,7 @@ from typing import Protocol
 
 from pipeline.runtime.monitoring import tracing
 from service.disk import FULL
-from service.errors import NoSpaceError, RequestError, TooLargeError
+from service.errors import NoSpaceError, RequestError, TooLargeError, TooManyUploadsError
 from service.filenames import clean_filename
 from service.files import StateFolder
 from service.jobs import Upload
@@ -52,6 +52,13 @@ class UploadTable(Protocol):
 
     def add_upload(self, upload: Upload) -> None:
         """Store the record."""
+
+
+class UploadLister(Protocol):
+    """The part of the store that says how many there are."""
+
+    def list_uploads(self, *, owner: str | None = None, limit: int, offset: int = 0) -> list[Upload]:
+        """Uploads of a key, newest first; of all if it is None."""
 
 
 class _Sink:
@@ -189,6 +196,18 @@ async def examined(
         expires_at=now + dt.timedelta(days=settings.upload_days),
         preflight=facts,
     )
+
+
+def check_number(store: UploadLister, owner: str | None, most: int, more: int) -> None:
+    """Refuse one more upload before its bytes come; `more` do not have a record yet.
+
+    Raises
+    ------
+    TooManyUploadsError
+        The owner has as many as `most`.
+    """
+    if more >= most or store.list_uploads(owner=owner, limit=1, offset=most - more - 1):
+        raise TooManyUploadsError.stored(most)
 
 
 def check_size(name: str, size: int, limit: int) -> None:

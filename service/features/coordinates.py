@@ -193,7 +193,8 @@ def parsed_window(text: str, crs: NamedCrs) -> Sequence[Box]:
     [(170.0, -10.0, 180.0, 10.0), (-180.0, -10.0, -170.0, 10.0)]
     """
     try:
-        values = [float(part) for part in text.split(",")]
+        # Python also reads 1_000
+        values = [float(part) for part in text.replace("_", "?").split(",", 6)]
     except ValueError:
         values = []
     if len(values) == 6 and np.isfinite(values).all():

@@ -147,7 +147,8 @@ def parsed_bbox(text: str, *, native: bool) -> Box:
     (4.3, 52.0, 4.4, 52.1)
     """
     try:
-        values = [float(part) for part in text.split(",")]
+        # Python also reads 1_000
+        values = [float(part) for part in text.replace("_", "?").split(",", 6)]
     except ValueError:
         values = []
     if len(values) != 4 or not all(math.isfinite(value) for value in values):

@@ -12,6 +12,9 @@ from service.wire.execute import EXAMPLE as EXECUTE_EXAMPLE
 from service.wire.jobs import StatusInfo
 from service.wire.problems import Problem
 
+REQUIRED = "x-required"
+"""Marks the schema of a parameter that must be there although the route itself refuses its absence."""
+
 JOB_ID = "3f2a9c0d5e6b47189a0b1c2d3e4f5a6b"
 """The job of the examples."""
 

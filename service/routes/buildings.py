@@ -45,9 +45,10 @@ from service.routes.bound import Base
 from service.routes.finished_jobs import FinishedJob, FinishedRun, ReadableRun
 from service.routes.negotiation import preferred
 from service.routes.results import FAILED
+from service.wire import patterns
 from service.wire.base import link, respond
 from service.wire.buildings import CityJson, Decision, Decisions, Feature, FeaturePage
-from service.wire.queries import words
+from service.wire.queries import entry_of, words
 
 router = APIRouter(tags=["results"])
 
@@ -117,9 +118,9 @@ _Coordinates = Annotated[
 _BuildingId = Annotated[
     str, Path(alias="buildingID", description="As in the lists.", examples=["3givd2mvtyerfjxv2yytjbmi"])
 ]
-_Statuses = Annotated[list[str] | None, AfterValidator(words(list(Status)))]
-_RoofTypes = Annotated[list[str] | None, AfterValidator(words(list(RoofType)))]
-_Reasons = Annotated[list[str] | None, AfterValidator(words(list(Reason)))]
+_Statuses = Annotated[list[Annotated[str, entry_of(Status)]] | None, AfterValidator(words(list(Status)))]
+_RoofTypes = Annotated[list[Annotated[str, entry_of(RoofType)]] | None, AfterValidator(words(list(RoofType)))]
+_Reasons = Annotated[list[Annotated[str, entry_of(Reason)]] | None, AfterValidator(words(list(Reason)))]
 
 
 def _any_of(kind: type[Status | RoofType | Reason]) -> str:
@@ -136,6 +137,7 @@ class _Asked:
             description="Only buildings whose footprint's bounds meet this window: west,south,east,north. Buildings "
             "without a footprint never do. Split a window over the 180th meridian into two requests.",
             examples=["9.99,53.55,10.01,53.57"],
+            json_schema_extra=patterns.stated(patterns.WINDOW),
         ),
     ] = None
     bbox_crs: Annotated[

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 from urllib.parse import urlencode
@@ -34,6 +35,7 @@ from service.routes.finished_jobs import results_of
 from service.routes.negotiation import preferred
 from service.store import JobStore
 from service.store.queries import JobFilter
+from service.wire import patterns
 from service.wire.base import RELATIONS, Link, link, page_links, respond, timestamp
 from service.wire.features import (
     Collection,
@@ -80,7 +82,11 @@ _CollectionId = Annotated[
 _FeatureId = Annotated[
     str, Path(alias="featureID", description="As in the pages.", examples=["3givd2mvtyerfjxv2yytjbmi"])
 ]
-_Crs = Annotated[str | None, Query(alias="crs", description="CRS of the answer; one of the collection's `crs`.")]
+_URI = patterns.stated(patterns.CRS_URI)
+_Crs = Annotated[
+    str | None,
+    Query(alias="crs", description="CRS of the answer; one of the collection's `crs`.", json_schema_extra=_URI),
+]
 _CRS_HEADER = header("Content-Crs", "CRS of the coordinates.")
 
 _COLLECTION_EXAMPLE: dict[str, Any] = {
@@ -325,16 +331,21 @@ class _Asked:
             description="Only features that meet this window: four numbers in the axis order of `bbox-crs`; in degrees "
             "it may cross the 180th meridian. Features without geometry are always there.",
             examples=["4.35,51.99,4.37,52.01"],
+            json_schema_extra=patterns.stated(patterns.WINDOW),
         ),
     ] = None
-    bbox_crs: Annotated[str | None, Query(alias="bbox-crs", description="CRS of bbox; CRS84 by default.")] = None
+    bbox_crs: Annotated[
+        str | None,
+        Query(alias="bbox-crs", description="CRS of bbox; CRS84 by default.", json_schema_extra=_URI),
+    ] = None
     crs: _Crs = None
     datetime: Annotated[
         str | None,
         AfterValidator(_is_interval),
         Query(
             description="Only features whose points were acquired then: an RFC 3339 time, or `a/b`, `../b`, `a/..`. "
-            "Features without such times are always there."
+            "Features without such times are always there.",
+            json_schema_extra=patterns.stated(patterns.INTERVAL),
         ),
     ] = None
     filter: Annotated[
@@ -344,7 +355,12 @@ class _Asked:
         Literal["cql2-text", "cql2-json"], Query(alias="filter-lang", description="Language of the filter.")
     ] = "cql2-text"
     filter_crs: Annotated[
-        str | None, Query(alias="filter-crs", description="CRS of coordinates in the filter; CRS84 by default.")
+        str | None,
+        Query(
+            alias="filter-crs",
+            description="CRS of coordinates in the filter; CRS84 by default.",
+            json_schema_extra=_URI,
+        ),
     ] = None
     limit: Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Maximum number of features of the page.")] = 100
     start: Annotated[
@@ -382,10 +398,9 @@ def _query(run: OpenRun, layer: Layer, asked: _Asked, given: Sequence[tuple[str,
     if unknown:
         known = f"{', '.join(sorted(_NAMES))}, or a property of its queryables"
         raise RequestError([f"query {name[:80]!r} is not known: use {known}" for name in dict.fromkeys(unknown)])
-    names = [name for name, _ in given]
-    twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
+    twice = {name: number for name, number in Counter(name for name, _ in given).items() if number > 1}
     if twice:
-        raise RequestError([f"query {name} is given {names.count(name)} times: give it once" for name in twice])
+        raise RequestError([f"query {name} is given {number} times: give it once" for name, number in twice.items()])
     filters: list[Filter] = [
         compiled(equality(name, value, layer.queryables), layer.queryables, filter_crs) for name, value in given
     ]

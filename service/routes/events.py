@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Annotated
 
@@ -99,34 +100,45 @@ async def events(
     if found.status.is_over and not await run_in_threadpool(store.events, job_id, after, 1):
         return Response(status_code=204)
     streams: Streams = request.app.state.streams
-    streams.open(settings.max_event_streams)
-    return EventStream(follow(store, job_id, after, settings.poll_s, lambda: streams.closing), streams)
+    streams.open(caller.key_id, settings.max_event_streams, settings.max_event_streams_per_key)
+    return EventStream(follow(store, job_id, after, settings.poll_s, lambda: streams.closing), streams, caller.key_id)
 
 
 class Streams:
     """The number of open streams, and whether they must end because the process does."""
 
     def __init__(self) -> None:
-        self.count = 0
+        self._of_keys: Counter[str | None] = Counter()
         self.closing = False
 
-    def open(self, most: int) -> None:
-        """Count one more.
+    @property
+    def count(self) -> int:
+        """The number of all."""
+        return self._of_keys.total()
+
+    def open(self, key_id: str | None, most: int, most_per_key: int) -> None:
+        """Count one more of a key; None if keys are not used, then only the total is limited.
 
         Raises
         ------
         TooManyRequestsError
             Too many are open.
         """
-        if self.count >= most:
+        own = self._of_keys[key_id]
+        fix = "poll the job, or try again later"
+        if key_id is not None and own >= most_per_key:
             raise TooManyRequestsError(
-                f"{self.count} event streams are open, the limit is {most}: poll the job, or try again later", 30.0
+                f"{own} event streams of this key are open, the limit is {most_per_key}: {fix}", 30.0
             )
-        self.count += 1
+        if self.count >= most:
+            raise TooManyRequestsError(f"{self.count} event streams are open, the limit is {most}: {fix}", 30.0)
+        self._of_keys[key_id] += 1
 
-    def close(self) -> None:
+    def close(self, key_id: str | None) -> None:
         """Count one less."""
-        self.count -= 1
+        self._of_keys[key_id] -= 1
+        if not self._of_keys[key_id]:
+            del self._of_keys[key_id]
 
 
 class EventStream(StreamingResponse):
@@ -134,16 +146,16 @@ class EventStream(StreamingResponse):
 
     media_type = "text/event-stream"
 
-    def __init__(self, content: AsyncIterator[bytes], streams: Streams) -> None:
+    def __init__(self, content: AsyncIterator[bytes], streams: Streams, key_id: str | None) -> None:
         super().__init__(content, headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})
-        self._streams = streams
+        self._streams, self._key_id = streams, key_id
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send it."""
         try:
             await super().__call__(scope, receive, send)
         finally:
-            self._streams.close()
+            self._streams.close(self._key_id)
 
 
 async def follow(

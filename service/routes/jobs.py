@@ -13,6 +13,7 @@ from fastapi import APIRouter, Body, Path, Query, Response
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
+from service import bodies
 from service.errors import JobNotOverError, RequestError
 from service.files import StateFolder
 from service.jobs import Fault, Job, JobStatus
@@ -41,6 +42,9 @@ DISMISSAL_S = 5.0
 
 LOOK_S = 0.1
 """Seconds between checks of a job that is being dismissed."""
+
+MAX_WORDS = 100
+"""Most words of one field of a form."""
 
 OTHER_PARTS = 50
 """Maximum number of parts of a form that are not files."""
@@ -112,7 +116,7 @@ async def _read(submission: Submission) -> Execute:
         elif name in inputs:
             faults.append(f"{shortened(name)} is given twice: give it once")
         elif text.strip():
-            inputs[name] = _value(name, text, faults)
+            inputs[name] = await _value(name, text, settings.max_body_bytes, faults)
     if faults:
         raise RequestError(faults)
     given = {"subscriber": inputs.pop("subscriber")} if "subscriber" in inputs else {}
@@ -134,24 +138,35 @@ async def _stored(part: Part, submission: Submission, number: int) -> dict[str, 
 
 
 def _words(text: str) -> list[str]:
-    """Words with commas between them."""
-    return [word.strip() for word in text.split(",") if word.strip()]
+    """Words with commas between them.
+
+    Raises
+    ------
+    RequestError
+        More than anything here has.
+    """
+    found = [word.strip() for word in text.split(",") if word.strip()]
+    if len(found) > MAX_WORDS:
+        raise RequestError([f"{shortened(text)} has {len(found):,} words: use at most {MAX_WORDS}"])
+    return found
 
 
 _AS_JSON = frozenset({"settings", "subscriber", "bbox", "priority", "allowOutsideAreaOfUse", "points", "geoidHeight"})
 
 
-def _value(name: str, text: str, faults: list[str]) -> Any:
+async def _value(name: str, text: str, max_bytes: int, faults: list[str]) -> Any:
     """A field's value: settings, subscriber, numbers and permissions (true, false) are JSON, anything else is text."""
     if name not in _AS_JSON:
         return text.strip()
     if name == "bbox" and not text.strip().startswith(("[", "{")):
         text = f"[{text}]"
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
+        return await bodies.read(text, max_bytes)
+    except json.JSONDecodeError as error:
         faults.append(f"{name} is {shortened(text)}: use JSON ({error})")
-        return None
+    except ValueError:  # the limit of Python's own, whose message names a function of Python
+        faults.append(f"{name} is {shortened(text)}: use numbers of fewer digits")
+    return None
 
 
 # --- list ------------------------------------------------------------------------------------------------------------

@@ -13,12 +13,14 @@ _SAME = {
 }
 """Other names under which a client may request a type; the answer carries the type itself."""
 _BYTES = ("application/octet-stream",)
+MAX_ENTRIES = 100
+"""Media types of a header that are looked at; browsers send a dozen."""
 
 
 def _weights(accept: str) -> dict[str, float]:
     """Weight by media range; entries that cannot be parsed are left out."""
     found: dict[str, float] = {}
-    for entry in accept.split(","):
+    for entry in accept.split(",", MAX_ENTRIES)[:MAX_ENTRIES]:
         name, *parameters = (part.strip().lower() for part in entry.split(";"))
         weight = 1.0
         for parameter in parameters:

@@ -8,6 +8,7 @@ import dataclasses
 import logging
 from collections.abc import AsyncIterator
 from typing import Annotated
+from urllib.parse import urlsplit
 
 import anyio
 import anyio.to_thread
@@ -15,10 +16,20 @@ from fastapi import Header, Request
 from fastapi.responses import Response
 
 from service.deliveries import CLAIM_S, Claim, Fingerprint, StoredAnswer
-from service.errors import KeyReusedError, StoreError
+from service.errors import (
+    KeyReusedError,
+    NoSuchJobError,
+    NoSuchScheduleError,
+    NoSuchUploadError,
+    NoSuchWebhookError,
+    RemovedSinceError,
+    StoreError,
+)
 from service.multipart import Form
+from service.resumable import find
 from service.routes.writing import Writer
 from service.store import JobStore, Patience
+from service.wire import patterns
 
 KEPT_HEADERS = (
     *("location", "etag", "cache-control", "content-type", "preference-applied"),
@@ -35,7 +46,7 @@ FREE_S = 1.0
 IdempotencyKey = Annotated[
     str | None,
     Header(
-        min_length=1,
+        json_schema_extra=patterns.stated(patterns.KEY),
         description="A text of your choice that names this request. Sent again with the same text, it makes nothing "
         "new and is answered as before.",
         examples=["8e03978e-40d5-43dd-bc93-6894a57f9324"],
@@ -76,6 +87,8 @@ async def checked_replay(request: Request, stored: StoredAnswer) -> ReplayedErro
     ------
     KeyReusedError
         It is another request.
+    RemovedSinceError
+        What the first one made is gone: its answer would be wrong now, and a second one was not asked for.
     """
     seen = fingerprint_of(request)
     async for _ in content(request, seen):
@@ -86,7 +99,39 @@ async def checked_replay(request: Request, stored: StoredAnswer) -> ReplayedErro
             "the Idempotency-Key was used for another request: use a new key for each request, and the same body when "
             "it is sent again"
         )
+    location = urlsplit(stored.headers.get("location", "")).path
+    if location and not await anyio.to_thread.run_sync(_is_there, request, location):
+        raise RemovedSinceError(
+            f"the request with this Idempotency-Key made {location}, which was removed since: use a new key to make "
+            "another"
+        )
     return ReplayedError(stored)
+
+
+def _is_there(request: Request, location: str) -> bool:
+    """Whether a thing that a request made still exists, by the end of its path; whose it is the key has shown."""
+    store: JobStore = request.app.state.store
+    *_, collection, name = location.split("/")
+    try:
+        if collection == "jobs":
+            store.get(name)
+        elif collection == "schedules":
+            store.schedules.get(name)
+        elif collection == "webhooks":
+            store.webhooks.get(name)
+        elif collection == "uploads" or not _is_unfinished(request, name):
+            store.upload(name)
+    except (NoSuchJobError, NoSuchScheduleError, NoSuchUploadError, NoSuchWebhookError):
+        return False
+    return True
+
+
+def _is_unfinished(request: Request, upload_id: str) -> bool:
+    try:
+        find(request.app.state.folder, upload_id, None)
+    except NoSuchUploadError:
+        return False
+    return True
 
 
 async def content(request: Request, seen: Fingerprint) -> AsyncIterator[None]:

@@ -21,7 +21,7 @@ from service.routes.html import PageRoute, in_either_form
 from service.routes.negotiation import preferred
 from service.status import results_document
 from service.wire.base import respond
-from service.wire.queries import words
+from service.wire.queries import Words
 from service.wire.results import Results
 
 router = APIRouter(tags=["results"], route_class=PageRoute)
@@ -67,13 +67,11 @@ _EXAMPLE = {
 def results(
     finished: Finished,
     base: Base,
-    outputs: Annotated[
-        list[str] | None, Query(description="Only these, with commas between them or the parameter again.")
-    ] = None,
+    outputs: Annotated[Words, Query(description="Only these, with commas between them or the parameter again.")] = None,
 ) -> Response:
     """List the outputs of a finished job, each with media type, size and sha256."""
     stored = finished.catalogue.outputs
-    wanted = words()(outputs) or []
+    wanted = outputs or []
     unknown = [name for name in wanted if name not in KINDS]
     if unknown:
         raise RequestError([f"query outputs names {unknown[0][:80]!r}: use {', '.join(KINDS)}"])

@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 from pipeline.schedule import Cron, Missed, Overlap
 from service.deliveries import Delivery
 from service.drafts import Draft
-from service.errors import ChangedMeanwhileError, RequestError
+from service.errors import ChangedMeanwhileError, RequestError, within
 from service.jobs import Job, JobRequest
 from service.processes import process_named
 from service.routes.answers import (
@@ -96,7 +96,7 @@ def _draft(process_id: str, execute: Execute, settings: ServiceSettings) -> Draf
     try:
         return process_named(process_id).draft(execute, settings)
     except RequestError as error:
-        raise RequestError([f"execute: {fault}" for fault in error.faults]) from error
+        raise RequestError(within("execute", error.faults)) from error
 
 
 def _definition(body: wire.SchedulePatch, before: Definition | None, request: JobRequest, priority: int) -> Definition:

@@ -27,7 +27,7 @@ from service.routes.replay import HeldKey, IdempotencyKey, checked_replay, finge
 from service.routes.writing import Write, Writer
 from service.settings import ServiceSettings
 from service.store import JobStore
-from service.uploads import receive, remove_file
+from service.uploads import check_number, receive, remove_file
 from service.webhook_targets import check_receiver
 
 Made = TypeVar("Made")
@@ -118,7 +118,11 @@ class Submission:
         ------
         QuotaError
             The uploads of the key are too large.
+        TooManyUploadsError
+            The key has too many uploads already.
         """
+        most = self.settings.max_uploads_per_key
+        await anyio.to_thread.run_sync(check_number, self.store, self.caller.key_id, most, len(self._arrived.uploads))
         return await receive(
             await self._within_quota(stream),
             filename,
@@ -191,12 +195,14 @@ class Submission:
             for uri in subscriber.uris:
                 await check_receiver(uri, self.settings)
             subscriber = dataclasses.replace(subscriber, base=self._base)
+        # a page may be open at another name of the service than that of its settings
+        bases = {self._base, str(self._request.base_url).rstrip("/")}
         stored: dict[Inline, InputReference] = {}
         for inline in draft.inline:
             stored[inline] = await self.keep(_once(inline.content), inline.filename)
 
         def check_and_make(delivery: Delivery[Made]) -> Made:
-            request = dataclasses.replace(draft.request(stored), subscriber=subscriber)
+            request = dataclasses.replace(draft.request(stored, bases), subscriber=subscriber)
             owner = self.caller.owner
             resolve_inputs(request, store=self._arrived, folder=self.folder, settings=self.settings, owner=owner)
             return make(request, delivery)
@@ -219,6 +225,7 @@ class Submission:
         delivery: Delivery[Made] = Delivery(
             uploads=tuple(self._arrived.uploads),
             max_upload_bytes=self.settings.max_upload_bytes_per_key,
+            max_uploads=self.settings.max_uploads_per_key,
             claim=None if held is None else held.claim,
             answer=None if seen is None else lambda made: stored_answer(answer(made), seen),
             kept_s=self.settings.idempotency_hours * 3600.0,

@@ -17,10 +17,11 @@ from fastapi import APIRouter, Depends, Header, HTTPException, Request, Response
 from service.arrivals import ALGORITHMS, Arrivals, Part, State
 from service.errors import RequestError
 from service.problems import MEDIA_TYPE
-from service.routes.answers import problems, reference
+from service.routes.answers import REQUIRED, problems, reference
 from service.routes.bound import Base, Settings_, Store, Submitter, visitor
 from service.routes.submission import Submitting
 from service.routes.uploads import UploadId
+from service.wire import patterns
 from service.wire.problems import Problem
 
 VERSION = "1.0.0"
@@ -35,7 +36,12 @@ MAX_METADATA = 4096
 
 def _check_version(
     tus_resumable: Annotated[
-        str | None, Header(description="Version of the protocol: 1.0.0.", examples=[VERSION])
+        str | None,
+        Header(
+            description="Version of the protocol: 1.0.0.",
+            examples=[VERSION],
+            json_schema_extra={"enum": [VERSION], REQUIRED: True},
+        ),
     ] = None,
 ) -> None:
     """Refuse other versions of the protocol."""
@@ -66,6 +72,7 @@ Checksum = Annotated[
         description=f"Algorithm ({' or '.join(ALGORITHMS)}) and base64 of the digest of the bytes of this request; "
         "bytes that differ are not kept.",
         examples=["sha1 Kq5sNclPz7QV2+lfQIuc6R7oRu0="],
+        json_schema_extra=patterns.stated(patterns.CHECKSUM),
     ),
 ]
 Metadata = Annotated[
@@ -75,6 +82,7 @@ Metadata = Annotated[
         description="`filename` with the base64 of the file's name; after a comma `sha256` with that of the file's "
         "SHA-256, hexadecimal. Other names are kept and not used.",
         examples=["filename ZGVsZnRfZWFzdC5sYXo="],
+        json_schema_extra=patterns.stated(patterns.METADATA),
     ),
 ]
 

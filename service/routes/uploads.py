@@ -76,7 +76,12 @@ EXAMPLE: dict[str, Any] = {
 UploadId = Annotated[str, Path(alias="uploadID", description="As in the answer to the upload.", examples=[UPLOAD_ID])]
 
 _BINARY = {"type": "string", "format": "binary"}
-_FORM = {"type": "object", "required": [FILE_FIELD], "properties": {FILE_FIELD: _BINARY}}
+_FORM = {
+    "type": "object",
+    "required": [FILE_FIELD],
+    "properties": {FILE_FIELD: _BINARY},
+    "additionalProperties": False,
+}
 
 
 def _named(

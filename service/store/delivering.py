@@ -24,15 +24,17 @@ def creating(
     ------
     QuotaError
         The owner of the uploads has too many bytes.
+    TooManyUploadsError
+        The owner of the uploads has too many of them.
     KeyInUseError
         The key of the request has passed to another one.
     """
     with database.write() as connection:
         if delivery is not None and delivery.uploads:
-            if delivery.max_upload_bytes:
+            if delivery.max_upload_bytes or delivery.max_uploads:
                 # no other process adds one between counting and adding
                 database.lock(connection, LOCK_SUBMISSIONS)
-                uploads.check_quota(connection, delivery.uploads, delivery.max_upload_bytes)
+                uploads.check_quota(connection, delivery.uploads, delivery.max_upload_bytes, delivery.max_uploads)
             for upload in delivery.uploads:
                 uploads.add(connection, upload)
 

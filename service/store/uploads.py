@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from service.errors import NoSuchUploadError, QuotaError, UploadInUseError
+from service.errors import NoSuchUploadError, QuotaError, TooManyUploadsError, UploadInUseError
 from service.files import is_id
 from service.jobs import JobStatus, Upload
 from service.store.records import storable, upload_of
@@ -41,17 +41,23 @@ def stored_bytes(connection: Connection, owner: str | None) -> int:
     return int(connection.execute(own).scalar_one())
 
 
-def check_quota(connection: Connection, added: Sequence[Upload], most: int) -> None:
-    """Refuse uploads of one owner that exceed its quota.
+def check_quota(connection: Connection, added: Sequence[Upload], most_bytes: int, most: int) -> None:
+    """Refuse uploads of one owner that exceed its quota; 0 stands for no limit.
 
     Raises
     ------
     QuotaError
-        They do.
+        They have too many bytes.
+    TooManyUploadsError
+        They are too many.
     """
-    stored, more = stored_bytes(connection, added[0].owner), sum(upload.size_bytes for upload in added)
-    if stored + more > most:
-        raise QuotaError(stored, more, most)
+    owner = added[0].owner
+    stored, more = stored_bytes(connection, owner), sum(upload.size_bytes for upload in added)
+    if most_bytes and stored + more > most_bytes:
+        raise QuotaError(stored, more, most_bytes)
+    own = sa.select(sa.func.count()).select_from(UPLOADS).where(UPLOADS.c.owner.is_not_distinct_from(owner))
+    if most and connection.execute(own).scalar_one() + len(added) > most:
+        raise TooManyUploadsError.stored(most)
 
 
 def get(connection: Connection, upload_id: str, owner: str | None) -> Upload:

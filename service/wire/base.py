@@ -9,6 +9,7 @@ from urllib.parse import urlencode
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     ModelWrapValidatorHandler,
     PlainSerializer,
@@ -17,6 +18,9 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
 from starlette.responses import Response
+
+from service.errors import MOST_FAULTS
+from service.wire.faults import FURTHER
 
 RELATIONS = "http://www.opengis.net/def/rel/ogc/1.0/"
 """Prefix of the standard's link relations."""
@@ -113,11 +117,23 @@ class Request(BaseModel):
     @model_validator(mode="wrap")
     @classmethod
     def _explained(cls, given: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        known, further = cls._without_most_unknown(cls.prepared(given))
         try:
-            return handler(cls.prepared(given))
+            return handler(known)
         except ValidationError as error:
             faults = [cls._explanation(fault) for fault in error.errors(include_url=False)]
+            if further:
+                count = PydanticCustomError(FURTHER, "further unknown members", {"number": further})
+                faults.append(InitErrorDetails(type=count, loc=(), input=None))
             raise ValidationError.from_exception_data(cls.__name__, faults) from None
+
+    @classmethod
+    def _without_most_unknown(cls, given: Any) -> tuple[Any, int]:
+        """The document with the first unknown members only, and the number of the others: each costs an error."""
+        if not isinstance(given, dict) or len(given) <= len(cls.model_fields) + MOST_FAULTS:
+            return given, 0
+        left = set([name for name in given if name not in cls.model_fields][MOST_FAULTS:])
+        return {name: value for name, value in given.items() if name not in left}, len(left)
 
     @classmethod
     def _explanation(cls, fault: Any) -> InitErrorDetails:
@@ -129,9 +145,26 @@ class Request(BaseModel):
             kind, message = "unknown", f"is not {cls.NOUN}: {fix}"
         elif kind in {"missing", "too_short", "too_long"} and len(fault["loc"]) == 1:
             context = context | {"fix": hint} if (hint := cls.HINTS.get(fault["loc"][0])) else context
-        if kind == "unknown" or "fix" in context:
-            kind = PydanticCustomError(kind, message, context)
-        return InitErrorDetails(type=kind, loc=fault["loc"], input=fault["input"], ctx=context)
+        return raised_again({**fault, "type": kind, "msg": message, "ctx": context})
+
+
+def raised_again(fault: Any, *place: int | str) -> InitErrorDetails:
+    """A fault of pydantic's or of ours as one of an error that is raised in its place, below `place`."""
+    kind, context = fault["type"], fault.get("ctx", {})
+    if kind in {"unknown", FURTHER} or "fix" in context:
+        kind = PydanticCustomError(kind, fault["msg"], context)
+    return InitErrorDetails(type=kind, loc=(*place, *fault["loc"]), input=fault["input"], ctx=context)
+
+
+def at_most(number: int) -> BeforeValidator:
+    """Refuses longer lists and objects before their entries are looked at: each bad one would cost an error."""
+
+    def check(given: Any) -> Any:
+        if isinstance(given, list | dict) and len(given) > number:
+            raise ValueError(f"use at most {number} entries")
+        return given
+
+    return BeforeValidator(check)
 
 
 class OneOf:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, ValidationError
 
@@ -12,7 +12,7 @@ from service.drafts import Draft
 from service.errors import RequestError
 from service.jobs import Subscriber
 from service.outputs import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, ECHO_OUTPUTS, OUTPUTS, OutputKind
-from service.wire.base import Request
+from service.wire.base import Request, at_most, optional_members
 from service.wire.faults import FaultsError, sentences, shortened
 from service.wire.inputs import ClassifyInputs, CompareInputs, EchoInputs, JobInputs, ReconstructInputs
 from service.wire.webhooks import ReceiverUrl
@@ -32,6 +32,9 @@ KINDS: Mapping[str, Mapping[str, OutputKind]] = {
     "echo": ECHO_OUTPUTS,
 }
 """The outputs of every process."""
+
+MAX_OUTPUTS = 100
+"""Most outputs that a request may name; no process has as many."""
 
 EXAMPLE = {
     "inputs": {
@@ -81,8 +84,15 @@ def wanted(names: Iterable[str]) -> dict[str, WantedOutput]:
     return {name: WantedOutput() for name in names}
 
 
+def _one_at_least(schema: dict[str, Any]) -> None:
+    optional_members(schema)
+    schema["minProperties"] = 1
+
+
 class SubscriberUris(Request):
     """Where to send news of the job; the page on webhooks shows bodies and signatures."""
+
+    model_config = ConfigDict(json_schema_extra=_one_at_least)
 
     successUri: ReceiverUrl | None = Field(None, description="Gets the results document when the job succeeds.")
     inProgressUri: ReceiverUrl | None = Field(
@@ -106,7 +116,7 @@ class Retry(Request):
         description="Inputs that replace those of the job; null takes one away. Tables of `settings` are merged: "
         "settings that are not named stay, null takes one away.",
     )
-    outputs: dict[str, WantedOutput] | None = Field(
+    outputs: Annotated[dict[str, WantedOutput], at_most(MAX_OUTPUTS)] | None = Field(
         default=None, description="The wanted outputs; those of the job if it is left out."
     )
 
@@ -138,16 +148,18 @@ def _merged_tables(before: Mapping[str, Any], changes: Mapping[str, Any]) -> dic
 
 
 class Execute(Request):
-    """A request for a job; other members are ignored."""
+    """A request for a job."""
 
-    model_config = ConfigDict(extra="ignore")
+    HINTS: ClassVar[Mapping[str, str]] = {
+        name: "it is an input, put it into inputs" for model in INPUTS.values() for name in model.model_fields
+    }
 
     inputs: dict[str, Any] = Field(
         default_factory=dict,
         description="By the names that the process's description lists; each a value, a reference `{href}`, a value "
         "with a media type `{value, encoding, mediaType}`, or a list of these.",
     )
-    outputs: dict[str, WantedOutput] | None = Field(
+    outputs: Annotated[dict[str, WantedOutput], at_most(MAX_OUTPUTS)] | None = Field(
         default=None, description="The wanted outputs; all if it is left out."
     )
     mode: Literal["async", "auto"] = Field(default="async", description="Jobs run asynchronously.")
@@ -166,6 +178,9 @@ class Execute(Request):
         RequestError
             Naming every fault of inputs and outputs.
         """
+        tiles = self.inputs.get("tiles")
+        if max_inputs is not None and isinstance(tiles, list) and len(tiles) > max_inputs:
+            raise RequestError([f"tiles has {len(tiles)} entries: use at most {max_inputs}"])
         faults: list[str] = []
         kinds, outputs, inputs = KINDS[process_id], None, None
         try:
@@ -177,9 +192,6 @@ class Execute(Request):
             faults += [f"{shortened(name)} is not an output: use {', '.join(kinds)}" for name in unknown]
             outputs = tuple(name for name in kinds if name in self.outputs)
             faults += [fault for name in outputs for fault in self.outputs[name].faults(name, kinds[name])]
-        tiles = self.inputs.get("tiles")
-        if max_inputs is not None and isinstance(tiles, list) and len(tiles) > max_inputs:
-            faults.append(f"tiles has {len(tiles)} entries: use at most {max_inputs}")
         if inputs is None or faults:
             raise RequestError(faults)
         draft = inputs.draft(process_id, outputs)

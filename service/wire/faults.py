@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from service.errors import RequestError
+from service.errors import MOST_FAULTS, Further, RequestError, few
+
+FURTHER = "further"
+"""Type of a fault that stands for as many as its context says."""
 
 FIXES: Mapping[str, str] = {
     "string_type": "use a text",
@@ -35,27 +38,46 @@ class FaultsError(ValueError):
     """Raised by validators for several faults, each a sentence with its path, instead of a fix for one value."""
 
     def __init__(self, faults: Sequence[str]) -> None:
-        self.faults = tuple(faults)
+        self.faults = few(faults)
         super().__init__("; ".join(self.faults))
 
 
 def sentences(errors: Sequence[Mapping[str, Any]]) -> list[str]:
-    """One sentence per fault."""
+    """One sentence per fault, for the first ones; the others are counted."""
     found: list[str] = []
+    for number, error in enumerate(errors):
+        if len(found) >= MOST_FAULTS:
+            found += [*(_numbers(errors[number:]))]
+            break
+        found += _sentences(error)
+    return [*few(found)]
+
+
+def _numbers(errors: Sequence[Mapping[str, Any]]) -> Iterator[Further]:
+    """How many faults there are, without their sentences, which take time."""
     for error in errors:
-        context = error.get("ctx") or {}
-        cause, kind = context.get("error"), error["type"]
+        cause, number = (error.get("ctx") or {}).get("error"), 1
         if isinstance(cause, FaultsError):
-            found += cause.faults
-        elif kind == "json_invalid":
-            found.append(f"the body is not JSON: {cause or error['msg']}")
-        elif kind == "missing":
-            found.append(f"{_path(error['loc'])} is missing: {context.get('fix', 'give a value')}")
-        elif kind == "unknown":
-            found.append(f"{shortened(error['loc'][-1])} {error['msg']}")
-        else:
-            found.append(f"{_path(error['loc'])} is {shortened(error['input'])}: {_fix(kind, context, error['msg'])}")
-    return found
+            number = sum(fault.number if isinstance(fault, Further) else 1 for fault in cause.faults)
+        elif error["type"] == FURTHER:
+            number = error["ctx"]["number"]
+        yield Further(number)
+
+
+def _sentences(error: Mapping[str, Any]) -> Sequence[str]:
+    context = error.get("ctx") or {}
+    cause, kind = context.get("error"), error["type"]
+    if isinstance(cause, FaultsError):
+        return cause.faults
+    if kind == FURTHER:
+        return [Further(context["number"])]
+    if kind == "json_invalid":
+        return [f"the body is not JSON: {cause or error['msg']}"]
+    if kind == "missing":
+        return [f"{_path(error['loc'])} is missing: {context.get('fix', 'give a value')}"]
+    if kind == "unknown":
+        return [f"{shortened(error['loc'][-1])} {error['msg']}"]
+    return [f"{_path(error['loc'])} is {shortened(error['input'])}: {_fix(kind, context, error['msg'])}"]
 
 
 def _fix(kind: str, context: Mapping[str, Any], message: str) -> str:
@@ -78,11 +100,15 @@ def _path(place: Sequence[int | str]) -> str:
     words, text = list(place), ""
     part = words.pop(0) if words and words[0] in {"body", "query", "path", "header"} else ""
     for word in words:
-        text += f"[{word}]" if isinstance(word, int) else f".{word}"
+        text += f"[{word}]" if isinstance(word, int) else f".{word if len(word) <= LONGEST_VALUE else shortened(word)}"
     text = text.removeprefix(".")
     if part in {"", "body"}:
         return text or "the body"
     return f"{part} {text}"
+
+
+LONGEST_VALUE = 80
+"""Characters of a value, or of the name of a member, in a sentence."""
 
 
 def json_bytes(value: Any) -> bytes:
@@ -101,5 +127,14 @@ def json_bytes(value: Any) -> bytes:
 
 def shortened(value: Any) -> str:
     """A value as JSON, cut if it is long."""
-    text = json_bytes(value).decode("utf-8")
-    return text if len(text) <= 80 else f"{text[:77]}..."
+    text = ""
+    # piece by piece, since a large value is not written whole only to be cut
+    for piece in _encoder.iterencode(value[: LONGEST_VALUE + 1] if isinstance(value, str) else value):
+        text += piece[: LONGEST_VALUE + 1]
+        if len(text) > LONGEST_VALUE:
+            text = f"{text[: LONGEST_VALUE - 3]}..."
+            break
+    return text.encode("utf-8", "replace").decode("utf-8")
+
+
+_encoder = json.JSONEncoder(ensure_ascii=False, default=repr)

@@ -7,12 +7,14 @@ import binascii
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, WithJsonSchema, WrapValidator
+from pydantic import BeforeValidator, Field, PlainValidator, ValidationError, WithJsonSchema, WrapValidator
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from service.drafts import Inline, reference_of
+from service.errors import MOST_FAULTS
 from service.jobs import InputReference
-from service.wire.base import OneOf, Request
-from service.wire.faults import json_bytes
+from service.wire.base import OneOf, Request, raised_again
+from service.wire.faults import FURTHER, json_bytes
 
 LAS, LAZ, PLY, TEXT, CSV = "application/vnd.las", "application/vnd.laszip", "application/ply", "text/plain", "text/csv"
 
@@ -50,17 +52,19 @@ Content = Annotated[bytes, BeforeValidator(_decoded)]
 
 
 class ByReference(Request):
-    """A file elsewhere."""
-
-    model_config = ConfigDict(extra="ignore")
+    """A file elsewhere: a link, of which only the `href` matters."""
 
     href: Annotated[InputReference, PlainValidator(_placed)]
+    rel: str | None = None
+    type: str | None = None
+    hreflang: str | None = None
+    title: str | None = None
+    length: int | None = None
 
 
 class PointsByValue(Request):
     """A point cloud within the request."""
 
-    model_config = ConfigDict(extra="ignore")
     HINTS: ClassVar[Mapping[str, str]] = {"value": "use an href, or a value with base64 content"}
 
     value: Content
@@ -69,12 +73,11 @@ class PointsByValue(Request):
 
 
 class OutlinesByValue(Request):
-    """A file of footprints or guides within the request."""
-
-    model_config = ConfigDict(extra="ignore")
+    """A file of footprints or guides within the request; its first bytes say its format."""
 
     value: Content
     encoding: Literal["base64"]
+    mediaType: str | None = None
 
 
 def _referenced(given: Mapping[str, Any]) -> InputReference:
@@ -135,8 +138,26 @@ def _vectors(given: Any, name: str) -> Source:
 
 
 def _one_or_several(given: Any, handler: Any) -> Any:
-    """A list, also of a single file that is sent without one."""
-    return handler(given) if isinstance(given, list) else [points(given)]
+    """A list, also of a single file that is sent without one. After many faults the rest is not looked at."""
+    del handler  # it would look at all
+    if not isinstance(given, list):
+        return [points(given)]
+    faults: list[InitErrorDetails] = []
+    found: list[Source] = []
+    for number, one in enumerate(given):
+        if len(faults) >= MOST_FAULTS:
+            rest = PydanticCustomError(FURTHER, "further entries", {"number": len(given) - number})
+            faults.append(InitErrorDetails(type=rest, loc=(), input=None))
+            break
+        try:
+            found.append(points(one))
+        except ValidationError as error:
+            faults += [raised_again(fault, number) for fault in error.errors(include_url=False)]
+        except ValueError as error:
+            faults.append(InitErrorDetails(type="value_error", loc=(number,), input=one, ctx={"error": error}))
+    if faults:
+        raise ValidationError.from_exception_data("tiles", faults)
+    return found
 
 
 def _encoded(*media_types: str) -> list[dict[str, str]]:

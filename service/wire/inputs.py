@@ -13,12 +13,13 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, Wit
 from pipeline.errors import CrsError
 from pipeline.io.crs import LARGEST_COORDINATE, UNITS_M, horizontal_unit_of
 from service.drafts import Draft, Inline
-from service.errors import RequestError
+from service.errors import RequestError, within
 from service.input_policy import checked_crs
 from service.outputs.kinds import FORMATS
 from service.outputs.published import formats_of
 from service.run_settings import DEFAULTS, VARIANTS, choices, settings_faults, settings_schema
-from service.wire.base import OneOf, Request
+from service.wire import patterns
+from service.wire.base import OneOf, Request, at_most
 from service.wire.faults import FaultsError, shortened
 from service.wire.files import Lines, Outlines, PointClouds
 
@@ -41,7 +42,9 @@ def _printable(text: str) -> str:
     return text
 
 
-Text = Annotated[str, Field(max_length=500), AfterValidator(_printable)]
+Text = Annotated[
+    str, Field(max_length=500, json_schema_extra=patterns.stated(patterns.TEXT)), AfterValidator(_printable)
+]
 """A text of the user."""
 
 
@@ -59,6 +62,8 @@ Crs = Annotated[str, Field(max_length=20_000), AfterValidator(_printable), After
 
 def _in_crs_of_tiles(given: Any, info: ValidationInfo) -> Any:
     """The four numbers of a rectangle that states its CRS."""
+    if isinstance(given, list) and len(given) > 4:
+        return _has_area(given)
     if not isinstance(given, Mapping):
         return given
     crs, of_tiles = given.get("crs"), info.data.get("crs")
@@ -143,7 +148,7 @@ def _completed(settings: dict[str, Any], info: ValidationInfo, *names: str) -> d
         if settings.get(name, word) != word
     ]
     completed = settings | given
-    faults += [f"settings: {fault}" for fault in settings_faults(completed)]
+    faults += within("settings", settings_faults(completed))
     if faults:
         raise FaultsError(faults)
     return completed
@@ -311,14 +316,14 @@ class ReconstructInputs(BuildingInputs):
         title="Points",
         description="Also deliver the points as 3D Tiles, with their classes and their distances to the models.",
     )
-    publish: Annotated[list[Annotated[str, OneOf(*FORMATS)]], BeforeValidator(_as_list), AfterValidator(_makeable)] = (
-        Field(
-            default_factory=list,
-            title="Publish",
-            description="Also deliver the models in these formats: 3D Tiles, GeoPackage, PMTiles, CityJSON files, a "
-            "STAC catalogue, solar energy per roof plane, party walls. Naming one of their outputs does the same.",
-            json_schema_extra={"uniqueItems": True},
-        )
+    publish: Annotated[
+        list[Annotated[str, OneOf(*FORMATS)]], BeforeValidator(_as_list), AfterValidator(_makeable), at_most(100)
+    ] = Field(
+        default_factory=list,
+        title="Publish",
+        description="Also deliver the models in these formats: 3D Tiles, GeoPackage, PMTiles, CityJSON files, a "
+        "STAC catalogue, solar energy per roof plane, party walls. Naming one of their outputs does the same.",
+        json_schema_extra={"uniqueItems": True},
     )
     geoidHeight: float | None = Field(
         None,
@@ -375,7 +380,7 @@ class CompareInputs(BuildingInputs):
         "points": "they show the distances to the models of one method; submit reconstruct with points once per method",
     }
 
-    methods: Annotated[list[Variant], BeforeValidator(_as_list), AfterValidator(_distinct)] = Field(
+    methods: Annotated[list[Variant], BeforeValidator(_as_list), AfterValidator(_distinct), at_most(100)] = Field(
         min_length=2,
         max_length=MAX_METHODS,
         title="Methods",

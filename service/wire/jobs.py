@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, WithJsonSchema
+from pydantic import ConfigDict, Field, WithJsonSchema
 
+from pipeline.io.crs import UNITS_M
+from service.outputs.kinds import FORMATS
+from service.run_settings import VARIANTS, choices
+from service.wire import patterns
 from service.wire.base import Answer, Link, OneOf, Request, Time
 from service.wire.execute import Execute
+from service.wire.inputs import Meshes, Text
 from service.wire.problems import Problem
+from service.wire.queries import entry_of
 
 Progress = Annotated[int, Field(ge=0, le=100)]
 Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
@@ -110,33 +116,45 @@ File = Annotated[bytes, WithJsonSchema({"type": "string", "format": "binary"})]
 class JobForm(Answer):
     """Fields of the form. They become the inputs of a process."""
 
+    model_config = ConfigDict(extra="forbid")
+
     tile: Annotated[
         list[File], Field(min_length=1, description="Point clouds. A field without a file name contains an href.")
     ]
     footprints: File | None = Field(None, description="Building outlines, as a file or an href.")
     guides: File | None = Field(None, description="Lines of roofs, as a file or an href.")
     crs: str | None = None
-    verticalUnit: str | None = None
+    verticalUnit: Annotated[str, OneOf(*UNITS_M)] | None = None
     allowOutsideAreaOfUse: bool | None = None
-    bbox: str | None = Field(None, description="x_min,y_min,x_max,y_max in the tiles' CRS.")
-    method: str | None = None
-    preset: str | None = Field(None, description="Starting point of the method's settings.")
-    lods: str | None = Field(None, description="Levels of detail with commas between them: 1.2, 1.3, 2.2, 2.3.")
-    methods: list[str] | None = Field(
+    bbox: str | None = Field(
+        None,
+        description="x_min,y_min,x_max,y_max in the tiles' CRS.",
+        json_schema_extra=patterns.stated(patterns.WINDOW),
+    )
+    method: Annotated[str, OneOf(*choices("method"))] | None = None
+    preset: Annotated[str, OneOf(*choices("preset"))] | None = Field(
+        None, description="Starting point of the method's settings."
+    )
+    lods: Annotated[str, OneOf(*choices("lods"))] | None = Field(
+        None, description="Levels of detail with commas between them: 1.2, 1.3, 2.2, 2.3."
+    )
+    methods: list[Annotated[str, entry_of(VARIANTS)]] | None = Field(
         None,
         description="Makes the job a comparison of these, each METHOD or METHOD:PRESET, instead of method and preset: "
         "the field several times, or with commas.",
     )
-    classes: str | None = None
+    classes: Annotated[str, OneOf(*choices("classes"))] | None = None
     settings: str | None = Field(None, description="JSON.")
-    meshes: str | None = None
+    meshes: Meshes | None = None
     points: bool | None = Field(None, description="Whether to deliver the points, too, as 3D Tiles.")
-    publish: list[str] | None = Field(
+    publish: list[Annotated[str, entry_of(FORMATS)]] | None = Field(
         None, description="Further formats of the models: the field several times, or with commas."
     )
-    geoidHeight: float | None = Field(None, description="Metres of the geoid above the ellipsoid, for 3D Tiles.")
-    licence: str | None = None
-    title: str | None = None
-    priority: int | None = None
+    geoidHeight: float | None = Field(
+        None, ge=-200.0, le=200.0, description="Metres of the geoid above the ellipsoid, for 3D Tiles."
+    )
+    licence: Text | None = None
+    title: Text | None = None
+    priority: int | None = Field(None, ge=-10, le=10)
     subscriber: str | None = Field(None, description="JSON, as in a process's execution.")
     outputs: str | None = Field(None, description="Ids of the wanted outputs, with commas between them.")

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field, WithJsonSchema
 
 from service.jobs import JobStatus
+from service.wire import patterns
 
 _MILLISECOND = dt.timedelta(microseconds=999)
 """The rest of the millisecond that a time in an answer names."""
 _LAST = dt.datetime.max.replace(tzinfo=dt.UTC)
+
+MAX_WORDS = 100
+"""Most words of one query parameter."""
 
 Limit = Annotated[int, Field(ge=1, le=1000, description="Maximum number of entries of the page.")]
 Offset = Annotated[int, Field(ge=0, le=2**31 - 1, description="Number of entries before the page.")]
@@ -24,12 +28,19 @@ def words(allowed: Sequence[str] = ()) -> Callable[[list[str] | None], list[str]
     def split(values: list[str] | None) -> list[str] | None:
         if values is None:
             return None
-        found = list(dict.fromkeys(word.strip() for value in values for word in value.split(",") if word.strip()))
+        found = list(dict.fromkeys(word for value in values for part in value.split(",") if (word := part.strip(" "))))
+        if len(found) > MAX_WORDS:
+            raise ValueError(f"use at most {MAX_WORDS} words")
         if allowed and not set(found) <= set(allowed):
             raise ValueError(f"use one of {', '.join(allowed)}")
         return found
 
     return split
+
+
+def entry_of(allowed: Iterable[str]) -> WithJsonSchema:
+    """The schema of one value of such a parameter."""
+    return WithJsonSchema({"type": "string", **patterns.stated(patterns.any_of(allowed))})
 
 
 Words = Annotated[list[str] | None, AfterValidator(words())]
@@ -65,12 +76,14 @@ def _instant(text: str, *, is_open: bool) -> dt.datetime | None:
     """An RFC 3339 time in UTC; None for an open end."""
     if is_open and text in {"", ".."}:
         return None
+    if not patterns.fits(patterns.TIME, text):
+        raise ValueError("use a time such as 2026-03-01T09:30:00Z")
     try:
         # in a query an unescaped plus is a space
-        at = dt.datetime.fromisoformat(text.strip().replace(" ", "+") if "T" in text else text)
+        at = dt.datetime.fromisoformat(text.replace(" ", "+"))
         return (at if at.tzinfo is not None else at.replace(tzinfo=dt.UTC)).astimezone(dt.UTC)
     except (ValueError, OverflowError):
-        raise ValueError("use a time such as 2026-03-01T09:30:00Z") from None
+        raise ValueError("use a day that exists, as in 2026-03-01T09:30:00Z") from None
 
 
 def _is_interval(text: str | None) -> str | None:
@@ -93,7 +106,7 @@ class JobQuery(Page):
 
     type: Words = Field(None, description="The only type is `process`.")
     processID: Words = Field(None, description="Only jobs of these processes.")
-    status: Annotated[list[str] | None, AfterValidator(words([word.value for word in JobStatus]))] = Field(
+    status: Annotated[list[Annotated[str, entry_of(JobStatus)]] | None, AfterValidator(words([*JobStatus]))] = Field(
         None, description=f"Only jobs with these: {', '.join(JobStatus)}."
     )
     scheduleID: str | None = Field(None, description="Only jobs of this schedule.")
@@ -101,7 +114,9 @@ class JobQuery(Page):
         None, description="Only jobs with each of these words in title, id or process; case does not matter."
     )
     datetime: Annotated[str | None, AfterValidator(_is_interval)] = Field(
-        None, description="Time of creation: an RFC 3339 time, or `a/b`, `../b`, `a/..`."
+        None,
+        description="Time of creation: an RFC 3339 time, or `a/b`, `../b`, `a/..`.",
+        json_schema_extra=patterns.stated(patterns.INTERVAL),
     )
     minDuration: Seconds | None = None
     maxDuration: Seconds | None = None

@@ -9,7 +9,8 @@ from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_va
 
 from pipeline.errors import SettingsError
 from pipeline.schedule import Cron
-from service.errors import RequestError
+from service.errors import RequestError, within
+from service.wire import patterns
 from service.wire.base import Answer, Link, OneOf, Request, Time, ZonedTime, optional_members
 from service.wire.execute import Execute
 from service.wire.faults import FaultsError
@@ -63,11 +64,14 @@ Expression = Annotated[
         max_length=200,
         description="Minute, hour, day of the month, month, day of the week, as in Debian's cron; or @hourly, @daily, "
         "@weekly, @monthly, @yearly.",
+        json_schema_extra=patterns.stated(patterns.CRON),
     ),
     _cron(lambda text: Cron(text, "UTC")),
 ]
 TimeZone = Annotated[
-    str, Field(description="Name of a time zone in the IANA database."), _cron(lambda text: Cron("* * * * *", text))
+    str,
+    Field(description="Name of a time zone in the IANA database.", json_schema_extra=patterns.stated(patterns.ZONE)),
+    _cron(lambda text: Cron("* * * * *", text)),
 ]
 
 
@@ -124,7 +128,7 @@ class SchedulePatch(Request):
             try:
                 execute.draft(info.data["processID"] or likely)
             except RequestError as error:
-                raise FaultsError([f"execute: {fault}" for fault in error.faults]) from error
+                raise FaultsError(within("execute", error.faults)) from error
         return execute
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field
 
-from service.wire.base import Answer, Link, Request, Time, optional_members
+from service.wire.base import Answer, Link, Request, Time, at_most, optional_members
 from service.wire.faults import FaultsError
 from service.wire.queries import Page
 
@@ -31,6 +31,7 @@ Events = Annotated[
     list[EventType],
     Field(min_length=1, max_length=20, description="Only these are sent. `job.progress` comes at most every 10 s."),
     AfterValidator(_each_once),
+    at_most(20),
 ]
 
 

@@ -5,7 +5,10 @@ import json
 import threading
 from collections.abc import Iterator
 
+from finished_runs import problem
+
 from service.jobs import JobEvent, JobStatus
+from service.keys import Scope, digest_of
 from service.routes import events as events_routes
 
 
@@ -116,14 +119,34 @@ def test_more_streams_than_allowed_are_refused_and_counted_down_again(starting) 
     service = starting(max_event_streams=1)
     job_id = finished(service)
     streams = service.client.app.state.streams
-    streams.open(1)
+    streams.open(None, 1, 1)
     refused = streamed(service, job_id)
     assert refused.status_code == 429
     assert int(refused.headers["retry-after"]) >= 1
-    streams.close()
+    streams.close(None)
     for _ in range(3):
         assert streamed(service, job_id).status_code == 200
     assert streams.count == 0
+
+
+def test_one_key_does_not_take_the_streams_of_all(starting) -> None:
+    service = starting(max_event_streams=3, max_event_streams_per_key=1)
+    mine, others = service.key(Scope.ADMIN), service.key(Scope.ADMIN)
+    job_id, streams = finished(service), service.client.app.state.streams
+    streams.open(owner_of(service, mine), 3, 1)
+    refused = streamed(service, job_id, **mine)
+    assert "1 event streams of this key are open" in problem(refused, 429, "too-many-requests")
+    assert int(refused.headers["retry-after"]) >= 1
+    assert streamed(service, job_id, **others).status_code == 200
+    streams.close(owner_of(service, mine))
+    assert streamed(service, job_id, **mine).status_code == 200
+    assert streams.count == 0
+
+
+def owner_of(service, header: dict[str, str]) -> str:
+    """The id of a key."""
+    key = service.store.key_by_digest(digest_of(header["Authorization"].removeprefix("Bearer ")))
+    return key.key_id
 
 
 def test_a_process_that_ends_ends_its_streams(starting) -> None:

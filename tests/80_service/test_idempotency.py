@@ -284,3 +284,37 @@ def test_a_second_process_knows_the_key(tmp_path: Path) -> None:
             for url in (one, other)
         )
     assert first.json()["uploadID"] == second.json()["uploadID"]
+
+
+def make_webhook(service: Any, upload: str, headers: dict[str, str]) -> httpx.Response:
+    return service.client.post("/webhooks", json={"url": "https://8.8.8.8/"}, headers=headers)
+
+
+def begin_upload(service: Any, upload: str, headers: dict[str, str]) -> httpx.Response:
+    tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "5", "Upload-Metadata": "filename cG9pbnRzLnh5eg=="}
+    return service.client.post("/uploads/tus", headers={**tus, **headers})
+
+
+@pytest.mark.parametrize("create", [*CREATING, make_webhook, begin_upload], ids=lambda create: create.__name__)
+def test_the_answer_of_something_that_was_removed_since_is_not_given_again(local_service: Any, create: Create) -> None:
+    upload = local_service.upload()
+    first = create(local_service, upload, KEY)
+    assert first.status_code == 201, first.text
+    place = first.headers["location"]
+    assert create(local_service, upload, KEY).status_code == 201
+    for _ in range(2 if "/jobs/" in place else 1):  # a job that waits is dismissed, then removed
+        removed = local_service.client.delete(place, headers={"Tus-Resumable": "1.0.0"})
+        assert removed.status_code in {200, 204}, removed.text
+    before = made_things(local_service)
+    detail = problem(create(local_service, upload, KEY), 409, "removed-since")
+    assert httpx.URL(place).path in detail
+    assert made_things(local_service) == before
+    assert create(local_service, upload, {"Idempotency-Key": "another"}).status_code == 201
+
+
+def test_a_resumable_upload_that_was_finished_since_counts_as_there(local_service: Any) -> None:
+    size = {"Upload-Length": str(len(POINTS))}
+    first = begin_upload(local_service, "", {**KEY, **size})
+    sent = {"Tus-Resumable": "1.0.0", "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
+    assert local_service.client.patch(first.headers["location"], content=POINTS, headers=sent).status_code == 204
+    assert begin_upload(local_service, "", {**KEY, **size}).status_code == 201

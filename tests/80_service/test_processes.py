@@ -367,7 +367,7 @@ def test_the_answer_of_a_full_queue_says_when_to_try_again(starting) -> None:
     ("href", "kind", "value"),
     [
         (f"/uploads/{'a' * 32}", "upload", "a" * 32),
-        (f"https://example.org/prefix/uploads/{'a' * 32}", "upload", "a" * 32),
+        (f"https://example.org/prefix/uploads/{'a' * 32}", "url", f"https://example.org/prefix/uploads/{'a' * 32}"),
         ("https://example.org/tile.laz", "url", "https://example.org/tile.laz"),
         ("file:///data/a%20b.laz", "path", "/data/a b.laz"),
         ("/data/tile.laz", "path", "/data/tile.laz"),
@@ -388,3 +388,53 @@ def test_values_may_be_wrapped_as_the_standard_allows() -> None:
     given = {"tiles": "/srv/a.laz", "title": [{"value": "a title"}], "meshes": ["none"]}
     inputs = ReconstructInputs.model_validate({**given, "tiles": [{"href": "/srv/a.laz"}]})
     assert (inputs.title, inputs.meshes) == ("a title", "none")
+
+
+def test_members_beside_the_inputs_are_refused_with_their_place(local_service) -> None:
+    body = {"inputs": of_an_upload(local_service), "priority": 5, "foo": 1}
+    answer = local_service.client.post("/processes/reconstruct/execution", json=body)
+    faults = faults_of(answer)
+    assert '"priority" is not a member: it is an input, put it into inputs' in faults
+    assert '"foo" is not a member: use inputs, outputs' in faults
+
+
+@pytest.mark.parametrize(
+    ("tile", "words"),
+    [
+        ({"href": "/srv/a.laz", "method": "POST"}, '"method" is not a member: use href'),
+        ({"value": "AAAA", "schema": {}}, '"schema" is not a member: use value'),
+    ],
+)
+def test_members_of_a_file_that_would_be_ignored_are_refused(local_service, tile: dict, words: str) -> None:
+    assert words in faults_of(execute(local_service, {"tiles": [tile]}))
+
+
+def test_a_link_may_say_what_links_say(local_service) -> None:
+    inputs = of_an_upload(local_service)
+    (tile,) = inputs["tiles"] if isinstance(inputs["tiles"], list) else [inputs["tiles"]]
+    linked = {**tile, "rel": "item", "type": "application/vnd.las", "title": "a tile", "hreflang": "en", "length": 9}
+    assert execute(local_service, {**inputs, "tiles": [linked]}).status_code == 201
+
+
+def test_an_upload_at_another_host_is_not_ours(local_service) -> None:
+    inputs = {"crs": "EPSG:28992"}
+    upload = local_service.upload()
+    own = [f"/uploads/{upload}", f"uploads/{upload}", f"http://127.0.0.1:8000/uploads/{upload}"]
+    for href in own:
+        made = execute(local_service, {**inputs, "tiles": {"href": href}})
+        assert local_service.request_of(made).tiles == (InputReference(kind="upload", value=upload),), href
+    foreign = ["http://other", "https://127.0.0.1:8000", "http://127.0.0.1:8001", "http://127.0.0.1:8000/prefix"]
+    foreign += ["http://me@127.0.0.1:8000", "file://"]
+    for base in foreign:
+        answer = execute(local_service, {**inputs, "tiles": {"href": f"{base}/uploads/{upload}"}})
+        assert answer.status_code == 403, base
+
+
+def test_an_upload_below_the_services_own_path_is_ours(starting) -> None:
+    service = starting(public_url="https://example.org/models/", root_path="/models")
+    upload = service.upload()
+    for href in (f"https://example.org/models/uploads/{upload}", f"/models/uploads/{upload}"):
+        made = execute(service, {"crs": "EPSG:28992", "tiles": {"href": href}})
+        assert service.request_of(made).tiles[0].kind == "upload", href
+    answer = execute(service, {"crs": "EPSG:28992", "tiles": {"href": f"https://example.org/uploads/{upload}"}})
+    assert answer.status_code == 403

@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import contextlib
+import dataclasses
 import datetime as dt
 import errno
 import hashlib
@@ -17,14 +18,16 @@ from typing import Any
 
 import httpx
 import pytest
+from finished_runs import problem as problem_of
 from hypothesis import given
 from hypothesis import strategies as st
-from live_service import DEADLINE_S, add_key, answer_to, las_bytes, raw_request, serving, settings_in
+from live_service import DEADLINE_S, POINTS, add_key, answer_to, las_bytes, raw_request, serving, settings_in
 from processes import wait_for
 
 from pipeline.errors import InputError
 from service import preflight, uploads
-from service.errors import NoSpaceError, RequestError, TooLargeError
+from service.deliveries import Delivery
+from service.errors import NoSpaceError, RequestError, TooLargeError, TooManyUploadsError
 from service.filenames import NAME_LIMIT, SUFFIXES, clean_filename
 from service.files import StateFolder
 from service.jobs import InputReference, JobRequest, Upload
@@ -588,3 +591,34 @@ def test_many_uploads_at_once_are_each_stored_once(tmp_path: Path) -> None:
         assert [answer.status_code for answer in answers] == [201] * 20
         assert len(httpx.get(f"{url}/uploads").json()["uploads"]) == 20
     assert len(files_in(StateFolder(settings.state).uploads)) == 20
+
+
+def test_a_key_has_a_number_of_uploads(starting) -> None:
+    service = starting(max_uploads_per_key=2)
+    mine, others = service.key(Scope.SUBMIT), service.key(Scope.SUBMIT)
+    first = service.upload(**mine)
+    service.upload(**mine)
+
+    def refused(answer: httpx.Response) -> None:
+        assert "2 uploads, which is the limit" in problem_of(answer, 429, "too-many-uploads")
+        assert int(answer.headers["retry-after"]) > 0
+
+    refused(service.client.post("/uploads?filename=b.xyz", content=POINTS, headers=mine))
+    refused(service.client.post("/jobs", data={"crs": "EPSG:28992"}, files={"tile": ("a.xyz", POINTS)}, headers=mine))
+    tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "5", "Upload-Metadata": "filename cG9pbnRzLnh5eg=="}
+    refused(service.client.post("/uploads/tus", headers={**tus, **mine}))
+    assert len(list((service.settings.state / "uploads").iterdir())) == 2
+    service.upload(**others)
+    assert service.client.delete(f"/uploads/{first}", headers=mine).status_code == 204
+    assert service.client.post("/uploads/tus", headers={**tus, **mine}).status_code == 201
+    refused(service.client.post("/uploads/tus", headers={**tus, **mine}))
+
+
+def test_the_number_of_uploads_is_checked_where_they_are_stored(starting) -> None:
+    service = starting()
+    stored = service.store.upload(service.upload())
+    more = [dataclasses.replace(stored, upload_id=f"{n:032x}") for n in range(2)]
+    with pytest.raises(TooManyUploadsError, match="2 uploads"):
+        service.store.add_uploads(Delivery(uploads=more, max_uploads=2))
+    service.store.add_uploads(Delivery(uploads=more[:1], max_uploads=2))
+    assert len(service.store.upload_ids()) == 2
