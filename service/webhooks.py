@@ -51,7 +51,7 @@ ROOM = 24
 """Most deliveries of one endpoint that wait in rows of their own. Others wait as events, which all endpoints share."""
 
 KEEPS_UP_S = 30.0
-"""An endpoint keeps up if no delivery waits longer in line. Others may be paused: a burst does not pause a quick one."""
+"""An endpoint keeps up if no delivery waits longer in line. Others may be paused: a burst pauses no quick one."""
 
 UNDER_WAY = dt.timedelta(minutes=1)
 """Longest time from an event to the commit of its row: longer than a transaction waits and works."""

@@ -143,7 +143,7 @@ def line(connection: Connection, avoided: Avoided, now: dt.datetime) -> list[Due
             _RECEIVER.not_in(list(busy)),
             _PAYER.not_in(list(avoided.payers)),
         )
-        .order_by(_TABLE.due_at, _TABLE.delivery_id)
+        .order_by(_TABLE.due_at, _TABLE.created_at, _TABLE.delivery_id)
         .limit(_LINE)
     )
     return [Due(*row) for row in connection.execute(due)]
