@@ -36,7 +36,7 @@ REFILL_S = 0.5
 """Seconds between two looks at endpoints whose events wait for room."""
 LATE_S = 5.0
 """Seconds between two looks at endpoints that may have to be paused."""
-FORGET_S = 5.0
+FORGET_S = 15.0
 """Seconds between two rounds that remove what the log has too much."""
 _ROUNDS = 20
 """Most transactions of such a round."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
+from collections.abc import Mapping
 from typing import Any
 
 import sqlalchemy as sa
@@ -79,7 +80,8 @@ def refill(connection: Connection, endpoint_ids: list[str], now: dt.datetime, *,
     chosen = sa.select(WEBHOOKS).where(_HOOKS.endpoint_id.in_(endpoint_ids), _HOOKS.is_enabled)
     rows = connection.execute(chosen.where(_HOOKS.paused_at.is_(None)).with_for_update(skip_locked=True)).all()
     counts = {row.endpoint_id: row for row in connection.execute(_waiting())}
-    added, paused = 0, []
+    news: list[tuple[sa.RowMapping | Mapping[str, Any], Receiver]] = []
+    replays, paused = 0, []
     for row in rows:
         waiting = counts.get(row.endpoint_id)
         number = 0 if waiting is None else waiting.number
@@ -88,20 +90,20 @@ def refill(connection: Connection, endpoint_ids: list[str], now: dt.datetime, *,
         found = connection.execute(_missing(row).limit(room - replayed + 1)).mappings().all()
         taken = found[: room - replayed]
         receiver = Receiver(endpoint_id=row.endpoint_id, url=row.url, base=row.base)
-        for event in taken:
-            add(connection, event, [receiver], now)
-        added += replayed + len(taken)
+        news += [(event, receiver) for event in taken]
+        replays += replayed
         is_full = len(found) > len(taken)
         # all events before the first one without a delivery have theirs
         settled = min(found[-1]["at"] - _TICK, now - UNDER_WAY) if is_full else now - UNDER_WAY
         has_more = is_full or (replayed > 0 and replayed == room)
         values: dict[str, Any] = {"is_behind": has_more, "sent_until": max(row.sent_until, settled)}
         is_late = waiting is not None and waiting.since <= now - dt.timedelta(seconds=KEEPS_UP_S)
-        if is_late and is_full and _is_more(connection, row, max_waiting - number - len(taken)):
+        if is_late and is_full and _is_more(connection, row, max_waiting - number):
             values["paused_at"] = now
             paused.append(row.endpoint_id)
         connection.execute(sa.update(WEBHOOKS).where(_HOOKS.endpoint_id == row.endpoint_id).values(**values))
-    return Refilled(added=added, paused=tuple(paused))
+    add(connection, news, now)
+    return Refilled(added=len(news) + replays, paused=tuple(paused))
 
 
 def not_sent(connection: Connection, row: sa.Row[Any]) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import sqlalchemy as sa
@@ -75,7 +75,7 @@ def announce(connection: Connection, job: sa.Row[Any], event: EventType, now: dt
     if event is EventType.PROGRESS:
         replaced = _replace_progress(connection, reports, made["event_id"], receivers, now)
         receivers = [one for one in receivers if one.key not in replaced]
-    add(connection, made, [one for one in receivers if one.has_room], now)
+    add(connection, [(made, one) for one in receivers if one.has_room], now)
     if event is EventType.PROGRESS:
         # one that finds no room is not needed: a later one follows, or the end
         return
@@ -83,21 +83,20 @@ def announce(connection: Connection, job: sa.Row[Any], event: EventType, now: dt
     _let_wait(connection, [one.endpoint_id for one in full if one.endpoint_id is not None])
     if event.is_end:
         reason = f"more than {MAX_SUBSCRIBED} messages to subscribers of this key wait: replay it when they are sent"
-        add(connection, made, [one for one in full if one.endpoint_id is None], now, refused=reason)
+        add(connection, [(made, one) for one in full if one.endpoint_id is None], now, refused=reason)
 
 
 def add(
     connection: Connection,
-    event: sa.RowMapping | dict[str, Any],
-    receivers: Sequence[Receiver],
+    news: Sequence[tuple[sa.RowMapping | Mapping[str, Any], Receiver]],
     now: dt.datetime,
     *,
     refused: str | None = None,
 ) -> None:
-    """Write the deliveries of an event; with a reason they have failed already."""
-    if not receivers:
+    """Write a delivery per event and receiver; with a reason they have failed already."""
+    if not news:
         return
-    state = {"state": _WAITING, "due_at": now}
+    state: dict[str, Any] = {"state": _WAITING, "due_at": now}
     if refused is not None:
         state = {"state": DeliveryState.FAILED.value, "reason": storable(refused), "finished_at": now}
     rows = [
@@ -117,7 +116,7 @@ def add(
             "tried_since": now,
             **state,
         }
-        for one in receivers
+        for event, one in news
     ]
     connection.execute(sa.insert(WEBHOOK_DELIVERIES), rows)
 
