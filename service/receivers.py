@@ -9,11 +9,11 @@ import dataclasses
 from collections import Counter
 from collections.abc import Sequence
 
-SENDERS = 128
+SENDERS = 256
 """Messages that one driver sends at once. Each has a thread, which mostly waits."""
-MAX_SLOW = SENDERS // 2
+MAX_SLOW = SENDERS // 4
 """Most of them to slow receivers, so that quick ones always find a free sender."""
-MAX_SLOW_PER_KEY = SENDERS // 4
+MAX_SLOW_PER_KEY = SENDERS // 8
 MAX_PER_KEY = SENDERS // 2
 """Most of them to receivers of one key, and to its slow ones."""
 SLOW_S = 1.0

@@ -32,6 +32,9 @@ LOG = logging.getLogger("gablework.driver")
 
 LEASE_S = SEND_S + 15.0
 """Seconds for which a delivery is held: an attempt, and the time to write its end."""
+PACE_S = 0.1
+"""Seconds between two rounds that claim and settle. Many messages share a transaction, and between two of them others,
+such as the requests of clients, find the database free."""
 REFILL_S = 0.5
 """Seconds between two looks at endpoints whose events wait for room."""
 LATE_S = 5.0
@@ -96,6 +99,7 @@ class Sender:
     def _work(self) -> None:
         pause = FIRST_PAUSE_S
         while not (self._stopping.is_set() and self._receivers.under_way == 0):
+            began_s = time.monotonic()
             self._look_again.clear()
             try:
                 self._settle()
@@ -109,6 +113,7 @@ class Sender:
             else:
                 pause = FIRST_PAUSE_S
             self._look_again.wait(wait_s)
+            self._stopping.wait(max(0.0, began_s + PACE_S - time.monotonic()))
 
     def _settle(self) -> None:
         """Write how attempts ended, all that have ended by now.

@@ -35,8 +35,8 @@ _TABLE = WEBHOOK_DELIVERIES.c
 _LOG = WEBHOOK_ATTEMPTS.c
 _RECEIVER = sa.func.coalesce(_TABLE.endpoint_id, _TABLE.url)
 _PAYER = sa.func.coalesce(WEBHOOKS.c.owner, _TABLE.owner, "")
-_LINE = 1024
-"""Most deliveries of a line: more than one driver sends at once, with several of the same receiver."""
+_LINE = 512
+"""Most deliveries of a line: twice as many as one driver sends at once."""
 _WAITING = DeliveryState.WAITING.value
 
 
@@ -153,7 +153,8 @@ def take(
     connection: Connection, chosen: Sequence[Due], driver: str, *, now: dt.datetime, lease_s: float
 ) -> list[Parcel]:
     """Claim deliveries of a line, with all that sending them needs; those of closed endpoints are dropped."""
-    payers = {due.delivery_id: due.payer for due in chosen}
+    busy = set(connection.execute(sa.select(_RECEIVER).where(_TABLE.lease_until > now)).scalars())
+    payers = {due.delivery_id: due.payer for due in chosen if due.receiver not in busy}
     free = sa.and_(_TABLE.delivery_id.in_(list(payers)), _is_due(now))
     rows = connection.execute(sa.select(WEBHOOK_DELIVERIES).where(free).with_for_update(skip_locked=True)).all()
     endpoints = _endpoints(connection, [row.endpoint_id for row in rows])

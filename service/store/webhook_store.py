@@ -240,16 +240,14 @@ class WebhookStore:
         avoided : Avoided
             What is not in the line.
         """
-        # most checks find nothing: they take no lock
+        # the long look takes no lock; what others claimed since then is left out
         with self._database.read() as connection:
-            line = deliveries.line(connection, avoided, self._database.now(connection))
-        if not choose(line):
+            chosen = choose(deliveries.line(connection, avoided, self._database.now(connection)))
+        if not chosen:
             return []
         with self._database.write() as connection:
             self._database.lock(connection, LOCK_SECRETS)
-            now = self._database.now(connection)
-            chosen = choose(deliveries.line(connection, avoided, now))
-            return deliveries.take(connection, chosen, driver, now=now, lease_s=lease_s) if chosen else []
+            return deliveries.take(connection, chosen, driver, now=self._database.now(connection), lease_s=lease_s)
 
     def settle(self, parcel: Parcel, result: Result, policy: RetryPolicy) -> DeliveryState:
         """Write how an attempt ended; the state of the delivery afterwards.
