@@ -56,6 +56,8 @@ class Receivers:
     def __init__(self) -> None:
         self.latencies_s: list[float] = []
         self.slow = 0
+        self.busy = 0
+        """Submissions that were refused for now, since the database was busy."""
         self.got: Counter[tuple[str, str, str]] = Counter()
         """Messages by path, event and job, at quick receivers."""
 
@@ -133,7 +135,11 @@ async def load(url: str, keys: list[str], receivers: Receivers, rows: Rows, opti
     for number in range(options.jobs):
         await asyncio.sleep(max(0.0, began + number / options.rate - time.monotonic()))
         asked = {"inputs": {"message": f"hello {number}"}}
-        answer = await clients[number % OWNERS].post("/processes/echo/execution", json=asked)
+        while (
+            answer := await clients[number % OWNERS].post("/processes/echo/execution", json=asked)
+        ).status_code == 503:
+            receivers.busy += 1
+            await asyncio.sleep(float(answer.headers["Retry-After"]))
         assert answer.status_code == 201, answer.text
         jobs.append(answer.json()["jobID"])
         if number % 5 == 0:
@@ -201,6 +207,7 @@ def main() -> int:
         f"{max(receivers.latencies_s):.2f} s",
         "messages": f"{len(receivers.latencies_s)} quick, {receivers.slow} slow in {seconds:.0f} s, "
         f"{sum(count - 1 for count in receivers.got.values())} came again",
+        "submissions put off": receivers.busy,
         "rows waiting at most": rows.most_waiting,
         "database at the end": f"{mib:.1f} MiB, {found}",
         "processor s": f"driver {driver_s:.1f}, API {api_s:.1f}, receivers and clients {own_s:.1f}",
