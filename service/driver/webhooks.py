@@ -33,8 +33,8 @@ LOG = logging.getLogger("gablework.driver")
 LEASE_S = SEND_S + 15.0
 """Seconds for which a delivery is held: an attempt, and the time to write its end."""
 PACE_S = 0.25
-"""Seconds between two rounds that claim and settle. Many messages share a transaction. Most of them are sent by then, so
-no thread that sends holds it up; in between others, such as the requests of clients, find the database free."""
+"""Seconds between two rounds that claim and settle. Many messages share a transaction. Most are sent by then, so no
+thread that sends holds it up; in between others, such as the requests of clients, find the database free."""
 REFILL_S = 0.5
 """Seconds between two looks at endpoints whose events wait for room."""
 LATE_S = 5.0
