@@ -250,6 +250,7 @@ class Sender:
                 for _ in range(_ROUNDS):
                     if not self._store.webhooks.forget(settings.webhook_log_days, most=settings.webhook_log_max):
                         break
+                    self._stopping.wait(PACE_S)
             except StoreError as error:
                 LOG.warning("old deliveries cannot be removed yet: %s", error, extra=self._facts)
 

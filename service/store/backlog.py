@@ -24,9 +24,9 @@ _EVENTS = WEBHOOK_EVENTS.c
 _HOOKS = WEBHOOKS.c
 _WAITING = DeliveryState.WAITING.value
 _ENDS = [event.value for event in EventType if event.is_end]
-_AT_ONCE = 1000
+_AT_ONCE = 500
 """Rows that one transaction removes."""
-_ENDPOINTS_AT_ONCE = 100
+_ENDPOINTS_AT_ONCE = 32
 """Endpoints that one transaction puts events in line for."""
 _TICK = dt.timedelta(milliseconds=1)
 _MOVED_AFTER = 1.5 * UNDER_WAY
@@ -64,7 +64,11 @@ def behind(connection: Connection, now: dt.datetime, *, with_late: bool) -> list
         .outerjoin(waiting, waiting.c.endpoint_id == _HOOKS.endpoint_id)
         .where(_HOOKS.is_enabled, _HOOKS.paused_at.is_(None), lacks, ready)
     )
-    return list(connection.execute(found.order_by(_HOOKS.sent_until).limit(_ENDPOINTS_AT_ONCE)).scalars())
+    return list(
+        connection.execute(
+            found.order_by(_HOOKS.is_behind.desc(), _HOOKS.sent_until).limit(_ENDPOINTS_AT_ONCE)
+        ).scalars()
+    )
 
 
 def refill(connection: Connection, endpoint_ids: list[str], now: dt.datetime, *, max_waiting: int) -> Refilled:
