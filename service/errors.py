@@ -15,6 +15,7 @@ ServiceError
 │   ├── QuotaError           the uploads of a key have too many bytes
 │   ├── QueueFullError       too many jobs wait
 │   ├── TooManySchedulesError a key has reached its limit of schedules
+│   ├── TooManyWebhooksError a key has reached its limit of webhooks
 │   ├── TooManyUploadsError  a key has reached its limit of uploads, or of unfinished ones
 │   └── TooManyRequestsError too many requests of one client
 ├── UnauthorizedError        no key, or one that is not known
@@ -222,6 +223,10 @@ class QueueFullError(LimitError):
 
 class TooManySchedulesError(LimitError):
     """A key has reached its limit of schedules."""
+
+
+class TooManyWebhooksError(LimitError):
+    """A key has reached its limit of webhooks."""
 
 
 class TooManyUploadsError(LimitError):

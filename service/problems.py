@@ -90,6 +90,7 @@ KINDS: Mapping[type[Exception], Kind] = {
         status=409, type_uri=f"{OWN}schedule-busy", title="A job of the schedule is under way"
     ),
     errors.TooManySchedulesError: Kind(status=409, type_uri=f"{OWN}too-many-schedules", title="Too many schedules"),
+    errors.TooManyWebhooksError: Kind(status=409, type_uri=f"{OWN}too-many-webhooks", title="Too many webhooks"),
     errors.KeyInUseError: Kind(status=409, type_uri=f"{OWN}key-in-use", title="The request is under way", retry=True),
     errors.KeyReusedError: Kind(status=422, type_uri=f"{OWN}key-reused", title="The key belongs to another request"),
     errors.RemovedSinceError: Kind(

@@ -129,6 +129,9 @@ class ServiceSettings(BaseSettings):
     max_schedules_per_key: int = Field(
         default=100, gt=0, description="Maximum number of schedules of one key, or in total if keys are not used."
     )
+    max_webhooks_per_key: int = Field(
+        default=100, gt=0, description="Maximum number of webhooks of one key, or in total if keys are not used."
+    )
     rate_limit: str = Field(
         default="6000/minute", description="Request limit of one key or address, in the notation of the library limits."
     )
@@ -206,7 +209,21 @@ class ServiceSettings(BaseSettings):
         "4 hours.",
     )
     webhook_log_days: float = Field(
-        default=30.0, gt=0.0, le=36_500.0, description="Days after which a finished delivery is removed from the log."
+        default=30.0,
+        gt=0.0,
+        le=36_500.0,
+        description="Days after which a finished delivery is removed from the log, and the end of a job that a paused "
+        "webhook did not get.",
+    )
+    webhook_log_max: int = Field(
+        default=20_000,
+        gt=0,
+        description="Maximum number of finished deliveries in the log, and of failed ones; the oldest are removed.",
+    )
+    webhook_max_waiting: int = Field(
+        default=200,
+        gt=0,
+        description="Maximum number of messages that wait for a webhook which does not keep up; then it is paused.",
     )
 
     # the web page

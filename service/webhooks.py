@@ -13,8 +13,9 @@ No SQL, no HTTP; time is an argument.
         +----------> dropped
 ```
 
-Each delivery is a row that is written in the transaction that changes the job, so no change goes unreported. A replay
-makes any of them wait again. Signatures follow Standard Webhooks (standardwebhooks.com).
+Each event is a row that is written in the transaction that changes the job, so no change goes unreported. A delivery
+per receiver comes with it, or later where too many of that receiver wait. A replay makes any of them wait again.
+Signatures follow Standard Webhooks (standardwebhooks.com).
 """
 
 from __future__ import annotations
@@ -45,6 +46,18 @@ LONGEST_PAUSE_S = 4.0 * 3600.0
 """Longest pause between two attempts: a receiver that comes back after a night gets its news within the morning."""
 _GROWTH = 3.0
 """Each pause is so many times the one before: about ten attempts in a day."""
+
+ROOM = 24
+"""Most deliveries of one endpoint that wait in rows of their own. Others wait as events, which all endpoints share."""
+
+KEEPS_UP_S = 30.0
+"""An endpoint keeps up if no delivery waits longer in line. Others may be paused: a burst pauses no quick one."""
+
+UNDER_WAY = dt.timedelta(minutes=1)
+"""Longest time from an event to the commit of its row: longer than a transaction waits and works."""
+
+MAX_SUBSCRIBED = 2000
+"""Most deliveries to subscribers of one key that wait. Ends of jobs beyond it fail at once and can be replayed."""
 
 GONE = 410
 """The status by which a receiver ends its deliveries."""
@@ -166,6 +179,12 @@ class Endpoint:
     updated_at: dt.datetime
     old_secret_until: dt.datetime | None = None
     """Time until which the replaced secret still signs."""
+    owner: str | None = None
+    """The key that made it; None if keys are not used."""
+    paused_at: dt.datetime | None = None
+    """Time since which nothing is sent because too much waited; None if it is not paused."""
+    not_sent: int = 0
+    """Number of messages that wait for room or, if it is paused, for a replay."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -231,6 +250,16 @@ class Parcel:
     """All that sign."""
     sent_at: dt.datetime
     """The time of this attempt."""
+    event_id: str | None = None
+    """The event; None for a delivery of an earlier version."""
+
+    payer: str = ""
+    """The key that made the endpoint or the job: it holds a share of the senders. Empty if keys are not used."""
+
+    @property
+    def receiver(self) -> str:
+        """The endpoint, or the URL of a subscriber: it gets one message at a time."""
+        return self.delivery.endpoint_id or self.delivery.url
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -246,6 +275,8 @@ class Result:
     """Seconds that the receiver asks for."""
     is_final: bool = False
     """Whether another attempt cannot help."""
+    is_own_fault: bool = False
+    """Whether the service failed, not the receiver."""
     body: str | None = None
     """The body that was sent, or would have been."""
 

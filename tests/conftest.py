@@ -23,7 +23,13 @@ if TYPE_CHECKING:
     from pipeline.terrain.filter_settings import MorphologicalFilterSettings
     from pipeline.terrain.lattice import Elevations, Part
 
-pytest.register_assert_rewrite("schedule_contract", "schedule_store_contract", "store_contract")
+pytest.register_assert_rewrite(
+    "schedule_contract",
+    "schedule_store_contract",
+    "store_contract",
+    "webhook_backlog_contract",
+    "webhook_store_contract",
+)
 
 # The same examples in every run: a change fails by what it changed, not by the draw. To search for new ones:
 # HYPOTHESIS_PROFILE=search make unit

@@ -57,7 +57,8 @@ def look_at(
 ) -> dt.datetime | None:
     """Look at the clock; run what is due."""
     with schedule.opened() as book:
-        due = enter(book, look(book.state, asked or rules(), now, under_way="a run" if is_busy else None))
+        under_way = "a run" if is_busy else None
+        due = enter(book, look(book.state, asked or rules(), now, under_way=under_way, has_run=book.has_run))
         if due is not None:
             schedule.run(book, due, now)
         book.save()
@@ -136,12 +137,54 @@ class ScheduleContract:
         assert look_at(schedule, NOON + 3.5 * HOUR) is None
         assert (len(schedule.entries()), schedule.counts()) == (1, {"missed": 1})
 
-    def test_a_clock_that_is_put_back_brings_no_slot_again(self, schedule: StoredSchedule) -> None:
-        look_at(schedule, NOON + 10 * DAY)
-        for now in (NOON + 9 * DAY, NOON + 10 * DAY + MINUTE):
+    def test_a_clock_that_is_corrected_brings_no_slot_again_and_is_no_news(self, schedule: StoredSchedule) -> None:
+        look_at(schedule, NOON + HOUR)
+        for now in (NOON + HOUR - 9 * MINUTE, NOON + HOUR, NOON + HOUR + MINUTE):
             assert look_at(schedule, now) is None
+        assert look_at(schedule, NOON + HOUR - 5 * MINUTE, rules(is_paused=True)) is None
+        assert state_of(schedule).decided_until == NOON + HOUR + MINUTE
+        assert len(schedule.entries()) == 1
+
+    def test_a_clock_that_is_put_back_is_noted_and_the_next_slot_of_the_present_is_run(
+        self, schedule: StoredSchedule
+    ) -> None:
+        assert look_at(schedule, NOON + 10 * DAY) == NOON + 10 * DAY
+        back = NOON + 2 * HOUR + MINUTE
+        assert look_at(schedule, back) is None
+        note = schedule.entries()[-1]
+        assert (note.outcome, note.slot, note.at) == (Outcome.MISSED, back, back)
+        assert "put back from 2030-06-11T12:00:00Z or later to 2030-06-01T14:01:00Z" in note.message
+        assert state_of(schedule).decided_until == back
+        # said once, and an hourly schedule runs within the hour
+        assert look_at(schedule, back + MINUTE) is None
+        assert [entry.message for entry in schedule.entries()].count(note.message) == 1
+        slots = [look_at(schedule, NOON + hours * HOUR) for hours in range(3, 10 * 24 + 3)]
+        expected = [NOON + hours * HOUR for hours in range(3, 10 * 24 + 3)]
+        # the one that had its run when the clock was ahead is not run again
+        assert slots == [None if slot == NOON + 10 * DAY else slot for slot in expected]
+        (again,) = (entry for entry in schedule.entries() if entry.outcome is Outcome.SKIPPED)
+        assert (again.slot, again.message) == (NOON + 10 * DAY, "it had its run before the clock was put back")
+
+    def test_a_slot_that_had_its_run_does_not_wait_for_another(self, schedule: StoredSchedule) -> None:
+        look_at(schedule, NOON + DAY)
+        look_at(schedule, NOON + HOUR / 2)
+        patient = rules(overlap=Overlap.WAIT)
+        assert look_at(schedule, NOON + DAY + MINUTE, patient, is_busy=True) is None
+        assert state_of(schedule).waiting is None
+        assert look_at(schedule, NOON + DAY + 2 * MINUTE, patient) is None
+
+    def test_a_clock_that_is_put_back_does_not_matter_to_a_paused_schedule(self, schedule: StoredSchedule) -> None:
+        look_at(schedule, NOON + 10 * DAY, rules(is_paused=True))
         assert look_at(schedule, NOON + 5 * DAY, rules(is_paused=True)) is None
-        assert state_of(schedule).decided_until == NOON + 10 * DAY + MINUTE
+        assert (state_of(schedule).decided_until, schedule.entries()) == (NOON + 5 * DAY, [])
+
+    def test_a_clock_that_goes_to_and_fro_has_a_bounded_history(self, schedule: StoredSchedule) -> None:
+        for _ in range(3):
+            look_at(schedule, NOON + DAY)
+            look_at(schedule, NOON)
+        outcomes = [entry.outcome for entry in schedule.entries()]
+        assert outcomes.count(schedule.done) == 1
+        assert sum("put back" in entry.message for entry in schedule.entries()) == 3 + 2
 
     @pytest.mark.parametrize(
         ("day", "local"),

@@ -8,14 +8,17 @@ for a line on its standard input before every lap of so many ticks.
 import datetime as dt
 import sys
 
-from pipeline.schedule import Outcome
-from service.store import JobStore
+from pipeline.schedule import Outcome, state
+from service.store import JobStore, ticks
+
+# these replicas are hours apart, which replicas by one database's clock never are
+state.PUT_BACK = ticks.PUT_BACK = dt.timedelta(days=1)
 
 
-def main(url: str, start: dt.datetime, step: dt.timedelta, ticks: int, lap: int) -> None:
+def main(url: str, start: dt.datetime, step: dt.timedelta, number_of_ticks: int, lap: int) -> None:
     """Tick, and bring to its end what waits."""
     with JobStore(url) as store:
-        for number in range(ticks):
+        for number in range(number_of_ticks):
             if number % lap == 0 and not sys.stdin.readline():
                 sys.exit("the test has ended")
             entries = store.schedules.tick(now=start + number * step, max_queued=10**6, max_queued_per_key=10**6)

@@ -281,10 +281,22 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         later = store.now() + 10 * DAY
         made = make(store, at=later - HOUR)
         assert len(tick(store, later)) == 1
-        # the database's own clock is ten days behind
+        # the database's own clock is ten days behind: the new times count from now on
         changed = store.schedules.change(made.schedule_id, definition("*/30 * * * *"), version=1)
-        assert changed.decided_until == later
-        assert tick(store, later - 5 * DAY) == []
+        assert changed.decided_until < later - 9 * DAY
+        found = tick(store, later)
+        assert [outcome for outcome, _, _ in found] == [Outcome.MISSED, Outcome.SKIPPED]
+        assert len(jobs_of(store, made)) == 1
+
+    def test_a_clock_that_was_put_back_does_not_stop_a_schedule(self, store: JobStore) -> None:
+        made = make(store)
+        assert len(tick(store, NOON + 10 * DAY)) == 2
+        store.dismiss(jobs_of(store, made)[0].job_id)
+        back = NOON + 2 * HOUR + MINUTE
+        assert tick(store, back) == [(Outcome.MISSED, back, 1)]
+        assert tick(store, back) == []
+        assert store.schedules.get(made.schedule_id).next_at == NOON + 3 * HOUR
+        assert tick(store, NOON + 3 * HOUR) == [(Outcome.SUBMITTED, NOON + 3 * HOUR, 1)]
 
     def test_a_schedule_that_is_removed_leaves_its_jobs(self, store: JobStore) -> None:
         made = make(store)

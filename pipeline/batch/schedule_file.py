@@ -119,6 +119,14 @@ class FileBook:
         """Add to the history and count it."""
         self.record = self.record.with_entry(entry if isinstance(entry, BatchEntry) else BatchEntry(**vars(entry)))
 
+    def has_run(self, slot: dt.datetime) -> bool:
+        """Whether the history has a run of a slot; also one that failed once it had begun."""
+        over = {Outcome.RAN, Outcome.INCOMPLETE}
+        return any(
+            entry.slot == slot and (entry.outcome in over or entry.started_at is not None)
+            for entry in self.record.entries
+        )
+
     @property
     def is_changed(self) -> bool:
         """Whether more changed since this process stored the record than that no slot has passed."""

@@ -208,9 +208,9 @@ class _Scheduler:
         if written_at is not None:
             # slots before the change of the file are decided by the old rules
             until = min(now, max(written_at, book.state.decided_until))
-            slot = self._enter(look(book.state, before, until, under_way=under_way))
+            slot = self._enter(look(book.state, before, until, under_way=under_way, has_run=book.has_run))
         under_way = under_way if slot is None else "a run"
-        slot = self._enter(look(book.state, rules, now, under_way=under_way)) or slot
+        slot = self._enter(look(book.state, rules, now, under_way=under_way, has_run=book.has_run)) or slot
         if slot is not None and self._refused:
             self._fail(slot, now, f"the batch file is refused: {self._refused}")
             slot = None

@@ -4,11 +4,13 @@ from pipeline.schedule.cron import Cron
 from pipeline.schedule.decisions import Decision, Missed, Overlap, Rules, decide
 from pipeline.schedule.slots import PassedSlots, passed_slots
 from pipeline.schedule.state import (
+    PUT_BACK,
     Entry,
     Look,
     Outcome,
     ScheduleBook,
     ScheduleState,
+    decided_by,
     enter,
     look,
     miss_passed,
@@ -18,6 +20,7 @@ from pipeline.schedule.state import (
 from pipeline.schedule.time_zones import time_zone
 
 __all__ = [
+    "PUT_BACK",
     "Cron",
     "Decision",
     "Entry",
@@ -30,6 +33,7 @@ __all__ = [
     "ScheduleBook",
     "ScheduleState",
     "decide",
+    "decided_by",
     "enter",
     "look",
     "miss_passed",

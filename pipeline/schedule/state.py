@@ -7,11 +7,16 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
+from collections.abc import Callable
 from enum import StrEnum
 from typing import Protocol
 
 from pipeline.schedule.decisions import Rules, decide
 from pipeline.schedule.slots import PassedSlots, passed_slots
+
+PUT_BACK = dt.timedelta(minutes=10)
+"""How far the clock may be behind what is decided: a correction, or machines whose clocks differ, is less. Within it no
+slot comes before what is decided; behind it the clock was put back, and the schedule goes by the present clock."""
 
 
 class Outcome(StrEnum):
@@ -28,9 +33,10 @@ class Outcome(StrEnum):
     INTERRUPTED = "interrupted"
     """A batch run was cut off; if the schedule itself was ended, the run continues when it is started again."""
     SKIPPED = "skipped"
-    """The run before it was still under way."""
+    """The run before it was still under way, or it had its run before the clock was put back."""
     MISSED = "missed"
-    """It was seen too late, a later slot replaced it, or the schedule was paused while it waited."""
+    """It was seen too late, a later slot replaced it, or the schedule was paused while it waited. An entry with this
+    outcome also notes that the clock was put back."""
     FAILED = "failed"
     """No run could be made, or a batch run ended with an error; the message says why."""
 
@@ -89,6 +95,9 @@ class ScheduleBook(Protocol):
         The final entry of a slot that waited replaces its entry `WAITING`. Old entries are dropped, their counts stay.
         """
 
+    def has_run(self, slot: dt.datetime) -> bool:
+        """Whether the history has a run of a slot."""
+
     def save(self) -> None:
         """Store state and history."""
 
@@ -101,26 +110,49 @@ def enter(book: ScheduleBook, found: Look) -> dt.datetime | None:
     return found.due
 
 
-def look(state: ScheduleState, rules: Rules, now: dt.datetime, *, under_way: str | None) -> Look:
+def was_put_back(state: ScheduleState, now: dt.datetime) -> bool:
+    """Whether the clock is so far behind what is decided that the schedule goes by the present clock."""
+    return state.decided_until - now > PUT_BACK
+
+
+def decided_by(state: ScheduleState, now: dt.datetime) -> dt.datetime:
+    """Time up to which all slots are decided after a look; up to the present if the clock was put back."""
+    return now if was_put_back(state, now) else max(now, state.decided_until)
+
+
+def look(
+    state: ScheduleState,
+    rules: Rules,
+    now: dt.datetime,
+    *,
+    under_way: str | None,
+    has_run: Callable[[dt.datetime], bool] = lambda _slot: False,
+) -> Look:
     """Decide all slots that have passed.
 
     Parameters
     ----------
     under_way : str or None
         The run of this schedule that is under way, in words for the history; None if there is none.
+    has_run : callable
+        Whether a slot had its run already: it may come again after the clock was put back.
     """
-    # after the clock was put back no slot comes a second time
-    decided_until = max(now, state.decided_until)
+    decided_until = decided_by(state, now)
     if rules.is_paused:
         found = miss_waiting(state, now, "the schedule was paused while it waited")
         return dataclasses.replace(found, state=ScheduleState(decided_until=decided_until))
     passed = passed_slots(rules.cron, state.decided_until, now)
-    decision = decide(passed, rules, waiting=state.waiting, is_busy=under_way is not None, now=now)
-    entries = []
+    entries = [_note_put_back(state, now)] if was_put_back(state, now) else []
+    again = None if passed is None or not has_run(passed.latest) else passed.latest
+    undecided = passed if again is None else None
+    decision = decide(undecided, rules, waiting=state.waiting, is_busy=under_way is not None, now=now)
     if passed is not None and (decision.late is not None or passed.earlier):
         fate = "only the latest of them counts" if decision.late is None else f"seen later than {rules.grace_s:g} s"
         message = f"the clock was not looked at from {utc(passed.first or passed.latest)} to {utc(now)}: {fate}"
         entries.append(_missed_together(passed, now, message, with_latest=decision.late is not None))
+    if again is not None:
+        message = "it had its run before the clock was put back"
+        entries.append(Entry(outcome=Outcome.SKIPPED, slot=again, at=now, message=message))
     if decision.replaced is not None:
         message = "a later slot took its place while it waited"
         entries.append(Entry(outcome=Outcome.MISSED, slot=decision.replaced, at=now, message=message))
@@ -134,11 +166,20 @@ def look(state: ScheduleState, rules: Rules, now: dt.datetime, *, under_way: str
     return Look(state=after, entries=tuple(entries), due=decision.run)
 
 
+def _note_put_back(state: ScheduleState, now: dt.datetime) -> Entry:
+    """The entry about a clock that was put back."""
+    message = (
+        f"the clock was put back from {utc(state.decided_until)} or later to {utc(now)}: the schedule goes by the "
+        "present clock, and times that had their run are not run again"
+    )
+    return Entry(outcome=Outcome.MISSED, slot=now, at=now, message=message)
+
+
 def miss_passed(state: ScheduleState, rules: Rules, now: dt.datetime, message: str) -> Look:
     """Miss all slots that have passed and are not decided; the slot that waits goes on waiting."""
     passed = None if rules.is_paused else passed_slots(rules.cron, state.decided_until, now)
     entries = () if passed is None else (_missed_together(passed, now, message, with_latest=True),)
-    after = dataclasses.replace(state, decided_until=max(now, state.decided_until))
+    after = dataclasses.replace(state, decided_until=decided_by(state, now))
     return Look(state=after, entries=entries)
 
 

@@ -1,9 +1,14 @@
-"""Sends webhooks: claims deliveries that are due, makes and signs their bodies, posts them, writes what came back."""
+"""Sends webhooks: claims deliveries that are due, makes and signs their bodies, posts them, writes what came back.
+
+One thread claims and settles, many at once; each message is sent by a thread that mostly waits for its receiver.
+`Receivers` decides who gets one, so that slow receivers hold up no others.
+"""
 
 from __future__ import annotations
 
 import json
 import logging
+import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -11,23 +16,35 @@ from collections.abc import Callable, Mapping
 from pipeline import __version__
 from pipeline.runtime.monitoring import tracing
 from service.driver.attempts import FIRST_PAUSE_S, LONGEST_PAUSE_S
-from service.errors import LeaseLostError, NoSuchOutputError, StoreError, TargetRefusedError
+from service.errors import NoSuchOutputError, StoreError, TargetRefusedError
 from service.files import StateFolder
 from service.outputs import read_catalogue
+from service.receivers import Receivers
 from service.settings import ServiceSettings
 from service.status import results_document, status_info
 from service.store import JobStore
 from service.traces import of_job
 from service.webhook_targets import SEND_S, SendError, post
-from service.webhooks import EventType, Parcel, Result, RetryPolicy, signed_headers
+from service.webhooks import DeliveryState, EventType, Parcel, Result, RetryPolicy, signed_headers
 from service.wire.webhooks import Message
 
 LOG = logging.getLogger("gablework.driver")
 
-SENDERS = 4
-"""Threads that send: a receiver that hangs holds up one of them."""
 LEASE_S = SEND_S + 15.0
 """Seconds for which a delivery is held: an attempt, and the time to write its end."""
+PACE_S = 0.25
+"""Seconds between two rounds that claim and settle. Many messages share a transaction. Most are sent by then, so no
+thread that sends holds it up; in between others, such as the requests of clients, find the database free."""
+REFILL_S = 0.5
+"""Seconds between two looks at endpoints whose events wait for room."""
+LATE_S = 5.0
+"""Seconds between two looks at endpoints that may have to be paused."""
+FORGET_S = 15.0
+"""Seconds between two rounds that remove what the log has too much."""
+_ROUNDS = 20
+"""Most transactions of such a round."""
+_MAX_BODIES = 64
+"""Bodies that are held for other receivers of the same event."""
 
 Post = Callable[..., tuple[int, str | None]]
 """`service.webhook_targets.post`."""
@@ -43,7 +60,7 @@ class Sender:
     folder : StateFolder
         The results of jobs.
     settings : ServiceSettings
-        Hosts, retries, pauses.
+        Hosts, retries, pauses, limits.
     name : str
         Unique name of the driver.
     send : callable, optional
@@ -54,43 +71,39 @@ class Sender:
         self, store: JobStore, folder: StateFolder, settings: ServiceSettings, *, name: str, send: Post = post
     ) -> None:
         self._store = store
-        self._folder = folder
         self._settings = settings
         self._name = name
-        self._send = send
         self._policy = RetryPolicy(hours=settings.webhook_hours, first_pause_s=settings.webhook_pause_s)
-        self._claiming = threading.Lock()
+        self._receivers = Receivers(settings.webhook_pause_s)
+        self._attempts = Attempts(folder, settings, send)
+        self._crew: list[threading.Thread] = []
+        self._parcels: queue.SimpleQueue[Parcel] = queue.SimpleQueue()
+        self._ended: queue.SimpleQueue[tuple[Parcel, Result]] = queue.SimpleQueue()
+        self._unwritten: list[tuple[Parcel, Result]] = []
+        self._refill_at_s = self._late_at_s = 0.0
         self._stopping = threading.Event()
         self._look_again = threading.Event()
         self.threads = [
-            threading.Thread(target=self._work, name=f"webhooks-{number}", daemon=True) for number in range(SENDERS)
+            threading.Thread(target=self._work, name="webhooks", daemon=True),
+            threading.Thread(target=self._forget, name="webhooks-log", daemon=True),
         ]
         """Not started yet."""
 
     def stop(self) -> None:
-        """Claim nothing more; an attempt that is under way ends within its time."""
+        """Claim nothing more; attempts that are under way end within their time."""
         self._stopping.set()
         self._look_again.set()
 
-    def _work(self) -> None:
-        while True:
-            # one thread looks for work; the others wait for it, or send
-            with self._claiming:
-                parcel = self._next()
-            if parcel is None:
-                return
-            self.deliver(parcel)
-            # its receiver is free for the next message
-            self._look_again.set()
+    # --- the thread that claims and settles
 
-    def _next(self) -> Parcel | None:
-        """Wait for a delivery that is due; None at the end."""
+    def _work(self) -> None:
         pause = FIRST_PAUSE_S
-        while not self._stopping.is_set():
+        while not (self._stopping.is_set() and self._receivers.under_way == 0):
+            began_s = time.monotonic()
             self._look_again.clear()
-            wait_s = self._settings.poll_s
             try:
-                parcel = self._store.webhooks.claim(self._name, lease_s=LEASE_S)
+                self._settle()
+                wait_s = LATE_S if self._stopping.is_set() else self._send_what_is_due()
             except StoreError as error:
                 LOG.warning("cannot look for webhooks, next try in %g s: %s", pause, error, extra=self._facts)
                 wait_s, pause = pause, min(LONGEST_PAUSE_S, 2.0 * pause)
@@ -98,54 +111,179 @@ class Sender:
                 LOG.exception("an unexpected fault with webhooks, next try in %g s", pause, extra=self._facts)
                 wait_s, pause = pause, min(LONGEST_PAUSE_S, 2.0 * pause)
             else:
-                if parcel is not None:
-                    return parcel
                 pause = FIRST_PAUSE_S
-            if not self._stopping.is_set():
-                self._look_again.wait(wait_s)
-        return None
+            self._look_again.wait(wait_s)
+            self._stopping.wait(max(0.0, began_s + PACE_S - time.monotonic()))
 
-    def deliver(self, parcel: Parcel) -> None:
-        """Send one delivery and write how that ended."""
-        began_s = time.monotonic()
+    def _settle(self) -> None:
+        """Write how attempts ended, all that have ended by now.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer; they are written the next time.
+        """
+        while not self._ended.empty():
+            self._unwritten.append(self._ended.get())
+        if not self._unwritten:
+            return
+        states = self._written(self._unwritten)
+        now_s = time.monotonic()
+        for (parcel, result), state in zip(self._unwritten, states, strict=True):
+            was_reached = result.status is not None or result.is_final or result.is_own_fault
+            duration_s = result.duration_ms / 1000.0
+            self._receivers.end(parcel.receiver, duration_s, was_reached=was_reached, now_s=now_s)
+            self._report(parcel, result, state)
+        self._unwritten = []
+
+    def _written(self, ended: list[tuple[Parcel, Result]]) -> list[DeliveryState | None]:
+        """Write how attempts ended; one that cannot be written holds up no others, and is sent again.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer.
+        """
+        try:
+            return self._store.webhooks.settle_all(ended, self._policy)
+        except StoreError:
+            raise
+        except Exception:
+            if len(ended) > 1:
+                return [state for one in ended for state in self._written([one])]
+            words = "the end of delivery %s cannot be written"
+            LOG.exception(words, ended[0][0].delivery.delivery_id, extra=self._facts)
+            return [None]
+
+    def _send_what_is_due(self) -> float:
+        """Hand out what is due; seconds until the next look.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer.
+        """
+        now_s = time.monotonic()
+        if now_s >= self._refill_at_s:
+            self._refill(now_s)
+        found = self._store.webhooks.claim_some(
+            self._name,
+            lambda line: self._receivers.chosen(line, now_s),
+            lease_s=LEASE_S,
+            avoided=self._receivers.avoided(now_s),
+        )
+        for parcel in found:
+            self._receivers.begin(parcel.receiver, parcel.payer, now_s)
+            self._parcels.put(parcel)
+        while len(self._crew) < self._receivers.under_way:
+            self._crew.append(threading.Thread(target=self._send, name=f"webhooks-{len(self._crew)}", daemon=True))
+            self._crew[-1].start()
+        return min(self._settings.poll_s, LATE_S)
+
+    def _refill(self, now_s: float) -> None:
+        """Put events in line for endpoints that have room again.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer.
+        """
+        with_late = now_s >= self._late_at_s
+        if with_late:
+            self._late_at_s = now_s + LATE_S
+        most = self._settings.webhook_max_waiting
+        found = self._store.webhooks.refill(max_waiting=most, with_late=with_late)
+        for endpoint_id in found.paused:
+            words = "webhook %s is paused: it does not keep up, and more than %d messages wait; replay it when it does"
+            LOG.warning(words, endpoint_id, most, extra=self._facts)
+        self._refill_at_s = now_s + REFILL_S
+
+    def _report(self, parcel: Parcel, result: Result, state: DeliveryState | None) -> None:
+        """Log how an attempt ended."""
         delivery = parcel.delivery
         facts = {**self._facts, "job": delivery.job_id, "delivery": delivery.delivery_id}
+        if state is None:
+            words = "delivery %s: attempt %d is no longer held"
+            LOG.warning(words, delivery.delivery_id, delivery.attempts, extra=facts)
+            return
+        level = logging.INFO if result.is_success else logging.WARNING
+        words = "%s to %s, attempt %d: %s"
+        outcome = state.value if result.error is None else f"{state.value}: {result.error}"
+        host = delivery.url.split("/")[2].rpartition("@")[2] if "//" in delivery.url else delivery.url
+        LOG.log(level, words, delivery.event.value, host, delivery.attempts, outcome, extra=facts)
+
+    # --- the threads that send
+
+    def _send(self) -> None:
+        while True:
+            parcel = self._parcels.get()
+            self._ended.put((parcel, self.attempt(parcel)))
+            # its receiver is free for the next message
+            self._look_again.set()
+
+    def attempt(self, parcel: Parcel) -> Result:
+        """Send a delivery once."""
+        began_s = time.monotonic()
+        delivery = parcel.delivery
         try:
             parent = of_job(parcel.job)
             with tracing.span("webhook", kind="client", parent=parent, delivery_id=delivery.delivery_id) as made:
-                result = self._attempt(parcel, began_s)
+                result = self._attempts.attempt(parcel, began_s)
                 tracing.note(made, event=delivery.event.value, attempt=delivery.attempts)
                 tracing.note(made, http__response__status_code=result.status)
                 if not result.is_success:
                     tracing.failed(made, "not delivered")
         except Exception:
+            facts = {**self._facts, "job": delivery.job_id, "delivery": delivery.delivery_id}
             LOG.exception("delivery %s met an unexpected fault", delivery.delivery_id, extra=facts)
-            result = Result(duration_ms=_since_ms(began_s), error="an unexpected fault of the service; its log has it")
-        pause = FIRST_PAUSE_S
-        while True:
-            try:
-                state = self._store.webhooks.settle(parcel, result, self._policy)
-            except LeaseLostError as error:
-                LOG.warning("%s", error, extra=facts)
-                return
-            except StoreError as error:
-                LOG.warning("the end of a delivery cannot be written yet: %s", error, extra=facts)
-                if self._stopping.wait(pause):
-                    return
-                pause = min(LONGEST_PAUSE_S, 2.0 * pause)
-            else:
-                level = logging.INFO if result.is_success else logging.WARNING
-                words = "%s to %s, attempt %d: %s"
-                outcome = state.value if result.error is None else f"{state.value}: {result.error}"
-                host = delivery.url.split("/")[2].rpartition("@")[2] if "//" in delivery.url else delivery.url
-                LOG.log(level, words, delivery.event.value, host, delivery.attempts, outcome, extra=facts)
-                return
+            error = "an unexpected fault of the service; its log has it"
+            result = Result(duration_ms=_since_ms(began_s), error=error, is_own_fault=True)
+        return result
 
-    def _attempt(self, parcel: Parcel, began_s: float) -> Result:
+    # --- the log
+
+    def _forget(self) -> None:
+        """Keep the log within its limits, so that the database does not grow without bound."""
+        settings = self._settings
+        while not self._stopping.wait(FORGET_S):
+            try:
+                for _ in range(_ROUNDS):
+                    if not self._store.webhooks.forget(settings.webhook_log_days, most=settings.webhook_log_max):
+                        break
+                    self._stopping.wait(PACE_S)
+            except StoreError as error:
+                LOG.warning("old deliveries cannot be removed yet: %s", error, extra=self._facts)
+
+    @property
+    def _facts(self) -> Mapping[str, object]:
+        return {"driver": self._name}
+
+
+class Attempts:
+    """Makes the bodies of messages, signs and posts them.
+
+    Parameters
+    ----------
+    folder : StateFolder
+        The results of jobs.
+    settings : ServiceSettings
+        Hosts, the service's URL.
+    send : callable
+        Posts a message.
+    """
+
+    def __init__(self, folder: StateFolder, settings: ServiceSettings, send: Post) -> None:
+        self._folder = folder
+        self._settings = settings
+        self._send = send
+        self._bodies: dict[tuple[str, str], str] = {}
+
+    def attempt(self, parcel: Parcel, began_s: float) -> Result:
+        """Send a delivery once."""
         delivery = parcel.delivery
         try:
             # an attempt sends the same bytes as the one before
-            body = body_of(parcel, self._folder, self._settings) if delivery.body is None else delivery.body
+            body = self._body(parcel) if delivery.body is None else delivery.body
         except NoSuchOutputError as error:
             return Result(duration_ms=_since_ms(began_s), error=str(error), is_final=True)
         raw = body.encode()
@@ -171,9 +309,23 @@ class Sender:
             body=body,
         )
 
-    @property
-    def _facts(self) -> Mapping[str, object]:
-        return {"driver": self._name}
+    def _body(self, parcel: Parcel) -> str:
+        """The body of a message; hundreds of endpoints get the same one at once.
+
+        Raises
+        ------
+        NoSuchOutputError
+            The results of the job are gone.
+        """
+        if parcel.event_id is None or parcel.delivery.endpoint_id is None:
+            return body_of(parcel, self._folder, self._settings)
+        key = (parcel.event_id, parcel.base)
+        body = self._bodies.get(key)
+        if body is None:
+            if len(self._bodies) >= _MAX_BODIES:
+                self._bodies = {}
+            body = self._bodies[key] = body_of(parcel, self._folder, self._settings)
+        return body
 
 
 def body_of(parcel: Parcel, folder: StateFolder, settings: ServiceSettings) -> str:

@@ -161,14 +161,21 @@ async def make_webhook(
     base: Base,
     store: Store,
     submitting: Submitting,
-    _caller: Admin,
+    caller: Admin,
 ) -> Response:
     """Send the events of all jobs to a URL, signed as in Standard Webhooks."""
     events = [EventType(word) for word in body.events]
+    most = submitting.settings.max_webhooks_per_key
 
     def create(delivery: Delivery[NewEndpoint]) -> NewEndpoint:
         return store.webhooks.create(
-            body.url, events=events, description=body.description, base=base, delivery=delivery
+            body.url,
+            events=events,
+            description=body.description,
+            base=base,
+            owner=caller.key_id,
+            most=most,
+            delivery=delivery,
         )
 
     def answer(made: NewEndpoint) -> Response:
@@ -225,7 +232,10 @@ async def change_webhook(
     write: Write,
     _caller: Admin,
 ) -> Response:
-    """Change what is given; the rest stays. Messages that wait are dropped if it is disabled."""
+    """Change what is given; the rest stays. Messages that wait are dropped if it is disabled.
+
+    A webhook that is paused goes on where it stopped if it is enabled.
+    """
     given = {name: getattr(body, name) for name in body.model_fields_set}
     if "url" in given:
         await check_receiver(body.url, settings)
@@ -236,6 +246,18 @@ async def change_webhook(
         changes["is_enabled"] = body.enabled
     changed = await write(lambda: store.webhooks.change(webhook_id, changes))
     return respond(wire.Webhook(**_members(changed, base)))
+
+
+@router.post(
+    "/webhooks/{webhookID}/replay",
+    summary="Send what was not sent to a webhook",
+    status_code=202,
+    responses={202: document(wire.Webhook, "Its messages are sent soon.", _EXAMPLE), **problems(404, 409)},
+)
+async def replay_webhook(webhook_id: WebhookId, base: Base, store: Store, write: Write, _caller: Admin) -> Response:
+    """Send all that waits for a webhook, and the ends of jobs that failed or were dropped. This ends its pause."""
+    found = await write(lambda: store.webhooks.replay_all(webhook_id))
+    return respond(wire.Webhook(**_members(found, base)), status_code=202)
 
 
 @router.delete(
@@ -280,6 +302,8 @@ def _members(found: records.Endpoint, base: str) -> dict[str, Any]:
         "created": found.created_at,
         "updated": found.updated_at,
         "oldSecretUntil": found.old_secret_until,
+        "pausedSince": found.paused_at,
+        "notSent": found.not_sent or None,
         "links": [
             link(place, "self", "This webhook"),
             link(f"{base}/webhooks/deliveries?webhook={found.endpoint_id}", "deliveries", "What was sent"),

@@ -12,7 +12,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from pipeline.errors import SettingsError
-from pipeline.schedule import Cron, Rules, enter, look, miss_passed
+from pipeline.schedule import Cron, Rules, decided_by, enter, look, miss_passed
 from service.errors import ChangedMeanwhileError, TooManySchedulesError
 from service.schedules import Definition
 from service.store.records import storable
@@ -94,7 +94,7 @@ def change(
             before = Rules(cron=Cron(row.cron, row.time_zone), is_paused=row.is_paused)
             why = "not decided before the times of the schedule were changed"
             enter(book, miss_passed(book.state, before, now, why))
-        book.state = dataclasses.replace(book.state, decided_until=max(now, row.decided_until))
+        book.state = dataclasses.replace(book.state, decided_until=decided_by(book.state, now))
         if definition.is_paused:
             enter(book, look(book.state, definition, now, under_way=None))
         values["next_at"] = _next_at(definition, book.state.decided_until)

@@ -178,7 +178,7 @@ class ScheduleStore:
         max_queued, max_queued_per_key : int
             Maximum number of waiting jobs, in total and per key.
         now : datetime, optional
-            The present; by default the database's clock, read once.
+            The present; by default the database's clock.
 
         Returns
         -------
@@ -194,6 +194,8 @@ class ScheduleStore:
         added: list[ScheduleRun] = []
         for _ in range(MAX_PER_TICK):
             with self._database.write() as connection:
+                # a process that stood still since its last look must not take the work of others for the future
+                at = self._database.now(connection) if now is None else now
                 found = ticks.decide_first(connection, now=at, limits=limits)
             if found is None:
                 break

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime as dt
 from typing import Any
 
 import sqlalchemy as sa
@@ -14,6 +15,7 @@ from service.store.records import storable
 from service.store.schedules import COLUMN_OF, busy_job
 from service.store.tables import SCHEDULE_RUNS, SCHEDULES
 
+_MOMENT = dt.timedelta(microseconds=1)
 MAX_KEPT = 1000
 """Maximum number of stored entries per schedule; the counts include all."""
 
@@ -49,11 +51,34 @@ class SlotBook:
             job_id=job_id,
         )
         if number is None:
+            self._make_room(run.slot)
             self._number = run.number
             self.connection.execute(sa.insert(SCHEDULE_RUNS).values(**dataclasses.asdict(run)))
         if run.outcome in self._counts:
             self._counts[run.outcome] += run.slots
         self.added.append(run)
+
+    def has_run(self, slot: dt.datetime) -> bool:
+        """Whether the history has a job of a slot."""
+        # an entry may have been moved; slots are minutes apart
+        of_slot = SCHEDULE_RUNS.c.slot.between(slot - dt.timedelta(seconds=1), slot)
+        own = SCHEDULE_RUNS.c.schedule_id == self.row.schedule_id
+        made = sa.and_(own, of_slot, SCHEDULE_RUNS.c.outcome == Outcome.SUBMITTED.value)
+        return self.connection.execute(sa.select(SCHEDULE_RUNS.c.number).where(made)).first() is not None
+
+    def _make_room(self, slot: dt.datetime | None) -> None:
+        """Move an earlier entry of a slot by a microsecond: each slot has one, and this one came before a clock change.
+
+        An entry that is in its way moves, too.
+        """
+        if slot is None:
+            return
+        same = sa.and_(SCHEDULE_RUNS.c.schedule_id == self.row.schedule_id, SCHEDULE_RUNS.c.slot == slot)
+        number = self.connection.execute(sa.select(SCHEDULE_RUNS.c.number).where(same)).scalar_one_or_none()
+        if number is not None:
+            before = slot - _MOMENT
+            self._make_room(before)
+            self.connection.execute(sa.update(SCHEDULE_RUNS).where(same).values(slot=before))
 
     def save(self, **columns: Any) -> None:
         """Write the schedule's own row, with further columns; delete its oldest entries."""

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from pipeline.errors import SettingsError
-from pipeline.schedule import Entry, Outcome, ScheduleState, enter, look
+from pipeline.schedule import PUT_BACK, Entry, Outcome, ScheduleState, decided_by, enter, look
 from service.errors import ForbiddenError, ScheduleBusyError, ServiceError
 from service.schedules import Schedule, ScheduleRun, Trigger
 from service.store import schedules
@@ -53,7 +53,7 @@ def decide_first(connection: Connection, *, now: dt.datetime, limits: QueueLimit
     book = SlotBook(connection, row)
     try:
         schedule = schedules.schedule_of(row)
-        found = look(book.state, schedule.definition, now, under_way=book.under_way)
+        found = look(book.state, schedule.definition, now, under_way=book.under_way, has_run=book.has_run)
         next_at = schedule.definition.cron.next_time(found.state.decided_until)
     except SettingsError as error:
         _fail_unreadable(book, now, str(error))
@@ -105,7 +105,7 @@ def _fail_unreadable(book: SlotBook, now: dt.datetime, message: str) -> None:
     for slot in slots:
         if slot is not None:
             book.add(Entry(outcome=Outcome.FAILED, slot=slot, at=now, message=message))
-    book.state = ScheduleState(decided_until=row.next_at if is_due else row.decided_until)
+    book.state = ScheduleState(decided_until=row.next_at if is_due else decided_by(book.state, now))
     book.save(next_at=now + BROKEN_PAUSE if is_due else row.next_at)
 
 
@@ -143,7 +143,9 @@ def _submit(connection: Connection, schedule: Schedule, now: dt.datetime, limits
 def _is_due(now: dt.datetime) -> sa.ColumnElement[bool]:
     # a schedule that is paused has neither
     freed = sa.and_(SCHEDULES.c.waiting_slot.is_not(None), ~schedules.is_busy())
-    return sa.or_(SCHEDULES.c.next_at <= now, freed)
+    # the clock was put back: otherwise the schedule would wait until the clock is where it was
+    put_back = sa.and_(SCHEDULES.c.next_at.is_not(None), SCHEDULES.c.decided_until > now + PUT_BACK)
+    return sa.or_(SCHEDULES.c.next_at <= now, freed, put_back)
 
 
 def _lateness(slot: dt.datetime, now: dt.datetime) -> str:

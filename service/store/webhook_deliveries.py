@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from service.errors import LeaseLostError, NoSuchDeliveryError, NotReplayableError
+from service.errors import NoSuchDeliveryError, NotReplayableError
 from service.files import is_id
+from service.jobs import Job
+from service.receivers import Avoided, Due
 from service.store import webhook_endpoints as webhooks
 from service.store.outbox import drop
 from service.store.records import storable
-from service.store.tables import WEBHOOK_ATTEMPTS, WEBHOOK_DELIVERIES, WEBHOOKS
+from service.store.tables import WEBHOOK_ATTEMPTS, WEBHOOK_DELIVERIES, WEBHOOK_EVENTS, WEBHOOKS
 from service.webhooks import (
+    ROOM,
     Attempt,
     Delivery,
     DeliveryState,
@@ -29,7 +33,10 @@ from service.webhooks import (
 
 _TABLE = WEBHOOK_DELIVERIES.c
 _LOG = WEBHOOK_ATTEMPTS.c
-_FORGOTTEN_AT_ONCE = 1000
+_RECEIVER = sa.func.coalesce(_TABLE.endpoint_id, _TABLE.url)
+_PAYER = sa.func.coalesce(WEBHOOKS.c.owner, _TABLE.owner, "")
+_LINE = 512
+"""Most deliveries of a line: twice as many as one driver sends at once."""
 _WAITING = DeliveryState.WAITING.value
 
 
@@ -64,7 +71,8 @@ def get(connection: Connection, delivery_id: str, owner: str | None) -> Delivery
     """
     row = _row(connection, delivery_id, owner, locked=False)
     log = connection.execute(sa.select(WEBHOOK_ATTEMPTS).where(_LOG.delivery_id == delivery_id).order_by(_LOG.number))
-    return _delivery(row, log=tuple(_attempt(one) for one in log))
+    found = _delivery(row, log=tuple(_attempt(one) for one in log))
+    return dataclasses.replace(found, body=_body(row, _events(connection, [row])[0]) if row.attempts else None)
 
 
 def listed(connection: Connection, criteria: DeliveryFilter) -> list[Delivery]:
@@ -89,20 +97,26 @@ def replay(connection: Connection, delivery_id: str, owner: str | None, now: dt.
     NoSuchDeliveryError
         It does not exist, or belongs to another key.
     NotReplayableError
-        It is being sent, or its endpoint is gone or disabled.
+        It is being sent, or its endpoint is gone, disabled or paused.
     """
     row = _row(connection, delivery_id, owner, locked=True)
     if row.state == _WAITING and row.lease_until is not None and row.lease_until > now:
         raise NotReplayableError(f"delivery {delivery_id} is being sent: look at its attempts in a moment")
+    values: dict[str, Any] = {"state": _WAITING, "reason": "replayed", "due_at": now, "finished_at": None}
     if row.endpoint_id is not None:
-        reason = _closed(connection, row.endpoint_id)
+        endpoint = _endpoints(connection, [row.endpoint_id])[row.endpoint_id]
+        reason = _closed(endpoint)
+        if endpoint is not None and endpoint.paused_at is not None:
+            reason = "its webhook is paused: replay the webhook, which sends all that it did not get"
         if reason is not None:
             raise NotReplayableError(f"delivery {delivery_id} cannot be sent: {reason}")
-    values = {"state": _WAITING, "reason": "replayed", "due_at": now, "tried_since": now, "finished_at": None}
+        full = sa.select(_TABLE.delivery_id).where(_TABLE.state == _WAITING, _TABLE.endpoint_id == row.endpoint_id)
+        if row.state != _WAITING and connection.execute(full.offset(ROOM - 1).limit(1)).first() is not None:
+            values = {"reason": "is sent again when other messages to its webhook are sent", "replay_at": now}
     connection.execute(
         sa.update(WEBHOOK_DELIVERIES)
         .where(_TABLE.delivery_id == delivery_id)
-        .values(**values, lease_owner=None, lease_until=None)
+        .values(**values, tried_since=now, lease_owner=None, lease_until=None)
     )
 
 
@@ -116,85 +130,166 @@ def counts(connection: Connection) -> dict[DeliveryState, int]:
 # --- for drivers
 
 
-def something_is_due(connection: Connection, now: dt.datetime) -> bool:
-    """Whether a claim may find something."""
-    return connection.execute(sa.select(_TABLE.delivery_id).where(_is_due(now)).limit(1)).first() is not None
+def line(connection: Connection, avoided: Avoided, now: dt.datetime) -> list[Due]:
+    """The deliveries that are due for the longest time, without those to receivers that get something already."""
+    is_busy = sa.select(_RECEIVER).where(_TABLE.lease_until > now)
+    busy = avoided.receivers | set(connection.execute(is_busy).scalars())
+    due = (
+        sa.select(_TABLE.delivery_id, _RECEIVER, _PAYER)
+        .outerjoin(WEBHOOKS, WEBHOOKS.c.endpoint_id == _TABLE.endpoint_id)
+        .where(
+            _is_due(now),
+            WEBHOOKS.c.paused_at.is_(None),
+            _RECEIVER.not_in(list(busy)),
+            _PAYER.not_in(list(avoided.payers)),
+        )
+        .order_by(_TABLE.due_at, _TABLE.created_at, _TABLE.delivery_id)
+        .limit(_LINE)
+    )
+    return [Due(*row) for row in connection.execute(due)]
 
 
-def take_first(connection: Connection, driver: str, *, now: dt.datetime, lease_s: float) -> Parcel | None:
-    """Claim the delivery that is due for the longest time, of receivers to which nothing is being sent.
-
-    A receiver that hangs therefore holds up one sender, not all.
-    """
-    other = WEBHOOK_DELIVERIES.alias()
-    is_busy = sa.exists(sa.select(other.c.delivery_id).where(other.c.lease_until > now, other.c.url == _TABLE.url))
-    line = sa.select(WEBHOOK_DELIVERIES).where(_is_due(now), ~is_busy).order_by(_TABLE.due_at, _TABLE.delivery_id)
-    row = connection.execute(line.limit(1).with_for_update(skip_locked=True)).one_or_none()
-    if row is None:
-        return None
-    one = _TABLE.delivery_id == row.delivery_id
-    if row.endpoint_id is not None:
-        reason = _closed(connection, row.endpoint_id)
+def take(
+    connection: Connection, chosen: Sequence[Due], driver: str, *, now: dt.datetime, lease_s: float
+) -> list[Parcel]:
+    """Claim deliveries of a line, with all that sending them needs; those of closed endpoints are dropped."""
+    busy = set(connection.execute(sa.select(_RECEIVER).where(_TABLE.lease_until > now)).scalars())
+    payers = {due.delivery_id: due.payer for due in chosen if due.receiver not in busy}
+    free = sa.and_(_TABLE.delivery_id.in_(list(payers)), _is_due(now))
+    rows = connection.execute(sa.select(WEBHOOK_DELIVERIES).where(free).with_for_update(skip_locked=True)).all()
+    endpoints = _endpoints(connection, [row.endpoint_id for row in rows])
+    for endpoint_id, endpoint in endpoints.items():
+        reason = _closed(endpoint)
         if reason is not None:
-            drop(connection, one, reason, now)
-            return None
-    lost = sa.and_(_LOG.delivery_id == row.delivery_id, _LOG.duration_ms.is_(None), _LOG.error.is_(None))
+            drop(connection, sa.and_(free, _TABLE.endpoint_id == endpoint_id), reason, now)
+    rows = [row for row in rows if row.endpoint_id is None or _closed(endpoints[row.endpoint_id]) is None]
+    if not rows:
+        return []
+    name, taken = storable(driver, 255), [row.delivery_id for row in rows]
+    lost = sa.and_(_LOG.delivery_id.in_(taken), _LOG.duration_ms.is_(None), _LOG.error.is_(None))
     words = "the driver ended during this attempt"
     connection.execute(sa.update(WEBHOOK_ATTEMPTS).where(lost).values(error=words))
-    number, name = row.attempts + 1, storable(driver, 255)
-    connection.execute(
-        sa.insert(WEBHOOK_ATTEMPTS).values(delivery_id=row.delivery_id, number=number, at=now, driver=name)
-    )
+    log = [{"delivery_id": row.delivery_id, "number": row.attempts + 1, "at": now, "driver": name} for row in rows]
+    connection.execute(sa.insert(WEBHOOK_ATTEMPTS), log)
     lease = {"lease_owner": name, "lease_until": now + dt.timedelta(seconds=lease_s)}
-    connection.execute(sa.update(WEBHOOK_DELIVERIES).where(one).values(attempts=number, **lease))
-    if row.endpoint_id is None:
-        secret = webhooks.own_secret(connection, row.owner, now)
-    else:
-        secret = webhooks.endpoint_secret(connection, row.endpoint_id)
-    return Parcel(
-        delivery=dataclasses.replace(_delivery(row), attempts=number),
-        driver=name,
-        job=job_of(row.snapshot),
-        base=row.base,
-        secrets=secret.valid(now),
-        sent_at=now,
-    )
+    held = sa.update(WEBHOOK_DELIVERIES).where(_TABLE.delivery_id.in_(taken))
+    connection.execute(held.values(attempts=_TABLE.attempts + 1, **lease))
+    own_secrets = {
+        owner: webhooks.own_secret(connection, owner, now)
+        for owner in sorted({row.owner for row in rows if row.endpoint_id is None}, key=str)
+    }
+    jobs: dict[str, Job] = {}
+    parcels = []
+    for row, event in zip(rows, _events(connection, rows), strict=True):
+        if event is not None and event.event_id not in jobs:
+            jobs[event.event_id] = job_of(event.snapshot)
+        endpoint = endpoints.get(row.endpoint_id)
+        secret = own_secrets[row.owner] if endpoint is None else webhooks.secret_of(endpoint)
+        parcels.append(
+            Parcel(
+                delivery=dataclasses.replace(_delivery(row), attempts=row.attempts + 1, body=_body(row, event)),
+                driver=name,
+                job=job_of(row.snapshot) if event is None else jobs[event.event_id],
+                base=row.base,
+                secrets=secret.valid(now),
+                sent_at=now,
+                event_id=row.event_id,
+                payer=payers[row.delivery_id],
+            )
+        )
+    return parcels
 
 
 def settle(
-    connection: Connection, parcel: Parcel, result: Result, *, now: dt.datetime, policy: RetryPolicy, chance: float
-) -> DeliveryState:
-    """Write how an attempt ended, and what becomes of the delivery.
+    connection: Connection,
+    ended: Sequence[tuple[Parcel, Result]],
+    *,
+    now: dt.datetime,
+    policy: RetryPolicy,
+    chance: Callable[[], float],
+) -> list[DeliveryState | None]:
+    """Write how attempts ended, and what becomes of the deliveries: their states.
 
-    Raises
-    ------
-    LeaseLostError
-        Another driver sends it by now, or it was removed.
+    None if another driver sends a delivery by now, or it was removed.
     """
-    delivery = parcel.delivery
-    chosen = sa.select(WEBHOOK_DELIVERIES).where(_TABLE.delivery_id == delivery.delivery_id)
-    row = connection.execute(chosen.with_for_update()).one_or_none()
-    if row is None or row.lease_owner != parcel.driver or row.attempts != delivery.attempts:
-        raise LeaseLostError(f"delivery {delivery.delivery_id}: attempt {delivery.attempts} is no longer held")
-    error = None if result.error is None else storable(result.error)
-    connection.execute(
-        sa.update(WEBHOOK_ATTEMPTS)
-        .where(_LOG.delivery_id == delivery.delivery_id, _LOG.number == delivery.attempts)
-        .values(duration_ms=result.duration_ms, status=result.status, error=error)
-    )
-    found = verdict(delivery, result, now, policy, chance)
-    values: dict[str, Any] = {"lease_owner": None, "lease_until": None, "body": result.body}
-    was_dropped = row.state != _WAITING and found.state is not DeliveryState.DELIVERED
-    if not was_dropped:
-        ended = None if found.state is DeliveryState.WAITING else now
-        reason = None if found.reason is None else storable(found.reason)
-        values |= {"state": found.state.value, "due_at": found.due_at, "reason": reason, "finished_at": ended}
-    connection.execute(sa.update(WEBHOOK_DELIVERIES).where(_TABLE.delivery_id == delivery.delivery_id).values(**values))
-    if found.state is DeliveryState.GONE:
-        _end(connection, delivery, found.reason or "", now)
-    elif found.state is DeliveryState.WAITING and _is_overtaken(connection, delivery):
-        drop(connection, _TABLE.delivery_id == delivery.delivery_id, "overtaken by a later report", now)
-    return DeliveryState(row.state) if was_dropped else found.state
+    by_id = {parcel.delivery.delivery_id: (parcel, result) for parcel, result in ended}
+    chosen = sa.select(WEBHOOK_DELIVERIES).where(_TABLE.delivery_id.in_(list(by_id))).order_by(_TABLE.delivery_id)
+    rows = [row for row in connection.execute(chosen.with_for_update()) if _is_held(row, by_id[row.delivery_id][0])]
+    bodies = _Bodies(connection, rows)
+    states: dict[str, DeliveryState] = {}
+    attempts, changes, after = [], [], []
+    for row in rows:
+        parcel, result = by_id[row.delivery_id]
+        error = None if result.error is None else storable(result.error)
+        key = {"of": row.delivery_id, "attempt": row.attempts}
+        attempts.append(key | {"duration_ms": result.duration_ms, "status": result.status, "error": error})
+        found = verdict(parcel.delivery, result, now, policy, chance())
+        values: dict[str, Any] = {"state": found.state.value, "due_at": found.due_at}
+        values |= {"reason": None if found.reason is None else storable(found.reason)}
+        values |= {"finished_at": None if found.state is DeliveryState.WAITING else now}
+        if row.state != _WAITING and found.state is not DeliveryState.DELIVERED:
+            # it was dropped meanwhile
+            values = {name: getattr(row, name) for name in values}
+        states[row.delivery_id] = DeliveryState(values["state"])
+        changes.append({"of": row.delivery_id, "body": bodies.own(row, result.body), **values})
+        if found.state is not DeliveryState.DELIVERED:
+            after.append((parcel.delivery, found))
+    if rows:
+        one = sa.and_(_LOG.delivery_id == sa.bindparam("of"), _LOG.number == sa.bindparam("attempt"))
+        connection.execute(sa.update(WEBHOOK_ATTEMPTS).where(one), attempts)
+        delivery = _TABLE.delivery_id == sa.bindparam("of")
+        free = {"lease_owner": None, "lease_until": None}
+        connection.execute(sa.update(WEBHOOK_DELIVERIES).where(delivery).values(**free), changes)
+    for delivery_, found in after:
+        if found.state is DeliveryState.GONE:
+            _end(connection, delivery_, found.reason or "", now)
+        elif found.state is DeliveryState.WAITING and _is_overtaken(connection, delivery_):
+            drop(connection, _TABLE.delivery_id == delivery_.delivery_id, "overtaken by a later report", now)
+    return [states.get(parcel.delivery.delivery_id) for parcel, _ in ended]
+
+
+def _is_held(row: sa.Row[Any], parcel: Parcel) -> bool:
+    """Whether a delivery is still held for the attempt of a parcel."""
+    return bool(row.lease_owner == parcel.driver and row.attempts == parcel.delivery.attempts)
+
+
+class _Bodies:
+    """Where bodies are stored: one that all endpoints get is stored once, with its event."""
+
+    def __init__(self, connection: Connection, rows: Sequence[sa.Row[Any]]) -> None:
+        self._connection = connection
+        found = _events(connection, [row for row in rows if row.endpoint_id is not None])
+        self._stored = {event.event_id: (event.base, event.body) for event in found if event is not None}
+
+    def own(self, row: sa.Row[Any], body: str | None) -> str | None:
+        """The body that a delivery stores itself; None if its event has it."""
+        if body is None or row.event_id not in self._stored:
+            return body
+        if self._stored[row.event_id][1] is None:
+            values = {"base": row.base, "body": body}
+            one = sa.and_(WEBHOOK_EVENTS.c.event_id == row.event_id, WEBHOOK_EVENTS.c.body.is_(None))
+            if self._connection.execute(sa.update(WEBHOOK_EVENTS).where(one).values(**values)).rowcount:
+                self._stored[row.event_id] = (row.base, body)
+        return None if self._stored[row.event_id] == (row.base, body) else body
+
+
+def _events(connection: Connection, rows: Sequence[sa.Row[Any]]) -> list[sa.Row[Any] | None]:
+    """The event of each delivery; None for one of an earlier version."""
+    wanted = {row.event_id for row in rows if row.event_id is not None}
+    found: dict[str, sa.Row[Any]] = {}
+    if wanted:
+        chosen = sa.select(WEBHOOK_EVENTS).where(WEBHOOK_EVENTS.c.event_id.in_(wanted))
+        found = {row.event_id: row for row in connection.execute(chosen)}
+    return [found.get(row.event_id) for row in rows]
+
+
+def _body(row: sa.Row[Any], event: sa.Row[Any] | None) -> str | None:
+    """The body as it was sent, or as others with the same links got it; None if nothing was sent yet."""
+    if row.body is not None or event is None or row.endpoint_id is None or event.base != row.base:
+        own: str | None = row.body
+        return own
+    shared: str | None = event.body
+    return shared
 
 
 def give_up_all(connection: Connection, driver: str) -> None:
@@ -203,28 +298,24 @@ def give_up_all(connection: Connection, driver: str) -> None:
     connection.execute(sa.update(WEBHOOK_DELIVERIES).where(held).values(lease_owner=None, lease_until=None))
 
 
-def forget(connection: Connection, before: dt.datetime) -> int:
-    """Remove finished deliveries that ended before some time, a limited number at once; how many."""
-    old = sa.select(_TABLE.delivery_id).where(_TABLE.finished_at < before).limit(_FORGOTTEN_AT_ONCE)
-    found = list(connection.execute(old).scalars())
-    if found:
-        connection.execute(sa.delete(WEBHOOK_ATTEMPTS).where(_LOG.delivery_id.in_(found)))
-        connection.execute(sa.delete(WEBHOOK_DELIVERIES).where(_TABLE.delivery_id.in_(found)))
-    return len(found)
-
-
 def _is_due(now: dt.datetime) -> sa.ColumnElement[bool]:
     is_free = sa.or_(_TABLE.lease_until.is_(None), _TABLE.lease_until <= now)
     return sa.and_(_TABLE.state == _WAITING, _TABLE.due_at <= now, is_free)
 
 
-def _closed(connection: Connection, endpoint_id: str) -> str | None:
+def _endpoints(connection: Connection, endpoint_ids: Collection[str | None]) -> dict[str, sa.Row[Any] | None]:
+    """Rows of `webhooks` by id; None for one that was removed."""
+    wanted = {endpoint_id for endpoint_id in endpoint_ids if endpoint_id is not None}
+    rows = connection.execute(sa.select(WEBHOOKS).where(WEBHOOKS.c.endpoint_id.in_(wanted))) if wanted else ()
+    found = {row.endpoint_id: row for row in rows}
+    return {endpoint_id: found.get(endpoint_id) for endpoint_id in wanted}
+
+
+def _closed(endpoint: sa.Row[Any] | None) -> str | None:
     """Why nothing may be sent to an endpoint; None if it is enabled."""
-    chosen = sa.select(WEBHOOKS.c.is_enabled, WEBHOOKS.c.disabled_reason).where(WEBHOOKS.c.endpoint_id == endpoint_id)
-    row = connection.execute(chosen).one_or_none()
-    if row is None:
+    if endpoint is None:
         return webhooks.REMOVED
-    return None if row.is_enabled else str(row.disabled_reason)
+    return None if endpoint.is_enabled else str(endpoint.disabled_reason)
 
 
 def _end(connection: Connection, delivery: Delivery, reason: str, now: dt.datetime) -> None:

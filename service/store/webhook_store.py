@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import builtins
-import datetime as dt
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from service import deliveries as deliveries_of_requests
+from service.errors import LeaseLostError
+from service.receivers import Avoided, Due
+from service.store import backlog
 from service.store import webhook_deliveries as deliveries
 from service.store import webhook_endpoints as webhooks
-from service.store.database import LOCK_SECRETS, Database
+from service.store.backlog import Refilled
+from service.store.database import LOCK_SECRETS, LOCK_SUBMISSIONS, Database
 from service.store.delivering import creating
 from service.store.webhook_deliveries import DeliveryFilter
 from service.webhooks import Delivery, DeliveryState, Endpoint, EventType, Parcel, Result, RetryPolicy, SigningSecret
@@ -40,6 +43,8 @@ class WebhookStore:
         events: Sequence[EventType],
         description: str | None = None,
         base: str,
+        owner: str | None = None,
+        most: int | None = None,
         delivery: deliveries_of_requests.Delivery[tuple[Endpoint, str]] | None = None,
     ) -> tuple[Endpoint, str]:
         """Make an endpoint; it and its secret.
@@ -54,14 +59,23 @@ class WebhookStore:
             The operator's words.
         base : str
             The service's own URL, for links.
+        owner : str or None
+            The key that makes it; None if keys are not used.
+        most : int or None
+            Maximum number of endpoints of the key; None for any number.
         delivery : Delivery, optional
             What else is written for the request that makes it.
+
+        Raises
+        ------
+        TooManyWebhooksError
+            The key has so many already.
         """
+        new = webhooks.NewEndpoint(url=url, events=events, description=description, base=base, owner=owner)
         with creating(self._database, delivery) as (connection, made):
-            now = self._database.now(connection)
-            endpoint_id = webhooks.insert(
-                connection, url=url, events=[*events], description=description, base=base, now=now
-            )
+            # no other process adds one between counting and adding
+            self._database.lock(connection, LOCK_SUBMISSIONS)
+            endpoint_id = webhooks.insert(connection, new, most=most, now=self._database.now(connection))
             secret = webhooks.endpoint_secret(connection, endpoint_id).secret
             return made((webhooks.get(connection, endpoint_id), secret))
 
@@ -84,7 +98,8 @@ class WebhookStore:
     def change(self, endpoint_id: str, changes: Mapping[str, Any]) -> Endpoint:
         """Change what is given: `url`, `events`, `description`, `is_enabled`.
 
-        Deliveries that wait go to the new URL. If it is disabled, they are dropped.
+        Deliveries that wait go to the new URL. If it is disabled, they are dropped, and so are events that wait. If it
+        is enabled and was paused, it goes on where it stopped.
 
         Raises
         ------
@@ -93,6 +108,22 @@ class WebhookStore:
         """
         with self._database.write() as connection:
             webhooks.change(connection, endpoint_id, changes, self._database.now(connection))
+            return webhooks.get(connection, endpoint_id)
+
+    def replay_all(self, endpoint_id: str) -> Endpoint:
+        """Send all that was not sent to an endpoint, as it has room, and end its pause.
+
+        These are the events that wait, and the ends of jobs in its log that failed or were dropped.
+
+        Raises
+        ------
+        NoSuchWebhookError
+            It does not exist.
+        NotReplayableError
+            It is disabled.
+        """
+        with self._database.write() as connection:
+            webhooks.replay(connection, endpoint_id, self._database.now(connection))
             return webhooks.get(connection, endpoint_id)
 
     def remove(self, endpoint_id: str) -> None:
@@ -176,22 +207,47 @@ class WebhookStore:
     # --- deliveries, for drivers
 
     def claim(self, driver: str, *, lease_s: float) -> Parcel | None:
-        """Claim a delivery that is due; no other driver sends it until the lease ends.
+        """Claim the delivery that is due for the longest time, of receivers to which nothing is being sent.
 
         Parameters
         ----------
         driver : str
             Name of the driver, unique per process.
         lease_s : float
-            Seconds for which it is held.
+            Seconds for which no other driver sends it.
         """
-        # most checks find nothing: they take no lock
+        found = self.claim_some(driver, lambda line: line[:1], lease_s=lease_s)
+        return found[0] if found else None
+
+    def claim_some(
+        self,
+        driver: str,
+        choose: Callable[[Sequence[Due]], Sequence[Due]],
+        *,
+        lease_s: float,
+        avoided: Avoided = Avoided(),  # noqa: B008 - it is frozen
+    ) -> builtins.list[Parcel]:
+        """Claim deliveries that are due; no other driver sends them until the lease ends.
+
+        Parameters
+        ----------
+        driver : str
+            Name of the driver, unique per process.
+        choose : callable
+            Picks from the line at most one delivery per receiver.
+        lease_s : float
+            Seconds for which they are held.
+        avoided : Avoided
+            What is not in the line.
+        """
+        # the long look takes no lock; what others claimed since then is left out
         with self._database.read() as connection:
-            if not deliveries.something_is_due(connection, self._database.now(connection)):
-                return None
+            chosen = choose(deliveries.line(connection, avoided, self._database.now(connection)))
+        if not chosen:
+            return []
         with self._database.write() as connection:
             self._database.lock(connection, LOCK_SECRETS)
-            return deliveries.take_first(connection, driver, now=self._database.now(connection), lease_s=lease_s)
+            return deliveries.take(connection, chosen, driver, now=self._database.now(connection), lease_s=lease_s)
 
     def settle(self, parcel: Parcel, result: Result, policy: RetryPolicy) -> DeliveryState:
         """Write how an attempt ended; the state of the delivery afterwards.
@@ -201,12 +257,52 @@ class WebhookStore:
         LeaseLostError
             Another driver sends it by now, or it was removed.
         """
+        (state,) = self.settle_all([(parcel, result)], policy)
+        if state is None:
+            delivery = parcel.delivery
+            raise LeaseLostError(f"delivery {delivery.delivery_id}: attempt {delivery.attempts} is no longer held")
+        return state
+
+    def settle_all(
+        self, ended: Sequence[tuple[Parcel, Result]], policy: RetryPolicy
+    ) -> builtins.list[DeliveryState | None]:
+        """Write how attempts ended, in one transaction; the states of the deliveries.
+
+        None if another driver sends a delivery by now, or it was removed.
+        """
         with self._database.write() as connection:
             now = self._database.now(connection)
-            chance = random.random()  # noqa: S311 - it only spreads retries
-            return deliveries.settle(connection, parcel, result, now=now, policy=policy, chance=chance)
+            # it only spreads retries
+            return deliveries.settle(connection, ended, now=now, policy=policy, chance=random.random)
 
-    def forget(self, days: float) -> int:
-        """Remove deliveries that ended so many days ago, a limited number at once; how many."""
+    def refill(self, *, max_waiting: int, with_late: bool = True) -> Refilled:
+        """Put events in line for endpoints that have room again; pause those that do not keep up.
+
+        Parameters
+        ----------
+        max_waiting : int
+            Most messages that may wait for an endpoint that does not keep up.
+        with_late : bool
+            Look at those without room, too, which may have to be paused.
+        """
+        with self._database.read() as connection:
+            found = backlog.behind(connection, self._database.now(connection), with_late=with_late)
+        if not found:
+            return Refilled()
         with self._database.write() as connection:
-            return deliveries.forget(connection, self._database.now(connection) - dt.timedelta(days=days))
+            self._database.lock(connection, LOCK_SECRETS)
+            now = self._database.now(connection)
+            return backlog.refill(connection, found, now, max_waiting=max_waiting)
+
+    def forget(self, days: float, *, most: int | None = None) -> int:
+        """Remove old deliveries and events that no one needs, a limited number at once; how many.
+
+        Parameters
+        ----------
+        days : float
+            Days after which a finished delivery goes, and the end of a job that a paused endpoint did not get.
+        most : int, optional
+            Most finished deliveries, and most of them that failed; the oldest go first.
+        """
+        with self._database.write() as connection:
+            return backlog.forget(connection, self._database.now(connection), days, most)

@@ -55,7 +55,10 @@ class WebhookPatch(Request):
     description: Annotated[str, Field(max_length=500)] | None = Field(
         None, description="Your own words; null for none.", json_schema_extra={"nullable": True}
     )
-    enabled: bool = Field(True, description="Whether anything is sent. If not, messages that wait are dropped.")
+    enabled: bool = Field(
+        True,
+        description="Whether anything is sent. If not, messages that wait are dropped. True also ends a pause.",
+    )
 
     @classmethod
     def prepared(cls, given: Any) -> Any:
@@ -87,6 +90,10 @@ class Webhook(Answer):
     created: Time
     updated: Time
     oldSecretUntil: Time | None = Field(None, description="Time until which the replaced secret still signs.")
+    pausedSince: Time | None = Field(
+        None, description="Time since which nothing is sent because the receiver did not keep up; a replay ends it."
+    )
+    notSent: int | None = Field(None, ge=1, description="Messages that wait for room or, while it is paused, a replay.")
     links: list[Link]
 
 

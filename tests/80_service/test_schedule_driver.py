@@ -1,5 +1,6 @@
 """The clock of the schedules in drivers with a scripted run in place of the science."""
 
+import datetime as dt
 import logging
 from collections import Counter
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import pytest
 from driver_bench import Bench
 from processes import wait_for
-from schedule_contract import HOUR
+from schedule_contract import DAY, HOUR
 from schedule_store_contract import jobs_of, make, runs_of
 
 from pipeline.schedule import Outcome, Overlap
@@ -48,19 +49,38 @@ def test_two_drivers_make_one_job_of_each_slot(bench: Bench) -> None:
 
 
 def test_a_slot_that_waits_is_run_when_the_drivers_job_is_over(bench: Bench) -> None:
-    schedule = make(bench.store, overlap=Overlap.WAIT)
+    schedule = due(bench, overlap=Overlap.WAIT)
     bench.script.waits()
     job = bench.store.schedules.run_now(schedule.schedule_id, max_queued=10, max_queued_per_key=10)
     bench.driver()
     bench.becomes(job, JobStatus.RUNNING)
-    slot = schedule.next_at
-    (entry,) = bench.store.schedules.tick(now=slot, max_queued=10, max_queued_per_key=10)
-    assert entry.outcome is Outcome.WAITING
+
+    def waiting() -> list[dt.datetime | None]:
+        return [run.slot for run in runs_of(bench.store, schedule) if run.outcome is Outcome.WAITING]
+
+    (slot,) = wait_for(waiting, "a slot that waits")
     bench.script.go_on.set()
     bench.over(job)
     wait_for(lambda: len(jobs_of(bench.store, schedule)) == 2, "the job that waited")
     latest = runs_of(bench.store, schedule)[0]
     assert (latest.outcome, latest.slot, latest.trigger) == (Outcome.SUBMITTED, slot, Trigger.CLOCK)
+
+
+def test_a_clock_that_was_put_back_by_days_is_reported_and_the_schedule_goes_on(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The database's clock was ten days ahead when the schedule was looked at last."""
+    schedule = make(bench.store, at=bench.store.now() + 10 * DAY)
+    with caplog.at_level(logging.INFO, logger="gablework.driver"):
+        bench.driver()
+        wait_for(lambda: runs_of(bench.store, schedule), "an entry of the history")
+        wait_for(lambda: "slots up to" in caplog.text, "a line in the log")
+    (entry,) = runs_of(bench.store, schedule)
+    assert "the clock was put back from" in entry.message
+    assert [r.levelno for r in caplog.records if "the clock was put back" in r.getMessage()] == [logging.WARNING]
+    after = bench.store.schedules.get(schedule.schedule_id)
+    assert after.next_at is not None
+    assert after.decided_until < after.next_at < bench.store.now() + 2 * HOUR
 
 
 def test_missed_slots_are_warned_of_in_the_log(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import threading
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,15 +11,17 @@ from typing import Any
 import finished_runs as runs
 import pytest
 from driver_bench import Bench
-from processes import wait_for
-from webhook_receiver import Receiver, failing, receiving
+from processes import LONG_S, wait_for
+from webhook_receiver import Received, Receiver, failing, receiving
+from webhook_store_contract import shift
 
 from service.driver.webhooks import body_of
 from service.files import StateFolder
 from service.jobs import Fault, Job, JobFailure, JobStatus, Subscriber
 from service.settings import ServiceSettings
 from service.store import DeliveryFilter, JobStore
-from service.webhooks import DeliveryState, EventType
+from service.store.webhook_store import WebhookStore
+from service.webhooks import ROOM, DeliveryState, EventType
 from service.wire.jobs import StatusInfo
 
 BASE = "http://service.example"
@@ -234,3 +237,83 @@ def test_a_fault_with_one_message_does_not_end_the_sender(
     assert bench.store.webhooks.delivery(first.delivery_id).log[0].error == (
         "an unexpected fault of the service; its log has it"
     )
+
+
+def test_receivers_that_hang_hold_up_no_others(bench: Bench, receiver: Receiver) -> None:
+    free = threading.Event()
+
+    def answer(message: Received) -> int:
+        if message.path.startswith("/slow"):
+            free.wait(LONG_S)
+        return 204
+
+    receiver.answer = answer
+    for number in range(40):
+        kind = "slow" if number % 2 else "quick"
+        bench.store.webhooks.create(f"{receiver.url}/{kind}/{number}", events=[EventType.ACCEPTED], base=BASE)
+    try:
+        bench.submit()
+        bench.driver()
+        wait_for(lambda: len(receiver.received) == 40, "a message to each of them")
+        bench.submit()
+        wait_for(lambda: len(receiver.accepted) == 40, "both messages to each that is quick")
+        assert {message.path.split("/")[1] for message in receiver.accepted} == {"quick"}
+        slow = [one for one in deliveries(bench.store) if "/slow/" in one.url]
+        assert [one.state for one in slow] == [DeliveryState.WAITING] * 40
+    finally:
+        free.set()
+    assert len(all_are(bench, DeliveryState.DELIVERED)) == 80
+
+
+def test_many_events_wait_in_few_rows_and_all_arrive(bench: Bench, receiver: Receiver) -> None:
+    bench.store.webhooks.create(f"{receiver.url}/ends", events=[EventType.DISMISSED], base=BASE)
+    jobs = [bench.submit() for _ in range(2 * ROOM)]
+    for job in jobs:
+        bench.store.dismiss(job.job_id)
+    assert len(deliveries(bench.store)) == ROOM
+    bench.driver()
+    wait_for(lambda: len(receiver.accepted) == len(jobs), "all messages")
+    assert [message.document["data"]["jobID"] for message in receiver.accepted] == [job.job_id for job in jobs]
+
+
+def test_a_webhook_that_does_not_keep_up_is_paused_with_a_warning(
+    bench: Bench, receiver: Receiver, caplog: pytest.LogCaptureFixture
+) -> None:
+    receiver.answer = lambda _message: 503
+    bench.settings = bench.settings.model_copy(update={"webhook_pause_s": 3600.0, "webhook_max_waiting": 5})
+    made, _ = bench.store.webhooks.create(f"{receiver.url}/ends", events=[EventType.DISMISSED], base=BASE)
+    for _ in range(2 * ROOM):
+        bench.store.dismiss(bench.submit().job_id)
+    shift(bench.store, 1.0)
+    with caplog.at_level(logging.WARNING):
+        bench.driver()
+        wait_for(lambda: bench.store.webhooks.get(made.endpoint_id).paused_at, "the pause")
+        wait_for(lambda: f"webhook {made.endpoint_id} is paused" in caplog.text, "a warning")
+
+
+def test_an_end_that_cannot_be_written_holds_up_no_others(
+    bench: Bench, receiver: Receiver, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    settle_all = WebhookStore.settle_all
+    broken: list[str] = []
+
+    def settle(self: WebhookStore, ended: Any, policy: Any) -> Any:
+        ids = [parcel.delivery.delivery_id for parcel, _ in ended]
+        if not broken:
+            broken.append(ids[0])
+        if broken[0] in ids:
+            raise ZeroDivisionError
+        return settle_all(self, ended, policy)
+
+    monkeypatch.setattr(WebhookStore, "settle_all", settle)
+    for number in range(5):
+        bench.store.webhooks.create(f"{receiver.url}/{number}", events=[EventType.ACCEPTED], base=BASE)
+    bench.submit()
+    with caplog.at_level(logging.ERROR):
+        bench.driver()
+
+        def written() -> bool:
+            return sum(one.state is DeliveryState.DELIVERED for one in deliveries(bench.store)) == 4
+
+        wait_for(written, "the ends of the others")
+    assert f"the end of delivery {broken[0]} cannot be written" in caplog.text

@@ -4,12 +4,14 @@ import base64
 from typing import Any
 
 import pytest
+from webhook_store_contract import shift
 
 from service.errors import ServiceError
 from service.jobs import JobStatus, Subscriber
 from service.keys import Scope
+from service.settings import ServiceSettings
 from service.store import DeliveryFilter
-from service.webhooks import EventType, Result, RetryPolicy
+from service.webhooks import ROOM, EventType, Result, RetryPolicy
 
 LISTED = "http://127.0.0.1:9"
 HOOK = f"{LISTED}/hook"
@@ -225,6 +227,55 @@ def test_the_metrics_count_deliveries(local_service) -> None:
     assert 'gablework_webhook_deliveries{state="failed"} 0.0' in text
 
 
+# --- limits, and webhooks that do not keep up
+
+
+def test_a_key_makes_so_many_webhooks_and_the_refusal_says_what_to_do(starting) -> None:
+    service = starting(webhook_hosts=(LISTED,), open_without_keys=False, max_webhooks_per_key=2)
+    first, second = service.key(Scope.ADMIN), service.key(Scope.ADMIN)
+    made = [make(service, first) for _ in range(2)]
+    refused = service.client.post("/webhooks", json={"url": HOOK}, headers=first)
+    assert (refused.status_code, refused.json()["type"]) == (409, "urn:gablework:problem:too-many-webhooks")
+    assert "there are 2 webhooks of this key, the limit is 2: remove one, or raise" in refused.json()["detail"]
+    make(service, second)
+    assert service.client.delete(f"/webhooks/{made[0]['webhookID']}", headers=first).status_code == 204
+    make(service, first)
+
+
+def test_at_least_a_hundred_webhooks_of_a_key_are_allowed() -> None:
+    assert ServiceSettings.model_fields["max_webhooks_per_key"].default >= 100
+
+
+def test_a_webhook_that_does_not_keep_up_is_shown_paused_and_its_owner_replays_it(local_service) -> None:
+    store = local_service.store
+    place = f"/webhooks/{make(local_service, events=['job.dismissed'])['webhookID']}"
+    jobs = [local_service.waiting() for _ in range(ROOM + 5)]
+    for job in jobs:
+        store.dismiss(job.job_id)
+    shown = local_service.client.get(place).json()
+    assert ("pausedSince" in shown, shown["notSent"]) == (False, 5)
+    shift(store, 1.0)
+    store.webhooks.refill(max_waiting=1)
+    (shown,) = local_service.client.get("/webhooks").json()["webhooks"]
+    assert (shown["enabled"], shown["notSent"]) == (True, ROOM + 5)
+    assert shown["pausedSince"].endswith("Z")
+    assert store.webhooks.claim("d", lease_s=60.0) is None
+    replayed = local_service.client.post(f"{place}/replay")
+    assert replayed.status_code == 202
+    assert "pausedSince" not in replayed.json()
+    sent = []
+    while (parcel := store.webhooks.claim("d", lease_s=60.0)) is not None:
+        store.webhooks.settle(parcel, Result(duration_ms=12, status=204, body="{}"), POLICY)
+        sent.append(parcel.delivery.job_id)
+        store.webhooks.refill(max_waiting=1000)
+    assert sorted(sent) == sorted(job.job_id for job in jobs)
+    assert "notSent" not in local_service.client.get(place).json()
+    local_service.client.patch(place, json={"enabled": False})
+    refused = local_service.client.post(f"{place}/replay")
+    assert (refused.status_code, refused.json()["type"]) == (409, "urn:gablework:problem:not-replayable")
+    assert local_service.client.post(f"/webhooks/{'0' * 32}/replay").status_code == 404
+
+
 # --- who may do what
 
 
@@ -242,6 +293,7 @@ def test_only_an_admin_manages_webhooks_and_owners_see_their_own_deliveries(keye
             client.patch(place, json={"enabled": False}, headers=headers),
             client.delete(place, headers=headers),
             client.post(f"{place}/rotate-secret", headers=headers),
+            client.post(f"{place}/replay", headers=headers),
         ]
         assert {answer.status_code for answer in answers} == {403}
     jobs = {}

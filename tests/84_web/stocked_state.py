@@ -152,6 +152,7 @@ class Stocking:
             else:
                 result = Result(duration_ms=31, status=204, body=body)
             self._store.webhooks.settle(parcel, result, policy)
+            self._store.webhooks.refill(max_waiting=1000)
             sent.append(delivery_id)
         return sent[0], sent[1]
 

@@ -5,7 +5,7 @@ import { getJson, request } from "./api";
 import { el } from "./elements";
 import type { Hooks } from "./job_view";
 import { announce, asProblem, problemNotice } from "./notices";
-import { count } from "./numbers";
+import { count, counted } from "./numbers";
 import { fact, table } from "./tables";
 import type { View } from "./views";
 import { Watching } from "./watching";
@@ -57,6 +57,23 @@ export function deliveryRemedy(state: string): string {
     default:
       return "";
   }
+}
+
+interface ReceiverState {
+  enabled: boolean;
+  pausedSince?: string;
+  notSent?: number;
+}
+
+export function receiverState({ enabled, pausedSince }: ReceiverState): "enabled" | "paused" | "disabled" {
+  if (!enabled) return "disabled";
+  return pausedSince === undefined ? "enabled" : "paused";
+}
+
+/** What waits for a receiver, and what to do about it if it is paused; empty if nothing does. */
+export function unsentWords({ pausedSince, notSent = 0 }: ReceiverState): string {
+  if (pausedSince !== undefined) return `It did not keep up: ${counted(notSent, "message")} not sent. Mend it, then choose “Send what it missed”.`;
+  return notSent === 0 ? "" : `${counted(notSent, "message")} wait for it`;
 }
 
 /** The body as it reads best; as it was sent if it is not JSON. */

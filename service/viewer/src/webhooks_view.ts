@@ -3,7 +3,7 @@
 import { actionMenu, type Item } from "./action_menu";
 import { hashOf, type Address } from "./address";
 import { getJson, request, type Problem } from "./api";
-import { DELIVERY_WORDS, EVENT_WORDS, showDelivery, type Delivery } from "./delivery_view";
+import { DELIVERY_WORDS, EVENT_WORDS, receiverState, showDelivery, unsentWords, type Delivery } from "./delivery_view";
 import { ask, openDialog, openForm } from "./dialogs";
 import { el } from "./elements";
 import { choice, field } from "./form_fields";
@@ -30,6 +30,8 @@ interface Webhook {
   disabledReason?: string;
   created: string;
   oldSecretUntil?: string;
+  pausedSince?: string;
+  notSent?: number;
 }
 
 interface Secret {
@@ -130,6 +132,7 @@ class Webhooks implements View {
     const events = one.events.map((event) => EVENT_WORDS[event] ?? event).join(", ");
     const items: Item[] = [
       { label: "Change…", act: () => this.edit(one) },
+      ...(one.enabled ? [{ label: "Send what it missed", act: () => this.changed(change(`${path}/replay`, "POST"), "What it missed is sent.") }] : []),
       {
         label: one.enabled ? "Disable" : "Enable",
         act: () => this.changed(change(path, "PATCH", { enabled: !one.enabled }), one.enabled ? "It is disabled." : "It is enabled."),
@@ -139,6 +142,8 @@ class Webhooks implements View {
       { label: "Remove…", act: () => this.remove(one, path) },
     ];
     const name = one.description ?? one.url;
+    const state = receiverState(one);
+    const unsent = unsentWords(one);
     return el(
       "tr",
       {},
@@ -153,7 +158,8 @@ class Webhooks implements View {
       el(
         "td",
         {},
-        el("span", { class: `chip ${one.enabled ? "chip-good" : "chip-warn"}` }, one.enabled ? "enabled" : "disabled"),
+        el("span", { class: `chip ${state === "enabled" ? "chip-good" : "chip-warn"}` }, state),
+        unsent === "" ? null : el("span", { class: "sub" }, unsent),
         one.disabledReason === undefined ? null : el("span", { class: "sub" }, one.disabledReason),
         one.oldSecretUntil === undefined ? null : el("span", { class: "sub" }, `old secret signs until ${new Date(one.oldSecretUntil).toLocaleString()}`),
       ),
