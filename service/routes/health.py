@@ -13,7 +13,7 @@ from service.errors import StoreError, StoreNewerError
 from service.files import StateFolder
 from service.metrics import Metrics
 from service.routes.answers import document
-from service.routes.bound import Folder, Reader, Store
+from service.routes.bound import Admin, Folder, Store
 from service.store import JobStore
 from service.wire.base import respond
 from service.wire.landing import Health
@@ -123,7 +123,7 @@ def _state(folder: StateFolder) -> str:
         }
     },
 )
-def metrics(request: Request, caller: Reader) -> Response:
+def metrics(request: Request, caller: Admin) -> Response:
     """Requests, durations and jobs by status, in the text format of Prometheus."""
     del caller
     metrics_: Metrics = request.app.state.metrics

@@ -148,9 +148,10 @@ def test_figures_count_requests_by_template_and_jobs_by_status(local_service) ->
     assert 0.0 <= float(oldest.split()[1]) < 600.0
 
 
-def test_figures_need_a_key_where_there_are_keys(local_service) -> None:
-    header = local_service.key(Scope.READ)
-    assert local_service.client.get("/metrics", headers=header).status_code == 200
+def test_figures_need_a_key_that_sees_the_work_of_all_keys(local_service) -> None:
+    expected = {Scope.READ: 403, Scope.SUBMIT: 403, Scope.ADMIN: 200}
+    for scope, status in expected.items():
+        assert local_service.client.get("/metrics", headers=local_service.key(scope)).status_code == status, scope
     assert local_service.client.get("/metrics").status_code == 401
 
 
