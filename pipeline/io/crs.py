@@ -7,6 +7,7 @@ import functools
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import CrsError
+from pipeline.io.library_faults import words_of
 
 if TYPE_CHECKING:
     import pyproj
@@ -97,9 +98,10 @@ def parse_crs(text: str, *, path: str) -> pyproj.CRS:
     try:
         return pyproj.CRS.from_user_input(text)
     except (pyproj.exceptions.ProjError, ValueError, RecursionError) as fault:
+        detail = str(fault)[:120] if isinstance(fault, pyproj.exceptions.ProjError) else words_of(fault)
         raise CrsError(
             path,
-            f"coordinate reference system {text[:80]!r} is not understood ({str(fault)[:120]})",
+            f"coordinate reference system {text[:80]!r} is not understood ({detail})",
             "Give an EPSG code such as EPSG:28992, or WKT",
         ) from fault
 

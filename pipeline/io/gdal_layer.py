@@ -40,8 +40,6 @@ _CRS_BYTES = 4096
 _FETCHED = frozenset({"link", "url"})
 """Types of a CRS that GDAL would fetch from a server."""
 _NAME_IT = 'Name the CRS: "crs": { "type": "name", "properties": { "name": "EPSG:28992" } }'
-_SMALL_BYTES = 150_000
-"""GeoJSON of this size cannot have too many values: a feature takes 54 bytes, a column 12. Other formats count."""
 
 
 def read_by_gdal(path: Path, layer: str | None, boxes: Boxes | None, shape: Shape) -> EncodedLayer:
@@ -53,12 +51,18 @@ def read_by_gdal(path: Path, layer: str | None, boxes: Boxes | None, shape: Shap
     import pyogrio
 
     source = _source_of(path)
+    about = None
     with in_our_words(path, _WHAT, VALID):
-        layers = {str(name): kind for name, kind in pyogrio.list_layers(source)}
+        if source.startswith(GEOJSON):  # it has one layer, and is parsed at each look
+            about = pyogrio.read_info(source, encoding=BYTES, force_feature_count=True)
+            layers = {str(about["layer_name"]): about["geometry_type"]}
+        else:
+            layers = {str(name): kind for name, kind in pyogrio.list_layers(source)}
     name = _chosen(path, layers, layer, shape)
     near, elsewhere = (None, 0) if boxes is None else _near(path, source, name, boxes, shape)
     with in_our_words(path, _WHAT, VALID):
-        _check_cells(path, source, name, near)
+        about = about or pyogrio.read_info(source, layer=name, encoding=BYTES, force_feature_count=near is None)
+        _check_cells(path, about["features"] if near is None else len(near), len(about["fields"]))
         meta, feature_ids, wkb, columns, is_decoded = _read(source, name, near)
     none = near is not None and len(near) == 0
     kept = slice(0, 0) if none else slice(None)
@@ -145,17 +149,9 @@ def _chosen(path: Path, layers: dict[str, str | None], layer: str | None, shape:
     return found[0]
 
 
-def _check_cells(path: Path, source: str, layer: str, near: npt.NDArray[np.int64] | None) -> None:
+def _check_cells(path: Path, features: int, columns: int) -> None:
     """Refuse a layer with so many values that holding the empty ones is too much."""
-    import pyogrio
-
-    size_bytes = path.stat().st_size
-    if source.startswith(GEOJSON) and size_bytes <= _SMALL_BYTES:
-        return  # it would be parsed once more
-    about = pyogrio.read_info(source, layer=layer, encoding=BYTES, force_feature_count=near is None)
-    features = about["features"] if near is None else len(near)
-    limit = cells_limit(size_bytes)
-    columns = len(about["fields"])
+    limit = cells_limit(path.stat().st_size)
     if features * columns > limit:
         raise UnreadableInputError(
             str(path),
