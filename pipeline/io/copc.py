@@ -59,6 +59,8 @@ def octree_info(header: laspy.LasHeader) -> OctreeInfo | None:
 
 _DEEPEST = 31
 """No octree is deeper: the numbers of its nodes have 32 bits."""
+_PAGE_LIMIT = 1 << 26
+"""Bytes of a page: two million nodes, some hundred thousand million points."""
 _FIX = "Get the file again, or rewrite it as LAZ"
 
 
@@ -102,7 +104,7 @@ def nodes_within(
 
 def _page(path: Readable, stream: BinaryIO, offset: int, size: int, file_size: int) -> npt.NDArray[np.void]:
     """The entries of a page."""
-    if size <= 0 or size % ENTRY.itemsize or offset + size > file_size:
+    if not 0 < size <= _PAGE_LIMIT or size % ENTRY.itemsize or offset + size > file_size:
         raise UnreadableInputError(
             str(path), f"the octree page at byte {offset} with {size} bytes is damaged or truncated", _FIX
         )

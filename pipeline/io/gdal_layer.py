@@ -17,6 +17,7 @@ from pipeline.errors import UnreadableInputError
 from pipeline.io.formats import first_bytes
 from pipeline.io.library_faults import in_our_words
 from pipeline.io.nearby import BATCH, Boxes, Nearby, Shape, cells_limit
+from pipeline.io.reading import moved
 from pipeline.io.vector_text import BYTES, Texts, without_controls
 from pipeline.io.wkb import EncodedLayer
 
@@ -221,5 +222,6 @@ def _batches(geometry: str, reader: Any) -> Iterator[_Batch]:
     """Ids and WKB of the batches of an Arrow reader."""
     number = next(name for name in reader.schema.names if name != geometry)
     for batch in reader:
+        moved()
         wkb = np.array([*batch.column(geometry).to_pylist(), None], dtype=object)[:-1]
         yield np.asarray(batch.column(number), dtype=np.int64), wkb

@@ -19,6 +19,7 @@ import shapely
 from pipeline.errors import UnreadableInputError
 from pipeline.io.library_faults import in_our_words, shortened
 from pipeline.io.nearby import BATCH, POLYGONS, Boxes, Nearby, Shape, cells_limit
+from pipeline.io.reading import moved
 from pipeline.io.vector_text import Texts
 from pipeline.io.wkb import EncodedLayer
 
@@ -93,6 +94,7 @@ def read_geoparquet(
         rows, batches, geometries = [np.empty(0, np.int64)], [], [np.empty(0, object)]
         first, cells = 0, 0
         for batch in file.iter_batches(BATCH, columns=about.wanted):
+            moved()
             wkb = _wkb_of(path, batch.column(batch.schema.names.index(about.name)), about.encoding)
             near = nearby.of(wkb)
             rows.append(first + np.flatnonzero(near))

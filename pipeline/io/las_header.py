@@ -23,6 +23,8 @@ HEADER_SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
 """Smallest header in bytes by minor version."""
 VLR_HEADER_SIZE = 54
 EVLR_HEADER_SIZE = 60
+RECORDS_LIMIT = 1 << 26
+"""Bytes of records before the points: all are held at once, and files have some kilobytes."""
 EVLR_LIMIT = 10_000
 """Extended records looked at: files have a handful, and a damaged count is in the billions."""
 WKT_RECORD_ID = 2112
@@ -136,6 +138,12 @@ def _check_layout(name: str, block: HeaderBlock, header_size: int, vlr_count: in
             REWRITE,
         )
     room = block.offset_to_points - header_size
+    if room > RECORDS_LIMIT:
+        raise InconsistentInputError(
+            name,
+            f"points begin at byte {block.offset_to_points}: records before them have {RECORDS_LIMIT} at most",
+            REWRITE,
+        )
     if vlr_count * VLR_HEADER_SIZE > room:
         raise InconsistentInputError(
             name, f"the header promises {vlr_count} variable length records in {room} bytes", REWRITE

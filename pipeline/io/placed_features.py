@@ -99,8 +99,7 @@ def _reprojected(
             f"the {what} cannot be reprojected from {own.name!r} to {target.name!r}: they lie outside its area",
             f"Check the CRS of the {what} and that of the points",
         )
-    # Of the operations that PROJ weighs, the one that it used for these points.
-    accuracy_m = transformer.get_last_used_operation().accuracy
+    accuracy_m = _accuracy_m(transformer)
     if accuracy_m is None or not 0.0 <= accuracy_m <= ACCURACY_LIMIT_M:
         good_to = (
             "an unknown accuracy" if accuracy_m is None or accuracy_m < 0.0 else f"an accuracy of {accuracy_m:g} m"
@@ -109,3 +108,14 @@ def _reprojected(
     else:
         warnings.append(f"the {what} are reprojected from {own.name!r} to {target.name!r}")
     return moved
+
+
+def _accuracy_m(transformer: pyproj.Transformer) -> float | None:
+    """The accuracy of the operation that PROJ used last, of those that it weighs; None where PROJ cannot name it."""
+    import pyproj
+
+    try:
+        accuracy: float | None = transformer.get_last_used_operation().accuracy
+    except pyproj.exceptions.ProjError:  # some parameters of a projection leave it without a name
+        return None
+    return accuracy

@@ -173,7 +173,9 @@ class PlyFile:
                         np.loadtxt(lines, dtype=np.float64, ndmin=2, comments=None) if lines else np.empty((0, width))
                     )
                 except ValueError as fault:
-                    problem = f"vertices {begin + 1} to {begin + count} are damaged ({str(fault)[:100]})"
+                    # numpy goes on with advice for programmers
+                    said = str(fault).partition(";")[0][:100]
+                    problem = f"vertices {begin + 1} to {begin + count} are damaged ({said})"
                     raise UnreadableInputError(name, problem, FIX) from fault
                 if table.shape != (count, width):
                     raise InconsistentInputError(

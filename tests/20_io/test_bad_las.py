@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from las_files import write_las
 from measured import memory_below
 
 from pipeline.errors import CrsError, EmptyInputError, InconsistentInputError, InputError, UnreadableInputError
@@ -280,3 +281,12 @@ def test_real_laz_is_held_to_its_count_to_the_point(tmp_path, shared_data):
             set_count(path, count + error)
             with pytest.raises(InconsistentInputError, match=f"promises {count + error} points"):
                 open_source(path)
+
+
+def test_records_before_the_points_are_bounded_before_they_are_read(tmp_path: Path) -> None:
+    path = write_las(tmp_path / "a.las", np.zeros((1, 3)))
+    patch(path, "<I", 96, 3 << 30)
+    with path.open("r+b") as stream:
+        stream.truncate(4 << 30)  # without a block on the disk
+    with memory_below(2**28), pytest.raises(InconsistentInputError, match="points begin at byte 3221225472: records"):
+        open_source(path)

@@ -5,6 +5,7 @@ import json
 import geopandas
 import numpy as np
 import pandas as pd
+import pyproj
 import pytest
 import shapely
 from measured import printed
@@ -289,3 +290,29 @@ def test_of_a_file_of_a_whole_country_only_a_little_is_held(tmp_path, suffix):
     assert (near[0] + near[1], whole[0], whole[1]) == (100_000, 100_000, 0)
     assert 25 <= near[0] <= 400
     assert near[2] < whole[2] / 2
+
+
+def test_an_outline_longer_than_any_building_is_left_out(tmp_path):
+    spiked = Polygon([(0, 0), (10, 0), (4e9, 10), (0, 10)])
+    path = write(tmp_path / "a.gpkg", [spiked, HOUSES[0]], id=["spiked", "good"])
+    found = read_footprints(path, reference())
+    assert found.ids == ("good",)
+    assert [(issue.source_id, issue.problem, issue.action) for issue in found.issues] == [
+        ("spiked", "too_large", "left out")
+    ]
+    assert "4e+09 m wide or long, more than 20000 m" in str(found.issues[0])
+    alone = write(tmp_path / "b.gpkg", [spiked], id=["spiked"])
+    with pytest.raises(EmptyInputError, match="no polygon of at most 20000 m has an area"):
+        read_footprints(alone, reference())
+
+
+def test_a_projection_that_proj_cannot_name_gives_an_unknown_accuracy(tmp_path):
+    damaged = (
+        pyproj.CRS.from_epsg(25832).to_wkt("WKT1_ESRI").replace('PRIMEM["Greenwich', 'PRIMEM["0],PARAMETEGreenwich')
+    )
+    assert 'PRIMEM["0]' in damaged
+    path = write(tmp_path / "a.shp", [box(500_000, 5_650_000, 500_010, 5_650_010)], crs="EPSG:25832", id=["a"])
+    path.with_suffix(".prj").write_text(damaged)
+    found = read_footprints(path, reference("EPSG:25832"))
+    assert found.polygons[0].area == pytest.approx(100.0, abs=0.1)
+    assert any(warning.endswith("with an unknown accuracy") for warning in found.warnings)

@@ -301,6 +301,17 @@ def test_given_footprints_are_overridden_by_their_own_id(plain: Any, overridden:
         ("[[building]]\nbuilding_id = 'a'\nsettings.roof.colour = 1", r"\[roof\] colour is not a setting"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POLYGO ((0 0))'", "is not WKT"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POINT (0 0)'", "is not a polygon: use POLYGON"),
+        (
+            "[[building]]\nbuilding_id = 'a'\nfootprint = 'POLYGON ((0 0, 9 0, 9 4e9, 0 0))'",
+            r"is 4e\+09 m wide or long: use at most 20000 m",
+        ),
+        ("[[building]]\nbuilding_id = 'a'\nfootprint = { file = 1, id = [] }", "footprint has the file 1: use text"),
+        (
+            "[[building]]\nbuilding_id = 'a'\nfootprint = { file = 'a', id = 1, layer = [] }",
+            r"footprint has the layer \[\]: use text",
+        ),
+        (f"[[building]]\npoint = [1, {'9' * 400}]\naction = 'accept'", r"point is \[1, 9+\.\.\.9+\]: use"),
+        (f"building = {'[' * 5000}", "is not TOML: its brackets are nested too deeply"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POLYGON ((0 0, 1 1, 1 0, 0 1, 0 0))'", "Self-intersection"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = 5", "footprint is neither WKT nor a table"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = {file = 'none.gpkg', id = 1}", "no such file"),
