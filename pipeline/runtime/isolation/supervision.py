@@ -360,7 +360,7 @@ class SupervisedChild:
 def system_kills() -> int:
     """Number of processes that Linux has ended for lack of memory since it started; 0 if unknown.
 
-    Those of this process's control group, whoever set its limit; without one, those of the machine.
+    Those of this process's control group; without one, those of the machine.
     """
     for path in (*_events_of_group(), Path("/proc/vmstat")):
         with contextlib.suppress(OSError, ValueError):
