@@ -13,7 +13,7 @@ from typing import Any
 from pipeline.errors import SettingsError
 from service.client.answers import OVER, Event, FetchedFile, Job, Output, Submitted
 from service.client.downloads import fetch_output, outputs_of
-from service.client.errors import ForeignAnswerError, JobDismissedError, JobFailedError, NotFoundError
+from service.client.errors import ForeignAnswerError, JobDismissedError, JobFailedError, NotFoundError, RefusedError
 from service.client.events import follow
 from service.client.session import Session, path_of
 from service.client.transport import LostError
@@ -29,6 +29,10 @@ OnEvent = Callable[[Event], None]
 
 def ignore(_: object) -> None:
     """Do nothing with a report."""
+
+
+_REMOVED = "removed-since"
+"""The kind of problem of a request under a key whose job was removed since."""
 
 
 class Operations:
@@ -121,7 +125,12 @@ class Operations:
         name = uuid.uuid4().hex if new else hashlib.sha256(content.encode()).hexdigest()[:32]
         for number in itertools.count(1):
             key = {"Idempotency-Key": f"{name}-{number}"}
-            answer = await self._session.ask("POST", path, document=body, headers=key)
+            try:
+                answer = await self._session.ask("POST", path, document=body, headers=key)
+            except RefusedError as error:
+                if error.problem.kind == _REMOVED:
+                    continue
+                raise
             job = self._job(self._session.document(answer))
             if answer.headers.get("idempotency-replayed") != "true" or new:
                 return Submitted(job=job, is_new=True)

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import resource
+import signal
 import sqlite3
 import struct
 import tracemalloc
@@ -21,6 +22,7 @@ from examples import examples
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from live_service import las_bytes
+from processes import wait_for
 
 from pipeline.errors import EmptyInputError, InputError, UnreadableInputError
 from pipeline.io import SpatialReference, read_footprints
@@ -425,32 +427,31 @@ def test_the_child_answers_as_the_function_does(tmp_path: Path, good: Path, exam
 
 
 def test_a_file_over_which_the_child_hangs_is_refused_and_the_next_is_served(good: Path, examiner: Examiner) -> None:
-    pipe = good.with_name("b.laz")
-    os.mkfifo(pipe)  # opening it waits for a writer that never comes
+    child = examiner._running()
+    child.send_signal(signal.SIGSTOP)
     examiner._timeout_s = 1.0
     with pytest.raises(UnreadableInputError, match="could not be read within 1 s"):
-        examiner.examine(pipe, max_points=MOST)
+        examiner.examine(good, max_points=MOST)
+    assert child.returncode == -signal.SIGKILL
     examiner._timeout_s = CHILD_S
     assert examiner.examine(good, max_points=MOST)["pointCount"] == 100
 
 
 def test_a_file_over_which_the_child_dies_is_refused_and_the_next_is_served(good: Path, examiner: Examiner) -> None:
-    pipe = good.with_name("b.laz")
-    os.mkfifo(pipe)
+    killed: set[int] = set()
 
-    def kill_the_readers() -> None:
-        # opening a pipe to write into it waits until the child has opened it to read: then the child is at work
-        for _ in range(2):  # it is tried twice
-            with pipe.open("wb"):
-                child = examiner._child
-                child.kill()
-                child.wait()
+    def kill_the_reader() -> bool:
+        child = examiner._child
+        if child is not None and child.pid not in killed:
+            killed.add(child.pid)
+            child.kill()
+        return len(killed) == 2  # it is tried twice
 
     with ThreadPoolExecutor(1) as pool:
-        killed = pool.submit(kill_the_readers)
+        killing = pool.submit(wait_for, kill_the_reader, "two children")
         with pytest.raises(UnreadableInputError, match="crashes the reader"):
-            examiner.examine(pipe, max_points=MOST)
-        killed.result()
+            examiner.examine(good, max_points=MOST)
+        killing.result()
     assert examiner.examine(good, max_points=MOST)["pointCount"] == 100
 
 
