@@ -32,6 +32,8 @@ ServiceError
 ├── ChangedMeanwhileError    the record has changed since the client read it
 ├── LeaseLostError           a driver's claim on a job has passed to another
 ├── AttemptEndedError        the process of an attempt ended before the attempt
+├── NoProcessError           the process of an attempt cannot be started now
+├── UnexpectedError          an exception that was not raised on purpose, of another process
 ├── StoreError               the database does not answer, or is not migrated
 │   ├── StoreBusyError       others hold its locks for too long
 │   ├── StoreNewerError      a newer version has migrated it
@@ -349,6 +351,10 @@ class AttemptEndedError(ServiceError):
     def __init__(self, detail: str, *, is_own: bool) -> None:
         self.is_own = is_own
         super().__init__(detail)
+
+
+class NoProcessError(ServiceError):
+    """The driver's machine has no room for the process of an attempt now, for which the job is not to blame."""
 
 
 class UnexpectedError(ServiceError):

@@ -224,6 +224,8 @@ def gather(
             progress=on_bytes,
         )
         before = seen
+        # an input that was examined is progress, too, though no byte of it was fetched
+        progress(seen)
         return found
 
     def on_bytes(so_far: int) -> None:

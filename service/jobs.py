@@ -226,8 +226,8 @@ class Job:
     """Attempts in a row that stood still, or ended by themselves, at stage `own_end_stage`; too many end the job."""
     own_end_stage: str = ""
     """The stage of the last of them."""
-    outside_ends: int = 0
-    """Attempts whose process was killed from outside."""
+    other_ends: int = 0
+    """Attempts whose process was killed from outside, or ended in another stage than the one before."""
     lease_owner: str | None = None
     """Name of the driver that holds it."""
     lease_until: dt.datetime | None = None

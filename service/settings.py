@@ -279,7 +279,7 @@ class ServiceSettings(BaseSettings):
     stop_s: float = Field(
         default=5.0,
         gt=0.0,
-        le=600.0,
+        le=60.0,
         description="Seconds that the process of a job gets to stop, after a dismissal or SIGTERM; then it is ended.",
     )
     stalled_days: float = Field(
@@ -297,8 +297,8 @@ class ServiceSettings(BaseSettings):
     drain_s: float = Field(
         default=30.0,
         ge=0.0,
-        description="Seconds within which a driver ends after SIGTERM; ten seconds before, jobs that are not done are "
-        "handed back, and their next attempt resumes finished stages.",
+        description="Seconds within which a driver ends after SIGTERM; `stop_s` and five seconds before, jobs that are "
+        "not done are handed back, and their next attempt resumes finished stages.",
     )
     log_json: bool = Field(default=False, description="Log one JSON object per line instead of plain lines.")
     input_timeout_s: float = Field(

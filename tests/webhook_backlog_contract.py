@@ -238,6 +238,41 @@ class WebhookBacklogContract(DatabaseContract):
 
     # --- limits and shares
 
+    def test_many_messages_to_one_receiver_leave_room_in_the_line_for_all_others(
+        self, store: JobStore, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("service.store.webhook_deliveries._LINE", 3)
+        endpoint(store, EventType.DISMISSED, url="https://busy.example/")
+        dismissed(store, 5)
+        endpoint(store, EventType.DISMISSED, url="https://late.example/")
+        dismissed(store, 1)
+        lines: list[list[str]] = []
+        store.webhooks.claim_some("d", lambda line: lines.append([due.receiver for due in line]) or [], lease_s=60.0)
+        assert len(lines[0]) == len(set(lines[0])) == 2
+
+    def test_what_is_replayed_goes_to_the_url_that_the_webhook_has_now(self, store: JobStore) -> None:
+        one = endpoint(store, EventType.DISMISSED, url="https://old.example/")
+        dismissed(store, 2)
+        final = Result(duration_ms=1, status=403, error="the receiver answered 403", is_final=True, body="{}")
+        send_all(store, final)
+        store.webhooks.change(one, {"url": "https://new.example/"})
+        single = log(store, state=DeliveryState.FAILED)[0]
+        store.webhooks.replay(single.delivery_id)
+        store.webhooks.replay_all(one)
+        sent = send_and_refill(store)
+        assert len(sent) == 2
+        assert {parcel.delivery.url for parcel in sent} == {"https://new.example/"}
+
+    def test_a_webhook_that_is_disabled_forgets_what_it_should_have_sent_again(self, store: JobStore) -> None:
+        one = endpoint(store, EventType.DISMISSED)
+        dismissed(store, MANY)
+        final = Result(duration_ms=1, status=403, error="the receiver answered 403", is_final=True, body="{}")
+        send_and_refill(store, final)
+        store.webhooks.replay_all(one)
+        store.webhooks.change(one, {"is_enabled": False})
+        store.webhooks.change(one, {"is_enabled": True})
+        assert send_and_refill(store) == []
+
     def test_a_key_makes_so_many_webhooks_and_not_more_also_at_once(self, store: JobStore) -> None:
         def make(number: int) -> bool:
             url = f"https://h{number}.example/"

@@ -19,7 +19,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.io.crs import LARGEST_COORDINATE, SpatialReference
 from pipeline.io.placed_features import boxes_around, in_metres
-from pipeline.io.repairs import Repairs, crossings
+from pipeline.io.repairs import EDGES_LIMIT, LOOKS_OF_FILE, Repairs, crossings
 from pipeline.io.urls import shown
 from pipeline.io.vector_layer import VectorLayer, read_layer
 
@@ -118,6 +118,7 @@ def read_footprints(
     id_column: str | None = None,
     crs: str | None = None,
     area: shapely.Geometry | None = None,
+    largest_m: float = LARGEST_OUTLINE_M,
 ) -> Footprints:
     """Footprints of a vector file, reprojected where its CRS is not the run's.
 
@@ -133,6 +134,8 @@ def read_footprints(
         The column of ids; None to look for the common names, then for the file's own feature id.
     crs : str, optional
         Overrides the file's CRS.
+    largest_m : float
+        Size in metres above which a polygon is left out.
     area : Geometry, optional
         Where footprints are wanted, in metres of the run's CRS. Of a file that covers a country all others are passed
         over unread, but for features whose place is not known. The boxes around its parts decide, 100 m wider: who
@@ -170,14 +173,14 @@ def read_footprints(
     for row in kept[~whole].tolist():
         problems[row] = ("outside_crs", "it cannot be reprojected to the run's CRS")
     polygons, kept = polygons[whole], kept[whole]
-    small = _small_enough(polygons, kept, problems)
+    small = _small_enough(polygons, kept, problems, largest_m)
     polygons, kept = polygons[small], kept[small]
     places = {int(row): tuple(bounds) for row, bounds in zip(kept, shapely.bounds(polygons).tolist(), strict=True)}
     polygons = _repaired(polygons, kept, problems, actions)
     solid = ~shapely.is_empty(polygons)
     polygons, kept = polygons[solid], kept[solid]
     if len(kept) == 0 and not found.elsewhere:
-        size = f" of at most {LARGEST_OUTLINE_M:g} m" if len(small) > small.sum() else ""
+        size = f" of at most {largest_m:g} m" if len(small) > small.sum() else ""
         raise EmptyInputError(name, f"no polygon{size} has an area", "Give polygons of buildings")
     table = {field: [_plain(value) for value in column] for field, column in found.columns.items()}
     ids, ids_of_all = _ids(name, table, found.feature_ids, kept, id_column)
@@ -205,14 +208,17 @@ def read_footprints(
 
 
 def _small_enough(
-    polygons: npt.NDArray[np.object_], rows: npt.NDArray[np.int64], problems: dict[int, tuple[str, str]]
+    polygons: npt.NDArray[np.object_],
+    rows: npt.NDArray[np.int64],
+    problems: dict[int, tuple[str, str]],
+    largest_m: float,
 ) -> npt.NDArray[np.bool_]:
-    """(n,) bool, whether polygons can be outlines of buildings by their size; the others are entered as problems."""
+    """(n,) bool, whether polygons are of a possible size; the others are entered as problems."""
     bounds = shapely.bounds(polygons).reshape(-1, 4)
     sides = (bounds[:, 2:] - bounds[:, :2]).max(axis=1, initial=0.0)
-    wide = sides > LARGEST_OUTLINE_M
+    wide = sides > largest_m
     for row, side in zip(rows[wide].tolist(), sides[wide].tolist(), strict=True):
-        problems[row] = ("too_large", f"it is {side:.6g} m wide or long, more than {LARGEST_OUTLINE_M:g} m")
+        problems[row] = ("too_large", f"it is {side:.6g} m wide or long, more than {largest_m:g} m")
     small: npt.NDArray[np.bool_] = ~wide
     return small
 
@@ -348,9 +354,20 @@ def _plain(value: Any) -> Any:
 
 def read_area(path: str | Path, reference: SpatialReference) -> Polygon | MultiPolygon:
     """The area of interest that the polygons of a vector file cover together, in the units of the run's CRS."""
-    polygons = list(read_footprints(path, reference).polygons)
-    count = crossings(shapely.get_rings(shapely.get_parts(polygons)))
-    if count is None or count.crossings > AREA_CROSSINGS:
+    found = read_footprints(path, reference, largest_m=math.inf)
+    for issue in found.issues:
+        # an area without one of its parts is another area
+        if issue.problem == "tangled":
+            raise InconsistentInputError(shown(str(path)), f"feature {issue.feature}: {issue.detail}", "Draw it anew")
+    polygons = list(found.polygons)
+    count = crossings(shapely.get_rings(shapely.get_parts(polygons)), LOOKS_OF_FILE, only_proper=True)
+    if count is None:
+        raise InconsistentInputError(
+            shown(str(path)),
+            f"its {len(polygons)} polygons have more than {EDGES_LIMIT} edges, or too many that lie over each other",
+            "Dissolve them into one area first, or draw it with fewer corners",
+        )
+    if count.crossings > AREA_CROSSINGS:
         raise InconsistentInputError(
             shown(str(path)),
             f"its {len(polygons)} polygons cross each other in more than {AREA_CROSSINGS} places",

@@ -23,12 +23,16 @@ INPUT_TIMEOUT_S = 600.0
 _limit_s: ContextVar[float] = ContextVar("input_timeout_s", default=INPUT_TIMEOUT_S)
 _listener: Callable[[], None] | None = None
 """What hears of progress: the alarm of this process, or the report to its supervisor."""
+_watcher: Callable[[], None] | None = None
+"""What hears of it besides, in a process that is watched and has an alarm all the same."""
 
 
 def moved() -> None:
     """Report that some more of an input was read."""
     if _listener is not None:
         _listener()
+    if _watcher is not None:
+        _watcher()
 
 
 def stalled(path: str, limit_s: float) -> UnreadableInputError:
@@ -57,6 +61,17 @@ def heard_by(listener: Callable[[], None]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def seen_by(watcher: Callable[[], None]) -> Iterator[None]:
+    """Let progress in the block be seen by someone who watches this process, beside its alarms. A context manager."""
+    global _watcher  # noqa: PLW0603 - as above
+    before, _watcher = _watcher, watcher
+    try:
+        yield
+    finally:
+        _watcher = before
+
+
+@contextlib.contextmanager
 def one_input(path: str) -> Iterator[None]:
     """Read an input in the block, within the limit between two pieces; a context manager.
 
@@ -64,6 +79,8 @@ def one_input(path: str) -> Iterator[None]:
     alarm of the process has another use. Raises UnreadableInputError once nothing was read for as long as the limit.
     """
     limit_s = _limit_s.get()
+    if _watcher is not None:
+        _watcher()
     free = (
         _listener is None
         and threading.current_thread() is threading.main_thread()

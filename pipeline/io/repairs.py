@@ -75,8 +75,12 @@ class Count:
     """Pairs of edges whose boxes meet, neighbours aside: each was looked at."""
 
 
-def crossings(lines: npt.NDArray[np.object_], looks_limit: int = LOOKS_LIMIT) -> Count | None:
+def crossings(
+    lines: npt.NDArray[np.object_], looks_limit: int = LOOKS_LIMIT, *, only_proper: bool = False
+) -> Count | None:
     """How often the edges of (n,) lines or rings meet, themselves or each other; None if counting is too much work.
+
+    With `only_proper` edges that touch do not count: polygons side by side have many of these.
 
     >>> bow_tie = shapely.linearrings([[0, 0], [2, 2], [2, 0], [0, 2]])
     >>> crossings(np.array([bow_tie]))
@@ -101,7 +105,8 @@ def crossings(lines: npt.NDArray[np.object_], looks_limit: int = LOOKS_LIMIT) ->
         looks += len(one)
         if looks > looks_limit:
             return None
-        met += int(np.count_nonzero(shapely.intersects(edges[one], edges[other])))
+        meet = shapely.crosses if only_proper else shapely.intersects
+        met += int(np.count_nonzero(meet(edges[one], edges[other])))
     return Count(crossings=met, looks=looks)
 
 

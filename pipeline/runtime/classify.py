@@ -24,8 +24,8 @@ from pipeline.runtime.resources import Resources
 from pipeline.runtime.run_context import RunContext, run_context
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
-from pipeline.runtime.scratch.location import resumable_scratch
 from pipeline.runtime.scratch.outcomes import Place, key_of, whole
+from pipeline.runtime.scratch.work_folder import locked_work
 from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.ingest import ingest, part_of
@@ -168,7 +168,7 @@ def classify(
         plan,
         progress,
         request.resources,
-        resumable_scratch(str(out / _SCRATCH)) if request.resources.resume else _scratch(out),
+        locked_work(str(out / _SCRATCH)) if request.resources.resume else _scratch(out),
         dataclasses.replace(expected(plan, 0), models=False),
         loads=loads_of("classify", footprints=footprints is not None),
         executor=executor,

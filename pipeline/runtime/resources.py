@@ -42,8 +42,8 @@ class Resources:
     """A folder that stores the outcomes of tasks. A run with the same folder resumes where an interrupted one stopped,
     and repeats only what changed since a finished one; None stores nothing beyond the run."""
     resume: bool = False
-    """Whether scratch stays in the run directory if the run is interrupted, so that a run into the same place resumes
-    there. A finished run removes it."""
+    """Whether scratch stays in the run directory, so that a run into the same place resumes there. The caller removes
+    it once it is not needed."""
     performance_report: str | None = None
     """File for a page about the workers' time; None writes none."""
 

@@ -40,9 +40,8 @@ from pipeline.runtime.overrides.overrides_file import Override, read_overrides
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
 from pipeline.runtime.run_context import RunContext, run_context
-from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_results
-from pipeline.runtime.scratch.location import check_scratch, resumable_scratch, run_scratch
+from pipeline.runtime.scratch.location import check_scratch, run_scratch
 from pipeline.runtime.scratch.outcomes import Place
 from pipeline.runtime.scratch.work_folder import is_known, locked_work
 from pipeline.runtime.stages.apply_overrides import apply_overrides
@@ -239,7 +238,7 @@ def run_variants(
                 plan,
                 progress,
                 resources,
-                _scratch_of(request),
+                run_scratch(request.out, resources.scratch) if work is None else locked_work(work),
                 expected(plan, None if footprints is None else len(footprints.polygons)),
                 loads=loads_of("reconstruct", footprints=footprints is not None, method=settings.general.method),
                 executor=executor,
@@ -274,15 +273,6 @@ def run_variants(
     seconds = time.perf_counter() - began
     progress.tell("finished", "", f"{outcomes[0].summary.counts['candidates']} candidates in {seconds:.1f} s")
     return outcomes
-
-
-def _scratch_of(request: RunRequest) -> contextlib.AbstractContextManager[Scratch]:
-    """Scratch that ends with the run, outlives it, or stays if the run is interrupted."""
-    if request.resources.work is not None:
-        return locked_work(request.resources.work)
-    if request.work is not None:
-        return resumable_scratch(request.work)
-    return run_scratch(request.out, request.resources.scratch)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import pickle
 import secrets
@@ -22,6 +23,7 @@ from pipeline.runtime.monitoring.events import Event, Listener
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
+from pipeline.runtime.scratch.location import SCRATCH
 from pipeline.settings import RunSettings
 from service.driver.failures import failure_of, has_no_space
 from service.driver.gathered import gathered_before, note_gathered
@@ -243,10 +245,16 @@ class AttemptParts:
         """What the parts of the work found that are done: an attempt that resumes does not repeat them."""
         return self.place / "done"
 
+    def clear_scratch(self) -> None:
+        """Remove the intermediate results of a run whose summary is stored."""
+        for folder in (self.run, self.comparison):
+            shutil.rmtree(folder / SCRATCH, ignore_errors=True)
+
     def once(self, name: str, work: Callable[[], Done]) -> Done:
         """The result of a part of the work, which is stored; that of an attempt before, by the same version, if any."""
         path = self.done / f"{name}-{__version__}"
-        if path.exists():
+        # one that a loss of power cut off is as good as none
+        with contextlib.suppress(FileNotFoundError, EOFError, pickle.UnpicklingError):
             before: Done = pickle.loads(path.read_bytes())  # noqa: S301 - from a folder of the service's own
             return before
         found = work()
@@ -342,6 +350,7 @@ def _reconstruct(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
         summary = parts.once("run", lambda: parts.tools.run(request, held.record, executor, held.cancelled))
+        parts.clear_scratch()
         problems = parts.once("formats", lambda: _published(held, parts))
         begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
@@ -391,6 +400,7 @@ def _compare(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
         summary = parts.once("compare", lambda: parts.tools.compare(request, held.record, executor, held.cancelled))
+        parts.clear_scratch()
         shutil.rmtree(out_dir, ignore_errors=True)
         begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
@@ -407,6 +417,7 @@ def _classify(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
         summary = parts.once("classify", lambda: parts.tools.classify(request, held.record, executor, held.cancelled))
+        parts.clear_scratch()
         shutil.rmtree(out_dir, ignore_errors=True)
         begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
@@ -471,6 +482,8 @@ def run_request(request: JobRequest, files: JobFiles, out: Path, settings: Servi
         allow_outside_area_of_use=request.allow_outside_area_of_use,
         bbox=request.bbox,
         resources=_resources(settings),
+        # an attempt that was handed back may have begun it; the folder is the attempt's own
+        overwrite=True,
         meshes=request.meshes,
         points=request.points,
         licence=request.licence,
@@ -491,8 +504,7 @@ def compare_request(request: JobRequest, files: JobFiles, out: Path, settings: S
         Settings are out of range, or a method is not known.
     """
     return CompareRequest(
-        # an attempt that was handed back may have begun it
-        run=dataclasses.replace(run_request(request, files, out, settings), overwrite=True),
+        run=run_request(request, files, out, settings),
         variants=parse_variants(request.methods),
         tables=own_tables(request.settings),
     )

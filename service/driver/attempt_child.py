@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ClusterError, GableworkError
+from pipeline.io.reading import seen_by
 from pipeline.runtime.cluster.dask_executor import Cluster, load_dask
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.isolation import child_main
+from pipeline.runtime.isolation.progress_reports import report_progress
 from pipeline.runtime.monitoring import tracing
 from pipeline.runtime.monitoring.events import Event
 from service import traces
@@ -239,7 +241,7 @@ def attend(order: Order) -> tuple[str, dict[str, Any]]:
         workers=_DriversWorkers(order.settings),
     )
     try:
-        with traces.attempt(order.job, order.driver):
+        with traces.attempt(order.job, order.driver), seen_by(report_progress):
             return perform(held, parts)
     except MemoryError:
         raise

@@ -36,9 +36,10 @@ from service.driver.attempt_child import (
     WorkersWanted,
     attend,
 )
+from service.driver.failures import has_no_space
 from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.driver.shared_cluster import SharedCluster
-from service.errors import AttemptEndedError, NoSuchUploadError
+from service.errors import AttemptEndedError, NoProcessError, NoSuchUploadError
 from service.files import StateFolder
 from service.jobs import Upload
 from service.settings import ServiceSettings
@@ -46,8 +47,6 @@ from service.store import JobStore
 
 _LOOK_S = 0.5
 """Seconds between two looks at the memory of the process, and at the pulse of its workers."""
-_AGAIN_S = 5.0
-"""Seconds before the next attempt if no process could be started."""
 _NEAR = 0.9
 """Share of the limit from which a process that was killed counts as out of memory."""
 _PULSES = tuple(Path(folder, "scratch", PULSE) for folder in ("run/scratch", "comparison/scratch"))
@@ -144,6 +143,8 @@ class InOwnProcess:
         ------
         AttemptEndedError
             The process ended, or was ended, before the attempt.
+        NoProcessError
+            It cannot be started now.
         """
         order = Order(
             job=held.job,
@@ -157,10 +158,12 @@ class InOwnProcess:
                 child = stack.enter_context(self._pool.borrowed(held.cancelled, fresh=True, loads=LOADS))
             except RunCancelledError:
                 raise
-            except RunError as error:
-                # this machine has no room for a process now, for which the job is not to blame
-                held.wait(_AGAIN_S)
-                raise AttemptEndedError(f"could not begin: {error}", is_own=False) from error
+            except (RunError, OSError, RuntimeError) as error:
+                if has_no_space(error):
+                    raise
+                raise NoProcessError(
+                    f"this machine has no room for its process now ({type(error).__name__})"
+                ) from error
             try:
                 return _Attended(held, child, order, self._shop.cluster).result(self._work)
             finally:

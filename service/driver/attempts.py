@@ -22,6 +22,7 @@ from service.driver.so_far import shown_while_watched
 from service.errors import (
     AttemptEndedError,
     LeaseLostError,
+    NoProcessError,
     NoSpaceError,
     ServiceError,
     StoreError,
@@ -132,6 +133,9 @@ class Attempts:
         if isinstance(error, AttemptEndedError):
             self._end_by_itself(held, error)
             return
+        if isinstance(error, NoProcessError):
+            self._wait_for_room(held, error)
+            return
         reference = secrets.token_hex(4)
         facts: dict[str, Any] = {**held.facts, "reference": reference}
         expected = isinstance(error, GableworkError | ServiceError) and not isinstance(error, UnexpectedError)
@@ -174,6 +178,17 @@ class Attempts:
                 job, ended, max_attempts=settings.max_attempts, kept_days=settings.stalled_days
             ),
             status,
+        )
+
+    def _wait_for_room(self, held: LeasedJob, error: NoProcessError) -> None:
+        """Give a job back that could not begin, as it is."""
+        LOG.warning("the attempt cannot begin: %s", error, extra=held.facts)
+        self._hand_back(held)
+        message = f"waiting: {error}; tried again in {NO_SPACE_PAUSE_S:g} s"
+        self._settle(
+            held,
+            lambda: self._shop.store.release(held.job, lost=False, message=message, retry_after_s=NO_SPACE_PAUSE_S),
+            JobStatus.ACCEPTED,
         )
 
     def _hand_back(self, held: LeasedJob) -> bool:

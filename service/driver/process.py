@@ -35,8 +35,6 @@ TIDY_S = 180.0
 """Seconds between two rounds of the janitor."""
 BEAT_S = 1.0
 """Seconds between two signs of life for the parent."""
-HAND_BACK_S = 10.0
-"""Seconds of the drain that are kept for handing back the jobs that are not done."""
 _GRACE_S = 4.0
 """Seconds, after those in which a job's process must stop, in which the outcome of its attempt must be written."""
 _TICK_S = 0.1
@@ -187,7 +185,8 @@ class Driver:
         """Let running jobs finish, or give them back; whether all ended."""
         began_s = time.monotonic()
         held = self._all_held()
-        drain_s = max(0.0, self._settings.drain_s - HAND_BACK_S)
+        # the rest is for handing back the jobs that are not done
+        drain_s = max(0.0, self._settings.drain_s - self._settings.stop_s - _GRACE_S - BEAT_S)
         LOG.info("the driver ends: its %d running jobs get %g s", len(held), drain_s, extra=self._facts)
         while self._is_busy():
             out_of_time = time.monotonic() - began_s >= drain_s
@@ -297,7 +296,9 @@ class Driver:
             self._attempts.work(held)
         finally:
             with self._lock:
-                del self._held[job.job_id]
+                # another slot may have the job's next attempt by now
+                if self._held.get(job.job_id) is held:
+                    del self._held[job.job_id]
         return True
 
     # --- the clock of the schedules

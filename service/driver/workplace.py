@@ -74,6 +74,8 @@ def deliver(place: Path, folder: StateFolder, job: Job) -> None:
     target.mkdir(exist_ok=True)
     for entry in place.iterdir():
         if entry.name != HOLDER:
+            # files there are from before a backup of the database was restored
+            shutil.rmtree(target / entry.name, ignore_errors=True)
             entry.rename(target / entry.name)
     shutil.rmtree(place, ignore_errors=True)
 

@@ -135,6 +135,12 @@ def replay_all(connection: Connection, endpoint_id: str, now: dt.datetime) -> No
     connection.execute(sa.update(WEBHOOK_DELIVERIES).where(ends).values(replay_at=now))
 
 
+def forget_replays(connection: Connection, endpoint_id: str) -> None:
+    """Leave out the replays that an endpoint still waits for."""
+    waiting = sa.and_(_DELIVERIES.endpoint_id == endpoint_id, _DELIVERIES.replay_at.is_not(None))
+    connection.execute(sa.update(WEBHOOK_DELIVERIES).where(waiting).values(replay_at=None))
+
+
 def resume(connection: Connection, endpoint_id: str, now: dt.datetime) -> None:
     """End the pause of an endpoint: what waits is sent, and its hours count anew."""
     own = sa.and_(_DELIVERIES.endpoint_id == endpoint_id, _DELIVERIES.state == _WAITING)
@@ -240,8 +246,11 @@ def _replay(connection: Connection, endpoint_id: str, room: int, now: dt.datetim
     )
     found = list(connection.execute(waiting.order_by(_DELIVERIES.created_at).limit(room)).scalars())
     if found:
-        values = {"state": _WAITING, "reason": "replayed", "due_at": now, "tried_since": now, "finished_at": None}
+        values: dict[str, Any] = {"state": _WAITING, "reason": "replayed", "due_at": now, "finished_at": None}
+        values |= {"tried_since": now}
         values |= {"replay_at": None, "lease_owner": None, "lease_until": None}
+        # it may have moved since
+        values["url"] = sa.select(_HOOKS.url).where(_HOOKS.endpoint_id == endpoint_id).scalar_subquery()
         one = _DELIVERIES.delivery_id.in_(found)
         connection.execute(sa.update(WEBHOOK_DELIVERIES).where(one).values(**values))
     return len(found)

@@ -10,7 +10,7 @@ from sqlalchemy.engine import Connection
 
 from service.jobs import EndedAttempt, Job, JobFailure, JobStatus
 from service.store.changes import lock_held, move
-from service.store.policies import after_end, after_loss, loss, own_ends, standstill
+from service.store.policies import after_end, after_loss, loss, other_ends, own_ends, standstill
 from service.store.records import job_of, storable
 from service.store.tables import JOBS
 
@@ -148,7 +148,7 @@ def end_attempt(
     row = lock_held(connection, held)
     job = job_of(row)
     status = after_end(job, ended, max_attempts)
-    counted: dict[str, Any] = {"own_ends": own_ends(job, ended), "outside_ends": job.outside_ends + (not ended.is_own)}
+    counted: dict[str, Any] = {"own_ends": own_ends(job, ended), "other_ends": other_ends(job, ended)}
     if ended.is_own:
         counted["own_end_stage"] = storable(ended.stage, 64)
     if status is JobStatus.FAILED:

@@ -6,8 +6,8 @@ import datetime as dt
 
 from service.jobs import EndedAttempt, Fault, Job, JobFailure, JobStatus
 
-MAX_OUTSIDE_ENDS = 20
-"""Kills of a job's processes from outside after which the job fails, too."""
+MAX_OTHER_ENDS = 20
+"""Attempts that were killed from outside, or ended now in this stage, now in that, after which a job fails, too."""
 
 
 def lease_expired(job: Job, now: dt.datetime) -> bool:
@@ -58,7 +58,7 @@ def after_end(job: Job, ended: EndedAttempt, max_attempts: int) -> JobStatus:
     Parameters
     ----------
     job : Job
-        As it was before; `own_ends` and `outside_ends` do not count this end yet.
+        As it was before; `own_ends` and `other_ends` do not count this end yet.
     ended : EndedAttempt
         The attempt.
     max_attempts : int
@@ -71,7 +71,7 @@ def after_end(job: Job, ended: EndedAttempt, max_attempts: int) -> JobStatus:
     """
     if job.dismiss_requested:
         return JobStatus.DISMISSED
-    is_last = own_ends(job, ended) >= max_attempts if ended.is_own else job.outside_ends + 1 >= MAX_OUTSIDE_ENDS
+    is_last = own_ends(job, ended) >= max_attempts or other_ends(job, ended) >= MAX_OTHER_ENDS
     return JobStatus.FAILED if is_last else JobStatus.ACCEPTED
 
 
@@ -82,15 +82,21 @@ def own_ends(job: Job, ended: EndedAttempt) -> int:
     return job.own_ends + 1 if job.own_end_stage == ended.stage else 1
 
 
+def other_ends(job: Job, ended: EndedAttempt) -> int:
+    """Attempts that were killed from outside, or ended in another stage than the one before, with this one."""
+    is_elsewhere = ended.is_own and job.own_ends > 0 and job.own_end_stage != ended.stage
+    return job.other_ends + (is_elsewhere or not ended.is_own)
+
+
 def standstill(job: Job, ended: EndedAttempt, kept_days: float) -> JobFailure:
     """The failure of a job whose attempts ended too often."""
     stage = f" at stage {ended.stage}" if ended.stage else ""
-    if ended.is_own:
-        times = own_ends(job, ended)
+    others, times = other_ends(job, ended), own_ends(job, ended)
+    if others >= MAX_OTHER_ENDS:
+        what = f"{others} attempts were killed from outside, or ended now here, now there: the last one {ended.detail}"
+    else:
         attempts = "an attempt" if times == 1 else f"{times} attempts in a row"
         what = f"{attempts} ended by themselves{stage}: the last one {ended.detail}"
-    else:
-        what = f"the process of {job.outside_ends + 1} attempts was killed from outside, the last time{stage}"
     return JobFailure(
         fault=Fault.STALLED,
         detail=f"{what}, so the job is not tried again. Its inputs are kept for {kept_days:g} days. Ask the operator "

@@ -40,7 +40,7 @@ def job_of(row: sa.Row[Any]) -> Job:
         lost_attempts=row.lost_attempts,
         own_ends=row.own_ends,
         own_end_stage=row.own_end_stage,
-        outside_ends=row.outside_ends,
+        other_ends=row.other_ends,
         lease_owner=row.lease_owner,
         lease_until=row.lease_until,
         failure=None if row.fault is None else JobFailure(fault=Fault(row.fault), detail=row.fault_detail or ""),

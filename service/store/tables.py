@@ -73,7 +73,7 @@ JOBS = sa.Table(
     sa.Column("traceparent", sa.String(55)),
     sa.Column("own_ends", sa.Integer, nullable=False, server_default="0"),
     sa.Column("own_end_stage", sa.String(64), nullable=False, server_default=""),
-    sa.Column("outside_ends", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("other_ends", sa.Integer, nullable=False, server_default="0"),
     sa.Column("progress_due_at", UtcTime),
     sa.Column("inputs_until", UtcTime),
 )

@@ -103,6 +103,8 @@ def replay(connection: Connection, delivery_id: str, owner: str | None, now: dt.
     if row.state == _WAITING and row.lease_until is not None and row.lease_until > now:
         raise NotReplayableError(f"delivery {delivery_id} is being sent: look at its attempts in a moment")
     values: dict[str, Any] = {"state": _WAITING, "reason": "replayed", "due_at": now, "finished_at": None}
+    # it may have waited for its replay already
+    values["replay_at"] = None
     if row.endpoint_id is not None:
         endpoint = _endpoints(connection, [row.endpoint_id])[row.endpoint_id]
         reason = _closed(endpoint)
@@ -110,6 +112,9 @@ def replay(connection: Connection, delivery_id: str, owner: str | None, now: dt.
             reason = "its webhook is paused: replay the webhook, which sends all that it did not get"
         if reason is not None:
             raise NotReplayableError(f"delivery {delivery_id} cannot be sent: {reason}")
+        assert endpoint is not None
+        # the webhook may have moved since
+        values["url"] = endpoint.url
         full = sa.select(_TABLE.delivery_id).where(_TABLE.state == _WAITING, _TABLE.endpoint_id == row.endpoint_id)
         if row.state != _WAITING and connection.execute(full.offset(ROOM - 1).limit(1)).first() is not None:
             values = {"reason": "is sent again when other messages to its webhook are sent", "replay_at": now}
@@ -134,8 +139,17 @@ def line(connection: Connection, avoided: Avoided, now: dt.datetime) -> list[Due
     """The deliveries that are due for the longest time, without those to receivers that get something already."""
     is_busy = sa.select(_RECEIVER).where(_TABLE.lease_until > now)
     busy = avoided.receivers | set(connection.execute(is_busy).scalars())
+    order = (_TABLE.due_at, _TABLE.created_at, _TABLE.delivery_id)
     due = (
-        sa.select(_TABLE.delivery_id, _RECEIVER, _PAYER)
+        sa.select(
+            _TABLE.delivery_id,
+            _RECEIVER.label("receiver"),
+            _PAYER.label("payer"),
+            _TABLE.due_at,
+            _TABLE.created_at,
+            # a receiver gets one message at a time: its others must not fill the line
+            sa.func.row_number().over(partition_by=_RECEIVER, order_by=order).label("place"),
+        )
         .outerjoin(WEBHOOKS, WEBHOOKS.c.endpoint_id == _TABLE.endpoint_id)
         .where(
             _is_due(now),
@@ -143,10 +157,15 @@ def line(connection: Connection, avoided: Avoided, now: dt.datetime) -> list[Due
             _RECEIVER.not_in(list(busy)),
             _PAYER.not_in(list(avoided.payers)),
         )
-        .order_by(_TABLE.due_at, _TABLE.created_at, _TABLE.delivery_id)
+        .subquery()
+    )
+    first = (
+        sa.select(due.c.delivery_id, due.c.receiver, due.c.payer)
+        .where(due.c.place == 1)
+        .order_by(due.c.due_at, due.c.created_at, due.c.delivery_id)
         .limit(_LINE)
     )
-    return [Due(*row) for row in connection.execute(due)]
+    return [Due(*row) for row in connection.execute(first)]
 
 
 def take(
@@ -227,6 +246,7 @@ def settle(
         values: dict[str, Any] = {"state": found.state.value, "due_at": found.due_at}
         values |= {"reason": None if found.reason is None else storable(found.reason)}
         values |= {"finished_at": None if found.state is DeliveryState.WAITING else now}
+        values |= {"replay_at": None if found.state is DeliveryState.DELIVERED else row.replay_at}
         if row.state != _WAITING and found.state is not DeliveryState.DELIVERED:
             # it was dropped meanwhile
             values = {name: getattr(row, name) for name in values}

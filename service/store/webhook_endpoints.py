@@ -121,6 +121,7 @@ def change(connection: Connection, endpoint_id: str, changes: Mapping[str, Any],
         connection.execute(sa.update(WEBHOOK_DELIVERIES).where(waiting).values(url=values["url"]))
     if values.get("is_enabled") is False:
         drop(connection, theirs, DISABLED, now)
+        backlog.forget_replays(connection, endpoint_id)
         values |= _CLOSED
     elif values.get("is_enabled") and not row.is_enabled:
         values["sent_until"] = now
@@ -151,6 +152,7 @@ def disable(connection: Connection, endpoint_id: str, reason: str, now: dt.datet
     values = {"is_enabled": False, "disabled_reason": storable(reason), "updated_at": now, **_CLOSED}
     connection.execute(sa.update(WEBHOOKS).where(one).values(**values))
     drop(connection, WEBHOOK_DELIVERIES.c.endpoint_id == endpoint_id, reason, now)
+    backlog.forget_replays(connection, endpoint_id)
 
 
 def remove(connection: Connection, endpoint_id: str, now: dt.datetime) -> None:
@@ -164,6 +166,7 @@ def remove(connection: Connection, endpoint_id: str, now: dt.datetime) -> None:
     _row(connection, endpoint_id)
     connection.execute(sa.delete(WEBHOOKS).where(WEBHOOKS.c.endpoint_id == endpoint_id))
     drop(connection, WEBHOOK_DELIVERIES.c.endpoint_id == endpoint_id, REMOVED, now)
+    backlog.forget_replays(connection, endpoint_id)
 
 
 def endpoint_secret(connection: Connection, endpoint_id: str) -> SigningSecret:

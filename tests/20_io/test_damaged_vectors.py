@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import shapely
-from shapely import LineString, MultiPolygon, Polygon, box
+from shapely import LineString, MultiPolygon, Polygon, affinity, box
 
 from pipeline.errors import CrsError, InconsistentInputError, InputError, UnreadableInputError, causes
 from pipeline.io import nearby
@@ -445,6 +445,28 @@ def test_an_area_of_interest_that_is_a_thicket_is_refused(tmp_path: Path, monkey
     monkeypatch.setattr("pipeline.io.footprints.AREA_CROSSINGS", 1000)
     with pytest.raises(InconsistentInputError, match=r"40 polygons cross each other in more than 1000.*Dissolve"):
         read_area(path, reference())
+
+
+def test_an_area_of_interest_may_be_large_and_of_many_parts_side_by_side(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.io.footprints.AREA_CROSSINGS", 0)
+    large = write(
+        tmp_path / "large.gpkg", [box(60_000, 420_000, 90_000, 450_000), box(90_000, 420_000, 91_000, 421_000)]
+    )
+    assert read_area(large, reference()).area == pytest.approx(901e6)
+    squares = [box(85_000 + x, 447_000 + y, 85_001 + x, 447_001 + y) for x in range(20) for y in range(20)]
+    assert read_area(write(tmp_path / "parcels.gpkg", squares), reference()).area == pytest.approx(400.0)
+
+
+def test_an_area_of_interest_with_a_part_that_cannot_be_repaired_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.io.repairs.PAIRS_LIMIT", 0)
+    monkeypatch.setattr("pipeline.io.footprints.Repairs", lambda: Repairs(pairs=0, simple=0))
+    parts = [box(85_000, 447_000, 85_010, 447_010), affinity.translate(star(11), 85_000, 447_000)]
+    with pytest.raises(InconsistentInputError, match="feature 2"):
+        read_area(write(tmp_path / "a.gpkg", parts), reference())
 
 
 def test_more_values_than_can_be_held_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -195,6 +195,31 @@ def test_higher_priorities_go_first(tmp_path: Path) -> None:
     assert high < min(order.index("low0"), order.index("low1")) <= low
 
 
+def test_a_run_says_that_it_waits_for_workers_that_others_keep_busy_and_one_at_work_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dispatch, "_QUIET_S", 0.2)
+    events: dict[str, list[Event]] = {"first": [], "second": []}
+
+    def go(cluster: Cluster, name: str) -> None:
+        with cluster.executor() as executor:
+            watch = Watch(listener=events[name].append)
+            list(executor.map(name, chores.wait_for_mark, [(str(tmp_path), name)], watch))
+
+    with Cluster(workers=1) as cluster, ThreadPoolExecutor(2) as threads:
+        ways = [threads.submit(go, cluster, "first")]
+        wait_for(lambda: list(tmp_path.glob("started-*")), "the first task")
+        ways.append(threads.submit(go, cluster, "second"))
+        wait_for(
+            lambda: len([one for one in events["second"] if one.kind == "waiting"]) >= 2, "the words of the second"
+        )
+        assert "busy with other runs" in events["second"][-1].message
+        assert [one for one in events["first"] if one.kind == "waiting"] == []
+        Path(tmp_path, "go").touch()
+        for way in ways:
+            way.result(LONG_S)
+
+
 @pytest.mark.slow
 def test_the_content_is_that_of_children_of_this_process(cluster: Cluster, suburb: Path, reconstruct: Any) -> None:
     settings = {"tile_size_m": 40.0}

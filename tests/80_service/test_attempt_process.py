@@ -1,5 +1,6 @@
 """Attempts in processes of their own: whatever one does, its slot is free again and the others go on."""
 
+import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from driver_bench import Bench
 from processes import LONG_S, wait_for
 
+from service.driver import attempts
 from service.jobs import Fault, JobStatus
 from service.store import policies
 
@@ -133,12 +135,27 @@ def test_a_refusal_travels_whole_from_the_process(apart: Bench) -> None:
 def test_a_process_killed_from_outside_does_not_count_as_the_jobs_own_end(
     apart: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(policies, "MAX_OUTSIDE_ENDS", 4)
+    monkeypatch.setattr(policies, "MAX_OTHER_ENDS", 4)
     apart.work = hostile_attempts.be_killed
     job = apart.submit()
     apart.driver()
     done = apart.over(job)
     # twice as many as may end by themselves
-    assert (done.attempt, done.outside_ends, done.own_ends, done.lost_attempts) == (4, 4, 0, 0)
+    assert (done.attempt, done.other_ends, done.own_ends, done.lost_attempts) == (4, 4, 0, 0)
     assert done.failure is not None
     assert (done.failure.fault, "killed from outside" in done.failure.detail) == (Fault.STALLED, True)
+
+
+def test_a_machine_without_room_for_a_process_fails_no_job(apart: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_given: object, **_more: object) -> None:
+        raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(attempts, "NO_SPACE_PAUSE_S", 0.1)
+    with monkeypatch.context() as short:
+        short.setattr("pipeline.runtime.isolation.child_pool.SupervisedChild", full)
+        apart.work = hostile_attempts.work_slowly
+        job = apart.submit()
+        apart.driver(stall_s=4.0)
+        wait_for(lambda: apart.store.get(job.job_id).attempt >= 2, "another attempt")
+    done = apart.over(job)
+    assert (done.status, done.lost_attempts, done.other_ends, done.own_ends) == (JobStatus.SUCCESSFUL, 0, 0, 0)

@@ -20,7 +20,7 @@ def subclasses(kind: type) -> set[type]:
 def test_every_error_of_the_service_that_a_client_can_meet_is_a_kind_of_its_own() -> None:
     unseen = {errors.ServiceError, errors.LimitError, errors.LeaseLostError, errors.StartUpError, JobFailedError}
     # between the processes of a driver
-    unseen |= {errors.AttemptEndedError, errors.UnexpectedError}
+    unseen |= {errors.AttemptEndedError, errors.NoProcessError, errors.UnexpectedError}
     untold = {kind for kind in subclasses(errors.ServiceError) if kind.__module__.startswith("service.")} - unseen
     assert {kind.__name__ for kind in untold if kind not in KINDS} == set()
 

@@ -17,7 +17,7 @@ from service.driver.leased_job import LeasedJob, Stop
 from service.errors import AttemptEndedError, QuotaError, RequestError, ScheduleBusyError, ServiceError
 from service.files import StateFolder
 from service.jobs import EndedAttempt, Fault, InputReference, Job, JobRequest, JobStatus, Upload
-from service.store.policies import MAX_OUTSIDE_ENDS, after_end, own_ends, standstill
+from service.store.policies import MAX_OTHER_ENDS, after_end, other_ends, own_ends, standstill
 
 NOW = dt.datetime(2026, 1, 1, tzinfo=dt.UTC)
 
@@ -46,12 +46,12 @@ def test_three_ends_in_one_stage_fail_a_job_and_another_stage_counts_anew() -> N
 
 def test_kills_from_outside_have_a_count_of_their_own() -> None:
     killed = ended(is_own=False)
-    assert after_end(job(own_ends=2, own_end_stage="split", outside_ends=5), killed, 3) is JobStatus.ACCEPTED
-    assert after_end(job(outside_ends=MAX_OUTSIDE_ENDS - 2), killed, 3) is JobStatus.ACCEPTED
-    last = job(outside_ends=MAX_OUTSIDE_ENDS - 1, own_ends=1, own_end_stage="split")
+    assert after_end(job(own_ends=2, own_end_stage="split", other_ends=5), killed, 3) is JobStatus.ACCEPTED
+    assert after_end(job(other_ends=MAX_OTHER_ENDS - 2), killed, 3) is JobStatus.ACCEPTED
+    last = job(other_ends=MAX_OTHER_ENDS - 1, own_ends=1, own_end_stage="split")
     assert after_end(last, killed, 3) is JobStatus.FAILED
     assert own_ends(last, killed) == 1
-    assert "20 attempts was killed from outside" in standstill(last, killed, 30.0).detail
+    assert "20 attempts were killed from outside" in standstill(last, killed, 30.0).detail
 
 
 def test_the_failure_says_what_happened_where_and_who_can_help() -> None:
@@ -62,6 +62,15 @@ def test_the_failure_says_what_happened_where_and_who_can_help() -> None:
         "is not tried again. Its inputs are kept for 30 days. Ask the operator for the driver's log; only an "
         "operator's key, with the scope admin, may retry the job"
     )
+
+
+def test_ends_now_here_now_there_are_counted_too() -> None:
+    wandering = job(own_ends=1, own_end_stage="ingest", other_ends=MAX_OTHER_ENDS - 1)
+    assert after_end(wandering, ended("split"), 3) is JobStatus.FAILED
+    assert "now here, now there" in standstill(wandering, ended("split"), 30.0).detail
+    assert other_ends(job(own_ends=1, own_end_stage="split"), ended("split")) == 0
+    assert other_ends(job(own_ends=1, own_end_stage="ingest"), ended("split")) == 1
+    assert other_ends(job(), ended("split")) == 0
 
 
 # --- the lease

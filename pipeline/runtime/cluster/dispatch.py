@@ -44,6 +44,8 @@ _SHARES = 8
 (Polychronopoulos and Kuck 1987)."""
 _AHEAD = 2
 """Declared memory of the tasks in flight as a multiple of the announced memory: one part runs, one is on its way."""
+_QUIET_S = 60.0
+"""Seconds without a result after which a run looks whether any of its tasks is executed."""
 _RESULT_S = 5.0
 _ENDED = frozenset({"finished", "error", "cancelled"})
 """Final states of a future; a pending future will still finish, and a lost one is computed again."""
@@ -210,6 +212,7 @@ class Dispatch(Generic[Task, Result]):
         self._wake = threading.Event()
         self._name = uuid.uuid4().hex[:12]
         self._submitted = 0
+        self._quiet_since_s = time.monotonic()
 
     def results(self) -> Generator[Measured[Result], None, None]:
         """Results as they come."""
@@ -221,7 +224,9 @@ class Dispatch(Generic[Task, Result]):
                 self._submit()
                 self._wake.wait(TICK_S)
                 self._wake.clear()
+                self._say_if_queued()
                 for future in [future for future in self._in_flight if future.status in _ENDED]:
+                    self._quiet_since_s = time.monotonic()
                     yield from self._landed(future)
         except KeyboardInterrupt:
             self.settle_s = min(self.settle_s, SETTLE_INTERRUPTED_S)
@@ -235,6 +240,21 @@ class Dispatch(Generic[Task, Result]):
             raise
         finally:
             self._settle()
+
+    def _say_if_queued(self) -> None:
+        """Report now and then that no task of this run has its turn, since all workers are busy with other runs."""
+        now_s = time.monotonic()
+        if now_s - self._quiet_since_s < _QUIET_S or not self.monitor.threads:
+            return
+        self._quiet_since_s = now_s
+        try:
+            if self._in_flight and self._executing(list(self._in_flight)):
+                return
+        except (OSError, TimeoutError):
+            # a worker that does not answer may be at work on one
+            return
+        message = "all workers are busy with other runs: this one continues as soon as one is free"
+        self.watch.listener(Event(kind="waiting", stage=self.stage, message=message))
 
     def _submit(self) -> None:
         """Send the tasks that may run now: a window of tasks, or one suspect alone."""

@@ -13,7 +13,6 @@ from uuid import uuid4
 from pipeline.errors import RunError
 from pipeline.io import is_url, shown
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.work_folder import locked_work
 
 SCRATCH = "scratch"
 """In the run directory."""
@@ -44,17 +43,6 @@ def run_scratch(run_dir: str, scratch: str | None) -> Iterator[Scratch]:
         yield found
     finally:
         remove_folder(folder)
-
-
-@contextlib.contextmanager
-def resumable_scratch(folder: str) -> Iterator[Scratch]:
-    """Scratch that stays if the run is interrupted, for the next run into the same place; a finished run removes it.
-
-    Raises the errors of `locked_work`.
-    """
-    with locked_work(folder) as found:
-        yield found
-    remove_folder(Path(folder))
 
 
 def _scratch_folder(run_dir: str, scratch: str | None) -> Path:

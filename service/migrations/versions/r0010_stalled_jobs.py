@@ -19,12 +19,12 @@ def upgrade() -> None:
     """Add the columns; no attempt of before ended by itself."""
     op.add_column("jobs", sa.Column("own_ends", sa.Integer, nullable=False, server_default="0"))
     op.add_column("jobs", sa.Column("own_end_stage", sa.String(64), nullable=False, server_default=""))
-    op.add_column("jobs", sa.Column("outside_ends", sa.Integer, nullable=False, server_default="0"))
+    op.add_column("jobs", sa.Column("other_ends", sa.Integer, nullable=False, server_default="0"))
     op.add_column("jobs", sa.Column("progress_due_at", sa.DateTime(timezone=True), nullable=True))
     op.add_column("jobs", sa.Column("inputs_until", sa.DateTime(timezone=True), nullable=True))
 
 
 def downgrade() -> None:
     """Remove them; kept inputs may be removed by now."""
-    for name in ("inputs_until", "progress_due_at", "outside_ends", "own_end_stage", "own_ends"):
+    for name in ("inputs_until", "progress_due_at", "other_ends", "own_end_stage", "own_ends"):
         op.drop_column("jobs", name)
