@@ -11,9 +11,6 @@ import sys
 from pipeline.schedule import Outcome, state
 from service.store import JobStore, ticks
 
-# these replicas are hours apart, which replicas by one database's clock never are
-state.PUT_BACK = ticks.PUT_BACK = dt.timedelta(days=1)
-
 
 def main(url: str, start: dt.datetime, step: dt.timedelta, number_of_ticks: int, lap: int) -> None:
     """Tick, and bring to its end what waits."""
@@ -33,6 +30,8 @@ def main(url: str, start: dt.datetime, step: dt.timedelta, number_of_ticks: int,
 
 
 if __name__ == "__main__":
+    # these replicas are hours apart, which replicas by one database's clock never are; in this process alone
+    state.PUT_BACK = ticks.PUT_BACK = dt.timedelta(days=1)
     main(
         sys.argv[1],
         dt.datetime.fromisoformat(sys.argv[3]),

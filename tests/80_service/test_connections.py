@@ -449,7 +449,8 @@ FORM = b'--x\r\nContent-Disposition: form-data; name="tiles"; filename="a.xyz"\r
         LINE.replace(b"uploads?filename=a.xyz", b"jobs")
         + b"Content-Type: multipart/form-data; boundary=x\r\nContent-Length: 1000\r\n\r\n"
         + FORM,
-        LINE.replace(b"uploads?filename=a.xyz", b"jobs") + b"Content-Length: 1000\r\n\r\n{",
+        LINE.replace(b"uploads?filename=a.xyz", b"processes/reconstruct/execution")
+        + b"Content-Type: application/json\r\nContent-Length: 1000\r\n\r\n{",
     ],
     ids=["file", "form", "document"],
 )
