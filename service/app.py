@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 from collections.abc import AsyncIterator
 
 from fastapi import APIRouter, Depends, FastAPI
@@ -81,10 +80,8 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     metrics = Metrics(kept, lambda: streams.count, folder.disk)
 
     @contextlib.asynccontextmanager
-    async def lifespan(starting: FastAPI) -> AsyncIterator[None]:
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(start, settings, kept)
-        # the first query needs it, which takes a fifth of a second: no client waits for that, nor the start
-        threading.Thread(target=starting.openapi, name="openapi", daemon=True).start()
         try:
             yield
         finally:

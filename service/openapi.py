@@ -6,6 +6,7 @@ JSON Schema, which are translated here.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -51,8 +52,19 @@ _made: dict[tuple[object, ...], dict[str, Any]] = {}
 """Documents by what they describe: making one takes a fifth of a second, and tests make hundreds of applications."""
 
 
+_making = threading.Lock()
+"""Held while one is made: the framework changes shared definitions meanwhile."""
+
+
 def document(app: FastAPI) -> dict[str, Any]:
     """The OpenAPI document of an application; made once per process for the same routers."""
+    if app.openapi_schema is not None:
+        return app.openapi_schema
+    with _making:
+        return _document(app)
+
+
+def _document(app: FastAPI) -> dict[str, Any]:
     routers = (getattr(route, "original_router", None) for route in app.routes)
     described = (
         *((id(router), len(router.routes)) for router in routers if router is not None),
