@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 from pipeline.errors import InputError
 from pipeline.io.area_of_use import location_of
@@ -188,6 +188,12 @@ def _check_shape(upload: Upload, kind: _Kind) -> None:
         raise RequestError([f"upload {upload.filename[:80]!r} is not a {kind}: it {what}. Upload a file that does"])
 
 
+def _known_facts(upload: Upload, settings: ServiceSettings) -> Mapping[str, Any] | None:
+    """What was found in an upload when it arrived: nothing changes its file. None if it must be examined again."""
+    known = "kind" in upload.preflight and int(upload.preflight.get("pointCount") or 0) <= settings.max_points
+    return upload.preflight if known else None
+
+
 def _check_sum(points: int, settings: ServiceSettings) -> None:
     if points > settings.max_points:
         raise TooLargeError(
@@ -272,14 +278,17 @@ def materialise(
         The job was cancelled.
     """
     digest = None
+    facts: Mapping[str, Any] | None = None
     if reference.kind == "upload":
         upload = store.upload(reference.value)
         path, digest = _upload_path(upload, folder), upload.sha256
+        facts = _known_facts(upload, settings)
     elif reference.kind == "path":
         path = checked_path(reference.value, settings)
     else:
         path, digest = download(
             reference.value, settings=settings, target=target, cancelled=cancelled, progress=progress
         )
-    facts = preflight(path, settings.max_points)
+    if facts is None:
+        facts = preflight(path, settings.max_points)
     return Fetched(reference=reference, path=path, points=int(facts.get("pointCount") or 0), sha256=digest)

@@ -218,9 +218,22 @@ class _DriversWorkers:
 
 def load() -> None:
     """Load what an attempt needs, before the process is forked; nothing here may start a thread."""
+    import pyarrow.compute
+    import pyarrow.parquet
+    import pyproj
+
+    import service.outputs.building_index
+    import service.outputs.footprints
+    import service.outputs.merged_cityjson
+    import service.outputs.merged_table
+    import service.outputs.report
     import service.preflight  # noqa: F401
+    from pipeline.io.area_of_use import location_of
 
     load_dask()
+    # opens the database of CRS, which every plan reads
+    location_of(pyproj.CRS.from_epsg(28992).to_wkt("WKT2_2019"), (84_000.0, 447_000.0, 84_001.0, 447_001.0))
+    del pyarrow
 
 
 def attend(order: Order) -> tuple[str, dict[str, Any]]:

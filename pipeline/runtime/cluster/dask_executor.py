@@ -49,9 +49,10 @@ _CANCELLED_ERRORS = _CancelledErrors()
 def load_dask() -> None:
     """Load what connects to a cluster, before a process is forked."""
     import dask
-    import distributed  # noqa: F401
+    import distributed
+    import tornado.platform.asyncio  # what a client's loop loads
 
-    del dask
+    del dask, distributed, tornado
 
 
 class Cluster:
