@@ -91,13 +91,16 @@ class Service:
         return str(answer.raise_for_status().json()["jobID"])
 
     def job(self, job_id: str) -> dict[str, Any]:
-        """The status of a job."""
-        found: dict[str, Any] = self.client.get(f"/jobs/{job_id}").raise_for_status().json()
+        """The status of a job; one that was over when it was deleted is removed."""
+        answer = self.client.get(f"/jobs/{job_id}")
+        if answer.status_code == httpx.codes.NOT_FOUND:
+            return {"status": "removed"}
+        found: dict[str, Any] = answer.raise_for_status().json()
         return found
 
     def is_over(self, job_id: str) -> bool:
         """Whether a job has ended, in any way."""
-        return self.job(job_id)["status"] in {"successful", "failed", "dismissed"}
+        return self.job(job_id)["status"] in {"successful", "failed", "dismissed", "removed"}
 
     def log(self, job_id: str) -> str:
         """The log of a job as text."""
