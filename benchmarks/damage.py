@@ -59,7 +59,7 @@ ODD_CRS = (
     "+proj=utm +zone=32",
     "[",
 )
-"""Systems that are no place for points, or hardly one, and what is not WKT."""
+"""Systems in which points cannot lie, or hardly can, and text that is not WKT."""
 ODD_BYTES = (
     b"\xff\xfe",
     b"\xe9",

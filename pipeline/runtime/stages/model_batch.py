@@ -258,7 +258,7 @@ def _loads(task: BatchTask) -> tuple[str, ...]:
 
 
 def _cancelled(task: BatchTask) -> bool:
-    task.scratch.check_mark()  # its error says more than a yes would; waiting for a building is no progress
+    task.scratch.check_mark()  # its error says more than a yes would; waiting for a building is not progress
     return False
 
 
