@@ -22,6 +22,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import faulthandler
 import gc
 import json
 import multiprocessing
@@ -50,6 +51,8 @@ FAULTS = {"internal_error", "crashed", "timed_out", "out_of_memory"}
 _NOT_JUDGED = 100
 """Exit code of a process whose command or results could not be judged."""
 _OUTPUT_BYTES = 4_000
+_TRACE_S = 2.0
+"""Seconds for a run that hangs to write where it stands."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -107,10 +110,10 @@ class Outcome:
 
     def __str__(self) -> str:
         """A line."""
-        last = " | ".join(self.detail.strip().splitlines()[-3:])
-        return (
-            f"{self.case.kind.name} {self.case.number} ({self.case.file}, {self.damage}): {self.result}: {last[-400:]}"
-        )
+        case, lines = self.case, self.detail.strip().splitlines()
+        # a run that hangs wrote where it stands
+        last = "\n".join(lines) if self.result == "hang" else " | ".join(lines[-3:])[-400:]
+        return f"{case.kind.name} {case.number} ({case.file}, {self.damage}): {self.result}: {last}"
 
 
 def command(case: Case, folder: Path) -> list[str]:
@@ -124,6 +127,7 @@ def _be_a_run(case: Case, folder: Path, limits: Limits) -> None:
     try:
         os.setsid()
         output = os.open(folder / "output.txt", os.O_CREAT | os.O_WRONLY | os.O_APPEND)
+        faulthandler.register(signal.SIGUSR2, file=output)
         for stream in (1, 2):
             os.dup2(output, stream)
         resource.setrlimit(resource.RLIMIT_DATA, (limits.memory_bytes, limits.memory_bytes))
@@ -176,6 +180,9 @@ def run_case(case: Case, originals: Path, folder: Path, limits: Limits) -> Outco
         _be_a_run(case, folder, limits)
     pidfd = os.pidfd_open(pid)
     in_time = bool(select.select([pidfd], [], [], limits.time_s)[0])
+    if not in_time:
+        signal.pidfd_send_signal(pidfd, signal.SIGUSR2)
+        select.select([pidfd], [], [], _TRACE_S)
     os.close(pidfd)
     with contextlib.suppress(ProcessLookupError):
         os.killpg(pid, signal.SIGKILL)  # it is not reaped yet: the group is its own, with all that it started
@@ -248,6 +255,14 @@ def _run_share(job: tuple[Sequence[Case], Path | None, Limits]) -> list[Outcome]
     return list(run_cases(*job))
 
 
+def _shared_out(cases: Sequence[Case], arguments: argparse.Namespace, limits: Limits) -> Iterator[Outcome]:
+    """The outcomes of cases that several processes share."""
+    shares = [(cases[k :: arguments.processes], arguments.keep, limits) for k in range(arguments.processes)]
+    with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
+        for share in pool.imap(_run_share, shares):
+            yield from share
+
+
 def table_of(outcomes: Sequence[Outcome]) -> str:
     """One row per kind, and their sum."""
     rows = []
@@ -283,24 +298,25 @@ def main(words: Sequence[str] | None = None) -> int:
     numbers = arguments.numbers or range(arguments.per_kind)
     cases = [Case(kind=kind, number=number, seed=arguments.seed) for kind in arguments.kinds for number in numbers]
     limits = Limits(time_s=arguments.time_limit)
+    found: Iterator[Outcome]
+    faulthandler.enable()
     if arguments.rest is not None:
         from benchmarks.damaged_uploads import send_cases
 
-        found = send_cases(arguments.rest, arguments.key, cases, arguments.processes, limits.time_s)
+        found = iter(send_cases(arguments.rest, arguments.key, cases, arguments.processes, limits.time_s))
     elif arguments.processes == 1:
-        found = list(run_cases(cases, arguments.keep, limits))
+        found = run_cases(cases, arguments.keep, limits)
     else:
-        shares = [(cases[k :: arguments.processes], arguments.keep, limits) for k in range(arguments.processes)]
-        with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
-            found = [outcome for share in pool.imap(_run_share, shares) for outcome in share]
-    bad = [one for one in found if one.result not in GOOD]
-    for kind in arguments.kinds:
-        for outcome in [one for one in (found if arguments.verbose else bad) if one.case.kind.name == kind.name][
-            : arguments.shown
-        ]:
-            print(outcome)
-    print(table_of(found))
-    return 1 if bad else 0
+        found = _shared_out(cases, arguments, limits)
+    outcomes, shown = [], Counter[str]()
+    for outcome in found:
+        outcomes.append(outcome)
+        name = outcome.case.kind.name
+        if arguments.verbose or (outcome.result not in GOOD and shown[name] < arguments.shown):
+            shown[name] += 1
+            print(outcome, flush=True)
+    print(table_of(outcomes))
+    return 0 if all(one.result in GOOD for one in outcomes) else 1
 
 
 if __name__ == "__main__":

@@ -164,17 +164,24 @@ def test_a_worker_process_that_is_killed_below_its_nanny_changes_nothing(bench: 
 
 
 def test_a_run_without_workers_reports_that_it_waits_and_continues_when_one_comes(bench: Bench, digest: str) -> None:
-    _, only, running = bench.paused()
+    folder, env = bench.pausing("split")
+    only = bench.start_worker("one", env=env)
+    running = bench.begin("run")
+    wait_for(reached(folder), "a task of split")
     only.kill()
 
-    def waiting_events() -> list[Event]:
-        return [event for event in bench.events if (event.kind, event.stage) == ("waiting", "split")]
+    def messages(kind: str) -> list[str]:
+        return [event.message for event in bench.events if (event.kind, event.stage) == (kind, "split")]
 
-    waiting = wait_for(waiting_events, "the event that it waits")[0]
-    assert f"gablework worker --scheduler {bench.address}" in waiting.message
-    bench.start_worker("two")
+    waiting = wait_for(lambda: messages("waiting"), "the event that it waits")[0]
+    assert f"gablework worker --scheduler {bench.address}" in waiting
+    # the workers are counted once a second: the second one stops in the stage, too, until it is seen
+    bench.start_worker("two", env=env)
+    wait_for(
+        lambda: [one for one in messages("run") if "workers are there after" in one], "the event that one is there"
+    )
+    (folder / "go").touch()
     assert running.result(END_S).digest == digest
-    assert any((e.kind, e.stage) == ("run", "split") and "workers are there after" in e.message for e in bench.events)
 
 
 def test_a_scheduler_killed_under_a_run_ends_it_with_a_clear_error(bench: Bench) -> None:
