@@ -11,7 +11,8 @@ import time
 import traceback
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 from pipeline.errors import ClusterError, GableworkError
 from pipeline.io.reading import seen_by
@@ -100,6 +101,10 @@ class End:
     """The attempt must end, for the process."""
 
 
+class _Over:
+    """The attempt is over, for the thread that hears the driver."""
+
+
 class KnownUploads:
     """The uploads that the order names; as the store's."""
 
@@ -130,7 +135,7 @@ class _NamingScrubber(Scrubber):
 
 
 class ChildJob:
-    """The job, in the process of its attempt; see `service.driver.attempt.Held`."""
+    """The job, in the process of its attempt; a context manager. See `service.driver.attempt.Held`."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
@@ -138,7 +143,19 @@ class ChildJob:
         self._stopped = threading.Event()
         self._lent: Lent | None = None
         self._answered = threading.Event()
-        threading.Thread(target=self._hear, name="driver", daemon=True).start()
+        self._ears = threading.Thread(target=self._hear, name="driver", daemon=True)
+
+    def __enter__(self) -> Self:
+        """Hear what the driver says."""
+        self._ears.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Hear no more: what comes is for the next job of this process."""
+        child_main.HEARD.put(_Over())
+        self._ears.join()
 
     @property
     def facts(self) -> dict[str, object]:
@@ -173,8 +190,7 @@ class ChildJob:
         return self._lent
 
     def _hear(self) -> None:
-        while True:
-            word = child_main.HEARD.get()
+        while not isinstance(word := child_main.HEARD.get(), _Over):
             if isinstance(word, Lent):
                 self._lent = word
                 self._answered.set()
@@ -245,7 +261,11 @@ def attend(order: Order) -> tuple[str, dict[str, Any]]:
         As `perform`; any other exception is logged here, and becomes an `UnexpectedError`.
     """
     configure(as_json=order.settings.log_json)
-    held = ChildJob(order.job)
+    with ChildJob(order.job) as held:
+        return _attended(held, order)
+
+
+def _attended(held: ChildJob, order: Order) -> tuple[str, dict[str, Any]]:
     parts = AttemptParts(
         settings=order.settings,
         folder=StateFolder(order.settings.state.resolve(), order.settings.reserve_bytes),

@@ -550,7 +550,7 @@ def test_a_slot_outlives_a_fault_that_is_unexpected(bench: Bench) -> None:
 
 def test_without_a_heartbeat_for_the_length_of_the_lease_the_work_stops(bench: Bench) -> None:
     flaky = Flaky(bench.patch)
-    job, _ = bench.under_way(lease_s=1.0)
+    job, _ = bench.under_way(lease_s=3.0)
     bench.script.waits()
     flaky.away.set()
     wait_for(lambda: not bench.folder.attempt(job.job_id, 1).exists(), "the end of the attempt")

@@ -234,10 +234,13 @@ class SupervisedChild:
         batch = Batch(function=function, items=[(0, item)], data_limit_bytes=data_limit_bytes)
         with contextlib.suppress(BrokenPipeError):  # the caller sees its end
             self._write(frame(batch))
+        before = self.begun
         for message in self._messages(never):
             match message:
-                case Said():
+                case Said() if self.begun > before:
                     yield message.content
+                case Said():  # a thread of the item before
+                    pass
                 case Raised():
                     raise message.error
                 case Begun():
