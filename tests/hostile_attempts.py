@@ -14,6 +14,8 @@ from service.errors import RequestError
 
 Done = tuple[str, dict[str, Any]]
 
+_kept: list[bytearray] = []
+
 
 def _begin(stage: str = "split") -> None:
     child_main.say(Event(kind="stage", stage=stage))
@@ -91,6 +93,30 @@ def work_slowly(order: Order) -> Done:
     for step in range(steps):
         time.sleep(order.settings.stall_s / 3.0)
         child_main.say(Event(kind="progress", stage="split", done=step + 1, total=steps))
+    return _results(order)
+
+
+def refuse_unless_urgent(order: Order) -> Done:
+    return _results(order) if order.job.priority else refuse(order)
+
+
+def keep_much(order: Order) -> Done:
+    """A process that holds as much memory as the job's priority says, in MiB, when its attempt is over."""
+    _kept.append(bytearray(os.urandom(1)) * (order.job.priority * 2**20))
+    return _results(order)
+
+
+def say_too_late(order: Order) -> Done:
+    """A thread that says something when the attempt is over."""
+
+    def say() -> None:
+        while not (order.settings.state / "go").exists():
+            time.sleep(0.01)
+        child_main.say(Event(kind="stage", stage="late"))
+        (order.settings.state / "said").touch()
+
+    if not (order.settings.state / "go").exists():
+        threading.Thread(target=say, daemon=True).start()
     return _results(order)
 
 

@@ -11,7 +11,7 @@ import pytest
 from driver_bench import Bench
 from processes import LONG_S, wait_for
 
-from service.driver import attempts
+from service.driver import attempt_process, attempts
 from service.jobs import Fault, JobStatus
 from service.store import policies
 
@@ -114,6 +114,45 @@ def test_honest_work_that_takes_long_is_not_ended(apart: Bench) -> None:
     assert (done.status, done.attempt) == (JobStatus.SUCCESSFUL, 1)
     assert done.summary is not None
     assert done.summary["pid"] != os.getpid()
+
+
+def process_of(bench: Bench, **values: Any) -> int | None:
+    """The process of a new job's attempt; None if the job failed."""
+    summary = bench.over(bench.submit(**values)).summary
+    return None if summary is None else int(summary["pid"])
+
+
+def test_a_process_goes_on_with_the_next_job_only_after_success(apart: Bench) -> None:
+    apart.work = hostile_attempts.refuse_unless_urgent
+    apart.driver()
+    first, second = process_of(apart, priority=1), process_of(apart, priority=1)
+    assert first == second
+    assert process_of(apart) is None
+    assert process_of(apart, priority=1) not in {first, None}
+
+
+def test_a_process_that_keeps_much_memory_or_has_done_much_is_replaced(
+    apart: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    apart.work = hostile_attempts.keep_much
+    apart.driver()
+    assert process_of(apart, priority=1) == (first := process_of(apart, priority=600))
+    assert (second := process_of(apart, priority=1)) != first
+    monkeypatch.setattr(attempt_process, "_MOST_ATTEMPTS", 2)
+    assert process_of(apart, priority=1) == second
+    assert process_of(apart, priority=1) != second
+
+
+def test_what_a_process_says_after_an_attempt_does_not_count_for_the_next_one(apart: Bench) -> None:
+    apart.work = hostile_attempts.say_too_late
+    apart.driver()
+    first = process_of(apart)
+    (apart.settings.state / "go").touch()
+    wait_for((apart.settings.state / "said").exists, "the late word")
+    done = apart.over(apart.submit())
+    assert done.summary is not None
+    assert done.summary["pid"] == first
+    assert done.stage != "late"
 
 
 def test_a_refusal_travels_whole_from_the_process(apart: Bench) -> None:
