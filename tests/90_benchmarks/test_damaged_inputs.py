@@ -53,7 +53,8 @@ def test_every_kind_of_damage_is_done_to_a_format(name: str, originals: Path) ->
 
 @pytest.mark.slow
 def test_damaged_inputs_end_in_time_as_named_refusals_or_as_valid_runs() -> None:
-    words = [sys.executable, "-m", "benchmarks.damaged_inputs", "--per-kind", str(PER_KIND), "--processes", "1"]
+    words = [sys.executable, "-m", "benchmarks.damaged_inputs", "--per-kind", str(PER_KIND)]
+    words += ["--processes", "1", "--verbose"]
     folder = Path(__file__).resolve().parents[2]
     with subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
