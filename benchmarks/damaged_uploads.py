@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from benchmarks.damaged_inputs import Case, Outcome
+from benchmarks.damaged_runs import Case, Outcome
 from benchmarks.undamaged_inputs import CRS, write_inputs
 from pipeline.errors import InputError, RemoteError, SettingsError
 from service.client import Client, Job

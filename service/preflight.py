@@ -299,8 +299,13 @@ class Examiner:
 
 
 _quick_examiner, _slow_examiner = Examiner(), Examiner()
-atexit.register(_quick_examiner.close)
-atexit.register(_slow_examiner.close)
+
+
+@atexit.register
+def end_examiners() -> None:
+    """End the children of this process that examine files; the next file starts another one."""
+    for examiner in (_quick_examiner, _slow_examiner):
+        examiner.close()
 
 
 def is_quick(path: Path) -> bool:

@@ -10,7 +10,14 @@ from typing import Any
 
 import shapely
 
-from pipeline.errors import CrsError, EmptyInputError, InconsistentInputError, InputError, all_at_fault
+from pipeline.errors import (
+    CrsError,
+    EmptyInputError,
+    InconsistentInputError,
+    InputError,
+    UnreadableInputError,
+    all_at_fault,
+)
 from pipeline.io import ReadOptions, SourceInfo, SpatialReference, is_url, open_source, shown
 from pipeline.io.area_of_use import refuse_far_outside
 from pipeline.io.gps_time import GpsTimeKind
@@ -24,6 +31,8 @@ from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
+_MOST_TILES = 250_000
+"""Tiles that a file may lie over: 500 by 500 km in tiles of 1 km."""
 _POINTS_PER_WINDOW = 4_000_000
 """Points that a tile with its halo should not exceed: tiles of 500 m up to 11 points per m2."""
 _POINTS_PER_SHARE = 2_000_000
@@ -137,6 +146,9 @@ def make_plan(
         origin_x_mm=round(settings.general.lattice_x_m * MM),
         origin_y_mm=round(settings.general.lattice_y_m * MM),
     )
+    faults = [too_wide for info in sources for too_wide in _too_wide(info, options, size)]
+    if faults:
+        raise all_at_fault(faults)
     return Plan(
         sources=sources,
         grid=grid,
@@ -148,6 +160,20 @@ def make_plan(
         ),
         warnings=tuple(warnings),
     )
+
+
+def _too_wide(info: SourceInfo, options: ReadOptions, size_m: float) -> list[InputError]:
+    """The fault of a file whose points lie over too many tiles, if they do."""
+    left, bottom, right, top = wanted_bounds_m(info, options) or (0.0, 0.0, 0.0, 0.0)
+    if (right - left) * (top - bottom) <= _MOST_TILES * size_m**2:
+        return []
+    fault = UnreadableInputError(
+        info.path,
+        f"its points lie over {(right - left) / 1000.0:,.0f} by {(top - bottom) / 1000.0:,.0f} km, more than "
+        f"{_MOST_TILES:,} tiles of {size_m:g} m",
+        "Points far from the others have damaged coordinates: remove them, or cut the region with --bbox",
+    )
+    return [fault]
 
 
 def _sharing(sources: Sequence[SourceInfo]) -> tuple[SourceInfo, ...]:

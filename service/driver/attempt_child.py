@@ -5,6 +5,7 @@ It has no connection to the database and holds no lease: it says what happens, a
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
 import time
@@ -31,6 +32,7 @@ from service.driver.messages import Scrubber
 from service.errors import NoSpaceError, NoSuchUploadError, ServiceError, UnexpectedError
 from service.files import StateFolder
 from service.jobs import Job, LogLevel, Upload
+from service.preflight import end_examiners
 from service.settings import ServiceSettings
 
 LOADS = ("service.driver.attempt_child:load",)
@@ -101,10 +103,6 @@ class End:
     """The attempt must end, for the process."""
 
 
-class _Over:
-    """The attempt is over, for the thread that hears the driver."""
-
-
 class KnownUploads:
     """The uploads that the order names; as the store's."""
 
@@ -143,6 +141,7 @@ class ChildJob:
         self._stopped = threading.Event()
         self._lent: Lent | None = None
         self._answered = threading.Event()
+        self._over = object()
         self._ears = threading.Thread(target=self._hear, name="driver", daemon=True)
 
     def __enter__(self) -> Self:
@@ -154,7 +153,7 @@ class ChildJob:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Hear no more: what comes is for the next job of this process."""
-        child_main.HEARD.put(_Over())
+        child_main.HEARD.put(self._over)
         self._ears.join()
 
     @property
@@ -190,7 +189,7 @@ class ChildJob:
         return self._lent
 
     def _hear(self) -> None:
-        while not isinstance(word := child_main.HEARD.get(), _Over):
+        while (word := child_main.HEARD.get()) is not self._over:
             if isinstance(word, Lent):
                 self._lent = word
                 self._answered.set()
@@ -242,8 +241,7 @@ def load() -> None:
     import service.outputs.footprints
     import service.outputs.merged_cityjson
     import service.outputs.merged_table
-    import service.outputs.report
-    import service.preflight  # noqa: F401
+    import service.outputs.report  # noqa: F401
     from pipeline.io.area_of_use import location_of
 
     load_dask()
@@ -261,8 +259,14 @@ def attend(order: Order) -> tuple[str, dict[str, Any]]:
         As `perform`; any other exception is logged here, and becomes an `UnexpectedError`.
     """
     configure(as_json=order.settings.log_json)
-    with ChildJob(order.job) as held:
-        return _attended(held, order)
+    # the peak memory that a job reports is its own
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    try:
+        with ChildJob(order.job) as held:
+            return _attended(held, order)
+    finally:
+        end_examiners()
 
 
 def _attended(held: ChildJob, order: Order) -> tuple[str, dict[str, Any]]:

@@ -55,6 +55,8 @@ _MOST_ATTEMPTS = 50
 """Attempts of a process, one after the other: what libraries lose little by little is given back."""
 _KEPT_BYTES = 2**29
 """Memory up to which a process may wait for the next attempt."""
+_KEPT_SPACE_BYTES = 2**31
+"""The same for its address space, of which Arrow returns nothing: after a small job it is 1.3 GiB."""
 _MARGIN_BYTES = 2**30
 """Allowance above the limit: a process reserves more address space than it uses."""
 
@@ -157,9 +159,11 @@ class InOwnProcess:
             uploads=_uploads(self._shop.store, held),
             driver=self._name,
         )
+        # what befell an attempt may come from those before it in its process
+        is_retry = held.job.own_ends > 0
         with contextlib.ExitStack() as stack:
             try:
-                child = stack.enter_context(self._pool.borrowed(held.cancelled, fresh=False, loads=LOADS))
+                child = stack.enter_context(self._pool.borrowed(held.cancelled, fresh=is_retry, loads=LOADS))
             except RunCancelledError:
                 raise
             except (RunError, OSError, RuntimeError) as error:
@@ -170,9 +174,18 @@ class InOwnProcess:
                 ) from error
             # the pool ends a child that an error leaves
             done = _Attended(held, child, order, self._shop.cluster).result(self._work)
-            if held.cancelled() or child.begun >= _MOST_ATTEMPTS or child.memory_bytes > _KEPT_BYTES:
+            if is_retry or held.cancelled() or _is_worn(child):
                 child.end()
             return done
+
+
+def _is_worn(child: SupervisedChild) -> bool:
+    """Whether a process has done or holds so much that the next attempt begins in another one."""
+    return (
+        child.begun >= _MOST_ATTEMPTS
+        or child.memory_bytes > _KEPT_BYTES
+        or child.address_space_bytes > _KEPT_SPACE_BYTES
+    )
 
 
 def _uploads(store: JobStore, held: LeasedJob) -> dict[str, Upload]:
@@ -200,7 +213,7 @@ class _Attended:
 
     def result(self, work: Callable[[Order], tuple[str, dict[str, Any]]]) -> tuple[str, dict[str, Any]]:
         """The result of the attempt; raises as `perform`, and AttemptEndedError."""
-        kills = system_kills()
+        kills, begun = system_kills(), self._child.begun
         limit = self._limit_bytes + _MARGIN_BYTES
         for word in self._child.converse(work, self._order, data_limit_bytes=limit):
             if isinstance(word, Finished):
@@ -213,6 +226,8 @@ class _Attended:
             else:
                 self._take(word)
         self._check_wanted()
+        if self._child.begun == begun:
+            raise NoProcessError("the process that waited for it has ended")
         detail = self._child.how_it_ended().removeprefix("its process ")
         if self._child.return_code != -signal.SIGKILL:
             raise AttemptEndedError(detail, is_own=True)

@@ -89,6 +89,19 @@ def test_a_plan_that_is_denser_than_any_survey_names_the_extent_and_no_absurd_me
     assert "GB" not in str(refused.value)
 
 
+def test_a_file_whose_points_lie_over_millions_of_tiles_is_refused_unless_a_region_is_cut(tmp_path: Path) -> None:
+    xyz = np.random.default_rng(1).uniform(0.0, 30.0, (1000, 3))
+    # a byte of many coordinates is damaged: a few points would be left aside
+    xyz[::5, :2] *= 2e6 / 30.0
+    path = tmp_path / "a.xyz"
+    np.savetxt(path, xyz, fmt="%.3f")
+    with pytest.raises(UnreadableInputError, match=r"lie over 1,9\d\d by 1,9\d\d km, .* --bbox") as refused:
+        make_plan([str(path)], ReadOptions(), RunSettings())
+    assert refused.value.path == str(path)
+    window = ReadOptions(bbox=(0.0, 0.0, 30.0, 30.0))
+    assert make_plan([str(path)], window, RunSettings()).points == 1000
+
+
 # --- many inputs
 
 

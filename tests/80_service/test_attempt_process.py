@@ -2,11 +2,13 @@
 
 import errno
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import hostile_attempts
+import psutil
 import pytest
 from driver_bench import Bench
 from processes import LONG_S, wait_for
@@ -141,6 +143,32 @@ def test_a_process_that_keeps_much_memory_or_has_done_much_is_replaced(
     monkeypatch.setattr(attempt_process, "_MOST_ATTEMPTS", 2)
     assert process_of(apart, priority=1) == second
     assert process_of(apart, priority=1) != second
+
+
+def test_a_job_that_met_what_another_one_left_is_tried_again_in_a_fresh_process(apart: Bench) -> None:
+    apart.work = hostile_attempts.crash_in_a_used_process
+    apart.driver(max_attempts=2)
+    assert apart.over(apart.submit()).attempt == 1
+    done = apart.over(apart.submit())
+    assert (done.status, done.attempt, done.own_ends) == (JobStatus.SUCCESSFUL, 2, 1)
+
+
+def test_a_process_that_ended_while_it_waited_costs_a_job_nothing(
+    apart: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(attempts, "NO_SPACE_PAUSE_S", 0.1)
+    apart.work = hostile_attempts.refuse_unless_urgent
+    apart.driver()
+    first = process_of(apart, priority=1)
+    assert first is not None
+    with monkeypatch.context() as unseen:
+        unseen.setattr("pipeline.runtime.isolation.supervision.SupervisedChild.alive", True)
+        os.kill(first, signal.SIGKILL)
+        wait_for(lambda: not psutil.pid_exists(first) or psutil.Process(first).status() == "zombie", "its end")
+        job = apart.submit(priority=1)
+        wait_for(lambda: apart.store.get(job.job_id).message.startswith("waiting"), "the attempt without a process")
+    done = apart.over(job)
+    assert (done.status, done.own_ends, done.other_ends, done.lost_attempts) == (JobStatus.SUCCESSFUL, 0, 0, 0)
 
 
 def test_what_a_process_says_after_an_attempt_does_not_count_for_the_next_one(apart: Bench) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.damage import BY_SUFFIX, damaged
-from benchmarks.damaged_inputs import Case, command
+from benchmarks.damaged_runs import Case, command
 from benchmarks.undamaged_inputs import KINDS, kind_named, write_inputs
 
 PER_KIND = 20
@@ -61,7 +61,7 @@ def test_damaged_inputs_end_in_time_as_named_refusals_or_as_valid_runs() -> None
             printed, _ = process.communicate(timeout=DEADLINE_S)
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGABRT)  # it writes where it stands
-            printed, _ = process.communicate()
+            printed, _ = process.communicate(timeout=60.0)
     assert process.returncode == 0, printed
     rows = re.findall(r"^\| (\w+) \| (\d+) \| (\d+) \| (\d+) \| 0 \| 0 \| 0 \| 0 \|", printed, flags=re.MULTILINE)
     assert [row[0] for row in rows] == [*(kind.name for kind in KINDS), "all"]

@@ -116,6 +116,12 @@ class SupervisedChild:
         info = self._psutil("memory_info")
         return 0 if info is None else int(info.rss) - int(getattr(info, "shared", 0))
 
+    @property
+    def address_space_bytes(self) -> int:
+        """What counts against its limit of data: also memory that a library has given up but not returned."""
+        info = self._psutil("memory_info")
+        return 0 if info is None else int(getattr(info, "data", info.rss))
+
     def spent_cpu_s(self) -> float:
         """CPU seconds since the last call, including its start; for a dead child up to the last look."""
         self._look_at_cpu()
@@ -236,17 +242,16 @@ class SupervisedChild:
             self._write(frame(batch))
         before = self.begun
         for message in self._messages(never):
-            match message:
-                case Said() if self.begun > before:
-                    yield message.content
-                case Said():  # a thread of the item before
-                    pass
-                case Raised():
-                    raise message.error
-                case Begun():
-                    self.begun += 1
-                case _:
-                    yield message
+            if isinstance(message, Begun):
+                self.begun += 1
+            elif message is not None and self.begun == before:
+                continue  # of a thread of the item before
+            elif isinstance(message, Said):
+                yield message.content
+            elif isinstance(message, Raised):
+                raise message.error
+            else:
+                yield message
 
     def answer(self, content: object) -> None:
         """Send something to the item that talks; harmless if the process is gone."""
