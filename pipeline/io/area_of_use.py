@@ -14,7 +14,7 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from pipeline.errors import CrsError
-from pipeline.io.crs import horizontal_part
+from pipeline.io.crs import horizontal_part, to_degrees
 
 if TYPE_CHECKING:
     import pyproj
@@ -160,7 +160,7 @@ class _Plane:
 
 @functools.lru_cache(maxsize=64)
 def _plane(wkt: str) -> _Plane | None:
-    """The horizontal part of a CRS; None if it is not projected."""
+    """The horizontal part of a CRS; None if it is not projected, or cannot be computed."""
     import pyproj
 
     plane = horizontal_part(pyproj.CRS.from_wkt(wkt))
@@ -175,8 +175,8 @@ def _plane(wkt: str) -> _Plane | None:
     found = None
     if area is not None:
         found = AreaOfUse(name=area.name, west=area.west, south=area.south, east=area.east, north=area.north)
-    to_degrees = pyproj.Transformer.from_crs(plane, "OGC:CRS84", always_xy=True)
-    return _Plane(name=name, area=found, to_degrees=to_degrees)
+    transformer = to_degrees(plane)
+    return None if transformer is None else _Plane(name=name, area=found, to_degrees=transformer)
 
 
 def _arc_deg(one: float, other: float, aside: float) -> float:

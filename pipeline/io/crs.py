@@ -78,6 +78,12 @@ class SpatialReference:
         crs = self.crs
         return None if crs is None else horizontal_part(crs)
 
+    @property
+    def to_degrees(self) -> pyproj.Transformer | None:
+        """As the function of this name; None also if the CRS is unknown."""
+        crs = self.horizontal_crs
+        return None if crs is None else to_degrees(crs)
+
 
 UNKNOWN_REFERENCE = SpatialReference()
 """No CRS: metres are assumed."""
@@ -113,6 +119,19 @@ def horizontal_part(crs: pyproj.CRS) -> pyproj.CRS:
     if crs.is_compound:
         return horizontal_part(crs.sub_crs_list[0])
     return crs
+
+
+def to_degrees(crs: pyproj.CRS) -> pyproj.Transformer | None:
+    """The transformation of a horizontal CRS to longitude and latitude, x first; None for a CRS without place on Earth.
+
+    Local and engineering CRS have none, and some that PROJ reads but cannot compute.
+    """
+    import pyproj
+
+    try:
+        return pyproj.Transformer.from_crs(crs, "OGC:CRS84", always_xy=True)
+    except pyproj.exceptions.ProjError:
+        return None
 
 
 def vertical_unit_of(crs: pyproj.CRS) -> float | None:

@@ -73,8 +73,11 @@ class TileIndex:
         if own is not None and target is not None and not own.equals(target, ignore_axis_order=True):
             import pyproj
 
-            project = pyproj.Transformer.from_crs(own, target, always_xy=True).transform_bounds
             known = np.flatnonzero(np.isfinite(bounds).all(axis=1))
+            try:
+                project = pyproj.Transformer.from_crs(own, target, always_xy=True).transform_bounds
+            except pyproj.exceptions.ProjError:  # one has no place on Earth: any tile may be near
+                return np.full(len(bounds), None, dtype=object)
             found = [project(x0, y0, x1, y1, 21) for x0, y0, x1, y1 in bounds[known].tolist()]
             bounds[known] = np.reshape(found, (-1, 4))
         placed = np.isfinite(bounds).all(axis=1) & (bounds[:, 0] <= bounds[:, 2]) & (bounds[:, 1] <= bounds[:, 3])

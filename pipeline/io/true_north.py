@@ -13,11 +13,10 @@ _STEP_M = 100.0
 
 def longitude_and_latitude(reference: SpatialReference, x_m: float, y_m: float) -> tuple[float, float]:
     """Degrees (WGS 84) of a place in metres of a known CRS; raises RunError if the CRS has no such place."""
-    import pyproj
-
-    transformer = pyproj.Transformer.from_crs(reference.horizontal_crs, pyproj.CRS.from_epsg(4326), always_xy=True)
-    unit_m = reference.horizontal_unit_m
-    longitude, latitude = transformer.transform(x_m / unit_m, y_m / unit_m)
+    transformer, unit_m = reference.to_degrees, reference.horizontal_unit_m
+    longitude, latitude = math.nan, math.nan
+    if transformer is not None:
+        longitude, latitude = transformer.transform(x_m / unit_m, y_m / unit_m)
     if not (math.isfinite(longitude) and math.isfinite(latitude)):
         raise RunError(
             f"{reference.name} has no place at {x_m / unit_m:.0f}, {y_m / unit_m:.0f}: the run has a wrong CRS. "

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pyproj
 import shapely
 
+from pipeline.io.crs import to_degrees
 from service.errors import NoSuchCollectionError, RequestError
 from service.features.row_index import Box
 
@@ -73,6 +74,11 @@ class CollectionCrs:
             )
         whole = pyproj.CRS.from_wkt(crs["wkt"])
         self._own = (whole.sub_crs_list[0] if whole.is_compound else whole).to_2d()
+        if to_degrees(self._own) is None:
+            raise NoSuchCollectionError(
+                f"{whole.name}, the coordinate reference system of run {run}, has no place on the globe, so its "
+                "features are no collection: model it again with --crs"
+            )
         self._wkt = self._own.to_wkt()
         code = self._own.to_epsg()
         self.storage_uri = None if code is None else f"{_EPSG}{code}"

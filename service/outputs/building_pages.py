@@ -174,7 +174,10 @@ def checked_choice(choice: CoordinateChoice | None, crs: ResultsCrs, parameter: 
         return choice is not None and choice.is_native
     if choice is not None and not choice.is_native:
         raise RequestError(
-            [f"query {parameter} is {choice.value}, but the CRS of the tiles is unknown: use native, or leave it out"]
+            [
+                f"query {parameter} is {choice.value}, but the CRS of the tiles is unknown or local: "
+                "use native, or leave it out"
+            ]
         )
     return True
 

@@ -14,6 +14,7 @@ import pyproj
 import shapely
 
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
+from pipeline.io.crs import to_degrees
 from service.outputs.catalogue import ResultsCrs
 
 DECIMALS = 9
@@ -21,7 +22,7 @@ DECIMALS = 9
 
 _NOT_PROPERTIES = frozenset({"geometry", "bbox", *SHAPE_COLUMNS})
 _UNKNOWN = (
-    "The coordinate reference system of the tiles is unknown: these coordinates are theirs, not WGS 84. "
+    "The coordinate reference system of the tiles is unknown or local: these coordinates are theirs, not WGS 84. "
     "Give `crs` with the job to get degrees."
 )
 
@@ -35,7 +36,7 @@ class Wgs84Transformation:
     crs: ResultsCrs
     """Its description for clients."""
     transformer: pyproj.Transformer | None
-    """None if the CRS is unknown."""
+    """None if the CRS is unknown, or has no place on Earth."""
     projjson: Mapping[str, Any] | None
     """The CRS as PROJJSON; None if it is unknown."""
 
@@ -51,12 +52,12 @@ class Wgs84Transformation:
         whole = pyproj.CRS.from_wkt(crs["wkt"])
         flat = (whole.sub_crs_list[0] if whole.is_compound else whole).to_2d()
         code = flat.to_epsg()
-        transformer = pyproj.Transformer.from_crs(flat, "OGC:CRS84", always_xy=True)
-        accuracy_m = transformer.accuracy
+        transformer = to_degrees(flat)
+        accuracy_m = None if transformer is None else transformer.accuracy
         results_crs = ResultsCrs(
             name=whole.name,
             uri=None if code is None else f"http://www.opengis.net/def/crs/EPSG/0/{code}",
-            to_wgs84=transformer.description,
+            to_wgs84=None if transformer is None else transformer.description,
             accuracy_m=None if accuracy_m is None or accuracy_m < 0 else float(accuracy_m),
         )
         return cls(crs=results_crs, transformer=transformer, projjson=whole.to_json_dict())

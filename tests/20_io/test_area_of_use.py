@@ -82,6 +82,8 @@ def test_places_far_outside_are_refused(crs, x, y):
 def test_local_crs_and_those_without_an_area_are_not_judged():
     local = 'ENGCRS["site",EDATUM["site"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
     assert location_of(local, (0.0, 0.0, 9.0, 9.0)) is None
+    beyond_proj = pyproj.CRS.from_epsg(28992).to_wkt().replace("Oblique Stereographic", "Odd").replace("9809", "9999")
+    assert location_of(beyond_proj, (84_000.0, 447_000.0, 84_009.0, 447_009.0)) is None
     own = the(at("+proj=tmerc +lat_0=10 +lon_0=5 +k=0.9 +x_0=17 +ellps=GRS80 +units=m", *DELFT))
     assert own.area is None
     refuse_far_outside("a.laz", own)

@@ -97,6 +97,17 @@ def crs_facts(epsg: int | None) -> dict[str, Any]:
     }
 
 
+LOCAL_CRS = 'ENGCRS["site",EDATUM["mark"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
+
+
+def with_local_crs(run_dir: Path) -> Path:
+    """A run whose coordinates are those of a building site."""
+    manifest = json.loads((run_dir / "run.json").read_text())
+    crs = {**manifest["crs"], "name": "site", "wkt": LOCAL_CRS, "epsg": None}
+    (run_dir / "run.json").write_text(json.dumps(manifest | {"crs": crs}))
+    return run_dir
+
+
 def write_run(
     run_dir: Path,
     tiles: Tiles | None = None,

@@ -557,8 +557,8 @@ def test_where_the_crs_is_unknown_there_are_only_the_tiles_own_coordinates(servi
     assert ids(found) == [GABLE]
     assert shapely.geometry.shape(found["features"][0]["geometry"]).bounds == (85_000.0, 447_000.0, 85_010.0, 447_008.0)
     assert page(service.client, job, crs="native", bbox_crs="native")["numberMatched"] == 6
-    assert "the CRS of the tiles is unknown: use native" in refused(service.client, job, crs="CRS84")
-    assert "the CRS of the tiles is unknown: use native" in refused(service.client, job, bbox_crs="CRS84")
+    assert "the CRS of the tiles is unknown or local: use native" in refused(service.client, job, crs="CRS84")
+    assert "the CRS of the tiles is unknown or local: use native" in refused(service.client, job, bbox_crs="CRS84")
     one = service.client.get(f"/jobs/{job}/buildings/{GABLE}").json()
     assert one["coordRefSys"] is None
     assert service.client.get(f"/jobs/{job}/buildings/{GABLE}", params={"crs": "CRS84"}).status_code == 400

@@ -312,6 +312,16 @@ def test_a_run_that_is_replaced_is_read_again(starting: Callable[..., Any], tmp_
     assert len(list((tmp_path / "state" / "features").iterdir())) == 1
 
 
+def test_a_job_whose_crs_is_local_has_no_collections(service: runs.Service) -> None:
+    job_id = service.finished(lambda run_dir: runs.with_local_crs(runs.write_run(run_dir)))
+    answer = service.client.get(f"/collections/{job_id}.buildings/items")
+    assert "site, the coordinate reference system of run" in runs.problem(answer, 404, "no-such-collection")
+    listed = service.client.get("/collections?limit=100").json()["collections"]
+    assert not [one for one in listed if one["id"].startswith(job_id)]
+    whole = service.client.get(f"/jobs/{job_id}/buildings").json()
+    assert len(whole["features"]) == 6
+
+
 def test_a_job_whose_crs_is_unknown_has_no_collections(service: runs.Service) -> None:
     job_id = service.finished(lambda run_dir: runs.write_run(run_dir, epsg=None))
     answer = service.client.get(f"/collections/{job_id}.buildings/items")

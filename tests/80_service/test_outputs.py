@@ -371,6 +371,16 @@ def test_an_unknown_crs_is_reported_and_the_coordinates_stay_the_tiles_own(tmp_p
     assert not read_catalogue(tmp_path / "out").crs.is_known
 
 
+def test_a_crs_without_a_place_on_earth_is_named_and_the_coordinates_stay_the_tiles_own(tmp_path: Path) -> None:
+    write_outputs(runs.with_local_crs(runs.write_run(tmp_path / "run")), tmp_path / "out")
+    found = json.loads(output_file(tmp_path / "out", "geojson").read_text())
+    assert (found["coordRefSys"], "not WGS 84" in found["note"]) == (None, True)
+    (gable,) = [feature for feature in found["features"] if feature["id"] == runs.ident("gable")]
+    assert shapely.geometry.shape(gable["geometry"]).bounds == (85_000.0, 447_000.0, 85_010.0, 447_008.0)
+    crs = read_catalogue(tmp_path / "out").crs
+    assert (crs.name, crs.is_known) == ("site", False)
+
+
 # --- meshes ----------------------------------------------------------------------------------------------------------
 
 

@@ -116,7 +116,7 @@ def diff(
     keys = [PARQUET, GEOJSON]
     with contextlib.ExitStack() as sinks:
         takers = [summary.add, *take_in, sinks.enter_context(parquet_sink(storage, reference))]
-        if request.geojson == "none" or reference.wkt is None:
+        if request.geojson == "none" or reference.to_degrees is None:
             keys.remove(GEOJSON)
         else:
             takers.append(sinks.enter_context(geojson_sink(storage, reference, request.geojson)))
@@ -126,7 +126,9 @@ def diff(
     if GEOJSON not in keys:
         storage.path(GEOJSON).unlink(missing_ok=True)  # of an earlier comparison
         if request.geojson != "none":
-            warnings.append(f"no {GEOJSON}: GeoJSON is in WGS 84 (RFC 7946), and the CRS of the runs is unknown")
+            warnings.append(
+                f"no {GEOJSON}: GeoJSON is in WGS 84 (RFC 7946), and the CRS of the runs is unknown or local"
+            )
     level = summary.level
     min_m = request.settings.min_height_change_m
     shift_m = request.settings.vertical_shift_m

@@ -60,9 +60,9 @@ def parquet_sink(storage: LocalStorage, reference: SpatialReference) -> Iterator
 def geojson_sink(storage: LocalStorage, reference: SpatialReference, rows: GeoJson) -> Iterator[TakeIn]:
     """A function that appends rows to `changes.geojson`: longitude and latitude of WGS 84, as in RFC 7946.
 
-    Raises ValueError if the CRS is unknown.
+    Raises ValueError if the CRS is unknown, or has no place on Earth.
     """
-    to_degrees = _to_degrees(reference)
+    moved = _to_degrees(reference)
     with _writing(storage, GEOJSON) as path, path.open("w", encoding="utf-8", newline="\n") as stream:
         stream.write('{"type":"FeatureCollection","features":[')
         separators = itertools.chain(["\n"], itertools.repeat(",\n"))
@@ -71,7 +71,7 @@ def geojson_sink(storage: LocalStorage, reference: SpatialReference, rows: GeoJs
             if rows == "changed":
                 table = table.filter(pc.not_equal(table["change"], Change.UNCHANGED.value))
             geometries = shapely.from_wkb(np.array(table["geometry"].to_pylist(), dtype=object))
-            turned = shapely.orient_polygons(shapely.transform(geometries, to_degrees))
+            turned = shapely.orient_polygons(shapely.transform(geometries, moved))
             texts = shapely.to_geojson(turned)
             for row, text in zip(table.drop_columns("geometry").to_pylist(), texts, strict=True):
                 stream.write(next(separators) + _feature(row, text))
@@ -93,17 +93,14 @@ def _text(value: Any) -> str:
 
 
 def _to_degrees(reference: SpatialReference) -> Callable[[Any], Any]:
-    crs = reference.horizontal_crs
-    if crs is None:
-        raise ValueError("the CRS is unknown")
-    import pyproj
+    transformer = reference.to_degrees
+    if transformer is None:
+        raise ValueError("the CRS is unknown, or has no place on Earth")
 
-    transformer = pyproj.Transformer.from_crs(crs, "OGC:CRS84", always_xy=True)
-
-    def to_degrees(xy: Any) -> Any:
+    def moved(xy: Any) -> Any:
         return np.round(np.column_stack(transformer.transform(xy[:, 0], xy[:, 1])), DEGREE_DIGITS)
 
-    return to_degrees
+    return moved
 
 
 @contextlib.contextmanager
