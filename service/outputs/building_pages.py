@@ -173,12 +173,8 @@ def checked_choice(choice: CoordinateChoice | None, crs: ResultsCrs, parameter: 
     if crs.is_known:
         return choice is not None and choice.is_native
     if choice is not None and not choice.is_native:
-        raise RequestError(
-            [
-                f"query {parameter} is {choice.value}, but the CRS of the tiles is unknown or local: "
-                "use native, or leave it out"
-            ]
-        )
+        fault = f"query {parameter} is {choice.value}, but the CRS of the tiles is unknown or local"
+        raise RequestError([f"{fault}: use native, or leave it out"])
     return True
 
 
