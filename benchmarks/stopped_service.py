@@ -8,7 +8,8 @@ Starts `gablework serve` as a user does and submits jobs with the tile. A row ea
 - ended: SIGTERM with four jobs of different kinds, once the first is in the stage, until all processes have ended; then
   the service starts again, and all jobs must succeed. The stages that the next attempts repeated are listed: those that
   had ended before.
-- stopped: SIGSTOP of the process of an attempt, with `GABLEWORK_STALL_S` at 20, until the job is in its next attempt.
+- stopped: SIGSTOP of the process of an attempt in the stage split, with `GABLEWORK_STALL_S` at 20, until the job is in
+  its next attempt.
 """
 
 from __future__ import annotations
@@ -183,7 +184,7 @@ def stopped(tile: Path) -> None:
     """The row of attempts that stand still."""
     with running(stall_s=STALL_S) as service:
         job_id = service.submit("reconstruct", {"tiles": [{"href": service.upload(tile)}]})
-        service.wait(is_in(service, job_id, "ingest"))
+        service.wait(is_in(service, job_id, "split"))
         (process,) = service.attempts()
         process.suspend()
         took_s = service.wait(lambda: "attempt 2: running" in service.log(job_id))
