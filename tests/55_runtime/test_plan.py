@@ -95,7 +95,7 @@ def test_a_file_whose_points_lie_over_millions_of_tiles_is_refused_unless_a_regi
     xyz[::5, :2] *= 2e6 / 30.0
     path = tmp_path / "a.xyz"
     np.savetxt(path, xyz, fmt="%.3f")
-    with pytest.raises(UnreadableInputError, match=r"lie over 1,9\d\d by 1,9\d\d km, .* --bbox") as refused:
+    with pytest.raises(UnreadableInputError, match=r"lie over 1,9\d\d by 1,9\d\d km, .*tile_size_m") as refused:
         make_plan([str(path)], ReadOptions(), RunSettings())
     assert refused.value.path == str(path)
     window = ReadOptions(bbox=(0.0, 0.0, 30.0, 30.0))
