@@ -311,6 +311,7 @@ def test_given_footprints_are_overridden_by_their_own_id(plain: Any, overridden:
             r"footprint has the layer \[\]: use text",
         ),
         (f"[[building]]\npoint = [1, {'9' * 400}]\naction = 'accept'", r"point is \[1, 9+\.\.\.9+\]: use"),
+        ("[[building]]\npoint = [1e308, 1]\naction = 'accept'", r"point is \[1e\+308, 1\]: use"),
         (f"building = {'[' * 5000}", "is not TOML: its brackets are nested too deeply"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POLYGON ((0 0, 1 1, 1 0, 0 1, 0 0))'", "Self-intersection"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = 5", "footprint is neither WKT nor a table"),

@@ -30,6 +30,8 @@ ACTIONS = ("accept", "reject")
 TABLE = "building"
 """The name of the array of tables."""
 
+_FARTHEST = 1e9
+"""No coordinate on Earth is larger, in metres or feet."""
 _PLACES = ("building_id", "source_id", "point")
 _EFFECTS = ("action", "footprint", "method", "preset", "settings")
 _KEYS = (*_PLACES, *_EFFECTS, "note")
@@ -206,7 +208,9 @@ def _entry_faults(entry: Mapping[str, Any]) -> list[str]:
 
 
 def _is_point(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(is_finite_number(v) for v in value)
+    if not (isinstance(value, list) and len(value) == 2 and all(is_finite_number(v) for v in value)):
+        return False
+    return max(map(abs, value)) <= _FARTHEST
 
 
 def _modelling_faults(override: Override, base: RunSettings) -> list[str]:
