@@ -210,7 +210,7 @@ def _entry_faults(entry: Mapping[str, Any]) -> list[str]:
 def _is_point(value: Any) -> bool:
     if not (isinstance(value, list) and len(value) == 2 and all(is_finite_number(v) for v in value)):
         return False
-    return max(map(abs, value)) <= _FARTHEST
+    return bool(max(map(abs, value)) <= _FARTHEST)
 
 
 def _modelling_faults(override: Override, base: RunSettings) -> list[str]:
