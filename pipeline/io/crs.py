@@ -80,7 +80,7 @@ class SpatialReference:
 
     @property
     def to_degrees(self) -> pyproj.Transformer | None:
-        """As the function of this name; None also if the CRS is unknown."""
+        """`to_degrees` of its horizontal part; None also if the CRS is unknown."""
         crs = self.horizontal_crs
         return None if crs is None else to_degrees(crs)
 

@@ -50,6 +50,13 @@ class NamedCrs:
         return _DECIMALS_DEG if self.crs.is_geographic else _DECIMALS
 
 
+def _without_place(run: str, crs: str) -> NoSuchCollectionError:
+    return NoSuchCollectionError(
+        f"the coordinate reference system of run {run} is {crs}, so its features have no place on the globe "
+        "and are no collection: model it again with --crs"
+    )
+
+
 class CollectionCrs:
     """The CRS of a run and those into which its features are transformed. Heights stay as they are.
 
@@ -63,22 +70,16 @@ class CollectionCrs:
     Raises
     ------
     NoSuchCollectionError
-        The CRS is unknown: such features have no place on the globe.
+        The CRS is unknown or local: such features have no place on the globe.
     """
 
     def __init__(self, crs: Mapping[str, Any] | None, run: str) -> None:
         if crs is None or crs.get("wkt") is None:
-            raise NoSuchCollectionError(
-                f"the coordinate reference system of run {run} is unknown, so its features have no place on the globe "
-                "and are no collection: model it again with --crs"
-            )
+            raise _without_place(run, "unknown")
         whole = pyproj.CRS.from_wkt(crs["wkt"])
         self._own = (whole.sub_crs_list[0] if whole.is_compound else whole).to_2d()
         if to_degrees(self._own) is None:
-            raise NoSuchCollectionError(
-                f"{whole.name}, the coordinate reference system of run {run}, has no place on the globe, so its "
-                "features are no collection: model it again with --crs"
-            )
+            raise _without_place(run, f"local ({whole.name})")
         self._wkt = self._own.to_wkt()
         code = self._own.to_epsg()
         self.storage_uri = None if code is None else f"{_EPSG}{code}"

@@ -140,9 +140,13 @@ def test_a_process_that_keeps_much_memory_or_has_done_much_is_replaced(
     apart.driver()
     assert process_of(apart, priority=1) == (first := process_of(apart, priority=600))
     assert (second := process_of(apart, priority=1)) != first
-    monkeypatch.setattr(attempt_process, "_MOST_ATTEMPTS", 2)
-    assert process_of(apart, priority=1) == second
-    assert process_of(apart, priority=1) != second
+    with monkeypatch.context() as fewer:
+        fewer.setattr(attempt_process, "_MOST_ATTEMPTS", 2)
+        assert process_of(apart, priority=1) == second
+        assert (third := process_of(apart, priority=1)) != second
+    monkeypatch.setattr(attempt_process, "_KEPT_SPACE_BYTES", 1)
+    assert process_of(apart, priority=1) == third
+    assert process_of(apart, priority=1) != third
 
 
 def test_a_job_that_met_what_another_one_left_is_tried_again_in_a_fresh_process(apart: Bench) -> None:

@@ -315,7 +315,7 @@ def test_a_run_that_is_replaced_is_read_again(starting: Callable[..., Any], tmp_
 def test_a_job_whose_crs_is_local_has_no_collections(service: runs.Service) -> None:
     job_id = service.finished(lambda run_dir: runs.with_local_crs(runs.write_run(run_dir)))
     answer = service.client.get(f"/collections/{job_id}.buildings/items")
-    assert "site, the coordinate reference system of run" in runs.problem(answer, 404, "no-such-collection")
+    assert "is local (site), so its features have no place" in runs.problem(answer, 404, "no-such-collection")
     listed = service.client.get("/collections?limit=100").json()["collections"]
     assert not [one for one in listed if one["id"].startswith(job_id)]
     whole = service.client.get(f"/jobs/{job_id}/buildings").json()
