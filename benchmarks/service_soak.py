@@ -49,8 +49,8 @@ FAULT_S = 10.0
 """How long the database is locked and the disk is full, in each minute."""
 LAST_JOBS_S = 900.0
 """How long the last jobs may take when nothing fails any more."""
-LATER = {429, 503, 507}
-"""Refusals that pass."""
+LATER = {409, 429, 503, 507}
+"""Refusals that pass; 409 while the first of two requests with one key is under way."""
 GOES_ON = {"accepted", "running"}
 
 

@@ -20,6 +20,7 @@ from laspy.point.record import PackedPointRecord
 
 from pipeline.errors import InconsistentInputError, UnreadableInputError
 from pipeline.io import copc
+from pipeline.io.apart import apart
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.las_header import REWRITE, header_crs, read_header_block
 from pipeline.io.laz_chunks import (
@@ -85,9 +86,6 @@ class LasFile:
                 self._laszip_record = self._read_laszip_record()
                 self._chunks = read_chunk_table(path, stream, self._block, self._laszip_record)
                 self._copc = copc.octree_info(self._header)
-                # the layers of a remote file are checked when its chunks are read: a plan needs few of these
-                if facts is None and (isinstance(path, Path) or self._block.point_format < LAYERED_FORMAT):
-                    check_chunks(path, stream, self._block, self._laszip_record, self._chunks)
             else:
                 self._check_room()
         self.facts = self._read_facts() if facts is None else facts
@@ -290,6 +288,15 @@ class LasFile:
             withheld=np.asarray(packed["withheld"], dtype=np.bool_),
         )
 
+    def _checked_sample(self) -> PointRecords:
+        """As `_sample`, of chunks that were held against the header."""
+        # the layers of a remote file are checked when its chunks are read: a plan needs few of these
+        if isinstance(self._path, Path) or self._block.point_format < LAYERED_FORMAT:
+            assert self._chunks is not None
+            with self._path.open("rb") as stream:
+                check_chunks(self._path, stream, self._block, self._laszip_record, self._chunks)
+        return self._sample()
+
     def _sample(self) -> PointRecords:
         """Points from some places spread over the file, in file order; of COPC the coarsest node."""
         pieces, most = [], max(1, min(SAMPLE_SIZE, PIECE_BYTES // SAMPLE_PLACES // self._block.point_size))
@@ -325,7 +332,8 @@ class LasFile:
 
     def _read_facts(self) -> FileFacts:
         """The facts from header and sample."""
-        header, block, sample = self._header, self._block, self._sample()
+        header, block = self._header, self._block
+        sample = self._sample() if self._chunks is None else apart(self._checked_sample, str(self._path))
         found = header_crs(self._path, header, block)
         self._warnings.extend(found.warnings)
         by_return = [int(n) for n in header.number_of_points_by_return]
@@ -369,11 +377,16 @@ class LasFile:
             self._warnings.append(
                 f"the header's bounds {lows.tolist()} to {highs.tolist()} cannot be: taken from the points"
             )
-            lows, highs = np.full(3, np.inf), np.full(3, -np.inf)
-            for piece in self.records(1_000_000, None):
-                lows, highs = np.minimum(lows, piece.xyz.min(axis=0)), np.maximum(highs, piece.xyz.max(axis=0))
+            lows, highs = apart(self._bounds_of_points, str(self._path))
         x_min, y_min, z_min, x_max, y_max, z_max = (float(value) for value in (*lows, *highs))
         return x_min, y_min, z_min, x_max, y_max, z_max
+
+    def _bounds_of_points(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """The (3,) lowest and highest coordinates of all points."""
+        lows, highs = np.full(3, np.inf), np.full(3, -np.inf)
+        for piece in self.records(1_000_000, None):
+            lows, highs = np.minimum(lows, piece.xyz.min(axis=0)), np.maximum(highs, piece.xyz.max(axis=0))
+        return lows, highs
 
 
 def _places(last: int) -> list[int]:

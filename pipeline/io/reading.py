@@ -21,7 +21,7 @@ INPUT_TIMEOUT_S = 600.0
 """Default of `--input-timeout`: a slow disk delivers a piece of some megabytes in seconds."""
 
 _limit_s: ContextVar[float] = ContextVar("input_timeout_s", default=INPUT_TIMEOUT_S)
-_listener: Callable[[], None] | None = None
+_listener: Callable[[], object] | None = None
 """What hears of progress: the alarm of this process, or the report to its supervisor."""
 _watcher: Callable[[], None] | None = None
 """What hears of it besides, in a process that is watched and has an alarm all the same."""
@@ -50,7 +50,7 @@ def set_input_timeout(seconds: float) -> None:
 
 
 @contextlib.contextmanager
-def heard_by(listener: Callable[[], None]) -> Iterator[None]:
+def heard_by(listener: Callable[[], object]) -> Iterator[None]:
     """Let progress in the block be heard by someone who watches this process; no alarm is set. A context manager."""
     global _listener  # noqa: PLW0603 - a process reads one input at a time
     before, _listener = _listener, listener

@@ -10,11 +10,11 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 
 from pipeline.errors import RunError
+from pipeline.io.apart import has_one_thread
 from pipeline.runtime.isolation.forked_child import (
     ForkServer,
     can_fork,
     fork_server_here,
-    has_one_thread,
     read_by_children,
     spawn_server,
 )

@@ -184,11 +184,6 @@ def fork_server_here(loads: Sequence[str], orders: socket.socket, stderr: IO[byt
     return ForkedServer(pid)
 
 
-def has_one_thread() -> bool:
-    """Whether this process has no second thread, not even one of a library, that could hold a lock during a fork."""
-    return sum(1 for _ in Path("/proc/self/task").iterdir()) == 1
-
-
 class ForkServer:
     """A server, seen from its owner.
 
