@@ -237,6 +237,7 @@ def compare(
 ) -> None:
     """Model the same candidates by several methods and write one page on what came out."""
     with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.model import Status
         from pipeline.ruler.evaluation.chapters import chapters
         from pipeline.ruler.evaluation.files import EvaluationRequest
         from pipeline.ruler.report.compare_files import compare_files, comparison_facts
@@ -294,7 +295,7 @@ def compare(
             )
         made = compare_files(request, reference, console.on_event)
         facts = comparison_facts(request, made.summary)
-        names = ("ok", "fallback", "failed")
+        names = tuple(map(str, Status))
         rows = [
             (
                 variant["label"],

@@ -61,7 +61,7 @@ BUILDINGS = (
     ),
     Column("source_id", TEXT, NONE, "id of the given footprint; null without footprints"),
     Column("source_attributes", TEXT, NONE, "the given footprint's columns as a JSON object; null without footprints"),
-    Column("status", TEXT, NONE, "`ok`, `fallback` or `failed`", page="records.md#status", required=True),
+    Column("status", TEXT, NONE, "`ok`, `doubtful`, `fallback` or `failed`", page="records.md#status", required=True),
     Column(
         "reason", TEXT, NONE, "why the status is not `ok`, from a closed list; null if it is", page="records.md#reasons"
     ),

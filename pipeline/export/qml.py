@@ -133,6 +133,11 @@ def _grey(level: int, pattern: str = "solid") -> Fill:
 STATUS_CLASSES = (
     Category(value=Status.OK.value, label="delivered: a closed, valid model", fill=Fill(colour=(63, 134, 181, 255))),
     Category(
+        value=Status.DOUBTFUL.value,
+        label="doubtful: the points do not support the model",
+        fill=Fill(colour=(216, 96, 60, 255)),
+    ),
+    Category(
         value=Status.FALLBACK.value,
         label="fallback block: the roof could not be delivered",
         fill=Fill(colour=(227, 178, 60, 255)),

@@ -30,7 +30,8 @@ _HALF_SHARE = 0.04
 _EDGE = "#ffffffa0"
 
 GOOD, FAIR, BAD, MISSING, UNJUDGED = "#3f86b5", "#e3b23c", "#cf4f2a", "#8d4fa8", "#9aa3ab"
-"""Blue, amber, vermilion, purple, grey: distinct for all kinds of colour vision, on white and on near black."""
+DOUBTFUL = "#009e73"
+"""Blue, amber, vermilion, purple, grey, green: distinct for all kinds of colour vision, on white and on near black."""
 NO_FIGURE = "-"
 """Shown for a missing figure."""
 

@@ -40,6 +40,12 @@ ROOF_COLOURS = {
 """The colour of each roof type in full light."""
 WALL_COLOUR = "#f1ece1"
 FAILED_COLOUR = "#c22032"
+HATCHES = {
+    Status.DOUBTFUL: ("....", "#333333"),
+    Status.FALLBACK: ("////", "#333333"),
+    Status.FAILED: ("xxxx", FAILED_COLOUR),
+}
+"""Hatch and colour of outlines that are not `ok`."""
 VIEW_SIDE_M = 180.0
 """Side of the square in the bird's-eye view: the one with the most roof faces."""
 WHOLE_BELOW_M = 260.0
@@ -158,12 +164,12 @@ def _draw_map(axes: Axes, buildings: pa.Table, planes: pa.Table, rejected: pa.Ta
     footprints = _geometries(buildings)
     _draw_outlines(axes, footprints, color="#2b2b2b", linewidths=0.6)
     statuses = np.array(buildings["status"].to_pylist(), dtype=object)
-    for status, colour in ((Status.FALLBACK, "#333333"), (Status.FAILED, FAILED_COLOUR)):
+    for status, (hatch, colour) in HATCHES.items():
         chosen = [g for g, s in zip(footprints, statuses, strict=True) if s == status and g is not None]
         hatched = [drawn_path(_rings(part)) for g in chosen for part in shapely.get_parts(g)]
         if hatched:
             marked = PathCollection(hatched, facecolors="none", edgecolors=colour, linewidths=0.9)
-            marked.set_hatch("////" if status is Status.FALLBACK else "xxxx")
+            marked.set_hatch(hatch)
             axes.add_collection(marked)
     if truth is not None:
         _draw_outlines(axes, truth, color="#0050a0", linewidths=1.4, linestyles=(0, (4, 2)))
@@ -270,8 +276,7 @@ def _legend(statistics: dict[str, Any], with_truth: bool) -> list[Any]:
         if kind != RoofType.NONE
     ]
     statuses = statistics["statuses"]
-    hatches = ((Status.FALLBACK, "////", "#333333"), (Status.FAILED, "xxxx", FAILED_COLOUR))
-    for status, hatch, colour in hatches:
+    for status, (hatch, colour) in HATCHES.items():
         label = f"{status.value} {statuses[status.value]}"
         entries.append(Patch(facecolor="none", edgecolor=colour, hatch=hatch, label=label))
     entries.append(Line2D([], [], color="#9a9a9a", linewidth=1.0, label=f"rejected {statistics['rejected']}"))

@@ -18,7 +18,7 @@ from pipeline.export.geoparquet import table_dataset
 from pipeline.io import arrow_at, storage_at
 from pipeline.model import REASONS, Reason, Status
 from pipeline.report.class_map import MAX_DRAWN, ROWS, ClassMap, MapClass
-from pipeline.report.maps import BAD, FAIR, GOOD, MISSING, NO_FIGURE
+from pipeline.report.maps import BAD, DOUBTFUL, FAIR, GOOD, MISSING, NO_FIGURE
 from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
 from pipeline.report.statistics import QUANTILES, run_statistics
@@ -45,7 +45,8 @@ _FIGURES = {
     "height_m": "height, m",
 }
 _STATUSES = {
-    Status.OK: ("models", GOOD, "closed, valid solids with a roof of the method"),
+    Status.OK: ("models", GOOD, "closed, valid solids with a roof that their points support"),
+    Status.DOUBTFUL: ("doubtful models", DOUBTFUL, "closed, valid solids that their points do not support"),
     Status.FALLBACK: ("blocks", FAIR, "the roof could not be delivered, a block stands in its place"),
     Status.FAILED: ("no model", MISSING, "the record and its reason remain"),
 }
@@ -87,7 +88,7 @@ def run_page(run_dir: str) -> str:
         without_outline=seen.without_outline,
         reasons=_reasons(statistics, seen),
         listed=seen.listed(),
-        not_ok=sum(statistics["statuses"][one.value] for one in (Status.FALLBACK, Status.FAILED)),
+        not_ok=statistics["candidates"] - statistics["statuses"][Status.OK.value],
         slowest=[_slow(one.building_id, one.seconds, seen.slow.get(one.building_id)) for one in manifest.slowest],
         stages=_stages(manifest),
         peaks=_peaks(manifest)[:PROCESSES],
@@ -110,7 +111,8 @@ class _Seen:
         label, colour, _ = _STATUSES[Status.OK]
         others = [
             MapClass(name=one.value, label=_STATUSES[one][0], colour=_STATUSES[one][1])
-            for one in (Status.FALLBACK, Status.FAILED)
+            for one in _STATUSES
+            if one is not Status.OK
         ]
         tiles = MapClass(name=_FAILED_TILE, label="tile that could not be published", colour=BAD, hatched=True)
         self.map = ClassMap(
@@ -231,7 +233,7 @@ def _meaning(reason: str) -> str:
 def _reasons(statistics: Mapping[str, Any], seen: _Seen) -> list[tuple[str, str, str, int, str, list[str]]]:
     """Status, reason, meaning, count, share of all candidates, a few ids; those without a model first."""
     found = []
-    for status in (Status.FAILED.value, Status.FALLBACK.value):
+    for status in (one.value for one in reversed(Status) if one is not Status.OK):
         for reason, count in statistics["reasons"].get(status, {}).items():
             share = f"{count / statistics['candidates']:.2%}"
             found.append((status, reason, _meaning(reason), count, share, sorted(seen.examples[status, reason])))

@@ -132,7 +132,7 @@ class RunManifest:
     tiles_without_terrain: tuple[str, ...] = ()
     """Keys of the tiles whose terrain was requested and could not be written; likewise."""
     counts: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """candidates, ok, fallback, failed, rejected, planes, points and the like."""
+    """candidates, ok, doubtful, fallback, failed, rejected, planes, points and the like."""
     timings_s: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Wall-clock seconds by stage."""
     peak_memory_bytes: Mapping[str, int] = dataclasses.field(default_factory=dict)

@@ -25,7 +25,7 @@ from pipeline.export.point_files import FOLDER as POINTS_FOLDER
 from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
 from pipeline.export.tile_update import updated_tile
 from pipeline.io import LocalStorage
-from pipeline.model import Reason
+from pipeline.model import Reason, Status
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.earlier import (
@@ -452,7 +452,7 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
     before = Counter(record.status for record in earlier.records(found.changed).values())
     after = Counter(m.status for m in modelled)
     counts = Counter(earlier.manifest.counts)
-    for status in ("ok", "fallback", "failed"):
+    for status in map(str, Status):
         counts[status] += after[status] - before[status]
         counts["candidates"] += after[status] - before[status]
     counts[REJECTED] += len(found.again.rejected) + after[REJECTED] - before[REJECTED]

@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from pipeline.model import Status
 from service.wording import as_inputs
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def _buildings(summary: RunSummary) -> str:
 
 
 def _by_status(summary: RunSummary) -> str:
-    return ", ".join(f"{summary.statuses.get(status, 0)} {status}" for status in ("ok", "fallback", "failed"))
+    return ", ".join(f"{summary.statuses.get(status, 0)} {status}" for status in Status)
 
 
 def comparison_outcome(summary: CompareSummary) -> str:

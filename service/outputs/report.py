@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline.model import Status
 from service.outputs.catalogue import ResultsCrs
 from service.wording import as_inputs
 
@@ -94,7 +95,7 @@ def report(
         },
         "buildings": {
             "candidates": tally.buildings,
-            "by_status": {name: tally.statuses[name] for name in ("ok", "fallback", "failed")},
+            "by_status": {status.value: tally.statuses[status.value] for status in Status},
             "by_reason": _sorted(tally.reasons),
             "by_roof_type": _sorted(tally.roof_types),
             "by_lod": _sorted(tally.lods),

@@ -148,7 +148,7 @@ def score_delivery(models: Sequence[RoofModel], reference: Reference, matching: 
 
 
 def _delivered(model: RoofModel) -> Delivered:
-    detailed = model.status is Status.OK and not model.lod.startswith(("0", "1"))
+    detailed = model.status.has_roof and not model.lod.startswith(("0", "1"))
     return Delivered.LOD2 if detailed else Delivered.BLOCK
 
 
@@ -222,7 +222,7 @@ DEFINITIONS = (
     defined(
         "delivery.lod2",
         "buildings with an LoD2 model",
-        f"{_OF_ALL}for which a model of status ok and level of detail >= 2 stands {_FOR}",
+        f"{_OF_ALL}for which a model of status ok or doubtful and level of detail >= 2 stands {_FOR}",
         Better.HIGHER,
     ),
     defined(
@@ -277,6 +277,9 @@ DEFINITIONS = (
         "count",
     ),
     defined("delivery.records_ok", "records ok", "records of status ok / all records of the run", Better.HIGHER),
+    defined(
+        "delivery.records_doubtful", "records in doubt", "records of status doubtful / all records", Better.LOWER
+    ),
     defined(
         "delivery.records_fallback", "records with a block", "records of status fallback / all records", Better.LOWER
     ),

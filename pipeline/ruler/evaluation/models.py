@@ -63,7 +63,7 @@ class RoofModel:
     source_id: str | None = None
     """As in the record; in simulated truth the block, which buildings that touch share."""
     status: Status = Status.OK
-    """ok, or fallback for a block; models of other programs are ok."""
+    """ok, doubtful, or fallback for a block; models of other programs are ok."""
     lod: str = "2.2"
     """Level of detail that the model claims."""
     solids: tuple[Solid, ...] = ()

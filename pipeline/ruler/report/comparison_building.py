@@ -71,7 +71,7 @@ class Record:
     @property
     def is_model(self) -> bool:
         """Whether the model of the method was delivered."""
-        return self.status is Status.OK
+        return self.status.has_roof
 
     @property
     def outcome(self) -> str | None:

@@ -77,7 +77,12 @@ def _rows(title: str, first: str, rows: Sequence[tuple[str, Sequence[Cell]]]) ->
 def _made(buildings: Sequence[ComparedBuilding], columns: Sequence[Records]) -> FigureTable:
     """Statuses with reasons, planes, residuals, coverage, validity."""
     common = [i for i, building in enumerate(buildings) if all(record.is_model for record in building.records)]
-    names = {Status.OK: "models by the method", Status.FALLBACK: "blocks in their place", Status.FAILED: "failed"}
+    names = {
+        Status.OK: "models by the method",
+        Status.DOUBTFUL: "models that their points do not support",
+        Status.FALLBACK: "blocks in their place",
+        Status.FAILED: "failed",
+    }
     rows: list[tuple[str, list[Cell]]] = [("candidates", [Cell(text=f"{len(records):,}") for records in columns])]
     rows += [(names[status], [_status(records, status) for records in columns]) for status in Status]
     rows.append(("records with valid solids", [_share(sum(one.valid for one in r), len(r)) for r in columns]))

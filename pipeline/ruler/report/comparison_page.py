@@ -204,6 +204,8 @@ def _summary(record: Record) -> str:
     if record.status is Status.FAILED:
         return f"failed, {record.reason}"
     kind = "model" if record.is_model else f"block in place of a model, {record.reason}"
+    if record.status is Status.DOUBTFUL:
+        kind = f"doubtful model, {record.reason}"
     planes = f"{record.n_planes} {'plane' if record.n_planes == 1 else 'planes'}"
     return f"{kind}, {record.roof_type} roof, {planes}, RMSE {figure(record.rmse_m, 'm', 3)}"
 

@@ -225,7 +225,7 @@ def _view(
 ) -> bytes:
     """A model with its points in the colours of their distances to it; blocks grey and hatched."""
     figure, axes = blank(WIDTH_PX, height_px)
-    is_block = model.status is not Status.OK
+    is_block = not model.status.has_roof
     faces = [
         dataclasses.replace(face, rings=tuple(ring - origin for ring in face.rings))
         for face in viewed_faces(model, BLOCK_COLOUR if is_block else None)

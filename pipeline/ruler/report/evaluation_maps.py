@@ -11,7 +11,7 @@ import pyarrow as pa
 import shapely
 
 from pipeline.model import Status
-from pipeline.report.maps import BAD, FAIR, GOOD, MISSING, UNJUDGED, Entry, Layer, Map, draw_map
+from pipeline.report.maps import BAD, DOUBTFUL, FAIR, GOOD, MISSING, UNJUDGED, Entry, Layer, Map, draw_map
 from pipeline.ruler.evaluation.counts import floats
 from pipeline.ruler.evaluation.evaluate import Evaluation
 
@@ -114,13 +114,19 @@ def _false_models(evaluation: Evaluation) -> Layer:
 
 
 def _status_layers(evaluation: Evaluation) -> list[Layer]:
-    """The models alone: ok, fallback, failed."""
+    """The models alone: ok, doubtful, fallback, failed."""
     models, failed = evaluation.models.models, evaluation.models.failed
-    ok = [model.status is Status.OK for model in models]
     footprints = [model.footprint for model in models]
+    of_status = [
+        _layer(label, colour, footprints, [model.status is status for model in models])
+        for status, label, colour in (
+            (Status.OK, "model", GOOD),
+            (Status.DOUBTFUL, "doubtful model", DOUBTFUL),
+            (Status.FALLBACK, "fallback (a block)", FAIR),
+        )
+    ]
     return [
-        _layer("model", GOOD, footprints, ok),
-        _layer("fallback (a block)", FAIR, footprints, [not one for one in ok]),
+        *of_status,
         _layer("no model", MISSING, [one.footprint for one in failed], [not one.footprint.is_empty for one in failed]),
     ]
 

@@ -36,6 +36,7 @@ HEADLINE = (
     ("detection.area_quality_without_ring", "detection.area_completeness_without_ring"),
     ("residuals.rmse_top_visible",),
     ("residuals.median_top_visible",),
+    ("delivery.records_doubtful",),
     ("delivery.records_fallback",),
     ("delivery.records_failed",),
 )

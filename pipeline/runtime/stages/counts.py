@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from pipeline.io.source import CAUSES
+from pipeline.model import Status
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.stages.batch_figures import Counted
 from pipeline.runtime.stages.ground import Ground
@@ -30,9 +31,7 @@ def run_counts(
         "outliers": sum(cells.outliers for cells in ground.cells.values()),
         "tiles": len(splits.figures),
         "candidates": by_status.total(),
-        "ok": by_status["ok"],
-        "fallback": by_status["fallback"],
-        "failed": by_status["failed"],
+        **{status.value: by_status[status.value] for status in Status},
         "rejected": sum(one.figures.count for one in joined.rejected) + found.rejected.total(),
         "reused": by_status.total() + found.rejected.total() - found.made,
         "small_surfaces": joined.small_fragments,

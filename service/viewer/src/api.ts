@@ -30,7 +30,7 @@ export type Status = "accepted" | "running" | "successful" | "failed" | "dismiss
 
 /** What a run found. */
 export interface Summary {
-  /** Buildings by status: ok, fallback, failed. */
+  /** Buildings by status: ok, doubtful, fallback, failed. */
   statuses?: Record<string, number>;
 }
 

@@ -42,6 +42,7 @@ const RESIDUALS: readonly (ColourClass & { upToM: number })[] = [
 
 const STATUSES: readonly ColourClass[] = [
   { label: "Modelled", colour: "#56b4e9" },
+  { label: "Doubtful model", colour: CATEGORIES.doubtful.colour, hatched: true },
   { label: "Fallback block", colour: CATEGORIES.fallback.colour, hatched: true },
   { label: "No model", colour: CATEGORIES.failed.colour, hatched: true },
 ];
@@ -88,7 +89,7 @@ function classOf(
     case "residual":
       return RESIDUALS.find(({ upToM }) => rmseM !== null && rmseM <= upToM) ?? RESIDUALS[RESIDUALS.length - 1];
     case "status":
-      return STATUSES[category === "fallback" ? 1 : category === "failed" ? 2 : 0];
+      return STATUSES[["doubtful", "fallback", "failed"].indexOf(category) + 1];
     case "reason":
       return reason === null ? NO_REASON : (REASONS.get(reason) ?? OTHER_REASON);
   }

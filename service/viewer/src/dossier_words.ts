@@ -111,6 +111,7 @@ export function trust(properties: Properties, decisions: readonly Decision[]): {
   const { status, reason, valid } = properties;
   const words = typeof reason === "string" ? reasonWords(reason) : "";
   if (status === "failed") bad.push(`There is no model: ${words}.`);
+  if (status === "doubtful") bad.push(`The model is doubtful: ${words}.`);
   if (status === "fallback") bad.push(`The roof is not modelled, the building is a block: ${words}.`);
   if (valid === true) good.push("The solid is closed and valid by the rules of ISO 19107.");
   for (const figure of trustFigures(properties)) (figure.good ? good : bad).push(figure.words);
@@ -121,7 +122,7 @@ export function trust(properties: Properties, decisions: readonly Decision[]): {
   const levelled = decisions.find(({ kind, outcome }) => kind === "form" && outcome === "chosen")?.levelled_share ?? 0;
   if (levelled > 0) bad.push(`Faces of ${percent(levelled)} of the plan were made level, since no plane fits the points there.`);
   if (typeof properties["source_id"] === "string") good.push("The outline is the given footprint.");
-  else if (status === "ok") {
+  else if (status === "ok" || status === "doubtful") {
     const spacing = number(properties["point_spacing_m"]);
     if (spacing !== null) good.push(`The outline is drawn from the points, which are ${measure(spacing, 2, "m")} apart.`);
   }

@@ -26,7 +26,7 @@ const SORT_WORDS: Record<Sort, string> = {
 };
 
 /** Categories of the two usual choices: what became a building, and what has no model. */
-const BUILDINGS: Category[] = [...STATUSES.ok.categories, "fallback", "failed"];
+const BUILDINGS: Category[] = [...STATUSES.ok.categories, "doubtful", "fallback", "failed"];
 const WITHOUT: Category[] = ["failed", "rejected"];
 
 /** Search, order and filters of the list. */

@@ -45,8 +45,9 @@ export function resultWords({ status, summary, exception, message }: StatusInfo)
 
 function buildings(summary: Summary | undefined): string {
   if (summary?.statuses === undefined) return "";
-  const { fallback = 0, failed = 0 } = summary.statuses;
+  const { doubtful = 0, fallback = 0, failed = 0 } = summary.statuses;
   const parts = [counted(total(summary.statuses), "building")];
+  if (doubtful > 0) parts.push(`${count(doubtful)} doubtful`);
   if (fallback > 0) parts.push(counted(fallback, "block"));
   if (failed > 0) parts.push(`${count(failed)} failed`);
   return parts.join(" · ");

@@ -338,7 +338,7 @@ export class OutlineMap {
   }
 }
 
-const DASHES: Partial<Record<Category, number[]>> = { fallback: [7, 3], failed: [4, 3], rejected: [1.5, 2.5] };
+const DASHES: Partial<Record<Category, number[]>> = { doubtful: [10, 2], fallback: [7, 3], failed: [4, 3], rejected: [1.5, 2.5] };
 
 /** The outlines of each category as paths of neighbours. */
 function cellsOf(shapes: readonly Shape[]): Cell[] {

@@ -103,7 +103,7 @@ function record(
 ): HTMLElement[] {
   const { status, reason, reason_detail: detail, lod, valid } = properties;
   const category = categoryOf(status, properties["roof_type"]);
-  const modelled = status === "ok" || status === "fallback";
+  const modelled = status === "ok" || status === "doubtful" || status === "fallback";
   const heading = el(
     "div",
     { class: "record-head" },
@@ -183,5 +183,5 @@ function takeAway(meshPath: unknown, path: string, method: string | null, buildi
 }
 
 function roofWord(category: string): string {
-  return category === "fallback" || category === "failed" ? "" : " roof";
+  return ["doubtful", "fallback", "failed"].includes(category) ? "" : " roof";
 }

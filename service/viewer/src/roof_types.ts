@@ -1,9 +1,9 @@
 /**
- * The category that an object is drawn in: the roof type of a building, or fallback or failed; rejected if it was judged
- * not to be a building.
+ * The category that an object is drawn in: the roof type of a building, or doubtful, fallback or failed; rejected if it
+ * was judged not to be a building.
  *
- * Colours are from the palette of Okabe and Ito (2008), distinguishable with every kind of colour blindness; fallback,
- * failed and rejected are shown by hatching and outline, too.
+ * Colours are from the palette of Okabe and Ito (2008), distinguishable with every kind of colour blindness;
+ * doubtful, fallback, failed and rejected are shown by hatching and outline, too.
  */
 export const CATEGORIES = {
   flat: { label: "Flat", colour: "#56b4e9" },
@@ -12,6 +12,7 @@ export const CATEGORIES = {
   hip: { label: "Hip", colour: "#cc79a7" },
   combination: { label: "Combination", colour: "#0072b2" },
   unknown: { label: "Other", colour: "#8d99a6" },
+  doubtful: { label: "Doubtful model", colour: "#f0e442" },
   fallback: { label: "Fallback block", colour: "#d55e00" },
   failed: { label: "No model", colour: "#c0392b" },
   rejected: { label: "Left out", colour: "#8f6fc0" },
@@ -23,13 +24,13 @@ export const CATEGORY_NAMES = Object.keys(CATEGORIES) as Category[];
 
 /** The category of a record. */
 export function categoryOf(status: unknown, roofType: unknown): Category {
-  if (status === "failed" || status === "fallback" || status === "rejected") return status;
+  if (status === "failed" || status === "fallback" || status === "doubtful" || status === "rejected") return status;
   return typeof roofType === "string" && roofType in CATEGORIES ? (roofType as Category) : "unknown";
 }
 
 /** Whether a category is hatched, as a sign in addition to its colour. */
 export function isHatched(category: Category): boolean {
-  return category === "fallback" || isFlat(category);
+  return category === "fallback" || category === "doubtful" || isFlat(category);
 }
 
 /** Whether objects of a category have no model: they lie on the ground as outlines. */

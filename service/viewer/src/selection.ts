@@ -7,7 +7,7 @@ import { CATEGORIES, CATEGORY_NAMES, type Category } from "./roof_types";
 
 export const SORTS = ["problems", "id", "roof", "reason", ...FIGURE_NAMES] as const;
 
-/** `problems`: objects without a model first, then fallback blocks, then the largest area. */
+/** `problems`: objects without a model first, then doubtful models, then fallback blocks, then the largest area. */
 export type Sort = (typeof SORTS)[number];
 
 /** Bounds of a figure in the record's unit, both included; null for none. */
@@ -152,8 +152,8 @@ export function selected(objects: readonly Listed[], wanted: Wanted): Listed[] {
   return objects.filter((object) => fits(wanted, object)).sort(orderOf(wanted));
 }
 
-const WEIGHTS: Partial<Record<Category, number>> = { failed: 0, rejected: 1, fallback: 2 };
-const weight = ({ category }: Listed): number => WEIGHTS[category] ?? 3;
+const WEIGHTS: Partial<Record<Category, number>> = { failed: 0, rejected: 1, doubtful: 2, fallback: 3 };
+const weight = ({ category }: Listed): number => WEIGHTS[category] ?? 4;
 
 /** Compares two objects; those without the figure come last in both directions, and ties follow the ids. */
 function orderOf({ sort, descending }: Wanted): (a: Listed, b: Listed) => number {
@@ -199,7 +199,8 @@ export function tallies(
 
 /** The categories of a status, in the words of the page. */
 export const STATUSES = {
-  ok: { label: "Modelled", categories: CATEGORY_NAMES.slice(0, CATEGORY_NAMES.indexOf("fallback")) },
+  ok: { label: "Modelled", categories: CATEGORY_NAMES.slice(0, CATEGORY_NAMES.indexOf("doubtful")) },
+  doubtful: { label: CATEGORIES.doubtful.label, categories: ["doubtful"] as Category[] },
   fallback: { label: CATEGORIES.fallback.label, categories: ["fallback"] as Category[] },
   failed: { label: CATEGORIES.failed.label, categories: ["failed"] as Category[] },
   rejected: { label: CATEGORIES.rejected.label, categories: ["rejected"] as Category[] },

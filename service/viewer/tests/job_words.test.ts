@@ -15,10 +15,10 @@ test("only a job that runs shows its progress", () => {
 });
 
 test("results are counted by what the process makes", () => {
-  const statuses = { ok: 44, fallback: 2, failed: 1 };
-  expect(resultWords(job({ summary: { statuses } }))).toBe("47 buildings · 2 blocks · 1 failed");
+  const statuses = { ok: 44, doubtful: 3, fallback: 2, failed: 1 };
+  expect(resultWords(job({ summary: { statuses } }))).toBe("50 buildings · 3 doubtful · 2 blocks · 1 failed");
   expect(resultWords(job({ summary: { statuses: { ok: 1, fallback: 0, failed: 0 } } }))).toBe("1 building");
-  expect(resultWords(job({ summary: { runs: { a: { statuses }, b: { statuses } } } }))).toBe("2 methods · 47 buildings · 2 blocks · 1 failed");
+  expect(resultWords(job({ summary: { runs: { a: { statuses }, b: { statuses } } } }))).toBe("2 methods · 50 buildings · 3 doubtful · 2 blocks · 1 failed");
   expect(resultWords(job({ summary: { classes: { "2": 1000, "6": 500 } } }))).toBe("1\u202f500 points");
   expect(resultWords(job({ summary: {} }))).toBe("");
   expect(resultWords(job({ status: "running" }))).toBe("");

@@ -20,6 +20,7 @@ test("numbers are grouped and carry their unit", () => {
 test("a building that is not ok is described by its status, whatever its roof type", () => {
   expect(categoryOf("ok", "hip")).toBe("hip");
   expect(categoryOf("fallback", "flat")).toBe("fallback");
+  expect(categoryOf("doubtful", "gable")).toBe("doubtful");
   expect(categoryOf("failed", "none")).toBe("failed");
   expect(categoryOf("ok", "onion")).toBe("unknown");
 });

@@ -258,11 +258,16 @@ def _model(
         name,
         assemble([part for geometry in geometries for part in parts_of(geometry, places)]),
         roof_type=_roof_type(attributes, [objects[part].get("attributes") or {} for part in parts]),
-        status=Status.FALLBACK if attributes.get("status") == Status.FALLBACK.value else Status.OK,
+        status=_status(attributes.get("status")),
         lod=lod,
         source_id=None if source_id is None else str(source_id),
         touches_data_edge=attributes.get("touches_data_edge") is True,
     )
+
+
+def _status(value: object) -> Status:
+    """The status of a model that a run delivered; `ok` where its file does not state one of ours."""
+    return Status(str(value)) if value in {Status.DOUBTFUL.value, Status.FALLBACK.value} else Status.OK
 
 
 def _roof_type(attributes: Object, of_parts: Sequence[Object]) -> RoofType:
