@@ -46,10 +46,8 @@ class Reason(StrEnum):
     HEIGHT_GIVEN = "height_given"
     POOR_FIT = "poor_fit"
     SCATTERED = "scattered"
-    ABOVE_POINTS = "above_points"
     NOT_SEEN = "not_seen"
     TOO_MANY_FACES = "too_many_faces"
-    UNCERTAIN = "uncertain"
     INTERNAL_ERROR = "internal_error"
     CRASHED = "crashed"
     TIMED_OUT = "timed_out"
@@ -77,11 +75,9 @@ REASONS: Mapping[Reason, str] = {
     Reason.HEIGHT_GIVEN: "no model could be made of the points; the block has the height that an attribute of its "
     "footprint gives",
     Reason.POOR_FIT: "`doubtful`: too few of its roof returns lie on the model",
-    Reason.SCATTERED: "`doubtful`: its roof returns scatter about the model more than those of a roof do: a tree, a heap",
-    Reason.ABOVE_POINTS: "`doubtful`: a part of the model rises above all points near it",
+    Reason.SCATTERED: "`doubtful`: its roof returns scatter about the model more than a roof does: a tree, a heap",
     Reason.NOT_SEEN: "`doubtful`: too much of the roof is drawn where no point is",
     Reason.TOO_MANY_FACES: "`doubtful`: too few roof returns for so many roof faces",
-    Reason.UNCERTAIN: "`doubtful`: the confidence that it is a building is too low",
     Reason.INTERNAL_ERROR: "a fault of gablework in this one building; the detail names the exception; kept as a "
     "bundle",
     Reason.CRASHED: "its process died at it, twice, the second time alone; the detail names the signal or the exit "

@@ -18,7 +18,7 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import BuildingError
-from pipeline.methods import OVERHANGS, ReconstructSettings, method_named
+from pipeline.methods import LODS, OVERHANGS, ReconstructSettings, method_named
 from pipeline.model import (
     BuildingResult,
     Candidate,
@@ -42,6 +42,7 @@ from pipeline.model import (
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, model_quality
 from pipeline.quality.residuals import vertical_residuals
+from pipeline.quality.support import doubt_of, support_of
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_forms, block_plane
 from pipeline.roof.facades import Walls
@@ -208,7 +209,7 @@ def _reconstruct(
                 _withdraw(building)
                 return failed_building(building.candidate, building.method, Reason.TOO_FEW_POINTS, too_few)
             if record := _delivered(building, model):
-                return record
+                return _judged(building, record, plan)
             _withdraw(building)
         codes_met = ", ".join(map(str, codes)) or "none"
         fallback = BuildingError(Reason.INVALID_SOLID, f"validity codes {codes_met}: no form of the solid passes")
@@ -424,6 +425,29 @@ def _explained_share(building: _Building, model: _Model) -> float:
     faces = [RoofFace(plane=face.plane, polygon=face.polygon) for part in model.parts for face in part.faces]
     residuals = vertical_residuals(building.roof.points, faces, model.planes)
     return float(np.mean(np.abs(residuals) <= building.settings.plan.residual_cap_m))
+
+
+def _judged(building: _Building, record: BuildingResult, plan: RoofPlan | None) -> BuildingResult:
+    """A model with a roof as `ok` or `doubtful`, or the block that explains the points as well as a doubtful one."""
+    if record.lod != LODS[-1]:
+        return record
+    settings = building.settings.support
+    doubt = doubt_of(support_of(record), settings)
+    if doubt is None:
+        return record
+    _withdraw(building)
+    block, _ = _first_valid(_blocks(building, plan), building)
+    if block is not None:
+        fallback = _record(building, block, BuildingError(doubt.reason, doubt.words))
+        if fallback.quality.share_within >= record.quality.share_within - settings.block_loss:
+            return fallback
+    return dataclasses.replace(
+        record,
+        status=Status.DOUBTFUL,
+        reason=doubt.reason,
+        reason_detail=doubt.words,
+        decisions=(*record.decisions, doubt.check),
+    )
 
 
 def _delivered(building: _Building, model: _Model) -> BuildingResult | None:

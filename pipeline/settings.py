@@ -12,6 +12,7 @@ from typing import Any
 from pipeline.errors import SettingsError
 from pipeline.methods import LODS, METHODS, OVERHANGS, PRESETS, ReconstructSettings, method_named
 from pipeline.parameters import Parameters, build, parameter, read_toml
+from pipeline.quality.settings import SupportSettings
 from pipeline.roof.settings import ArrangementSettings, FootprintSettings, GuideSettings, RoofSettings, RoofTypeSettings
 from pipeline.terrain.class_codes import ClassCodeSettings
 from pipeline.terrain.scene_settings import SceneSettings
@@ -98,6 +99,7 @@ SECTIONS: Mapping[str, type[Parameters]] = {
     "plan": ArrangementSettings,
     "roof-type": RoofTypeSettings,
     "guides": GuideSettings,
+    "support": SupportSettings,
 }
 """Tables of the settings file that every method shares; each method adds one of its own name."""
 _OPTIONAL = frozenset({"footprints", "guides"})
@@ -159,6 +161,7 @@ class RunSettings:
             "plan": self.building.plan,
             "roof-type": self.building.roof_type,
             "guides": self.building.guides,
+            "support": self.building.support,
             self.general.method: method,
         }
 
@@ -212,6 +215,7 @@ class RunSettings:
             plan=built.get("plan", ArrangementSettings()),
             roof_type=built.get("roof-type", RoofTypeSettings()),
             guides=built.get("guides", GuideSettings()),
+            support=built.get("support", SupportSettings()),
         )
         return cls(
             general=general or GeneralSettings(),

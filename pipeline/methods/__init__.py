@@ -15,6 +15,7 @@ from pipeline.methods.settings import (
     RoofFaceSettings,
 )
 from pipeline.parameters import Parameters
+from pipeline.quality.settings import SupportSettings
 from pipeline.roof.settings import ArrangementSettings, GuideSettings, RoofSettings, RoofTypeSettings
 from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
 
@@ -139,6 +140,8 @@ class ReconstructSettings:
     """Thresholds of the roof types."""
     guides: GuideSettings = dataclasses.field(default_factory=GuideSettings)
     """Given lines of the roof."""
+    support: SupportSettings = dataclasses.field(default_factory=SupportSettings)
+    """From which figures on a model is doubtful."""
     lods: tuple[str, ...] = LODS[-1:]
     """Levels of detail to be modelled, of `LODS` and in their order, then `OVERHANGS` if it is asked for."""
 

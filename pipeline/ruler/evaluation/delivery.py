@@ -277,9 +277,7 @@ DEFINITIONS = (
         "count",
     ),
     defined("delivery.records_ok", "records ok", "records of status ok / all records of the run", Better.HIGHER),
-    defined(
-        "delivery.records_doubtful", "records in doubt", "records of status doubtful / all records", Better.LOWER
-    ),
+    defined("delivery.records_doubtful", "records in doubt", "records of status doubtful / all records", Better.LOWER),
     defined(
         "delivery.records_fallback", "records with a block", "records of status fallback / all records", Better.LOWER
     ),

@@ -14,7 +14,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 
 from pipeline.geometry import top_visible
-from pipeline.model import FloatArray, Status
+from pipeline.model import FloatArray
 from pipeline.report.perspective import View, draw_view, projected
 from pipeline.report.pictures import blank, png_of
 from pipeline.ruler.evaluation.models import RoofModel

@@ -117,6 +117,7 @@ def write_bundle(folder: str, bundle: Bundle) -> str:
             "plan": dataclasses.asdict(bundle.settings.plan),
             "roof-type": dataclasses.asdict(bundle.settings.roof_type),
             "guides": dataclasses.asdict(bundle.settings.guides),
+            "support": dataclasses.asdict(bundle.settings.support),
         },
         "incident": incident,
         "reference": dataclasses.asdict(bundle.reference),

@@ -35,7 +35,7 @@ _FARTHEST = 1e9
 _PLACES = ("building_id", "source_id", "point")
 _EFFECTS = ("action", "footprint", "method", "preset", "settings")
 _KEYS = (*_PLACES, *_EFFECTS, "note")
-_SHARED_TABLES = ("roof", "plan", "roof-type", "guides")
+_SHARED_TABLES = ("roof", "plan", "roof-type", "guides", "support")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

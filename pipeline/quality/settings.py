@@ -1,0 +1,38 @@
+"""Settings of the judgement whether a model's own points support it."""
+
+from __future__ import annotations
+
+from pipeline.parameters import Parameters, parameter
+
+
+class SupportSettings(Parameters):
+    """Thresholds from which on a valid model is `doubtful` in place of `ok`; they change no geometry of models."""
+
+    min_share_on_roof: float = parameter(
+        0.7,
+        "Share of the roof returns within 0.2 m of the model; below it the reason is `poor_fit`.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    max_scatter_m: float = parameter(
+        0.15,
+        "Robust standard deviation of the roof returns about the model; above it the reason is `scattered`.",
+        unit="m",
+        minimum=0.0,
+        maximum=10.0,
+    )
+    max_unseen_share: float = parameter(
+        0.4,
+        "Share of the roof's plan area without a point on the roof nearby; above it the reason is `not_seen`.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    min_returns_per_face: float = parameter(
+        2.0, "Roof returns per roof face; below it the reason is `too_many_faces`.", minimum=0.0, maximum=1000.0
+    )
+    block_loss: float = parameter(
+        0.05,
+        "A block replaces a doubtful model if it explains at most this share of the roof returns less.",
+        minimum=0.0,
+        maximum=1.0,
+    )
