@@ -15,7 +15,7 @@ from pathlib import PurePath
 
 import numpy as np
 import shapely
-from shapely import MultiPolygon, Polygon
+from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
 from pipeline.methods import LODS, OVERHANGS, ReconstructSettings, method_named
@@ -68,7 +68,7 @@ from pipeline.roof.plan import (
 from pipeline.roof.primitives import primitive_partition
 from pipeline.roof.roof_type import roof_type
 from pipeline.roof.shaded_points import with_shaded_points
-from pipeline.roof.solid import SolidPart, solid_parts
+from pipeline.roof.solid import SolidPart, renumbered, solid_parts, united
 from pipeline.roof.templates.fitting import RankedFaces
 from pipeline.roof.wider_eaves import wider_parts
 
@@ -557,8 +557,8 @@ def _record(
     solids = tuple(part.solid for part in model.parts)
     if used != list(range(len(used))):
         faces = tuple(RoofFace(plane=number[face.plane], polygon=face.polygon) for face in faces)
-        solids = tuple(_renumbered(solid, number) for solid in solids)
-    footprint = _united([part.footprint for part in model.parts])
+        solids = tuple(renumbered(solid, number) for solid in solids)
+    footprint = united([part.footprint for part in model.parts])
     with guide_steps():
         guides = followed(candidate.guides, [face.polygon for face in faces], roof.guide_distance_m)
     residuals, quality = model_quality(
@@ -619,7 +619,7 @@ def _overhangs(building: _Building, model: _Model, walls: Walls | None) -> Overh
     else:
         used = sorted({face.plane for part in model.parts for face in part.faces})
         number = {plane: k for k, plane in enumerate(used)}
-        solids = tuple(_renumbered(solid, number) for solid in drawn)
+        solids = tuple(renumbered(solid, number) for solid in drawn)
     planes = [face.plane for solid in solids for face in solid.faces if face.plane >= 0]
     building.decisions.append(
         Decision(
@@ -649,7 +649,7 @@ def _with_overhangs(building: _Building, model: _Model, walls: Walls | None) -> 
             raise UndrawableError(NoOverhang.FOOTPRINT_GIVEN, "beyond_footprint_m is 0")
         if given_m < least_m:
             raise UndrawableError(NoOverhang.OVERHANG_TOO_SMALL, f"{given_m:.3f} m, less than {least_m:g} m")
-        walls_mm = footprint_in_mm(_united([part.footprint for part in parts]))
+        walls_mm = footprint_in_mm(united([part.footprint for part in parts]))
         parts = wider_parts(parts, model.planes, facades, given_m, ground_z_m)
     else:
         source = OverhangSource.USUAL if math.isnan(walls.overhang_m) else OverhangSource.SEEN
@@ -674,23 +674,6 @@ def _with_overhangs(building: _Building, model: _Model, walls: Walls | None) -> 
 def _lod_model(model: LodParts) -> LodModel:
     """A coarser model as it is delivered."""
     return LodModel(lod=model.lod, planes=tuple(model.planes), solids=tuple(part.solid for part in model.parts))
-
-
-def _renumbered(solid: Solid, number: dict[int, int]) -> Solid:
-    """The solid with other plane numbers."""
-    faces = tuple(dataclasses.replace(f, plane=number[f.plane]) if f.plane >= 0 else f for f in solid.faces)
-    return Solid(vertices=solid.vertices, faces=faces)
-
-
-def _united(footprints: Sequence[Polygon]) -> Polygon | MultiPolygon:
-    """One geometry of footprints that do not overlap."""
-    if len(footprints) == 1:
-        return footprints[0]
-    together = MultiPolygon(list(footprints))
-    if together.is_valid:
-        return together
-    united = shapely.union_all(list(footprints), grid_size=1e-3)
-    return united if isinstance(united, Polygon | MultiPolygon) else MultiPolygon(list(footprints))
 
 
 def failed_building(candidate: Candidate, method: str, reason: Reason, detail: str) -> BuildingResult:

@@ -88,3 +88,20 @@ def _parts(solids: Extruded, labels: Sequence[int]) -> list[SolidPart]:
             parts.append(SolidPart(solid=solid, faces=tuple(roofs), footprint=shapely.force_2d(next(polygons))))
             faces, roofs = [], []
     return parts
+
+
+def renumbered(solid: Solid, number: dict[int, int]) -> Solid:
+    """The solid with other plane numbers."""
+    faces = tuple(dataclasses.replace(f, plane=number[f.plane]) if f.plane >= 0 else f for f in solid.faces)
+    return Solid(vertices=solid.vertices, faces=faces)
+
+
+def united(footprints: Sequence[shapely.Polygon]) -> shapely.Polygon | shapely.MultiPolygon:
+    """One geometry of footprints that do not overlap."""
+    if len(footprints) == 1:
+        return footprints[0]
+    together = shapely.MultiPolygon(list(footprints))
+    if together.is_valid:
+        return together
+    one = shapely.union_all(list(footprints), grid_size=1e-3)
+    return one if isinstance(one, shapely.Polygon | shapely.MultiPolygon) else together

@@ -164,7 +164,7 @@ def test_every_reason_status_and_roof_type_is_reported() -> None:
     assert re.findall(r"^\| `(\w+)` \|", reasons, re.MULTILINE) == [reason.value for reason in Reason]
     reported = re.findall(r"^\| `\w+` \| [\w, ]+ \| (.*) \|$", reasons, re.MULTILINE)
     assert [re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text) for text in reported] == [REASONS[reason] for reason in Reason]
-    status = text.split("## Status")[1].split("## Reasons")[0]
+    status = text.split("## Status")[1].split("## Support")[0]
     assert re.findall(r"^\| `(\w+)` \|", status, re.MULTILINE) == [entry.value for entry in Status]
     meaning = next(column.meaning for column in COLUMNS["buildings"] if column.name == "roof_type")
     assert all(f"`{kind.value}`" in meaning for kind in RoofType)

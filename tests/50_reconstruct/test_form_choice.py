@@ -10,6 +10,7 @@ from candidates_by_hand import candidate
 from pipeline import reconstruct
 from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, Plane, Status
+from pipeline.quality.settings import SupportSettings
 from pipeline.reconstruct import reconstruct_building
 from pipeline.roof import block
 from pipeline.roof.partition import RoofPartition
@@ -52,7 +53,8 @@ def test_a_form_that_was_made_level_gives_way_to_one_that_explains_the_points(mo
 
 def test_a_form_that_was_made_level_is_delivered_where_no_other_is_better(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn_forms = levelled_at_first(monkeypatch, 1_000)
-    result = reconstruct_building(gable(), "arrangement", ReconstructSettings())
+    trusting = SupportSettings(max_scatter_m=10.0, min_share_on_roof=0.0, max_unseen_share=1.0)
+    result = reconstruct_building(gable(), "arrangement", ReconstructSettings(support=trusting))
     assert (result.status, result.lod) == (Status.OK, "2.2")
     assert len(drawn_forms) > 2
     assert [plane.c for plane in result.planes] == [6.4]

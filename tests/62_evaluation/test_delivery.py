@@ -147,6 +147,7 @@ def test_records_are_counted_without_any_reference() -> None:
     figures = {one.name: one for one in record_measures(made)}
     assert {name: one.value for name, one in figures.items()} == {
         "delivery.records_ok": 0.5,
+        "delivery.records_doubtful": 0.0,
         "delivery.records_fallback": 0.25,
         "delivery.records_failed": 0.25,
     }

@@ -17,8 +17,8 @@ from pipeline.report.table import statistics_tables
 def test_statuses_reasons_and_types_are_counted(street_run: Path) -> None:
     found = run_statistics(str(street_run))
     assert (found["candidates"], found["rejected"]) == (4, 1)
-    assert found["statuses"] == {"ok": 2, "fallback": 1, "failed": 1}
-    assert found["shares"] == {"ok": 0.5, "fallback": 0.25, "failed": 0.25}
+    assert found["statuses"] == {"ok": 2, "doubtful": 0, "fallback": 1, "failed": 1}
+    assert found["shares"] == {"ok": 0.5, "doubtful": 0.0, "fallback": 0.25, "failed": 0.25}
     assert found["reasons"] == {"failed": {"too_few_points": 1}, "fallback": {"invalid_solid": 1}}
     assert found["rejected_reasons"] == {"vegetation": 1}
     assert found["roof_types"] == {"flat": 1, "gable": 2, "none": 1}

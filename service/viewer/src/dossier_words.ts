@@ -147,6 +147,10 @@ const CHECKS: Record<string, Check> = {
     met: "sparse: simple shapes compete with the arrangement",
     missed: "dense: the arrangement is drawn without competition",
   },
+  scatter_m: { label: "Scatter of the points about the roof", show: (v) => measure(v, 2, "m"), met: "like that of a roof", missed: "more than that of a roof: the model is doubtful" },
+  share_on_roof: { label: "Points on the roof", show: percent, met: "enough", missed: "too few: the model is doubtful" },
+  unseen_share: { label: "Roof without points", show: percent, met: "little", missed: "too much: the model is doubtful" },
+  returns_per_face: { label: "Points per roof face", show: (v) => measure(v, 1), met: "enough", missed: "too few: the model is doubtful" },
   explained_share: { label: "Roof points that the model explains", show: percent, met: "enough for so few points", missed: "too few: the model is not delivered" },
 };
 

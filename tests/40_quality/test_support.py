@@ -1,0 +1,93 @@
+"""The rule that makes a valid model doubtful."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import shapely
+from candidates_by_hand import candidate
+
+from pipeline.errors import SettingsError
+from pipeline.methods import ReconstructSettings
+from pipeline.model import DecisionKind, Outcome, Reason, Status
+from pipeline.quality.settings import SupportSettings
+from pipeline.quality.support import Support, doubt_of
+from pipeline.reconstruct import reconstruct_building
+from pipeline.settings import RunSettings
+
+GOOD = Support(share_on_roof=0.95, scatter_m=0.04, unseen_share=0.02, returns_per_face=40.0)
+
+
+@pytest.mark.parametrize(
+    ("figures", "reason", "words"),
+    [
+        (
+            {"share_on_roof": 0.69},
+            Reason.POOR_FIT,
+            "69% of its roof returns lie within 0.2 m of the roof, less than 70%",
+        ),
+        ({"scatter_m": 0.16}, Reason.SCATTERED, "its roof returns scatter by 0.16 m, more than 0.15 m"),
+        ({"unseen_share": 0.41}, Reason.NOT_SEEN, "41% of its roof has no point on the roof nearby, more than 40%"),
+        ({"returns_per_face": 1.9}, Reason.TOO_MANY_FACES, "1.9 roof returns per roof face, less than 2"),
+        ({"share_on_roof": 0.3, "scatter_m": 0.5}, Reason.SCATTERED, "its roof returns scatter by 0.50 m"),
+    ],
+)
+def test_the_gravest_threshold_that_is_missed_is_named(figures: dict[str, float], reason: Reason, words: str) -> None:
+    doubt = doubt_of(dataclasses.replace(GOOD, **figures), SupportSettings())
+    assert doubt is not None
+    assert doubt.reason is reason
+    assert doubt.words.startswith(words)
+    assert doubt.check.value == figures[doubt.check.name]
+
+
+def test_a_model_on_its_points_and_one_without_figures_raise_no_doubt() -> None:
+    unknown = Support(share_on_roof=math.nan, scatter_m=math.nan, unseen_share=math.nan, returns_per_face=math.nan)
+    exact = Support(share_on_roof=0.7, scatter_m=0.15, unseen_share=0.4, returns_per_face=2.0)
+    assert [doubt_of(one, SupportSettings()) for one in (GOOD, unknown, exact)] == [None, None, None]
+
+
+def crown(seed: int) -> np.ndarray:
+    """The upper side of a crown of 8 m, rough by some decimetres, 4 points per m2."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-4.0, 4.0, (2, 256))
+    z = 8.0 + 3.0 * np.sqrt(np.maximum(0.0, 1.0 - (x * x + y * y) / 20.0)) - rng.exponential(0.6, 256)
+    return np.column_stack((x, y, z))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_crown_is_doubtful_and_says_why(seed: int) -> None:
+    result = reconstruct_building(candidate(crown(seed)), "arrangement", ReconstructSettings())
+    assert result.status in {Status.DOUBTFUL, Status.FALLBACK}
+    assert result.reason in {Reason.SCATTERED, Reason.POOR_FIT}
+    assert result.reason_detail
+    assert result.solids
+    if result.status is Status.DOUBTFUL:
+        last = result.decisions[-1]
+        assert (last.kind, last.outcome) == (DecisionKind.CHECK, Outcome.MISSED)
+
+
+@pytest.mark.parametrize("noise_m", [0.02, 0.1])
+def test_a_gable_with_a_dormer_and_a_chimney_is_ok(noise_m: float) -> None:
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(0, 12, 960), rng.uniform(0, 8, 960)
+    z = 5.0 + 0.7 * np.minimum(y, 8.0 - y) + rng.normal(0, noise_m, 960)
+    z[(abs(x - 3.0) < 1.0) & (y < 2.5) & (y > 1.0)] = 7.2
+    z[(abs(x - 9.0) < 0.3) & (abs(y - 4.0) < 0.3)] = 9.0
+    result = reconstruct_building(
+        candidate(np.column_stack((x, y, z)), footprint=shapely.box(0, 0, 12, 8)), "arrangement", ReconstructSettings()
+    )
+    assert (result.status, result.reason, result.reason_detail) == (Status.OK, None, "")
+
+
+def test_a_block_that_the_settings_ask_for_is_not_judged_as_a_roof() -> None:
+    result = reconstruct_building(candidate(crown(1)), "arrangement", ReconstructSettings(lods=("1.2",)))
+    assert result.status is Status.OK
+
+
+def test_thresholds_are_settings() -> None:
+    settings = RunSettings.from_mapping({"support": {"min_share_on_roof": 0.2, "max_scatter_m": 5.0}})
+    assert reconstruct_building(candidate(crown(1)), "arrangement", settings.building).status is Status.OK
+    assert settings.settings_hash != RunSettings().settings_hash
+    with pytest.raises(SettingsError, match="min_share_on_roof"):
+        RunSettings.from_mapping({"support": {"min_share_on_roof": 2.0}})
