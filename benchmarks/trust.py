@@ -87,9 +87,7 @@ class Truth:
 
     def judge(self, model: RoofModel, tolerance_m: float, lift_m: float = 0.0) -> Judgement:
         """Hold a model against the truth, which may be up to `lift_m` higher than it is."""
-        shared = (
-            shapely.area(shapely.intersection(self.outlines, model.footprint))
-        )
+        shared = shapely.area(shapely.intersection(self.outlines, model.footprint))
         covered = shapely.intersection(self.plan, model.footprint).area / model.footprint.area
         top = top_of([model])
         near = best = (0.0, 0.0)
@@ -317,7 +315,9 @@ def counted(runs: Iterable[Judged]) -> Counts:
         buildings += one.buildings
         without += one.without_model
         rejected += sum(one.rejected.column("is_building").to_pylist())
-    return Counts(right=right, wrong=wrong, buildings=buildings, without_model=without, rejected_buildings=rejected)
+    return Counts(
+        right=dict(right), wrong=dict(wrong), buildings=buildings, without_model=without, rejected_buildings=rejected
+    )
 
 
 def table(groups: Mapping[str, Counts]) -> str:

@@ -205,7 +205,7 @@ def _simulate_one(request: _Request, scene: Scene, out: Path, before: int = 0) -
     if tile.points == 0:
         raise InputError(str(laz), "the survey hit nothing", "Use a larger scene or a higher density")
     rows = []
-    for first in range(0, len(scene.buildings), _BUILDINGS_PER_PART):
+    for first in range(0, max(1, len(scene.buildings)), _BUILDINGS_PER_PART):  # a scene without buildings has one part
         part = f"part{first // _BUILDINGS_PER_PART:05d}"
         rows += write_models(scene.buildings[first : first + _BUILDINGS_PER_PART], scene, request.scanner, truth, part)
     write_conditions(rows, truth / "conditions.parquet")
