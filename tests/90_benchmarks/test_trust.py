@@ -11,7 +11,7 @@ import pytest
 import shapely
 from roofs_by_hand import ORIGIN, flat, gable, model, rectangle, surface
 
-from benchmarks.trust import Judged, Judgement, Truth, counted, run_cell, table, write
+from benchmarks.trust import Judged, Judgement, Truth, counted, run_cell, table, top_of, write
 from pipeline.model import RoofType
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.simulation.dataset import simulate
@@ -87,6 +87,18 @@ def test_half_of_a_house_is_wrong_although_all_of_it_is_near() -> None:
     assert found.share_under == pytest.approx(1.0)
     assert found.share_of_building == pytest.approx(0.5, abs=0.02)
     assert found.wrong_because == "roof_of_building"
+
+
+def test_the_parts_of_a_divided_house_are_right_if_they_are_together() -> None:
+    sides = [model(f"side {k}", RoofType.PENT, [face]) for k, face in enumerate(HOUSE.surfaces)]
+    high = gable("high", lift=1.0)
+    found = [Truth([HOUSE]).judge(one, 0.2, 0.0, top_of(sides)) for one in sides]
+    assert [one.right for one in found] == [True, True]
+    assert found[0].share_of_building == pytest.approx(0.5, abs=0.02)
+    assert found[0].share_together == pytest.approx(1.0)
+    beside = [sides[0], model("wrong side", RoofType.PENT, [high.surfaces[1]])]
+    right, wrong = (Truth([HOUSE]).judge(one, 0.2, 0.0, top_of(beside)) for one in beside)
+    assert (right.wrong_because, wrong.wrong_because) == ("roof_of_building", "roof_under_it")
 
 
 def test_one_model_of_two_houses_that_touch_is_right() -> None:

@@ -48,6 +48,14 @@ def spread(side_m: float, spacing_m: float, random: np.random.Generator) -> Floa
     return grid + random.uniform(-0.25, 0.25, grid.shape) * spacing_m
 
 
+def _wood(side_m: float, spacing_m: float, random: np.random.Generator) -> FloatArray:
+    """The places (n, 2) of `spread`, without those on a ride through the middle: some ground is seen."""
+    places = spread(side_m, spacing_m, random)
+    azimuth = float(random.uniform(0.0, math.pi))
+    across = (places - side_m / 2) @ (math.cos(azimuth), -math.sin(azimuth))
+    return places[np.abs(across) > spacing_m + float(random.uniform(1.0, 3.0))]
+
+
 def _lines(side_m: float, spacing_m: float, random: np.random.Generator) -> FloatArray:
     """Places (n, 2) along a few parallel lines, which gaps divide."""
     azimuth, apart = float(random.uniform(0.0, 360.0)), float(random.uniform(10.0, 18.0))
@@ -85,15 +93,15 @@ def _apart(side_m: float, spacing_m: float, random: np.random.Generator) -> Floa
 
 STANDS: Mapping[str, StandRule] = {
     "broadleaf_forest": StandRule(
-        places=spread, spacing_m=(4.0, 7.0), radius_share=(0.6, 0.85), height_m=(12.0, 24.0),
+        places=_wood, spacing_m=(4.0, 7.0), radius_share=(0.6, 0.85), height_m=(12.0, 24.0),
         free_path_share=(0.06, 0.3),
     ),
     "conifer_forest": StandRule(
-        places=spread, spacing_m=(2.6, 4.5), radius_share=(0.45, 0.65), height_m=(8.0, 28.0),
+        places=_wood, spacing_m=(2.6, 4.5), radius_share=(0.45, 0.65), height_m=(8.0, 28.0),
         free_path_share=(0.08, 0.3), lumps=0, tiers=3,
     ),
     "young_forest": StandRule(
-        places=spread, spacing_m=(1.8, 3.0), radius_share=(0.6, 0.8), height_m=(3.0, 7.0),
+        places=_wood, spacing_m=(1.8, 3.0), radius_share=(0.6, 0.8), height_m=(3.0, 7.0),
         free_path_share=(0.03, 0.25), lumps=1,
     ),
     "tree_rows": StandRule(
