@@ -25,7 +25,8 @@ from pipeline.ruler.simulation.als import joined, scan
 from pipeline.ruler.simulation.hofmann310 import SCANNER, hofmann310
 from pipeline.ruler.simulation.scene import Building
 from pipeline.ruler.simulation.seeds import seed_of
-from pipeline.ruler.simulation.survey_files import last_returns
+from pipeline.ruler.simulation.strips import Returns
+from pipeline.ruler.simulation.survey_files import recorded
 from pipeline.tin.delaunay import triangulate, unique_xy
 
 SURROUNDINGS_M = 5.0
@@ -136,7 +137,7 @@ def face_spreads(building: Building, points: FloatArray, own: FloatArray, face: 
 def draw_statistics(seed: int) -> Drawn:
     """Scan one draw and measure it."""
     scene = hofmann310(seed)
-    block = joined(list(last_returns(scan(scene, SCANNER, seed))))
+    block = joined(list(recorded(scan(scene, SCANNER, seed), Returns.LAST)))
     xyz = block.points.xyz - np.array(scene.origin)
     tree = shapely.STRtree(shapely.points(xyz[:, :2]))
     faces: list[FaceSpread] = []

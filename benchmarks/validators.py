@@ -31,7 +31,7 @@ from benchmarks.entries import markdown_table
 from benchmarks.results_page import filled
 from pipeline.ruler.simulation.suites import SUITES
 
-SIMULATED = [name for name in SUITES if name != "sweep"]
+SIMULATED = [name for name in SUITES if name not in {"sweep", "trust"}]
 SWEEP = {f"sweep-{cell.key}": cell for cell in SUITES["sweep"].cells}
 """The sweep is one scene that is surveyed many times."""
 LODS = "1.2,1.3,2.2"

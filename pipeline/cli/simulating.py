@@ -23,8 +23,8 @@ def simulate(
         str,
         typer.Argument(
             metavar="SUITE",
-            help="suburb, town, cube, hofmann310, sweep, city, low_buildings, bridges_and_vans, wide_halls or one of "
-            "the roof shapes.",
+            help="suburb, town, cube, hofmann310, sweep, city, low_buildings, bridges_and_vans, wide_halls, trust or "
+            "one of the roof shapes.",
         ),
     ],
     out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: LAZ tiles and the truth beside them.")],
@@ -41,10 +41,10 @@ def simulate(
         typer.Option(metavar="EAST NORTH", help="Extent in metres; default the suite's own."),
     ] = None,
     density: Annotated[
-        float | None, typer.Option(metavar="D", help="Pulses per square metre; for sweep, which cells.")
+        float | None, typer.Option(metavar="D", help="Pulses per square metre; for sweep and trust, which cells.")
     ] = None,
     noise: Annotated[
-        float | None, typer.Option(metavar="M", help="Range noise in metres; for sweep, which cells.")
+        float | None, typer.Option(metavar="M", help="Range noise in metres; for sweep and trust, which cells.")
     ] = None,
     with_classes: Annotated[bool, typer.Option("--with-classes", help="Write the true classes into the tile.")] = False,
     as_json: AsJson = False,

@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,14 @@ _PULSES_PER_BLOCK = 131_072
 
 _Job = tuple[FlightLine, range]
 """Consecutive scan lines of one strip."""
+
+
+class _Beneath(NamedTuple):
+    """A scene without its glass."""
+
+    arrays: SceneArrays
+    number_of: LabelArray
+    """(n,) int32, number in the scene of each building that is left."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -79,11 +88,19 @@ def scan(
     """
     margin_m = settings.beam_radius_m + settings.pulse_spacing_m
     arrays = scene_arrays(scene, settings.max_lean, margin_m, settings.beam_radius_m)
+    opaque = tuple(number for number, building in enumerate(scene.buildings) if building.glass_share == 0.0)
+    beneath = None
+    if len(opaque) < len(scene.buildings):
+        without = dataclasses.replace(scene, buildings=tuple(scene.buildings[number] for number in opaque))
+        beneath = _Beneath(
+            arrays=scene_arrays(without, settings.max_lean, margin_m, settings.beam_radius_m),
+            number_of=np.array(opaque, dtype=np.int32),
+        )
     survey = _survey(scene, settings, seed)
     strips = strip_count(scene, settings)
     jobs = _jobs(scene, settings, seed, min(_PULSES_PER_BLOCK, chunk_points) // survey.pulses_per_line)
     pending: list[ScanBlock] = []
-    for block in _in_order(jobs, functools.partial(_block, scene, arrays, survey, strips), threads):
+    for block in _in_order(jobs, functools.partial(_block, scene, (arrays, beneath), survey, strips), threads):
         if len(block):
             pending.append(block)
         if sum(len(one) for one in pending) >= chunk_points:
@@ -156,13 +173,19 @@ def _in_order(jobs: Iterator[_Job], block_of: Callable[[_Job], ScanBlock], threa
             yield running.popleft().result()
 
 
-def _block(scene: Scene, arrays: SceneArrays, survey: Survey, strips: int, job: _Job) -> ScanBlock:
-    """Scan some lines of one of the strips."""
-    flight, lines = job
-    capacity = len(lines) * survey.pulses_per_line * MAX_RETURNS
-    floats, integers = np.empty((capacity, 5)), np.empty((capacity, COLUMNS), np.int32)
-    count = scan_lines(arrays, flight, survey, lines.start, lines.stop, floats, integers)
-    floats, integers = floats[:count], integers[:count]
+def _block(
+    scene: Scene, seen: tuple[SceneArrays, _Beneath | None], survey: Survey, strips: int, job: _Job
+) -> ScanBlock:
+    """Scan some lines of one of the strips; the scene, and what is beneath its glass if it has any."""
+    flight, _ = job
+    arrays, beneath = seen
+    floats, integers = _scanned(arrays, survey, job)
+    if beneath is not None:
+        under, hit = _scanned(beneath.arrays, survey, job)
+        on_building = hit[:, 4] >= 0
+        hit[on_building, 4] = beneath.number_of[hit[on_building, 4]]
+        floats, integers = _through_glass(scene, (floats, integers), (under, hit))
+    count = len(floats)
     faults = fault_rows(scene.survey_faults, floats)
     strip = np.full(count, flight.number, np.int32)
     if len(faults):
@@ -170,6 +193,44 @@ def _block(scene: Scene, arrays: SceneArrays, survey: Survey, strips: int, job: 
         others = move_faulty(floats, lines_of, faults, survey.seed, flight.number)
         strip = np.where(others >= 0, strips + others, strip)
     return _as_block(floats, integers, scene, strip)
+
+
+def _scanned(arrays: SceneArrays, survey: Survey, job: _Job) -> tuple[FloatArray, LabelArray]:
+    """The columns that `scan_lines` writes, for some lines of a strip."""
+    flight, lines = job
+    capacity = len(lines) * survey.pulses_per_line * MAX_RETURNS
+    floats, integers = np.empty((capacity, 5)), np.empty((capacity, COLUMNS), np.int32)
+    count = scan_lines(arrays, flight, survey, lines.start, lines.stop, floats, integers)
+    return floats[:count], integers[:count]
+
+
+def _through_glass(
+    scene: Scene, over: tuple[FloatArray, LabelArray], under: tuple[FloatArray, LabelArray]
+) -> tuple[FloatArray, LabelArray]:
+    """The returns of a scene with glass: of each pulse those from on it (`over`) or from beneath it (`under`).
+
+    A pulse that hits glass goes through with its chance, which is drawn from its time. Both surveys fired the same
+    pulses at the same times.
+    """
+    shares = np.array([building.glass_share for building in scene.buildings])
+    floats, integers = over
+    is_roof = (integers[:, 4] >= 0) & (integers[:, 5] >= 0)
+    share = np.where(is_roof, shares[np.maximum(integers[:, 4], 0)], 0.0)
+    gone = np.unique(floats[_chance_of(floats[:, 3]) < share, 3])
+    stays, comes = ~np.isin(floats[:, 3], gone), np.isin(under[0][:, 3], gone)
+    columns = np.concatenate([floats[stays], under[0][comes]])
+    numbers = np.concatenate([integers[stays], under[1][comes]])
+    order = np.lexsort((numbers[:, 0], columns[:, 3]))
+    return columns[order], numbers[order]
+
+
+def _chance_of(time: FloatArray) -> FloatArray:
+    """A number in [0, 1) for each time (n,), from the bits of it (Steele, Lea, Flood 2014)."""
+    bits = np.ascontiguousarray(time).view(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    chance: FloatArray = (bits ^ (bits >> np.uint64(31))) / 2.0**64
+    return chance
 
 
 def _as_block(floats: FloatArray, integers: LabelArray, scene: Scene, strip: LabelArray) -> ScanBlock:

@@ -8,7 +8,7 @@ truth/labels.parquet            one row per point, in the order of the LAZ: clas
 truth/labels/<key>.parquet      the same of one tile
 truth/conditions.parquet        one row per building: shape, defects, groups of its faces, slope of the terrain
 truth/buildings, planes, meshes, cityjson      the exact models, laid out and named as in a run directory
-<cell>/ and sweep.json          a suite of several surveys (sweep): one such data set per cell, and their list
+<cell>/ and sweep.json          a suite of several surveys (sweep, trust): one such data set per cell, and their list
 ```
 """
 
@@ -27,9 +27,9 @@ from pipeline.errors import InputError, SettingsError
 from pipeline.ruler.simulation.als import ScannerSettings, scan, strip_count
 from pipeline.ruler.simulation.conditions import write_conditions
 from pipeline.ruler.simulation.scene import Scene
-from pipeline.ruler.simulation.strips import survey_extent
+from pipeline.ruler.simulation.strips import Returns, survey_extent
 from pipeline.ruler.simulation.suites import Suite, suite_named
-from pipeline.ruler.simulation.survey_files import TileFiles, last_returns, write_points
+from pipeline.ruler.simulation.survey_files import TileFiles, recorded, write_points
 from pipeline.ruler.simulation.sweep import Cell, chosen_cells
 from pipeline.ruler.simulation.truth_files import write_manifest, write_models
 
@@ -127,6 +127,7 @@ def simulate(
         seed=seed,
         size_m=plan.size_m if size_m is None else size_m,
         scanner=plan.scanner,
+        returns=plan.returns,
         output=output,
     )
     out = Path(out_dir)
@@ -170,7 +171,13 @@ class _Request:
     seed: int
     size_m: tuple[float, float]
     scanner: ScannerSettings
+    returns: Returns
     output: Output
+
+    def of_cell(self, cell: Cell) -> _Request:
+        """The same with the survey of a cell."""
+        output = dataclasses.replace(self.output, with_classes=self.output.with_classes or cell.with_classes)
+        return dataclasses.replace(self, scanner=cell.scanner(self.scanner), returns=cell.returns, output=output)
 
     def surveyed(self, density_per_m2: float | None, noise_m: float | None) -> _Request:
         """The same with another density and noise, where they are given."""
@@ -184,8 +191,7 @@ class _Request:
     def write_tile(self, scene: Scene, laz: Path, labels: Path, before: int) -> TileFiles:
         """Scan a scene into a LAZ file and its labels; earlier tiles have `before` points."""
         blocks = scan(scene, self.scanner, self.seed, chunk_points=self.output.chunk_points)
-        if self.plan.last_returns_only:
-            blocks = last_returns(blocks)
+        blocks = recorded(blocks, self.returns)
         notify = self.output.on_points
         on_points = None if notify is None else lambda n: notify(before + n)
         return write_points(blocks, scene, laz, labels, self.output.with_classes, on_points)
@@ -199,7 +205,7 @@ def _simulate_one(request: _Request, scene: Scene, out: Path, before: int = 0) -
     if tile.points == 0:
         raise InputError(str(laz), "the survey hit nothing", "Use a larger scene or a higher density")
     rows = []
-    for first in range(0, len(scene.buildings), _BUILDINGS_PER_PART):
+    for first in range(0, max(1, len(scene.buildings)), _BUILDINGS_PER_PART):  # a scene without buildings has one part
         part = f"part{first // _BUILDINGS_PER_PART:05d}"
         rows += write_models(scene.buildings[first : first + _BUILDINGS_PER_PART], scene, request.scanner, truth, part)
     write_conditions(rows, truth / "conditions.parquet")
@@ -256,12 +262,13 @@ def _known_tiles(manifest: Path) -> list[Path]:
 
 
 def _simulate_cells(request: _Request, cells: tuple[Cell, ...], out: Path) -> ScenePaths:
-    """One data set per cell: the same scene under every survey."""
+    """One data set per cell: the same scene under every survey, or the scene of each cell."""
+    make_for = request.plan.make_for
     scene = request.plan.make(request.seed, request.size_m)
     made: list[ScenePaths] = []
     for cell in cells:
-        survey = request.surveyed(cell.density_per_m2, cell.noise_m)
-        made.append(_simulate_one(survey, scene, out / cell.key, sum(one.points for one in made)))
+        here = scene if make_for is None else make_for(request.seed, cell.key)
+        made.append(_simulate_one(request.of_cell(cell), here, out / cell.key, sum(one.points for one in made)))
     listed = [
         {"cell": cell.key, "density_per_m2": cell.density_per_m2, "noise_m": cell.noise_m, "points": one.points}
         for cell, one in zip(cells, made, strict=True)

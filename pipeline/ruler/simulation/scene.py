@@ -120,6 +120,8 @@ class Building:
     """A number for every roof face; faces with one number count as one, such as both parts of a side of a bent hip."""
     wet_spots: tuple[WetSpot, ...] = ()
     """Circles where its roof does not return pulses."""
+    glass_share: float = 0.0
+    """Share of the pulses on its roof that go through to what is beneath: glass."""
     defects: tuple[Defect, ...] = ()
     """Reasons why it is hard."""
 

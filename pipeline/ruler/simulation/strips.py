@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from enum import StrEnum
 
 import numpy as np
 
@@ -16,6 +17,21 @@ _FIRST_GPS_TIME_S = 427_536_018.0
 """Start of the first strip: 1 April 2025, 10:00 UTC, as adjusted standard GPS time."""
 _TURN_S = 120.0
 """From the end of a strip to the start of the next."""
+
+
+class Returns(StrEnum):
+    """The returns of a pulse that an instrument records."""
+
+    ALL = "all"
+    """As many as the beam has."""
+    FIVE = "five"
+    """The first five."""
+    FIRST_AND_LAST = "first_and_last"
+    """Two."""
+    FIRST = "first"
+    """One."""
+    LAST = "last"
+    """One."""
 
 
 class ScannerSettings(Parameters):
@@ -49,6 +65,9 @@ class ScannerSettings(Parameters):
     )
     strip_lift_m: float = parameter(
         0.0, "Standard deviation of a strip's own vertical shift.", unit="m", minimum=0.0, maximum=5.0
+    )
+    strip_step_m: float = parameter(
+        0.0, "By how much every second strip is too high.", unit="m", minimum=-5.0, maximum=5.0
     )
     wrong_row_share: float = parameter(
         0.0, "Share of scan rows whose elevations are wrong, all over the survey.", minimum=0.0, maximum=1.0
@@ -121,7 +140,7 @@ def flight_lines(scene: Scene, settings: ScannerSettings, seed: int) -> list[Fli
                 time=time,
                 shift_x=float(shift[0]),
                 shift_y=float(shift[1]),
-                shift_z=float(shift[2]),
+                shift_z=float(shift[2]) + (settings.strip_step_m if k % 2 else 0.0),
             )
         )
         time += (end - start) / settings.speed_m_s + _TURN_S

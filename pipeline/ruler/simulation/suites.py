@@ -19,10 +19,14 @@ from pipeline.ruler.simulation.low_buildings import SCANNER as LOW_SCANNER
 from pipeline.ruler.simulation.low_buildings import low_buildings
 from pipeline.ruler.simulation.roofs import FlatPart, RoofDimensions, RoofShape
 from pipeline.ruler.simulation.scene import Scene, Terrain, place_building, undulating_terrain
+from pipeline.ruler.simulation.strips import Returns
 from pipeline.ruler.simulation.suburb import suburb, tree_at
 from pipeline.ruler.simulation.sweep import CELLS, Cell, sweep
 from pipeline.ruler.simulation.sweep import SCANNER as SWEEP_SCANNER
 from pipeline.ruler.simulation.town import town
+from pipeline.ruler.simulation.trust import CELLS as TRUST_CELLS
+from pipeline.ruler.simulation.trust import SCANNER as TRUST_SCANNER
+from pipeline.ruler.simulation.trust import trust
 from pipeline.ruler.simulation.wide_halls import SCANNER as HALL_SCANNER
 from pipeline.ruler.simulation.wide_halls import SIZE_M as HALLS_SIZE_M
 from pipeline.ruler.simulation.wide_halls import wide_halls
@@ -46,10 +50,12 @@ class Suite:
     """Default seed."""
     is_sized: bool = True
     """False if the extent follows from the buildings; `size_m` is then an approximate result, not an input."""
-    last_returns_only: bool = False
-    """Whether the instrument records the last return only."""
+    returns: Returns = Returns.ALL
+    """The returns of a pulse that the instrument records."""
     cells: tuple[Cell, ...] = ()
     """The surveys of a suite of several; empty for a single one."""
+    make_for: Callable[[int, str], Scene] | None = None
+    """Scene from a seed and the key of a cell; None if all cells survey the scene of `make`."""
     part: Callable[[int, tuple[float, float], ScannerSettings], Callable[[Extent], Scene]] | None = None
     """From seed, size and survey to a function that makes the scene of the tile of an extent; None if the scene is made
     as a whole."""
@@ -204,7 +210,7 @@ SUITES: dict[str, Suite] = {
             size_m=(700.0, 700.0),
             seed=1,
             is_sized=False,
-            last_returns_only=True,
+            returns=Returns.LAST,
         ),
         Suite(
             name="sweep",
@@ -254,6 +260,17 @@ SUITES: dict[str, Suite] = {
             size_m=(HALLS_SIZE_M, HALLS_SIZE_M),
             seed=1,
             is_sized=False,
+        ),
+        Suite(
+            name="trust",
+            summary="what is taken for a house, and houses seen badly: small scenes of 18 kinds under several surveys",
+            make=lambda seed, _: trust(seed, TRUST_CELLS[0].key),
+            scanner=TRUST_SCANNER,
+            size_m=(80.0, 80.0),
+            seed=1,
+            is_sized=False,
+            cells=TRUST_CELLS,
+            make_for=trust,
         ),
         *(_single_suite(shape) for shape in RoofShape),
     )

@@ -16,7 +16,9 @@ from laspy.vlrs.known import WktCoordinateSystemVlr
 import pipeline
 from pipeline.io.crs import UNKNOWN_REFERENCE, SpatialReference
 from pipeline.ruler.simulation.als import ScanBlock
+from pipeline.ruler.simulation.beam import MAX_RETURNS
 from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.strips import Returns
 
 _DATE = dt.date(2025, 4, 1)
 """Date of the simulated survey in the header: the same scene gives the same bytes on any day."""
@@ -124,15 +126,27 @@ def _las_points(block: ScanBlock, header: laspy.LasHeader, with_classes: bool) -
     return record
 
 
-def last_returns(blocks: Iterator[ScanBlock]) -> Iterator[ScanBlock]:
-    """The blocks as an instrument delivers them that records the last return only."""
+_RECORDED = {
+    Returns.ALL: (MAX_RETURNS, False),
+    Returns.FIVE: (5, False),
+    Returns.FIRST_AND_LAST: (1, True),
+    Returns.FIRST: (1, False),
+    Returns.LAST: (0, True),
+}
+"""How many of the first returns, and whether the last one."""
+
+
+def recorded(blocks: Iterator[ScanBlock], returns: Returns) -> Iterator[ScanBlock]:
+    """The blocks as an instrument delivers them that records these returns; they are numbered anew."""
+    firsts, with_last = _RECORDED[returns]
+    most = firsts + with_last
     for block in blocks:
-        last = block.points.return_number == block.points.return_count
-        cloud = block.points.take(last)
-        single = np.ones(len(cloud), np.uint8)
-        kept = {
-            field.name: getattr(block, field.name)[last]
-            for field in dataclasses.fields(ScanBlock)
-            if field.name != "points"
-        }
-        yield ScanBlock(points=dataclasses.replace(cloud, return_number=single, return_count=single), **kept)
+        number, count = block.points.return_number, block.points.return_count
+        kept = (number <= firsts) | (with_last & (number == count))
+        cloud = block.points.take(kept)
+        number, count = (np.minimum(column, np.uint8(most)) for column in (cloud.return_number, cloud.return_count))
+        others = [field.name for field in dataclasses.fields(ScanBlock) if field.name != "points"]
+        yield ScanBlock(
+            points=dataclasses.replace(cloud, return_number=number, return_count=count),
+            **{name: getattr(block, name)[kept] for name in others},
+        )

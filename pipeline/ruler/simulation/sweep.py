@@ -10,11 +10,11 @@ import shapely
 
 from pipeline.errors import SettingsError
 from pipeline.ruler.simulation.additions import can_have_dormers, random_dormers, random_superstructures
-from pipeline.ruler.simulation.als import ScannerSettings
 from pipeline.ruler.simulation.plots import PlannedBuilding, packed_plots
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
 from pipeline.ruler.simulation.scene import Building, Defect, Scene, Terrain, Tree, place_building, undulating_terrain
+from pipeline.ruler.simulation.strips import Returns, ScannerSettings
 from pipeline.ruler.simulation.suburb import tree_at
 
 DENSITIES_PER_M2 = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 50.0)
@@ -40,17 +40,25 @@ def cell_name(density_per_m2: float, noise_m: float) -> str:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Cell:
-    """One survey of the sweep."""
+    """One survey of a suite of several."""
 
     density_per_m2: float
     """Pulses per square metre of one strip."""
     noise_m: float
     """Standard deviation along the beam."""
+    returns: Returns = Returns.ALL
+    """The returns of a pulse that the instrument records."""
+    with_classes: bool = False
+    """Whether the points have their true classes."""
 
     @property
     def key(self) -> str:
         """Name of its folder."""
         return cell_name(self.density_per_m2, self.noise_m)
+
+    def scanner(self, usual: ScannerSettings) -> ScannerSettings:
+        """The survey, from the usual one of the suite."""
+        return dataclasses.replace(usual, pulse_density_per_m2=self.density_per_m2, range_noise_m=self.noise_m)
 
 
 CELLS = tuple(Cell(density_per_m2=density, noise_m=noise) for density in DENSITIES_PER_M2 for noise in NOISES_M)

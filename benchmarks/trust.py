@@ -1,0 +1,406 @@
+"""Which models of a run are wrong, and whether their status says so: the suite `trust`, held against its truth.
+
+    python -m benchmarks.trust --out DIR [--split dev|test] [--draws 3] [--kinds houses glass] [--jobs 2]
+
+Makes the scenes of the suite below DIR/SPLITn, models each with default settings, its classes ignored and, where they
+were written, trusted, and judges every model. A model is wrong if it is not of a building: true buildings lie under
+less than half of it. It is wrong as well if less than 70 % of the true roofs under it lie within 0.2 m of it
+vertically (0.4 m under 2 pulses per m2), or less than 70 % of the roof of the true building that it stands for; of a
+building that is divided into several models they count together. Areas are in plan. In strips that disagree the truth
+may be at any elevation between the two.
+
+DIR/SPLIT.parquet has a row per model: scene, survey, classes, the judgement, and the columns of the record.
+DIR/SPLIT_rejected.parquet has the rejected objects, DIR/SPLIT.json and DIR/SPLIT.md the tables.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import dataclasses
+import json
+import multiprocessing
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import shapely
+
+from benchmarks.entries import markdown_table
+from pipeline.export.geoparquet import read_table
+from pipeline.model import BoolArray, FloatArray
+from pipeline.quality.residuals import TopSurface
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.ruler.simulation.seeds import seed_of
+from pipeline.ruler.simulation.trust import CELLS, KINDS, TrustCell
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run import run
+from pipeline.settings import RunSettings
+
+TOLERANCE_M, SPARSE_TOLERANCE_M, SPARSE_PER_M2 = 0.2, 0.4, 2.0
+LEAST_SHARE = 0.7
+"""Of the area in plan within the tolerance, in a right model."""
+COVERED_SHARE = 0.5
+"""Of a model that lies over true buildings; of a true building that has a model."""
+BOX_SHARE = 0.4
+"""Of the box around a rejected object that lies over true buildings, if it is one: turned houses do not fill theirs."""
+STEP_M, LIFT_STEP_M = 0.25, 0.05
+"""Distance of the places at which roofs are compared, and of the elevations that are tried for strips that disagree."""
+OK = "ok"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Judgement:
+    """A model beside the truth."""
+
+    right: bool
+    """Whether it is of a building, and near enough to its roof."""
+    wrong_because: str | None
+    """not_a_building, roof_under_it or roof_of_building; None if it is right."""
+    covered_share: float
+    """Share of the model that lies over true buildings."""
+    share_under: float
+    """Share of the true roofs under it within the tolerance; 0 without any."""
+    share_of_building: float
+    """Share of the roof of the true building that it stands for within the tolerance of it."""
+    share_together: float
+    """The same share within the tolerance of all models of the run."""
+    true_building: str | None
+    """The true building under most of it."""
+    true_area_m2: float
+    """Plan area of that building; 0 without one."""
+
+
+class Truth:
+    """The true buildings of a scene."""
+
+    def __init__(self, buildings: Sequence[RoofModel]) -> None:
+        self.buildings = buildings
+        self.outlines = np.array([building.footprint for building in buildings], dtype=object)
+        self.plan = shapely.union_all(self.outlines)
+        self.top = top_of(buildings)
+
+    def judge(
+        self, model: RoofModel, tolerance_m: float, lift_m: float = 0.0, all_models: TopSurface | None = None
+    ) -> Judgement:
+        """Hold a model against the truth, which may be up to `lift_m` higher than it is.
+
+        `all_models` is the top surface of all models of the run; None if this is the only one.
+        """
+        shared = shapely.area(shapely.intersection(self.outlines, model.footprint))
+        covered = shapely.intersection(self.plan, model.footprint).area / model.footprint.area
+        top = top_of([model])
+        best = (0.0, 0.0, 0.0)
+        building = self.buildings[int(np.argmax(shared))] if shared.any() else None
+        if building is not None:
+            under, own = places_in(model.footprint), places_in(building.footprint)
+            roof = top_of([building])
+            gaps = gap(top, self.top, under), gap(top, roof, own), gap(all_models or top, roof, own)
+            beneath = ~np.isnan(self.top.elevation(*under.T))
+            for lift in np.arange(0.0, lift_m + LIFT_STEP_M / 2, LIFT_STEP_M):
+                within = [np.abs(one - lift) <= tolerance_m for one in gaps]
+                near = _share(within[0], beneath), float(within[1].mean()), float(within[2].mean())
+                best = max(best, near, key=lambda one: min(one[0], max(one[1:])))
+        why = None
+        if covered < COVERED_SHARE or building is None:
+            why = "not_a_building"
+        elif best[0] < LEAST_SHARE:
+            why = "roof_under_it"
+        elif max(best[1:]) < LEAST_SHARE:
+            why = "roof_of_building"
+        return Judgement(
+            right=why is None,
+            wrong_because=why,
+            covered_share=covered,
+            share_under=best[0],
+            share_of_building=best[1],
+            share_together=best[2],
+            true_building=None if building is None else building.building_id,
+            true_area_m2=0.0 if building is None else building.footprint.area,
+        )
+
+    def without_model(self, models: Sequence[RoofModel]) -> list[str]:
+        """The buildings of which models cover less than half."""
+        modelled = shapely.union_all([model.footprint for model in models])
+        return [
+            building.building_id
+            for building in self.buildings
+            if shapely.intersection(building.footprint, modelled).area < COVERED_SHARE * building.footprint.area
+        ]
+
+    def is_building(self, box: shapely.Geometry | None) -> bool:
+        """Whether a box holds most of a true building, and little else."""
+        if box is None or not box.area or not len(self.outlines):
+            return False
+        shares = shapely.area(shapely.intersection(self.outlines, box)) / shapely.area(self.outlines)
+        return bool(shares.max() >= COVERED_SHARE) and shapely.intersection(self.plan, box).area >= BOX_SHARE * box.area
+
+
+def _share(flags: BoolArray, among: BoolArray) -> float:
+    return float(flags[among].mean()) if among.any() else 0.0
+
+
+def top_of(models: Sequence[RoofModel]) -> TopSurface:
+    """The top surface of the roofs of models."""
+    faces = [face for model in models for face in model.surfaces]
+    return TopSurface(
+        [face.polygon for face in faces],
+        np.array([face.coefficients for face in faces]).reshape(-1, 3),
+        np.array([face.origin for face in faces]).reshape(-1, 3),
+        tolerance_m=0.002,
+    )
+
+
+def gap(above: TopSurface, below: TopSurface, places: FloatArray) -> FloatArray:
+    """One surface minus another at places (n, 2), (n,) m; nan where one is missing."""
+    x, y = places.T
+    return above.elevation(x, y) - below.elevation(x, y)
+
+
+def places_in(outline: shapely.Geometry) -> FloatArray:
+    """Places (n, 2) of a lattice of `STEP_M` inside an outline; one inside it if it is smaller."""
+    x0, y0, x1, y1 = outline.bounds
+    x, y = np.meshgrid(np.arange(x0 + STEP_M / 2, x1, STEP_M), np.arange(y0 + STEP_M / 2, y1, STEP_M))
+    inside = shapely.contains_xy(outline, x, y)
+    if not inside.any():
+        return shapely.get_coordinates(outline.representative_point())
+    return np.column_stack([x[inside], y[inside]])
+
+
+def tolerance_of(cell: TrustCell) -> float:
+    """The vertical tolerance of a survey."""
+    return SPARSE_TOLERANCE_M if cell.density_per_m2 < SPARSE_PER_M2 else TOLERANCE_M
+
+
+# ------------------------------------------------------------------------------------------------------------- runs
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Judged:
+    """One run of one scene."""
+
+    kind: str
+    survey: str
+    classes: str
+    draw: int
+    models: pa.Table
+    """A row per record: the columns of `Judgement`, null without a model, and those of the record."""
+    rejected: pa.Table
+    """A row per rejected object, with `is_building`."""
+    buildings: int
+    """True buildings."""
+    without_model: int
+    """Those of which models cover less than half."""
+
+
+def judge_run(models_dir: Path, truth_dir: Path, cell: TrustCell, classes: str, draw: int) -> Judged:
+    """Hold a run directory against the truth of its scene."""
+    truth = Truth(read_models(truth_dir).models)
+    found = read_models(models_dir).models
+    tolerance, top = tolerance_of(cell), top_of(found)
+    judgements = {
+        model.building_id: dataclasses.asdict(truth.judge(model, tolerance, cell.strip_step_m, top)) for model in found
+    }
+    scene = {"scene": cell.kind, "survey": cell.survey, "classes": classes, "draw": draw}
+    records = read_table(str(models_dir), "buildings")
+    records = records.select([name for name in records.column_names if not name.startswith("solid")])
+    rows = [judgements.get(name, {}) for name in records.column("building_id").to_pylist()]
+    rejected = read_table(str(models_dir), "rejected")
+    boxes = [None if box is None else shapely.from_wkb(box) for box in rejected.column("geometry").to_pylist()]
+    return Judged(
+        kind=cell.kind,
+        survey=cell.survey,
+        classes=classes,
+        draw=draw,
+        models=_with_columns(records, scene, rows, JUDGED),
+        rejected=_with_columns(rejected, scene, [{"is_building": truth.is_building(box)} for box in boxes], REJECTED),
+        buildings=len(truth.buildings),
+        without_model=len(truth.without_model(found)),
+    )
+
+
+SCENE = pa.schema([("scene", pa.string()), ("survey", pa.string()), ("classes", pa.string()), ("draw", pa.int32())])
+JUDGED = pa.schema(
+    [
+        ("right", pa.bool_()),
+        ("wrong_because", pa.string()),
+        ("covered_share", pa.float64()),
+        ("share_under", pa.float64()),
+        ("share_of_building", pa.float64()),
+        ("share_together", pa.float64()),
+        ("true_building", pa.string()),
+        ("true_area_m2", pa.float64()),
+    ]
+)
+REJECTED = pa.schema([("is_building", pa.bool_())])
+
+
+def _with_columns(
+    records: pa.Table, scene: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], schema: pa.Schema
+) -> pa.Table:
+    """Records behind the columns of their scene and their judgements."""
+    fields = [*SCENE, *schema]
+    columns = [pa.array([{**scene, **row}.get(field.name) for row in rows], field.type) for field in fields]
+    return pa.table([*columns, *records.columns], names=[*(field.name for field in fields), *records.column_names])
+
+
+def run_cell(task: tuple[TrustCell, Path, int]) -> list[Judged]:
+    """Model a scene with its classes ignored, and trusted if it has any, and judge both."""
+    cell, place, draw = task
+    found = []
+    for classes in ("ignore", "trust") if cell.with_classes else ("ignore",):
+        out = place / f"models-{classes}"
+        settings = RunSettings.from_mapping({"classes": classes})
+        run(
+            RunRequest(
+                inputs=(str(place / "trust.laz"),), out=str(out), settings=settings, resources=Resources(workers=0),
+                meshes="none", overwrite=True,
+            )
+        )  # fmt: skip
+        found.append(judge_run(out, place / "truth", cell, classes, draw))
+    return found
+
+
+def run_split(split: str, draws: int, kinds: Sequence[str], out: Path, jobs: int) -> list[Judged]:
+    """Make, model and judge all scenes of some draws."""
+    tasks = []
+    for draw in range(draws):
+        place = out / f"{split}{draw}"
+        if not (place / "sweep.json").exists():
+            simulate("trust", place, seed_of(split, draw))
+        tasks += [(cell, place / cell.key, draw) for cell in CELLS if cell.kind in kinds]
+    if jobs < 2:
+        return [one for task in tasks for one in run_cell(task)]
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return [one for some in pool.map(run_cell, tasks) for one in some]
+
+
+# ----------------------------------------------------------------------------------------------------------- tables
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Counts:
+    """The models of some runs."""
+
+    right: Mapping[str, int]
+    """Right models by status."""
+    wrong: Mapping[str, int]
+    """Wrong models by status."""
+    buildings: int
+    without_model: int
+    rejected_buildings: int
+
+    @property
+    def wrong_ok(self) -> float:
+        """Share of the wrong models that are `ok`; nan without any."""
+        return _ratio(self.wrong.get(OK, 0), sum(self.wrong.values()))
+
+    @property
+    def right_not_ok(self) -> float:
+        """Share of the right models that are not `ok`; nan without any."""
+        return _ratio(sum(self.right.values()) - self.right.get(OK, 0), sum(self.right.values()))
+
+
+def _ratio(part: int, whole: int) -> float:
+    return part / whole if whole else float("nan")
+
+
+def counted(runs: Iterable[Judged]) -> Counts:
+    """The counts of some runs together."""
+    right, wrong = collections.Counter[str](), collections.Counter[str]()
+    buildings = without = rejected = 0
+    for one in runs:
+        for status, is_right in zip(
+            one.models.column("status").to_pylist(), one.models.column("right").to_pylist(), strict=True
+        ):
+            if is_right is not None:
+                (right if is_right else wrong)[status] += 1
+        buildings += one.buildings
+        without += one.without_model
+        rejected += sum(one.rejected.column("is_building").to_pylist())
+    return Counts(
+        right=dict(right), wrong=dict(wrong), buildings=buildings, without_model=without, rejected_buildings=rejected
+    )
+
+
+def table(groups: Mapping[str, Counts]) -> str:
+    """A row per group."""
+    statuses = sorted({status for one in groups.values() for status in (*one.right, *one.wrong)} | {OK}, key=_order)
+    heads = [*(f"right, {status}" for status in statuses), *(f"wrong, {status}" for status in statuses)]
+    rows = []
+    for name, one in groups.items():
+        counts = [one.right.get(status, 0) for status in statuses] + [one.wrong.get(status, 0) for status in statuses]
+        shares = [one.wrong_ok, one.right_not_ok]
+        others = [one.buildings, one.without_model, one.rejected_buildings]
+        rows.append([name, *map(str, counts), *("" if s != s else f"{s:.1%}" for s in shares), *map(str, others)])
+    shares = ["wrong that are ok", "right that are not ok"]
+    return markdown_table(["", *heads, *shares, "buildings", "without a model", "rejected buildings"], rows)
+
+
+def _order(status: str) -> tuple[bool, str]:
+    return status != OK, status
+
+
+def grouped(runs: Sequence[Judged]) -> dict[str, dict[str, Counts]]:
+    """The counts by kind of scene, by survey and by both, for classes ignored and trusted."""
+    tables: dict[str, dict[str, Counts]] = {}
+    for classes in ("ignore", "trust"):
+        some = [one for one in runs if one.classes == classes]
+        names = {
+            "scene": lambda one: one.kind,
+            "survey": lambda one: one.survey,
+            "scene and survey": lambda one: f"{one.kind} {one.survey}",
+        }
+        for what, name in names.items():
+            keys = dict.fromkeys(map(name, some))
+            tables[f"{classes}, by {what}"] = {
+                **{key: counted(one for one in some if name(one) == key) for key in keys},
+                "all": counted(some),
+            }
+    tables["all"] = {"all": counted(runs)}
+    return tables
+
+
+def write(runs: Sequence[Judged], out: Path, name: str) -> str:
+    """Write the tables; returns their text without that by scene and survey."""
+    pq.write_table(pa.concat_tables([one.models for one in runs]), out / f"{name}.parquet", compression="zstd")
+    pq.write_table(pa.concat_tables([one.rejected for one in runs]), out / f"{name}_rejected.parquet")
+    tables = grouped(runs)
+    document = {
+        title: {
+            key: {**dataclasses.asdict(one), "wrong_ok": one.wrong_ok, "right_not_ok": one.right_not_ok}
+            for key, one in groups.items()
+        }
+        for title, groups in tables.items()
+    }
+    (out / f"{name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    texts = {title: f"## {title}\n\n{table(groups)}\n" for title, groups in tables.items()}
+    (out / f"{name}.md").write_text("\n".join(texts.values()), encoding="utf-8")
+    return "\n".join(text for title, text in texts.items() if "and survey" not in title)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Make, model, judge, write and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--split", choices=("dev", "test"), default="dev")
+    parser.add_argument("--draws", type=int, default=3)
+    parser.add_argument("--kinds", nargs="*", choices=tuple(KINDS), default=tuple(KINDS))
+    parser.add_argument("--jobs", type=int, default=2)
+    given = parser.parse_args(words)
+    given.out.mkdir(parents=True, exist_ok=True)
+    runs = run_split(given.split, given.draws, given.kinds, given.out, given.jobs)
+    print(write(runs, given.out, given.split))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
