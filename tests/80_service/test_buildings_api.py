@@ -200,7 +200,7 @@ def test_words_filter_alone_repeated_and_with_commas(client: TestClient, job_id:
         ("limit", "10001", "limit"),
         ("offset", "-1", "offset"),
         ("offset", str(2**64), "offset"),
-        ("status", "fine", '["fine"]: use one of ok, fallback, failed'),
+        ("status", "fine", '["fine"]: use one of ok, doubtful, fallback, failed'),
         ("roof_type", "onion", '["onion"]: use one of flat, pent'),
         ("reason", "bad luck", '["bad luck"]: use one of'),
     ],
@@ -241,7 +241,7 @@ def test_geopandas_reads_a_page(client: TestClient, job_id: str) -> None:
 # --- against a slow twin ---------------------------------------------------------------------------------------------
 
 _WORDS = {
-    "statuses": ("ok", "fallback", "failed"),
+    "statuses": ("ok", "doubtful", "fallback", "failed"),
     "roof_types": ("gable", "pent", "flat", "none", "hip"),
     "reasons": ("invalid_solid", "too_few_points", "no_plane"),
 }

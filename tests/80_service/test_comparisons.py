@@ -165,7 +165,7 @@ def test_a_driver_compares_and_says_how_it_goes(bench: Bench) -> None:
     bench.driver()
     done = bench.over(job)
     assert (done.status, done.progress) == (JobStatus.SUCCESSFUL, 100), done.failure
-    by_status = "2 ok, 0 fallback, 0 failed"
+    by_status = "2 ok, 0 doubtful, 0 fallback, 0 failed"
     assert done.message == f"2 methods on 2 buildings: {ROBUST} {by_status}; {FAITHFUL} {by_status}"
     assert list(done.summary["runs"]) == [ROBUST, FAITHFUL]
     assert done.summary["runs"][FAITHFUL]["digest"] == "d" * 64

@@ -30,7 +30,7 @@ def test_a_job_is_run_and_its_results_are_kept(bench: Bench) -> None:
     bench.driver()
     done = bench.over(job)
     assert (done.status, done.progress, done.attempt) == (JobStatus.SUCCESSFUL, 100, 1)
-    assert done.message == "2 buildings: 2 ok, 0 fallback, 0 failed; 1 object rejected; 1 warning"
+    assert done.message == "2 buildings: 2 ok, 0 doubtful, 0 fallback, 0 failed; 1 object rejected; 1 warning"
     assert done.summary["digest"] == "d" * 64
     assert (bench.folder.outputs(job.job_id, 1) / "outputs.json").exists()
     assert (bench.folder.run(job.job_id, 1) / "run.json").exists()

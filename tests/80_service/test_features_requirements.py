@@ -373,7 +373,7 @@ def queryables(service: runs.Service) -> None:
     assert found["$id"].endswith(f"{PLACE[0]}/queryables")
     assert found["type"] == "object"
     assert found["properties"]["height_m"] == {"title": "height_m", "type": "number"}
-    assert found["properties"]["status"]["enum"] == ["ok", "fallback", "failed"]
+    assert found["properties"]["status"]["enum"] == ["ok", "doubtful", "fallback", "failed"]
     assert found["properties"]["geometry"]["format"].startswith("geometry-")
 
 

@@ -430,7 +430,7 @@ def test_a_run_without_meshes_offers_none(tmp_path: Path) -> None:
 def test_the_report_accounts_for_every_candidate_and_object(out_dir: Path) -> None:
     report = json.loads(output_file(out_dir, "report").read_text())
     assert report["buildings"]["candidates"] == 6
-    assert report["buildings"]["by_status"] == {"ok": 4, "fallback": 1, "failed": 1}
+    assert report["buildings"]["by_status"] == {"ok": 4, "doubtful": 0, "fallback": 1, "failed": 1}
     assert report["buildings"]["by_reason"] == {"invalid_solid": 1, "too_few_points": 1}
     assert report["buildings"]["by_roof_type"] == {"gable": 3, "flat": 1, "none": 1, "pent": 1}
     assert report["buildings"]["by_lod"] == {"2.2": 4, "1.2": 1}
