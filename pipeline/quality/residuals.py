@@ -19,6 +19,8 @@ from pipeline.quality.unseen_roof import Raster, middles_of_cells, unseen_cells
 
 _MAX_CELLS = 1_000_000
 """Cells of the raster over a roof: bounds the memory."""
+_FAR_M = 1.0
+"""Of the farthest tenth of the points no distance counts more than this, unless the other nine tenths reach farther."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,7 +28,8 @@ class ResidualSummary:
     """Figures of the residuals of a building."""
 
     rmse_m: float
-    """Root mean square over the covered points; nan without any."""
+    """Root mean square over the covered points; nan without any. A chimney does not decide: no distance counts more
+    than 1 m, or than the 90th percentile if that is larger."""
     median_m: float
     """Median of the absolute residuals of the covered points; nan without any."""
     p95_m: float
@@ -359,8 +362,8 @@ def _quantile(ascending: FloatArray, share: float) -> float:
 
 
 @kernel
-def _distances(residuals: FloatArray, tolerance_m: float) -> tuple[FloatArray, float, int]:
-    """The absolute residuals of the covered points, the sum of their squares, and how many are within the tolerance."""
+def _distances(residuals: FloatArray, tolerance_m: float) -> tuple[FloatArray, int]:
+    """The absolute residuals of the covered points, and how many are within the tolerance."""
     distances = np.empty(len(residuals))
     covered = within = 0
     for residual in residuals:
@@ -368,8 +371,15 @@ def _distances(residuals: FloatArray, tolerance_m: float) -> tuple[FloatArray, f
             distances[covered] = abs(residual)
             within += distances[covered] <= tolerance_m
             covered += 1
-    distances = distances[:covered]
-    return distances, exact_sum(distances * distances), within
+    return distances[:covered], within
+
+
+@kernel
+def _mean_square(ascending: FloatArray) -> float:
+    """Mean square of distances (n,) metres, at least one; those of the farthest tenth are limited."""
+    n = len(ascending)
+    limited = np.minimum(ascending, max(_FAR_M, ascending[n - n // 10 - 1]))
+    return exact_sum(limited * limited) / n
 
 
 def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummary:
@@ -383,7 +393,7 @@ def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummar
     (0.5, 0.75)
     """
     n = len(residuals)
-    distances, squares, within = _distances(residuals, tolerance_m)
+    distances, within = _distances(residuals, tolerance_m)
     distances.sort()
     covered = len(distances)
     if covered == 0:
@@ -391,7 +401,7 @@ def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummar
             rmse_m=math.nan, median_m=math.nan, p95_m=math.nan, share_within=0.0, coverage=0.0, n_points=n
         )
     return ResidualSummary(
-        rmse_m=math.sqrt(squares / covered),
+        rmse_m=math.sqrt(_mean_square(distances)),
         median_m=_quantile(distances, 0.5),
         p95_m=_quantile(distances, 0.95),
         share_within=within / n,

@@ -46,7 +46,7 @@ def support_of(record: BuildingResult) -> Support:
         share_on_roof=quality.share_within,
         scatter_m=quality.noise_m,
         unseen_share=quality.unexplained_m2 / area_m2 if area_m2 > 0.0 else math.nan,
-        returns_per_face=record.n_points / n_faces if n_faces else math.nan,
+        returns_per_face=record.n_points * (1.0 - quality.share_below_roof) / n_faces if n_faces else math.nan,
     )
 
 
