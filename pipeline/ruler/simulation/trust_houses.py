@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 
-from pipeline.ruler.simulation.bridges_and_vans import bridges_and_vans
+from pipeline.ruler.simulation.bridges_and_vans import BRIDGES, bridges_and_vans
 from pipeline.ruler.simulation.plots import PlannedBuilding, packed_plots
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
@@ -221,13 +221,11 @@ def _in_front(
 
 
 def small_bridges(random: np.random.Generator, side_m: float) -> Scene:
-    """A corner of the suite of bridges and vehicles."""
+    """The bridges of a part of the suite of bridges and vehicles, without the vehicles."""
     scene = bridges_and_vans(int(random.integers(2**31)))
     x0, y0, _, _ = scene.extent
-    extent = (x0, y0, x0 + side_m, y0 + side_m)
-    near = shapely.box(*extent).buffer(15.0)
-    boxes = tuple(box for box in scene.boxes if near.intersects(shapely.Polygon(box.corners)))
-    return dataclasses.replace(scene, origin=ORIGIN, extent=extent, boxes=boxes)
+    extent = (x0, y0, x0 + 2 * side_m, y0 + side_m)
+    return dataclasses.replace(scene, origin=ORIGIN, extent=extent, boxes=scene.boxes[:BRIDGES])
 
 
 def terraces(random: np.random.Generator, side_m: float) -> Scene:
