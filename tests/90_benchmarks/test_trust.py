@@ -11,7 +11,8 @@ import pytest
 import shapely
 from roofs_by_hand import ORIGIN, flat, gable, model, rectangle, surface
 
-from benchmarks.trust import Judged, Judgement, Truth, counted, run_cell, table, top_of, write
+from benchmarks.trust import Judged, counted, run_cell, table, write
+from benchmarks.trust_judge import Judgement, Truth, top_of
 from pipeline.model import RoofType
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.simulation.dataset import simulate

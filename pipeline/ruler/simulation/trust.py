@@ -98,9 +98,8 @@ _TWO_STRIPS = {"strip_spacing_m": 50.0, "strip_overlap": 1.0}
 """Most of the scene lies under two strips."""
 
 KINDS: Mapping[str, Kind] = {
-    **{name: Kind(make=functools.partial(stand, rule)) for name, rule in STANDS.items()},
-    "houses_and_trees": Kind(make=trees_at_houses),
     "houses": Kind(make=houses),
+    "houses_and_trees": Kind(make=trees_at_houses),
     "half_seen_wet": Kind(make=half_seen_when_wet),
     "half_seen_shadow": Kind(make=half_seen_in_shadow, scanner=_LOW_FLIGHT),
     "sparse_houses": Kind(make=houses, surveys=SPARSE_SURVEYS),
@@ -108,6 +107,7 @@ KINDS: Mapping[str, Kind] = {
     "bridges": Kind(make=small_bridges),
     "decks": Kind(make=terraces),
     "glass": Kind(make=glass_houses),
+    **{name: Kind(make=functools.partial(stand, rule)) for name, rule in STANDS.items()},
 }
 """The kinds of scenes by name."""
 

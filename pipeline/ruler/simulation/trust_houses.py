@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 
-from pipeline.ruler.simulation.bridges_and_vans import bridges_and_vans
+from pipeline.ruler.simulation.bridges_and_vans import BRIDGES, bridges_and_vans
 from pipeline.ruler.simulation.plots import PlannedBuilding, packed_plots
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
@@ -37,6 +37,9 @@ _SLOPING = (
 )  # fmt: skip
 _SPOT_M, _SPOT_STEP_M = 0.5, 0.6
 """Radius of the circles that make a part of a roof wet, and their distance: together they leave no gap."""
+
+_FLIGHT_M, _ROW_M = 45.0, 24.0
+"""Scenes with shadows: easting of the flight line, and the depth of a row of lots."""
 
 
 def _terrain(random: np.random.Generator, slope_deg: float = 3.0) -> Terrain:
@@ -161,64 +164,72 @@ def _spots(part: shapely.Geometry) -> tuple[WetSpot, ...]:
 
 
 def half_seen_in_shadow(random: np.random.Generator, side_m: float) -> Scene:
-    """Houses in two rows, each behind a tower or a row of tall dense trees on the side of the flight line.
+    """Houses in two rows along a flight line that runs north through the middle; most of each is hidden by something.
 
-    The flight line runs north through the middle. A third of the houses have a dense crown over half of the roof
-    instead.
+    It is a tower or a row of tall dense trees on the side of the flight line, or two dense crowns over the roof.
     """
     terrain = _terrain(random, 1.0)
-    middle, step = 45.0, 24.0
+    rows = int(side_m / _ROW_M)
     buildings: list[Building] = []
     trees: list[Tree] = []
-    number = 0
-    for row in range(max(1, int(side_m / step))):
-        for side in (-1.0, 1.0):
-            number += 1
-            shape = _SLOPING[int(random.integers(3))]
-            size = random_dimensions(shape, random, area_m2=float(random.uniform(80.0, 150.0)))
-            size = dataclasses.replace(size, length_m=min(size.length_m, 17.0))
-            y = (row + 0.5) * step
-            azimuth = float(random.choice([0.0, 90.0])) + float(random.uniform(-8.0, 8.0))
-            house = place_building(
-                f"house-{number:02d}-{shape}", shape, size, at=(middle + side * 31.0, y), azimuth_deg=azimuth,
-                eave_height_m=float(random.uniform(3.0, 6.0)), terrain=terrain,
-            )  # fmt: skip
-            buildings.append(house)
-            west, _, east, _ = house.footprint.bounds
-            inner = west if side > 0 else east
-            way = random.random()
-            if way < 0.4:
-                at = (inner - side * (float(random.uniform(1.0, 3.0)) + 4.0), y)
-                buildings.append(
-                    place_building(
-                        f"tower-{number:02d}", RoofShape.FLAT, RoofDimensions(length_m=20.0, width_m=8.0), at=at,
-                        azimuth_deg=0.0, eave_height_m=float(random.uniform(22.0, 45.0)), terrain=terrain,
-                    )
-                )  # fmt: skip
-            elif way < 0.7:
-                height = float(random.uniform(16.0, 30.0))
-                for k in range(-3, 4):
-                    place = (inner - side * 4.0, y + 2.8 * k)
-                    trees += grown(*place, 3.0, height, terrain, free_path_share=0.01, lumps=3, random=random)
-            else:
-                trees += _tree_beside(house, terrain, random, reach=float(random.uniform(0.6, 1.0)))
-                trees += _tree_beside(house, terrain, random, reach=float(random.uniform(0.6, 1.0)))
-    rows = max(1, int(side_m / step))
-    return _scene((0.0, -_EDGE_M, 2 * middle, rows * step + _EDGE_M), terrain, buildings, trees)
+    for number in range(2 * rows):
+        side = 1.0 if number % 2 else -1.0
+        shape = _SLOPING[int(random.integers(3))]
+        size = random_dimensions(shape, random, area_m2=float(random.uniform(80.0, 150.0)))
+        house = place_building(
+            f"house-{number:02d}-{shape}",
+            shape,
+            dataclasses.replace(size, length_m=min(size.length_m, 17.0)),
+            at=(_FLIGHT_M + side * 31.0, (number // 2 + 0.5) * _ROW_M),
+            azimuth_deg=float(random.choice([0.0, 90.0])) + float(random.uniform(-8.0, 8.0)),
+            eave_height_m=float(random.uniform(3.0, 6.0)),
+            terrain=terrain,
+        )
+        towers, crowns = _in_front(house, side, terrain, random)
+        buildings += [house, *towers]
+        trees += crowns
+    return _scene((0.0, -_EDGE_M, 2 * _FLIGHT_M, rows * _ROW_M + _EDGE_M), terrain, buildings, trees)
+
+
+def _in_front(
+    house: Building, side: float, terrain: Terrain, random: np.random.Generator
+) -> tuple[list[Building], list[Tree]]:
+    """What hides a house east (`side` 1) or west (-1) of the flight line."""
+    west, _, east, _ = house.footprint.bounds
+    edge, way = (west if side > 0 else east), random.random()
+    trees: list[Tree] = []
+    if way < 0.4:
+        tower = place_building(
+            house.building_id.replace("house", "tower"),
+            RoofShape.FLAT,
+            RoofDimensions(length_m=20.0, width_m=8.0),
+            at=(edge - side * float(random.uniform(5.0, 7.0)), house.y),
+            azimuth_deg=0.0,
+            eave_height_m=float(random.uniform(22.0, 45.0)),
+            terrain=terrain,
+        )
+        return [tower], []
+    if way < 0.7:
+        height = float(random.uniform(16.0, 30.0))
+        for k in range(-3, 4):
+            place = (edge - side * 4.0, house.y + 2.8 * k)
+            trees += grown(*place, 3.0, height, terrain, free_path_share=0.01, lumps=3, random=random)
+        return [], trees
+    for _ in range(2):
+        trees += _tree_beside(house, terrain, random, reach=float(random.uniform(0.6, 1.0)))
+    return [], trees
 
 
 def small_bridges(random: np.random.Generator, side_m: float) -> Scene:
-    """A corner of the suite of bridges and vehicles."""
+    """The bridges of a part of the suite of bridges and vehicles, without the vehicles."""
     scene = bridges_and_vans(int(random.integers(2**31)))
     x0, y0, _, _ = scene.extent
-    extent = (x0, y0, x0 + side_m, y0 + side_m)
-    near = shapely.box(*extent).buffer(15.0)
-    boxes = tuple(box for box in scene.boxes if near.intersects(shapely.Polygon(box.corners)))
-    return dataclasses.replace(scene, origin=ORIGIN, extent=extent, boxes=boxes)
+    extent = (x0, y0, x0 + 2 * side_m, y0 + side_m)
+    return dataclasses.replace(scene, origin=ORIGIN, extent=extent, boxes=scene.boxes[:BRIDGES])
 
 
 def terraces(random: np.random.Generator, side_m: float) -> Scene:
-    """Decks on a slope, level with the ground on the upper side, and parked trucks: no building."""
+    """Decks on a slope, level with the ground on the upper side: no building."""
     fall_deg, aspect = float(random.uniform(12.0, 22.0)), float(random.uniform(0.0, 360.0))
     terrain = undulating_terrain(60.0, fall_deg, aspect, 0.2, 60.0, random)
     boxes = []
