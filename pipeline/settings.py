@@ -19,6 +19,7 @@ from pipeline.terrain.settings import (
     CandidateSettings,
     GroundSettings,
     OutlierSettings,
+    StripSettings,
     SurfaceSettings,
     UnitSettings,
     VegetationSettings,
@@ -88,6 +89,7 @@ class GeneralSettings(Parameters):
 SECTIONS: Mapping[str, type[Parameters]] = {
     "class-codes": ClassCodeSettings,
     "footprints": FootprintSettings,
+    "strips": StripSettings,
     "outliers": OutlierSettings,
     "ground": GroundSettings,
     "vegetation": VegetationSettings,
@@ -149,6 +151,7 @@ class RunSettings:
             "general": self.general,
             "class-codes": self.class_codes,
             "footprints": self.footprints,
+            "strips": self.scene.strips,
             "outliers": self.scene.outliers,
             "ground": self.scene.ground,
             "vegetation": self.scene.vegetation,
