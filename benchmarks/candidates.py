@@ -18,8 +18,8 @@ from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.runtime.stages.ground import find_ground
-from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.join import join
+from pipeline.runtime.stages.read_inputs import read_inputs
 from pipeline.runtime.stages.sites import RejectedSite, found_sites
 from pipeline.runtime.stages.split import split
 from pipeline.settings import RunSettings
@@ -52,8 +52,8 @@ def found_scene(
         scratch = Scratch(str(Path(folder, "scratch")))
         scratch.create()
         context = RunContext(plan=plan, progress=progress, executor=SerialExecutor(), scratch=scratch)
-        ingested = ingest(context, tiles)
-        ground = find_ground(context, settings, ingested, footprints=given is not None)
+        inputs = read_inputs(context, settings, tiles, footprints=given is not None)
+        ingested, ground = inputs.ingested, find_ground(context, settings, inputs.cells)
         splits = split(context, settings, ingested, ground, given)
         roof = settings.building.roof
         joined = join(context, settings.scene, roof, splits, given)

@@ -44,8 +44,8 @@ from pipeline.runtime.resources import SERIAL, Resources
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.ground import find_ground
-from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.join import join
+from pipeline.runtime.stages.read_inputs import read_inputs
 from pipeline.runtime.stages.split import split
 from pipeline.settings import RunSettings
 
@@ -91,8 +91,8 @@ def one_lap(tiles: Sequence[str], plan: Plan, settings: RunSettings, executor: E
         scratch.create()
         context = RunContext(plan=plan, progress=progress, executor=executor, scratch=scratch)
         began = time.process_time()
-        ingested = ingest(context, tiles)
-        ground = find_ground(context, settings, ingested, footprints=False)
+        inputs = read_inputs(context, settings, tiles, footprints=False)
+        ingested, ground = inputs.ingested, find_ground(context, settings, inputs.cells)
         splits = split(context, settings, ingested, ground, None)
         joined = join(context, settings.scene, settings.building.roof, splits, None)
         cpu_s = time.process_time() - began

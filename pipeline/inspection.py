@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.io.area_of_use import Location
 from pipeline.io.source import ReadOptions, Source, SourceInfo, open_source
-from pipeline.model import FloatArray
+from pipeline.model import FloatArray, IntArray, PointCloud
 from pipeline.runtime.engine import engine_of, workers_that_fit
 from pipeline.runtime.expected import expected
 from pipeline.runtime.forecast import Forecast, forecast
@@ -20,6 +20,9 @@ from pipeline.runtime.plan import Plan, make_plan
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.settings import RunSettings
+from pipeline.terrain.settings import StripSettings
+from pipeline.terrain.survey_strips import SQUARE_MM, compared_strips, moves_of, offsets_of, strips_warning
+from pipeline.tiling import MM
 
 RAISED_M = 2.5
 """Cells this far above the lowest surroundings count as raised."""
@@ -27,6 +30,8 @@ SURROUNDINGS_M = 40.0
 """Side of the square of the lowest surroundings: wider than most buildings."""
 MIN_AREA_M2 = 10.0
 """Smaller groups of raised cells are not counted."""
+_COMPARED_POINTS = 2_000_000
+"""Points, about, among which flight strips are compared: 60 MB."""
 MAX_CELLS = 4_000_000
 """Bounds the raster's memory: a larger tile gets coarser cells."""
 
@@ -125,17 +130,20 @@ def inspect(
     classes = np.zeros(256, dtype=np.int64)
     returns = np.zeros(256, dtype=np.int64)
     used, lowest, highest = 0, math.inf, -math.inf
+    strips = _Strips(source.info.point_count)
     for cloud in source.chunks():
         classes += np.bincount(cloud.classification, minlength=256)
         returns += np.bincount(cloud.return_count, minlength=256)
         raster.add(cloud.xyz)
+        strips.add(cloud)
         used += len(cloud)
         lowest = min(lowest, float(cloud.xyz[:, 2].min()))
         highest = max(highest, float(cloud.xyz[:, 2].max()))
         on_progress(used, source.info.point_count)
     plan = make_plan([str(path)], options, settings)
     run = _forecast(path, options, plan, settings)
-    return _inspection(source, raster, classes, returns, used, (lowest, highest), run)
+    found = _inspection(source, raster, classes, returns, used, (lowest, highest), run)
+    return dataclasses.replace(found, warnings=found.warnings + strips.warnings(settings.scene.strips))
 
 
 def _forecast(path: str | Path, options: ReadOptions, plan: Plan, settings: RunSettings) -> Forecast:
@@ -184,6 +192,31 @@ def _outside(info: SourceInfo) -> tuple[str, ...]:
     if location is None or not location.is_far_outside:
         return ()
     return (f"{location.problem}. {location.fix}",)
+
+
+class _Strips:
+    """The points of some squares in which flight strips are compared; of all, where these are few."""
+
+    def __init__(self, points: int) -> None:
+        self._every = math.ceil(math.sqrt(max(1, points) / _COMPARED_POINTS))
+        self._parts: list[tuple[IntArray, ...]] = []
+
+    def add(self, cloud: PointCloud) -> None:
+        """Keep the points of the squares."""
+        xyz_mm = np.rint(cloud.xyz * MM).astype(np.int64)
+        column, row = xyz_mm[:, 0] // SQUARE_MM, xyz_mm[:, 1] // SQUARE_MM
+        kept = (column % self._every == 0) & (row % self._every == 0)
+        columns = (*xyz_mm.T, cloud.return_number, cloud.return_count, cloud.source_id)
+        self._parts.append(tuple(np.ascontiguousarray(values[kept]) for values in columns))
+
+    def warnings(self, settings: StripSettings) -> tuple[str, ...]:
+        """A warning if strips do not fit."""
+        if not self._parts:
+            return ()
+        x, y, z, number, returns, source = (np.concatenate(columns) for columns in zip(*self._parts, strict=True))
+        rows = compared_strips((x, y, z), (number, returns), source, None)
+        apart = offsets_of([rows], settings)
+        return (strips_warning(apart, moves_of([rows], settings)),) if apart else ()
 
 
 class _Raster:

@@ -60,6 +60,7 @@ class Reason(StrEnum):
     TOO_NARROW = "too_narrow"
     BRIDGE = "bridge"
     VEHICLE = "vehicle"
+    STRIPS_DISAGREE = "strips_disagree"
     OVERRIDDEN = "overridden"
 
 
@@ -93,6 +94,8 @@ REASONS: Mapping[Reason, str] = {
     Reason.TOO_NARROW: "narrower than a building: a wall, a hedge, a wire",
     Reason.BRIDGE: "level with the ground along two opposite ends and free along its sides: the deck of a bridge",
     Reason.VEHICLE: "narrow, low and free all around: a van, a truck, a row of them, a container",
+    Reason.STRIPS_DISAGREE: "the flight strips that saw it lie above one another by more than "
+    "`min_strip_offset_m`, so it may be a building; the detail names the offset, and what it looks like",
     Reason.OVERRIDDEN: "the user's overrides reject it; the detail is their note",
 }
 """Meanings of the reasons, as in the records' reference."""

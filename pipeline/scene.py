@@ -11,9 +11,11 @@ import dataclasses
 
 import numpy as np
 
-from pipeline.model import BoolArray, ByteArray, IntArray, LabelArray
+from pipeline.model import BoolArray, ByteArray, IntArray, KindArray, LabelArray
+from pipeline.terrain.class_codes import ClassCodeSettings
 from pipeline.terrain.facets import SceneVertices, VertexKind
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
+from pipeline.terrain.incomplete_classes import OnRoof, undecided_on_roofs
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
 from pipeline.terrain.needed_ground import needed_vertices
 from pipeline.terrain.outliers import dense_enough
@@ -30,8 +32,8 @@ GROUND_CLASS = 2
 BUILDING_CLASS = 6
 VEGETATION_CLASSES = (3, 4, 5)
 """Low, medium and high vegetation."""
-NEUTRAL_CLASSES = (0, 1, 12, 19)
-"""Classes without information on buildings: never classified, unclassified, overlap, overhead structure."""
+OTHER_CLASSES = ClassCodeSettings().other
+"""Classes of what is neither ground, nor building, nor vegetation: water, roads, wires, bridges."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -142,8 +144,11 @@ def _vertices(
     stands = used & (height_mm >= round(1000 * settings.ground.tolerance_m))
     floor = lowest_below(points.x_mm, points.y_mm, points.z_mm, stands, chosen, cell, settings.vegetation.level_m)
     planar[_has_floor(points, height_mm, floor, planar == 0, settings)] = 1
+    inner = core.grown(round(1000 * facets_m)).contains(x, y)
+    on_roof = _on_roofs((x, y, z), kind, inner, settings)
     kind[crowns(x, y, z, planar, several[chosen], settings.vegetation)] = VertexKind.CROWN
-    near = np.flatnonzero(core.grown(round(1000 * facets_m)).contains(x, y))
+    kind[(on_roof == OnRoof.YES) & (kind == VertexKind.OBJECT)] = VertexKind.JOINED
+    near = np.flatnonzero(inner & ((on_roof != OnRoof.BESIDE) | (kind != VertexKind.OBJECT)))
     surfaces = settings.surfaces
     far_mm = max(surfaces.far_mm, round(1000 * surfaces.thin_m))
     near = near[needed_vertices(x[near], y[near], kind[near], 1000.0 * surfaces.max_circumradius_m, far_mm)]
@@ -155,6 +160,16 @@ def _vertices(
         kind=kind[near],
         planar=planar[near],
     )
+
+
+def _on_roofs(
+    places_mm: tuple[IntArray, IntArray, IntArray], kind: KindArray, inner: BoolArray, settings: SceneSettings
+) -> KindArray:
+    """`OnRoof` of the inner vertices (v,) of which neither class nor height says what they are."""
+    undecided, building = kind == VertexKind.OBJECT, kind == VertexKind.BUILDING
+    wanted = undecided & inner
+    reach_m = settings.surfaces.reach_m
+    return undecided_on_roofs(places_mm, building, undecided | building, wanted, settings.vegetation, reach_m)
 
 
 def _has_floor(
@@ -206,7 +221,7 @@ def split_tile(
     building = (points.classification == BUILDING_CLASS) & classes.building
     excluded = np.zeros(len(points), np.bool_)
     if classes.building:
-        excluded = ~np.isin(points.classification, (*NEUTRAL_CLASSES, GROUND_CLASS, BUILDING_CLASS))
+        excluded = np.isin(points.classification, (*VEGETATION_CLASSES, *OTHER_CLASSES))
     elif classes.vegetation:
         excluded = np.isin(points.classification, VEGETATION_CLASSES)
     vertices = _vertices(points, core, height, terrain, building, excluded, settings, classes)

@@ -20,6 +20,7 @@ from pipeline.terrain.settings import (
     CandidateSettings,
     GroundSettings,
     OutlierSettings,
+    StripSettings,
     SurfaceSettings,
     UnitSettings,
     VegetationSettings,
@@ -89,6 +90,7 @@ class GeneralSettings(Parameters):
 SECTIONS: Mapping[str, type[Parameters]] = {
     "class-codes": ClassCodeSettings,
     "footprints": FootprintSettings,
+    "strips": StripSettings,
     "outliers": OutlierSettings,
     "ground": GroundSettings,
     "vegetation": VegetationSettings,
@@ -151,6 +153,7 @@ class RunSettings:
             "general": self.general,
             "class-codes": self.class_codes,
             "footprints": self.footprints,
+            "strips": self.scene.strips,
             "outliers": self.scene.outliers,
             "ground": self.scene.ground,
             "vegetation": self.scene.vegetation,

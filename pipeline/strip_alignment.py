@@ -263,6 +263,22 @@ def strip_offsets_m(points: FloatArray, strip: npt.NDArray[np.uint16], min_offse
     return np.zeros((len(points), 3)) if shifts is None else shifts[number]
 
 
+def _largest_m(shifts: FloatArray, sizes: IntArray, points: int) -> float:
+    """The largest offset between two strips of so many points, metres, from their `_shifts_m`."""
+    used = shifts if sizes.sum() < points else shifts[:-1]
+    return math.sqrt(((used[:, None] - used) ** 2).sum(axis=2).max())
+
+
+def disagreement_m(points: FloatArray, strip: npt.NDArray[np.uint16], min_offset_m: float) -> float:
+    """The largest offset between two strips, metres; nan where they fit, or nothing shows that they do not.
+
+    Arguments are those of `strip_offsets_m`.
+    """
+    number, sizes = _numbered(strip)
+    shifts = _shifts_m(np.ascontiguousarray(points), number, sizes, min_offset_m)
+    return math.nan if shifts is None else _largest_m(shifts, sizes, len(points))
+
+
 def aligned_mm(
     xyz_mm: IntArray, strip: npt.NDArray[np.uint16], marked: BoolArray, min_offset_m: float
 ) -> tuple[IntArray, BoolArray, float]:
@@ -279,7 +295,6 @@ def aligned_mm(
     if shifts is None:
         return xyz_mm, marked, math.nan
     moved = xyz_mm - np.rint(shifts * 1e3).astype(np.int64)[number]
-    used = shifts if sizes.sum() < len(number) else shifts[:-1]
-    largest_m = math.sqrt(((used[:, None] - used) ** 2).sum(axis=2).max())
+    largest_m = _largest_m(shifts, sizes, len(number))
     order = np.lexsort(moved.T[::-1])
     return moved[order], marked[order], largest_m

@@ -185,7 +185,7 @@ def is_object(kind: int, sums: IntArray, settings: CandidateSettings) -> bool:
 
 
 def _joins(kind: int, sums: IntArray, verdict: Verdict | None, settings: CandidateSettings) -> bool:
-    """Whether a surface is roof-like and mostly bounded by steps, as a dormer, a lift house or an upper storey."""
+    """Whether a surface may join a larger roof, along steps as a dormer does, or along a seam of classes."""
     f = _figures(sums)
     small_roof = verdict is None or (
         verdict.reason in {Reason.TOO_SMALL, Reason.TOO_NARROW, Reason.BELOW_Z_AVG}
@@ -193,7 +193,10 @@ def _joins(kind: int, sums: IntArray, verdict: Verdict | None, settings: Candida
         and f["planar_share"] >= settings.min_planar_share
         and f["canopy_share"] <= settings.max_canopy_share
     )
-    return kind in {FacetKind.OBJECT, FacetKind.BUILDING} and small_roof and f["step_share"] >= settings.unite_share
+    by_class = kind == FacetKind.BUILDING and verdict is not None and verdict.reason == Reason.TOO_SMALL
+    along_steps = small_roof and f["step_share"] >= settings.unite_share
+    along_seam = (small_roof or by_class) and sums[Sum.SEAM] >= 2000
+    return kind in {FacetKind.OBJECT, FacetKind.BUILDING} and (along_steps or along_seam)
 
 
 def slowly_united(surfaces: Surfaces, verdicts: list[Verdict | None], settings: CandidateSettings) -> IntArray:

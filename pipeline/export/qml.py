@@ -174,6 +174,7 @@ REJECTED_CLASSES = (
     Category(value=Reason.TOO_FEW_POINTS.value, label="too few points", fill=_grey(130, "b_diagonal")),
     Category(value=Reason.BRIDGE.value, label="bridge", fill=_grey(130, "cross")),
     Category(value=Reason.VEHICLE.value, label="vehicle, container", fill=_grey(130, "diagonal_x")),
+    Category(value=Reason.STRIPS_DISAGREE.value, label="flight strips that disagree", fill=_grey(60, "horizontal")),
     Category(value=Reason.OVERRIDDEN.value, label="rejected by an override", fill=_grey(130, "f_diagonal")),
     Category(value="", label="another reason", fill=_grey(230)),
 )

@@ -28,7 +28,7 @@ from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.scratch.work_folder import locked_work
 from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.runtime.stages.ground import find_ground
-from pipeline.runtime.stages.ingest import ingest, part_of
+from pipeline.runtime.stages.ingest import part_of
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.label import LabelTask, SitesNear, label, neighbourhood
@@ -41,6 +41,7 @@ from pipeline.runtime.stages.rasters import (
     with_neighbours,
     write_mosaic,
 )
+from pipeline.runtime.stages.read_inputs import read_inputs
 from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import split
 from pipeline.runtime.stages.write_classified import (
@@ -174,8 +175,9 @@ def classify(
         executor=executor,
         cancelled=cancelled,
     ) as context:
-        ingested = ingest(context, paths)
-        ground = find_ground(context, request.settings, ingested, footprints=footprints is not None)
+        inputs = read_inputs(context, request.settings, paths, footprints=footprints is not None)
+        ingested = inputs.ingested
+        ground = find_ground(context, request.settings, inputs.cells)
         splits = split(context, request.settings, ingested, ground, footprints)
         roof = request.settings.building.roof
         joined = join(context, request.settings.scene, roof, splits, footprints, outlines=False)

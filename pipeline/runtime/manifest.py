@@ -141,6 +141,8 @@ class RunManifest:
     """The buildings that took longest, the slowest first."""
     warnings: tuple[str, ...] = ()
     """The warnings of the run."""
+    strip_moves_m: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """By how many metres each flight strip (`point_source_id`) was moved up; empty where all strips fit."""
     content_sha256: str | None = None
     """`gablework digest` of the finished run; None where it was not computed."""
 
@@ -150,6 +152,11 @@ class RunManifest:
             value = getattr(self, name)
             if value is not None and value.tzinfo is None:
                 raise RunError(f"{name} is {value.isoformat()}: give a time zone")
+
+    @property
+    def strip_moves_mm(self) -> dict[int, int]:
+        """The moves in whole millimetres, by the number of the strip."""
+        return {int(strip): round(move * MM) for strip, move in self.strip_moves_m.items()}
 
     def squares(self, keys: Iterable[str]) -> list[Any]:
         """The tiles of some keys as squares in metres, in their order; none where the lattice is unknown."""

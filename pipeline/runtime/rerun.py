@@ -55,7 +55,7 @@ from pipeline.runtime.stages.batch_figures import REJECTED, Modelled
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints_of_run
 from pipeline.runtime.stages.given_guides import given_guides
-from pipeline.runtime.stages.ground import find_ground
+from pipeline.runtime.stages.ground import cells_of_blocks, find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested, points_by_tile
 from pipeline.runtime.stages.join import join
@@ -171,7 +171,7 @@ def _rerun(
         executor=executor,
         cancelled=cancelled,
     ) as context:
-        ingested = ingest(context, paths)
+        ingested = ingest(context, paths, earlier.manifest.strip_moves_mm)
         check_points(earlier.manifest, paths, ingested)
         search = _Search(
             context=context,
@@ -263,7 +263,9 @@ class _Search:
     def _candidates(self, tiles: frozenset[Tile] | None) -> _Found:
         """The candidates of some tiles; of all tiles for None."""
         context, settings = self.context, self.request.settings
-        ground = find_ground(context, settings, self.ingested, footprints=self.footprints is not None, only=tiles)
+        given = self.footprints is not None
+        cells = cells_of_blocks(context, settings, self.ingested, footprints=given, only=tiles)
+        ground = find_ground(context, settings, cells)
         splits = split(context, settings, self.ingested, ground, self.footprints, tiles)
         joined = join(context, settings.scene, settings.building.roof, splits, self.footprints)
         before = self.earlier.fingerprints

@@ -53,10 +53,10 @@ from pipeline.runtime.stages.counts import run_counts
 from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints_of_run
 from pipeline.runtime.stages.given_guides import GivenGuides, given_guides
 from pipeline.runtime.stages.ground import Ground, find_ground
-from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.publish import Published, RunOutput, publish
+from pipeline.runtime.stages.read_inputs import read_inputs
 from pipeline.runtime.stages.reconstruct import QUARANTINE, Models, models_stage, reconstruct
 from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import Splits, split
@@ -280,6 +280,7 @@ class _Candidates:
     """What the stages that all variants share found."""
 
     ingested: Sequence[Ingested]
+    moves_mm: Mapping[int, int]
     ground: Ground
     splits: Splits
     joined: Joined
@@ -289,11 +290,11 @@ def _find_candidates(
     context: RunContext, settings: RunSettings, paths: Sequence[str], footprints: GivenFootprints | None
 ) -> _Candidates:
     """The stages up to the candidates."""
-    ingested = ingest(context, paths)
-    ground = find_ground(context, settings, ingested, footprints=footprints is not None)
-    splits = split(context, settings, ingested, ground, footprints)
+    inputs = read_inputs(context, settings, paths, footprints=footprints is not None)
+    ground = find_ground(context, settings, inputs.cells)
+    splits = split(context, settings, inputs.ingested, ground, footprints)
     joined = join(context, settings.scene, settings.building.roof, splits, footprints)
-    return _Candidates(ingested=ingested, ground=ground, splits=splits, joined=joined)
+    return _Candidates(ingested=inputs.ingested, moves_mm=inputs.moves_mm, ground=ground, splits=splits, joined=joined)
 
 
 def _override(
@@ -514,6 +515,7 @@ class _VariantRun:
             timings_s={name: round(seconds, 3) for name, seconds in timings.items()},
             peak_memory_bytes=self.progress.peaks,
             slowest=self.counted.slowest,
+            strip_moves_m={str(strip): move / MM for strip, move in sorted(found.moves_mm.items())},
             warnings=tuple(self.progress.warnings),
             content_sha256=self.digest,
         )

@@ -32,8 +32,13 @@ NOWHERE = 2**62
 """Coordinate of the smallest point of a surface that has none."""
 SOLID = (FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.CROWN)
 """Kinds of the surfaces that are judged."""
+CONNECTING = (FacetKind.STEP, FacetKind.SEAM)
+"""Kinds of what lies between two of them that may be one building."""
 _NARROW_M = 1.0
 """Narrower surfaces count as this wide: their width is known no better."""
+_LEAST_SEAM_M = 2.0
+"""Shorter seams join nothing, as shorter borders of patches do not in `terrain.units`. Not a setting: what they join is
+divided into units again, at steps."""
 _BLOCK = 65_536
 """Surfaces judged at once: it limits the memory to 20 MB."""
 
@@ -137,6 +142,7 @@ def _figures(sums: IntArray) -> dict[str, FloatArray]:
         "wall_share": sums[:, Sum.WALL] / outline_mm,
         "top_share": sums[:, Sum.WALL_TOP] / np.maximum(1, sums[:, Sum.WALL]),
         "step_share": sums[:, Sum.STEP] / outline_mm,
+        "seam_m": sums[:, Sum.SEAM] / 1000.0,
         **shape_figures(sums),
     }
 
@@ -281,15 +287,21 @@ def are_objects(kind: KindArray, sums: IntArray, settings: CandidateSettings) ->
 
 
 def may_join(kind: KindArray, sums: IntArray, faults: KindArray, settings: CandidateSettings) -> BoolArray:
-    """Which surfaces (k,) are roof-like and mostly bounded by steps, like a dormer, a lift house or an upper storey."""
+    """Which surfaces (k,) may belong to a larger roof across a step or a seam.
+
+    They are roof-like, and mostly bounded by steps, like a dormer, a lift house or an upper storey; or they go on in
+    the larger roof without a wall, of which the classes of the file name one part only.
+    """
     f = _figures(sums)
     small_roof = np.isin(faults, (Fault.TOO_SMALL, Fault.TOO_NARROW, Fault.BELOW_Z_AVG))
     small_roof &= f["top_m"] >= settings.min_height_m
     small_roof &= f["planar_share"] >= settings.min_planar_share
     small_roof &= f["canopy_share"] <= settings.max_canopy_share
     roof_like = (faults == Fault.NONE) | small_roof
-    joins: BoolArray = np.isin(kind, (FacetKind.OBJECT, FacetKind.BUILDING)) & roof_like
-    return joins & (f["step_share"] >= settings.unite_share)
+    joins: BoolArray = roof_like & (f["step_share"] >= settings.unite_share)
+    by_class = (kind == FacetKind.BUILDING) & (faults == Fault.TOO_SMALL)
+    joins |= (roof_like | by_class) & (f["seam_m"] >= _LEAST_SEAM_M)
+    return np.isin(kind, (FacetKind.OBJECT, FacetKind.BUILDING)) & joins
 
 
 @kernel
@@ -322,7 +334,7 @@ def _largest_beside(
 
 
 def unite_levels(surfaces: Surfaces, faults: KindArray, settings: CandidateSettings) -> IntArray:
-    """The candidate that each whole surface belongs to, (k,): its own index, or that of a larger roof across a step.
+    """The candidate that each whole surface belongs to, (k,): its own index, or that of a larger roof beside it.
 
     `faults` are those of `judge_surfaces`. -1 for surfaces that belong to no candidate.
     """

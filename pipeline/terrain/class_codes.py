@@ -11,11 +11,11 @@ import dataclasses
 from pipeline.parameters import Parameters, parameter
 
 OTHER = 255
-"""Replaces an ASPRS code that the user took out of its group: neither ground, nor building, nor undecided."""
+"""Replaces a producer's own code for other things, and an ASPRS code that the user took out of its list."""
 
 
 class ClassCodeSettings(Parameters):
-    """Meaning of the codes in the file; if classes are trusted, points with a code in no list cannot be roof."""
+    """Meaning of the codes in the file; points with a code in no list are undecided."""
 
     ground: tuple[int, ...] = parameter((2,), "Codes that mean ground.", minimum=0, maximum=255)
     building: tuple[int, ...] = parameter((6,), "Codes that mean building.", minimum=0, maximum=255)
@@ -25,20 +25,26 @@ class ClassCodeSettings(Parameters):
     )
     undecided: tuple[int, ...] = parameter(
         (0, 1, 12, 19),
-        "Codes without information: such points are judged by their own evidence.",
+        "Codes without information: such points are judged by their own evidence, as are those of codes in no list.",
+        minimum=0,
+        maximum=255,
+    )
+    other: tuple[int, ...] = parameter(
+        (8, 9, 10, 11, 13, 14, 15, 16, 17, 20, 21, 22, 26, OTHER),
+        "Codes of other things, such as water, roads, wires and bridges (26 in the Netherlands), which are never roof.",
         minimum=0,
         maximum=255,
     )
 
     @classmethod
     def role(cls, code: int) -> str:
-        """What an ASPRS code means to a run: the name of its list, or `other`.
+        """What an ASPRS code means to a run: the name of its list, or `undecided`.
 
-        >>> [ClassCodeSettings.role(code) for code in (2, 6, 9, OTHER)]
-        ['ground', 'building', 'other', 'other']
+        >>> [ClassCodeSettings.role(code) for code in (2, 6, 9, 28, OTHER)]
+        ['ground', 'building', 'other', 'undecided', 'other']
         """
         lists: dict[str, tuple[int, ...]] = dataclasses.asdict(cls())
-        return next((name for name, codes in lists.items() if code in codes), "other")
+        return next((name for name, codes in lists.items() if code in codes), "undecided")
 
     def cross_faults(self) -> list[str]:
         """A code means one thing."""
@@ -59,8 +65,8 @@ class ClassCodeSettings(Parameters):
         >>> ClassCodeSettings().table is None
         True
         >>> table = ClassCodeSettings(building=(67,)).table
-        >>> table[67], table[6], table[9]
-        (6, 255, 9)
+        >>> table[67], table[6], table[9], table[28]
+        (6, 255, 9, 28)
         """
         asprs: dict[str, tuple[int, ...]] = dataclasses.asdict(ClassCodeSettings())
         table = list(range(256))
@@ -69,5 +75,5 @@ class ClassCodeSettings(Parameters):
                 table[code] = OTHER
         for name, codes in asprs.items():
             for code in getattr(self, name):
-                table[code] = code if code in codes else codes[0]
+                table[code] = code if code in codes else OTHER if name == "other" else codes[0]
         return None if table == list(range(256)) else tuple(table)

@@ -36,11 +36,13 @@ class FacetKind(IntEnum):
     OBJECT = 3
     """All vertices stand above the ground; nothing else is known."""
     BUILDING = 4
-    """All vertices are building by the file's trusted classes."""
+    """All vertices are building by the file's trusted classes, or joined to it."""
     STEP = 5
     """A wall between two levels that both stand well above the ground."""
     CROWN = 6
     """Some vertex has rough surroundings, as crowns of trees have; no vertex is ground."""
+    SEAM = 7
+    """Building goes on without a wall in what nothing is known of."""
 
 
 class VertexKind(IntEnum):
@@ -53,6 +55,8 @@ class VertexKind(IntEnum):
     """Vegetation, water or a bridge by the file's trusted classes."""
     CROWN = 4
     """Stands above the ground among rough surroundings."""
+    JOINED = 5
+    """Undecided by its class, and on one plane with building around it."""
 
 
 class SceneVertices(NamedTuple):
@@ -108,6 +112,12 @@ def stands_up(kind: int) -> bool:
 
 
 @kernel(inline="always")
+def connects(kind: int) -> bool:
+    """Whether a FacetKind is one of steps and seams, along which surfaces may be one building."""
+    return kind == FacetKind.STEP or kind == FacetKind.SEAM  # noqa: PLR1714 - compiled
+
+
+@kernel(inline="always")
 def first_corner(x: IntArray, y: IntArray, facets: LabelArray, f: int) -> int:
     """Which corner of facet f, 0 to 2, is its smallest vertex by (x, y)."""
     k = 0
@@ -132,6 +142,20 @@ def _bridges_gap(x: IntArray, y: IntArray, corners: tuple[int, int, int], radius
         if found < 2:
             return False
     return True
+
+
+@kernel(inline="always")
+def _kind_above(a: int, b: int, c: int) -> int:
+    """FacetKind of a facet that no wall cuts, by the kinds of its vertices, none of which is ground or excluded."""
+    buildings, crowns = 0, 0
+    for kind in (a, b, c):
+        buildings += kind == VertexKind.BUILDING or kind == VertexKind.JOINED  # noqa: PLR1714 - compiled
+        crowns += kind == VertexKind.CROWN
+    if buildings == 3:
+        return FacetKind.BUILDING
+    if buildings > 0:
+        return FacetKind.BORDER if crowns > 0 else FacetKind.SEAM
+    return FacetKind.CROWN if crowns > 0 else FacetKind.OBJECT
 
 
 @kernel
@@ -178,12 +202,8 @@ def classify_facets(vertices: SceneVertices, facets: LabelArray, limits: FacetLi
             x, y, (a, b, c), math.sqrt(radius2 / whole)
         ):
             out[f] = FacetKind.VOID
-        elif kind[a] == kind[b] and kind[b] == kind[c] and kind[a] != VertexKind.CROWN:
-            out[f] = FacetKind.BUILDING if kind[a] == VertexKind.BUILDING else FacetKind.OBJECT
-        elif kind[a] != VertexKind.BUILDING and kind[b] != VertexKind.BUILDING and kind[c] != VertexKind.BUILDING:
-            out[f] = FacetKind.CROWN
         else:
-            out[f] = FacetKind.BORDER
+            out[f] = _kind_above(kind[a], kind[b], kind[c])
     return out
 
 

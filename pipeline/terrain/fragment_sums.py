@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import IntArray, LabelArray
-from pipeline.terrain.facets import FacetKind, LabelledTin, SceneVertices, VertexKind, first_corner, stands_up
+from pipeline.terrain.facets import FacetKind, LabelledTin, SceneVertices, VertexKind, connects, first_corner, stands_up
 
 
 class Sum(IntEnum):
@@ -73,6 +73,8 @@ class Sum(IntEnum):
     GAP_XX = 35
     GAP_XY = 36
     GAP_YY = 37
+    SEAM = 38
+    """Length of the outline where building goes on in what nothing is known of, or the reverse, mm."""
 
 
 N_SUMS = len(Sum)
@@ -141,7 +143,7 @@ def _add_free_outline(
     x, y = (vertices.x_mm[v] + vertices.x_mm[w]) // 2, (vertices.y_mm[v] + vertices.y_mm[w]) // 2
     if g < 0 or tin.kinds[g] == FacetKind.VOID:
         _add_moments(row, Sum.GAP_W, length // 10, x, y)
-    elif tin.kinds[g] == FacetKind.BORDER:
+    elif tin.kinds[g] == FacetKind.BORDER or tin.kinds[g] == FacetKind.SEAM:
         beyond = tin.facets[g, 0] + tin.facets[g, 1] + tin.facets[g, 2] - v - w
         height, z = vertices.height_mm, vertices.z_mm
         # below two thirds of the mean height of the edge
@@ -212,8 +214,8 @@ def sum_fragments(
                 sums[fragment, Sum.WALLS_OWN_Z] += own
                 if 2 * own >= top + foot:
                     sums[fragment, Sum.WALL_TOP] += length
-            if kinds[g] == FacetKind.STEP and kinds[f] != FacetKind.STEP:
-                sums[fragment, Sum.STEP] += length
+            if connects(kinds[g]) and not connects(kinds[f]):
+                sums[fragment, Sum.STEP if kinds[g] == FacetKind.STEP else Sum.SEAM] += length
                 along = _with_room(along, n_along)
                 along[n_along, 0], along[n_along, 1], along[n_along, 2] = fragment, label[g], length
                 n_along += 1

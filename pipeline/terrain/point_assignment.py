@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
-from pipeline.terrain.facets import FacetKind, LabelledTin, SceneVertices, first_corner, stands_up
+from pipeline.terrain.facets import FacetKind, LabelledTin, SceneVertices, VertexKind, first_corner, stands_up
 from pipeline.terrain.fragment_sums import Sum
 
 
@@ -100,6 +100,8 @@ class AssignmentLimits(NamedTuple):
     """Millimetres: how far points belong to a surface, from where on they are canopy, lie above ground, are far off."""
 
     reach: int
+    same: int
+    """How far undecided points belong to a surface that is building by its class."""
     canopy: int
     ground: int
     far: int
@@ -174,11 +176,11 @@ def _above_facet(px: int, py: int, pz: int, f: int, vertices: SceneVertices, fac
 
 
 @kernel(inline="always")
-def _of_corner_on_level(
+def _corner_on_level(
     px: int, py: int, pz: int, f: int, vertices: SceneVertices, tin: LabelledTin, reach_mm: int
 ) -> int:
-    """Fragment of the corner of facet f that is nearest in elevation, then in plan; -1 beyond the reach."""
-    fragment = -1
+    """The corner of facet f that is nearest in elevation, then in plan; -1 beyond the reach."""
+    found = -1
     best = reach_mm + 1
     best_distance = np.int64(2**62)
     for q in range(3):
@@ -190,8 +192,23 @@ def _of_corner_on_level(
         if dz < best or (dz == best and distance < best_distance):
             best = dz
             best_distance = distance
-            fragment = tin.vertex_label[v]
-    return fragment if best <= reach_mm else -1
+            found = v
+    return found if best <= reach_mm else -1
+
+
+@kernel(inline="always")
+def _at_joined_edge(f: int, vertices: SceneVertices, tin: LabelledTin) -> bool:
+    """Whether a facet lies between the ground and a building to which one of its corners was joined."""
+    if f < 0 or tin.kinds[f] != FacetKind.BORDER:
+        return False
+    joined = False
+    for q in range(3):
+        kind = vertices.kind[tin.facets[f, q]]
+        if kind == VertexKind.JOINED:
+            joined = True
+        elif kind != VertexKind.GROUND and kind != VertexKind.BUILDING:  # noqa: PLR1714 - compiled
+            return False
+    return joined
 
 
 @kernel(inline="always")
@@ -213,7 +230,8 @@ def assign_points(
     """Fragment of every point of the core, int32 (n,), -1 where none; fills the columns of sums that count points.
 
     A point belongs to the surface of the facet around it, or at walls and borders to that of the vertex nearest in
-    elevation. `lowest_point` (f, 3) int64 gets the smallest point of each fragment. All in mm.
+    elevation. Where that is building by its class, an undecided point has to be nearer, within `limits.same`.
+    `lowest_point` (f, 3) int64 gets the smallest point of each fragment. All in mm.
     """
     x, y, z = vertices.x_mm, vertices.y_mm, vertices.z_mm
     facets, kinds, vertex_label = tin.facets, tin.kinds, tin.vertex_label
@@ -229,12 +247,10 @@ def assign_points(
         at_vertex = _corner_at(px, py, f, vertices, facets)
         if at_vertex < 0 and f >= 0 and on_edge >= 0:
             f = _facet_at_edge(f, on_edge, vertices, tin)
-        fragment = -1
+        fragment, v, over = -1, -1, 0.0
         if f < 0 or kinds[f] == FacetKind.VOID or at_vertex >= 0:
             # facets across gaps differ from tile to tile: only the nearest vertex is sure
             v = at_vertex if at_vertex >= 0 else _nearest_vertex(px, py, pz, x, y, z, limits.far)
-            if v >= 0 and abs(pz - z[v]) <= limits.reach:
-                fragment = vertex_label[v]
         elif kinds[f] == FacetKind.OBJECT or kinds[f] == FacetKind.BUILDING:
             over = _above_facet(px, py, pz, f, vertices, facets)
             if abs(over) <= limits.reach:
@@ -242,11 +258,17 @@ def assign_points(
             elif over > limits.canopy and not points.last[i]:
                 sums[tin.label[f], Sum.CANOPY] += 1
         else:
-            fragment = _of_corner_on_level(px, py, pz, f, vertices, tin, limits.reach)
+            v = _corner_on_level(px, py, pz, f, vertices, tin, limits.reach)
+        if v >= 0 and abs(pz - z[v]) <= limits.reach:
+            fragment, over = vertex_label[v], float(pz - z[v])
         if fragment < 0 or not stands_up(tin.fragment_kind[fragment]):
             continue
         if tin.fragment_kind[fragment] == FacetKind.BUILDING and points.allowed[i] != Allowed.BUILDING:
-            continue
+            # at its edges they belong to it only beside others that do
+            is_sure = v < 0 or at_vertex >= 0 or vertices.kind[v] == VertexKind.JOINED
+            continues = is_sure or _at_joined_edge(f, vertices, tin)
+            if points.allowed[i] != Allowed.ANY or not continues or abs(over) > limits.same:
+                continue
         sums[fragment, Sum.POINTS] += 1
         sums[fragment, Sum.SEVERAL] += points.several[i]
         sums[fragment, Sum.THROUGH] += not points.last[i]

@@ -8,6 +8,7 @@ from pipeline.terrain.settings import (
     CandidateSettings,
     GroundSettings,
     OutlierSettings,
+    StripSettings,
     SurfaceSettings,
     UnitSettings,
     VegetationSettings,
@@ -39,6 +40,7 @@ class SceneSettings:
     surfaces: SurfaceSettings = dataclasses.field(default_factory=SurfaceSettings)
     candidates: CandidateSettings = dataclasses.field(default_factory=CandidateSettings)
     units: UnitSettings = dataclasses.field(default_factory=UnitSettings)
+    strips: StripSettings = dataclasses.field(default_factory=StripSettings)
 
     @property
     def support_m(self) -> float:

@@ -236,6 +236,26 @@ class SurfaceSettings(Parameters):
         return round(2 * self.thinning_m * 1000)
 
 
+class StripSettings(Parameters):
+    """What becomes of flight strips that do not fit each other."""
+
+    warn_m: float = parameter(
+        0.1,
+        "Strips that lie farther above one another are named in a warning.",
+        unit="m",
+        minimum=0.02,
+        maximum=10.0,
+    )
+    align_m: float = parameter(
+        0.35,
+        "Strips that lie farther above one another are moved to their common mean before anything else; those below "
+        "are aligned building by building (min_strip_offset_m).",
+        unit="m",
+        minimum=0.05,
+        maximum=10.0,
+    )
+
+
 class CandidateSettings(Parameters):
     """Conditions that make a surface a candidate."""
 

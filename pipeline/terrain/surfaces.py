@@ -28,6 +28,10 @@ from pipeline.terrain.fragment_sums import Core, sum_fragments
 from pipeline.terrain.point_assignment import AssignmentLimits, ScenePoints, assign_points
 from pipeline.terrain.settings import SurfaceSettings
 
+_SAME_M = 0.2
+"""Farthest that an undecided point lies from the surface of a building that it belongs to. Not a setting: it is the
+least step between two roofs (`min_step_m`), and far above the noise of a scanner."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Fragments:
@@ -90,7 +94,8 @@ def fragments_of(
     labelled = LabelledTin(tin.facets, tin.neighbours, kinds, label, vertex_label, fragment_kind)
     sums, boxes, along = sum_fragments(vertices, labelled, core, wall_mm)
     lowest = np.full((len(fragment_kind), 3), 2**62, np.int64)
-    reaches = AssignmentLimits(round(settings.reach_m * 1000), round(canopy_m * 1000), round(ground_m * 1000), far_mm)
+    reach, same, canopy, ground = (round(1000 * m) for m in (settings.reach_m, _SAME_M, canopy_m, ground_m))
+    reaches = AssignmentLimits(reach, same, canopy, ground, far_mm)
     point_fragment = assign_points(points, vertices, labelled, reaches, sums, lowest)
     crossing = np.flatnonzero((label >= 0) & with_vertex(tin.facets, shared))
     return (

@@ -219,6 +219,7 @@ figures = st.fixed_dictionaries(
         Sum.THROUGH: st.integers(0, 1000),
         Sum.SMOOTH: st.integers(0, 400),
         Sum.OPEN: st.integers(0, 200_000),
+        Sum.SEAM: st.integers(0, 6_000),
     }
 )
 weights = st.lists(st.tuples(st.integers(1, 10**6), st.integers(0, 400), st.integers(0, 400)), max_size=6)

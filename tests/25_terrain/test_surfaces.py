@@ -166,8 +166,11 @@ def slow_kind(scene: Scene, facet: npt.NDArray[np.int32]) -> FacetKind:
         return FacetKind.VOID
     if (kinds == VertexKind.OBJECT).all():
         return FacetKind.OBJECT
-    if (kinds == VertexKind.BUILDING).any():
-        return FacetKind.BUILDING if (kinds == VertexKind.BUILDING).all() else FacetKind.BORDER
+    building = np.isin(kinds, (VertexKind.BUILDING, VertexKind.JOINED))
+    if building.any() and (kinds == VertexKind.CROWN).any():
+        return FacetKind.BORDER
+    if building.any():
+        return FacetKind.BUILDING if building.all() else FacetKind.SEAM
     return FacetKind.CROWN
 
 
@@ -177,6 +180,8 @@ def test_facet_kinds_agree_with_a_slow_twin() -> None:
     kind = scene.vertices.kind.copy()
     x = scene.vertices.x_mm
     kind[(x > 20_000) & (kind == VertexKind.OBJECT)] = VertexKind.BUILDING
+    kind[(random.random(len(kind)) < 0.05) & (kind == VertexKind.BUILDING)] = VertexKind.JOINED
+    kind[(random.random(len(kind)) < 0.05) & (kind == VertexKind.BUILDING)] = VertexKind.OBJECT
     kind[(random.random(len(kind)) < 0.02) & (kind != VertexKind.GROUND)] = VertexKind.EXCLUDED
     kind[(random.random(len(kind)) < 0.05) & (kind == VertexKind.OBJECT)] = VertexKind.CROWN
     gap = in_box(x / 1000, scene.vertices.y_mm / 1000, 22, 26, 39, 32)
@@ -374,8 +379,8 @@ def test_sums_agree_with_a_walk_over_all_edges(heights: Height) -> None:
                 row[Sum.WALLS] += 1
                 row[Sum.WALLS_Z_MX] += top
                 row[Sum.WALLS_OWN_Z] += own
-            if kinds[g] == FacetKind.STEP:
-                row[Sum.STEP] += length
+            if kinds[g] in {FacetKind.STEP, FacetKind.SEAM}:
+                row[Sum.STEP if kinds[g] == FacetKind.STEP else Sum.SEAM] += length
     fragments, _ = scene.cut()
     columns = [Sum.FACETS, Sum.AREA2, *range(Sum.BOUNDARY, Sum.POINTS), *range(Sum.OPEN, N_SUMS)]
     assert (expected[:, [Sum.OPEN, Sum.AREA_W, Sum.GAP_W]].sum(axis=0) > 0).tolist() == [True, True, heights is slab]
@@ -500,15 +505,23 @@ def test_points_of_thin_objects_are_evidence_alone() -> None:
     np.testing.assert_array_equal(found.lowest_point_mm[roof], min(map(tuple, rest.tolist())))
 
 
-def test_only_points_of_class_building_join_a_surface_of_that_class() -> None:
+def test_undecided_points_join_a_surface_of_class_building_if_they_lie_on_it() -> None:
     scene = built(box, seed=13)
-    v = scene.vertices
+    v, p = scene.vertices, scene.points
     kind = np.where(v.kind == VertexKind.OBJECT, VertexKind.BUILDING, v.kind).astype(np.int8)
-    building = np.random.default_rng(13).random(len(scene.points.x_mm)) < 0.5
-    points = scene.points._replace(allowed=np.where(building, Allowed.BUILDING, Allowed.ANY).astype(np.int8))
+    random = np.random.default_rng(13)
+    allowed = random.choice(np.array([Allowed.BUILDING, Allowed.ANY, Allowed.NEVER], np.int8), len(p.x_mm))
+    lift_mm = np.where((allowed != Allowed.BUILDING) & (random.random(len(p.x_mm)) < 0.3), 300, 0)
+    points = p._replace(z_mm=p.z_mm + lift_mm, height_mm=p.height_mm + lift_mm, allowed=allowed)
     fragments, labels = dataclasses.replace(scene, vertices=v._replace(kind=kind), points=points).cut()
     (roof,) = of_kind(fragments, FacetKind.BUILDING)
-    np.testing.assert_array_equal(labels == roof, building & (points.z_mm == 6000))
+    on_roof = p.z_mm == 6000
+    known, undecided = on_roof & (allowed == Allowed.BUILDING), on_roof & (allowed == Allowed.ANY) & (lift_mm == 0)
+    assert (labels[known] == roof).all()
+    assert not (labels == roof)[~known & ~undecided].any(), "others, and those that lie 0.3 m above the roof"
+    inner = undecided & (abs(p.x_mm - p.x_mm[on_roof].mean()) < 6000) & (abs(p.y_mm - p.y_mm[on_roof].mean()) < 4000)
+    assert inner.any()
+    assert (labels[inner] == roof).all()
 
 
 # -- tiles -------------------------------------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ from pipeline.terrain.lattice import NO_DATA, lowest_per_cell
 from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.scene_settings import ClassesInUse
 from pipeline.terrain.settings import OutlierSettings
+from pipeline.terrain.survey_strips import SQUARE_MM, Rows, compared_strips
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 
@@ -67,6 +68,8 @@ class TileCells:
     """Digest of the cells."""
     states: int
     """CRC-32 of the states of its points."""
+    strips: Rows
+    """How its flight strips differ."""
 
 
 def find_all_cells(
@@ -75,8 +78,10 @@ def find_all_cells(
     ingested: Sequence[Ingested],
     classes: ClassesInUse,
     tiles: Iterable[Tile],
+    *,
+    again: bool = False,
 ) -> dict[Tile, TileCells]:
-    """The cells of some tiles with points, the fullest first."""
+    """The cells of some tiles with points, the fullest first; in silence where they are found `again`."""
     grid, points, content = context.plan.grid, points_by_tile(ingested), content_by_tile(ingested)
     # the marks of points are in the order of the buckets, which equal points do not imply
     files: dict[Tile, list[tuple[tuple[str, ...], str]]] = {}
@@ -98,7 +103,7 @@ def find_all_cells(
     clear_tiles(context.scratch, FOLDER, tasks)
     function = functools.partial(find_cells, settings=settings)
     stored: Files[CellsTask, TileCells] = Files(reads=_read, leaves=_left, intact=is_intact)
-    found_cells = context.map_stored("cells", function, tasks, whole, files=stored)
+    found_cells = context.map_stored("cells", function, tasks, whole, files=stored, quiet=again)
     return {cells.tile: cells for cells in found_cells.values()}
 
 
@@ -124,8 +129,10 @@ def find_cells(task: CellsTask, settings: OutlierSettings) -> TileCells:
     parts = [bucket(path) for path in bucket_paths(scratch, task.tile)]
     own, first = _columns_of(parts, core)
     del parts
-    around = _around(task, core.grown(math.ceil(settings.support_m * MM)))
+    around = _around(task, core.grown(max(SQUARE_MM, math.ceil(settings.support_m * MM))))
     x, y, z = (np.concatenate([columns[axis] for columns in (own, *around)]) for axis in range(3))
+    number, source, returns = (np.concatenate([columns[k] for columns in (own, *around)]) for k in (3, 5, 7))
+    strips = compared_strips((x, y, z), (number, returns), source, core)
     task.scratch.check_cancelled()
     n = len(own[0])
     kept = dense_enough(x, y, z, settings)[:n]
@@ -147,6 +154,7 @@ def find_cells(task: CellsTask, settings: OutlierSettings) -> TileCells:
         outliers=int(n - np.count_nonzero(kept)),
         outcome=_digest_of(*rasters.values()),
         states=zlib.crc32(states.data),
+        strips=strips,
     )
 
 

@@ -30,7 +30,7 @@ from pipeline.scene import lattice_of
 from pipeline.settings import RunSettings
 from pipeline.terrain.ground import ground_on
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
-from pipeline.terrain.scene_settings import APRON_M
+from pipeline.terrain.scene_settings import APRON_M, ClassesInUse
 from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
@@ -78,17 +78,37 @@ class Ground:
     """The terrain of each tile."""
 
 
-def find_ground(
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BlockCells:
+    """The cells of a run, and the blocks over which the ground is found."""
+
+    blocks: Mapping[tuple[int, int], Sequence[Tile]]
+    """The tiles of each block, by its column and row."""
+    seen: Mapping[tuple[int, int], tuple[Tile, ...]]
+    """The tiles with points that the filter of each block sees."""
+    drawn: Collection[Tile]
+    """All tiles of the blocks."""
+    cells: Mapping[Tile, TileCells]
+    """What was found of the points of each tile."""
+    reach_mm: int
+    """How far an elevation looks."""
+    classes: ClassesInUse
+    """Which of the file's classes are believed."""
+
+
+def cells_of_blocks(
     context: RunContext,
     settings: RunSettings,
     ingested: Sequence[Ingested],
     *,
     footprints: bool,
     only: Collection[Tile] | None = None,
-) -> Ground:
-    """The ground of all tiles, or of some and of what their splits see; `footprints` says whether they are given.
+    again: bool = False,
+) -> BlockCells:
+    """The cells of all tiles, or of some and of what their splits see; `footprints` says whether they are given.
 
-    Raises InputError if the points of a tile do not fit into a worker, now that they are counted.
+    `again` finds those that this run found before, in silence. Raises InputError if the points of a tile do not fit
+    into a worker, now that they are counted.
     """
     grid, scene = context.plan.grid, settings.scene
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
@@ -108,7 +128,14 @@ def find_ground(
         for name, tiles in blocks.items()
     }
     wanted = {tile for tiles in seen.values() for tile in tiles}
-    cells = find_all_cells(context, scene.outliers, ingested, classes, wanted)
+    cells = find_all_cells(context, scene.outliers, ingested, classes, wanted, again=again)
+    return BlockCells(blocks=blocks, seen=seen, drawn=drawn, cells=cells, reach_mm=reach_mm, classes=classes)
+
+
+def find_ground(context: RunContext, settings: RunSettings, found: BlockCells) -> Ground:
+    """The ground of the blocks whose cells were found."""
+    grid, scene = context.plan.grid, settings.scene
+    cells, classes, reach_mm, seen = found.cells, found.classes, found.reach_mm, found.seen
     duplicates, outliers = (sum(getattr(c, name) for c in cells.values()) for name in ("duplicates", "outliers"))
     if duplicates:
         context.progress.warn("cells", f"{duplicates} duplicated points were dropped")
@@ -116,7 +143,7 @@ def find_ground(
         context.progress.warn("cells", f"{outliers} gross outliers were left out")
     alike = key_of(grid, scene.ground, classes.ground)
     tasks = {}
-    for (column, row), tiles in blocks.items():
+    for (column, row), tiles in found.blocks.items():
         around = seen[column, row]
         key = key_of(alike, [tile.key for tile in tiles], digests_of(cells, around))
         window = _around(grid, tiles).grown(reach_mm)
@@ -129,11 +156,11 @@ def find_ground(
             scratch=context.scratch,
             memory_bytes=ground_bytes(window, scene.ground),
         )
-    clear_tiles(context.scratch, FOLDER, tasks, {tile.key for tile in drawn})
+    clear_tiles(context.scratch, FOLDER, tasks, {tile.key for tile in found.drawn})
     function = functools.partial(draw_ground, settings=scene.ground)
     files: Files[GroundTask, tuple[TileGround, ...]] = Files(reads=_read, leaves=_left, intact=is_intact)
-    found = context.map_stored("ground", function, tasks, whole, files=files)
-    return Ground(cells=cells, tiles={one.tile: one for tiles in found.values() for one in tiles})
+    drawn = context.map_stored("ground", function, tasks, whole, files=files)
+    return Ground(cells=cells, tiles={one.tile: one for tiles in drawn.values() for one in tiles})
 
 
 def _read(task: GroundTask) -> list[str]:

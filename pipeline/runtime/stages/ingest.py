@@ -11,7 +11,7 @@ import functools
 import hashlib
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from uuid import uuid4
 
@@ -68,6 +68,8 @@ class IngestTask:
     """The share; None for the whole file."""
     limits: IsolationLimits | None = None
     """Limits of the child process that reads it; None reads it in the process that runs the task."""
+    moves_mm: tuple[tuple[int, int], ...] = ()
+    """Flight strips that are moved, and by how much up."""
 
     @property
     def supervises(self) -> bool:
@@ -75,9 +77,12 @@ class IngestTask:
         return self.limits is not None
 
 
-def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
+def ingest(
+    context: RunContext, paths: Sequence[str], moves_mm: Mapping[int, int] | None = None, *, again: bool = False
+) -> list[Ingested]:
     """Bucket the points of all inputs by tile; what each input held, in the order of the paths.
 
+    `moves_mm` are flight strips whose points are moved up; `again` reads inputs that this run read before, in silence.
     Raises EmptyInputError if no usable point is left, InconsistentInputError if all points lie on one line.
     """
     plan, progress = context.plan, context.progress
@@ -97,17 +102,18 @@ def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
                 known=file,
                 share=share,
                 limits=context.reading,
+                moves_mm=tuple(sorted((moves_mm or {}).items())),
             )
-            key = key_of(path, file.file_size, written, task.options, task.grid, share)
+            key = key_of(path, file.file_size, written, task.options, task.grid, share, task.moves_mm)
             tasks[Place("ingest", task.part, key)] = task
     clear_points(context.scratch, tasks)
     buckets: Files[IngestTask, Ingested] = Files(leaves=_buckets, intact=is_intact)
-    stored = context.map_stored("ingest", ingest_file, tasks, whole, files=buckets)
+    stored = context.map_stored("ingest", ingest_file, tasks, whole, files=buckets, quiet=again)
     shares: dict[str, list[Ingested]] = {path: [] for path in paths}
     for place, found in stored.items():
         shares[tasks[place].path].append(found)
     ingested = [of_file(known[shown(path)], found) for path, found in shares.items()]
-    for found in ingested:
+    for found in () if again else ingested:
         for warning in found.warnings:
             progress.warn("ingest", f"{shown(found.path)}: {warning}")
     points = sum(points_by_tile(ingested).values())
@@ -266,6 +272,8 @@ def _ingested(task: IngestTask) -> Ingested:
     for cloud in source.chunks(_CHUNK_POINTS, task.share):
         task.scratch.check_cancelled()
         records = to_records(cloud)
+        for strip, move_mm in task.moves_mm:
+            records["z"][records["source"] == strip] += move_mm
         x, y, z = (np.ascontiguousarray(records[name]) for name in "xyz")
         for axis, values in enumerate((x, y, z)):
             low[axis] = min(low[axis], int(values.min()))

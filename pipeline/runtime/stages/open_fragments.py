@@ -21,7 +21,7 @@ from pipeline.kernels.union_find import united
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
 from pipeline.runtime.stages.border_facets import are_beyond, facet_names, shared_facets
 from pipeline.runtime.stages.finished_surfaces import Finished, finished
-from pipeline.terrain.candidates import SOLID, Fault, Surfaces, judge_surfaces, may_join
+from pipeline.terrain.candidates import CONNECTING, SOLID, Fault, Surfaces, judge_surfaces, may_join
 from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.settings import CandidateSettings, SurfaceSettings
 from pipeline.terrain.surfaces import Fragments
@@ -93,7 +93,7 @@ def open_fragments(
     kind, count = fragments.kind, len(fragments.kind)
     reach, holders, names = _shared_facets(fragments, tile, grid, cut)
     is_open = are_beyond(reach, (tile.column, tile.row, tile.column, tile.row))
-    solid, step = np.isin(kind, SOLID), kind == FacetKind.STEP
+    solid, step = np.isin(kind, SOLID), np.isin(kind, CONNECTING)
     pairs = _linking_pairs(fragments, is_open, settings)
     piece = united(count, pairs[:, 0], pairs[:, 1])
     waits = np.zeros(count, np.bool_)

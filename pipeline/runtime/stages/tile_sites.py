@@ -37,18 +37,17 @@ class TileSitesFigures:
     points: int
     """Points of the candidates."""
     tiles: tuple[Tile, ...]
-    """The tiles in which the candidates lie, sorted."""
+    """The tiles in which all of them lie, sorted."""
     digest: str
     """Of all that is stored of them."""
 
 
 def figures_of(owner: Tile, sites: TileSites) -> TileSitesFigures:
     """What the driver needs to know."""
-    ranges = sites.found.candidate_ranges
     return TileSitesFigures(
         owner=owner,
         points=sites.found.candidate_points,
-        tiles=tuple(sorted(sites.tiles[number] for number in np.unique(ranges[:, 1]).tolist())),
+        tiles=tuple(sorted(sites.tiles)),
         digest=key_of(sites),
     )
 

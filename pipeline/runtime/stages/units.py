@@ -24,6 +24,7 @@ from pipeline.runtime.scratch.outcomes import InParts, Place, brief_within, drop
 from pipeline.runtime.stages.cleanup import clear_units
 from pipeline.runtime.stages.gather import canonical_order
 from pipeline.runtime.stages.outline import outlined
+from pipeline.runtime.stages.rejected_strips import with_strips_that_disagree
 from pipeline.runtime.stages.sites import (
     UNITS,
     CandidateSite,
@@ -181,7 +182,8 @@ def sites_of_tile(task: UnitTask) -> InParts[SitesBrief]:
     warnings: list[str] = []
     if task.outlines:
         divided, warnings = outlined(largest_first(divided), task.roof, task.grid, task.scratch)
-    rejected = found.rejected if task.share == 0 else ()
+    least_m = task.roof.min_strip_offset_m
+    rejected = with_strips_that_disagree(found.rejected, task.scratch, least_m) if task.share == 0 else ()
     return stored_sites(divided, rejected, task.grid, task.scale, checksums, warnings)
 
 

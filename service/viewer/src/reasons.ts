@@ -24,6 +24,7 @@ const REASONS: Record<string, string> = {
   too_narrow: "narrower than a building: a wall, a hedge or a wire",
   bridge: "the deck of a bridge",
   vehicle: "narrow, low and free all around: a vehicle or a container",
+  strips_disagree: "flight strips that do not fit each other here: it may be a building",
   overridden: "an override says that it is not a building",
 };
 

@@ -1,0 +1,100 @@
+"""Flight strips that lie above one another: named with their offset, and the houses on them are found."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import invoke
+from plain_houses import AREAS_M2, SIDE_M, houses, write_houses
+from run_tables import rows
+
+from pipeline.model import Reason
+from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.rerun import RerunRequest, rerun
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run import run
+
+
+def two_strips(path: Path, lift_m: float, tilt_m: float = 0.0) -> Path:
+    """The houses in two strips that cover all; the second lies higher, and rises from west to east."""
+    found = houses(per_m2=8.0)
+    strips = np.random.default_rng(6).integers(11, 13, len(found.house))
+    share = (found.xyz[:, 0] - 400_000.0) / SIDE_M - 0.5
+    return write_houses(path, found, strips=strips, lift_m=(strips == 12) * (lift_m + tilt_m * share))
+
+
+def warning_of(summary: Any) -> str:
+    """The warning about strips; empty without one."""
+    return next((warning for warning in summary.warnings if "flight strips" in warning), "")
+
+
+@pytest.mark.parametrize("lift_m", [0.3, 0.45, 0.6, 1.5])
+def test_houses_in_strips_that_disagree_are_found_and_the_strips_named(
+    lift_m: float, tmp_path: Path, reconstruct: Any
+) -> None:
+    summary = reconstruct(two_strips(tmp_path / "tile.laz", lift_m))
+    assert summary.statuses == {"ok": 3}
+    found = rows(summary.run_dir)
+    assert sorted(row["footprint_area_m2"] for row in found) == pytest.approx(AREAS_M2, rel=0.06)
+    assert f"strip 11 lies {lift_m:.2f} m below strip 12" in warning_of(summary)
+    # a house stays at the mean of the strips, its height stays true
+    assert min(row["ridge_z"] for row in found) == pytest.approx(55.0 + lift_m / 2, abs=0.06)
+    assert max(row["height_m"] for row in found) == pytest.approx(10.0, abs=0.25)
+
+
+def test_strips_that_fit_are_not_named_and_not_moved(tmp_path: Path, reconstruct: Any) -> None:
+    summary = reconstruct(two_strips(tmp_path / "tile.laz", 0.03))
+    assert summary.statuses == {"ok": 3}
+    assert warning_of(summary) == ""
+    assert read_manifest(summary.run_dir).strip_moves_m == {}
+
+
+def test_inspect_names_the_strips(tmp_path: Path) -> None:
+    code, out, _ = invoke("inspect", str(two_strips(tmp_path / "tile.laz", 0.6)), "--json")
+    assert code == 0
+    assert any("strip 11 lies 0.60 m below strip 12" in warning for warning in json.loads(out)["warnings"])
+
+
+def test_an_object_that_its_strips_keep_from_being_a_building_says_so(tmp_path: Path, reconstruct: Any) -> None:
+    summary = reconstruct(two_strips(tmp_path / "tile.laz", 1.5), settings={"strips": {"align_m": 10.0}})
+    said = [row for row in rows(summary.run_dir, "rejected") if row["reason"] == Reason.STRIPS_DISAGREE]
+    assert said
+    assert all(row["reason_detail"].startswith("strips lie 1.50 m apart, at most 0.1; ") for row in said)
+
+
+def test_houses_in_a_tilted_strip_are_found_and_the_strips_named_with_their_range(
+    tmp_path: Path, reconstruct: Any
+) -> None:
+    summary = reconstruct(two_strips(tmp_path / "tile.laz", 0.0, tilt_m=1.2))
+    assert summary.statuses == {"ok": 3}
+    assert "strip 11 lies -0.3" in warning_of(summary)
+
+
+def test_the_moves_of_strips_are_a_setting(tmp_path: Path, reconstruct: Any) -> None:
+    path = two_strips(tmp_path / "tile.laz", 0.6)
+    summary = reconstruct(path, settings={"strips": {"align_m": 1.0}})
+    assert read_manifest(summary.run_dir).strip_moves_m == {}
+    assert "aligned one by one" in warning_of(summary)
+    assert read_manifest(reconstruct(path).run_dir).strip_moves_m == {"11": 0.3, "12": -0.3}
+
+
+@pytest.mark.slow
+def test_moved_strips_depend_on_neither_tiles_nor_workers_nor_files(tmp_path: Path, reconstruct: Any) -> None:
+    path = two_strips(tmp_path / "tile.laz", 0.6)
+    whole = reconstruct(path)
+    tiled = reconstruct(path, settings={"tile_size_m": 23.0, "lattice_x_m": 3.0})
+    request = RunRequest(inputs=(str(path),), out=str(tmp_path / "workers"), resources=Resources(workers=2))
+    assert {whole.digest, tiled.digest, run(request).digest} == {whole.digest}
+
+
+@pytest.mark.slow
+def test_a_rerun_moves_the_strips_as_the_run_did(tmp_path: Path, reconstruct: Any) -> None:
+    summary = reconstruct(two_strips(tmp_path / "tile.laz", 0.6), out=str(tmp_path / "run"))
+    before = {row["building_id"]: row["ridge_z"] for row in rows(summary.run_dir)}
+    one = min(before)
+    again = rerun(RerunRequest(run_dir=summary.run_dir, only=(one,), resources=Resources(workers=0)))
+    assert again.digest == summary.digest
+    assert {row["building_id"]: row["ridge_z"] for row in rows(summary.run_dir)} == before
