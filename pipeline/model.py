@@ -48,6 +48,7 @@ class Reason(StrEnum):
     SCATTERED = "scattered"
     NOT_SEEN = "not_seen"
     TOO_MANY_FACES = "too_many_faces"
+    UNCERTAIN = "uncertain"
     INTERNAL_ERROR = "internal_error"
     CRASHED = "crashed"
     TIMED_OUT = "timed_out"
@@ -79,6 +80,7 @@ REASONS: Mapping[Reason, str] = {
     Reason.SCATTERED: "`doubtful`: its roof returns scatter about the model more than a roof does: a tree, a heap",
     Reason.NOT_SEEN: "`doubtful`: too much of the roof is drawn where no point is",
     Reason.TOO_MANY_FACES: "`doubtful`: too few roof returns for so many roof faces",
+    Reason.UNCERTAIN: "`doubtful`: it may not be a building; the detail is the confidence",
     Reason.INTERNAL_ERROR: "a fault of gablework in this one building; the detail names the exception; kept as a "
     "bundle",
     Reason.CRASHED: "its process died at it, twice, the second time alone; the detail names the signal or the exit "
@@ -305,6 +307,8 @@ class Candidate:
     """(i, 3) float64, the same of pulses with several returns, the last of each."""
     touches_data_edge: bool = False
     """True where the data end at the candidate: it may be cut."""
+    is_known: bool = False
+    """True where a footprint or the user says that it is a building."""
     strip_offset_m: float = math.nan
     """Largest offset between two flight strips that was taken out of the points, metres; nan where none was."""
     guides: tuple[Guide, ...] = ()

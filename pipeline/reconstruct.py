@@ -432,7 +432,7 @@ def _judged(building: _Building, record: BuildingResult, plan: RoofPlan | None) 
     if record.lod != LODS[-1]:
         return record
     settings = building.settings.support
-    doubt = doubt_of(support_of(record), settings)
+    doubt = doubt_of(support_of(record, is_known=building.candidate.is_known), settings)
     if doubt is None:
         return record
     _withdraw(building)

@@ -17,7 +17,7 @@ from pipeline.export.dimensions import Dimensions, dimensions
 from pipeline.export.facts import CandidateFacts, RecordContext, RejectedObject
 from pipeline.export.solid_geometry import WALL_OUTLINE, solid_columns
 from pipeline.model import BuildingResult, ModelQuality, Plane
-from pipeline.quality.detection import detection_confidence
+from pipeline.quality.detection import confidence_of
 
 _SAYS_BUILDING = frozenset({"accept", "footprint"})
 """Overrides by which a user says that an object is a building."""
@@ -120,8 +120,7 @@ def _confidence(result: BuildingResult, facts: CandidateFacts) -> float | None:
     """How probably it is a building; None without a model, and where a footprint or the user says that it is one."""
     if result.source_id is not None or _SAYS_BUILDING & set((facts.overridden or "").split(", ")):
         return None
-    share_of_all = result.quality.share_within * (1.0 - result.quality.share_below_roof)
-    return _or_none(detection_confidence(result.n_points, share_of_all, facts.through_share))
+    return _or_none(confidence_of(result))
 
 
 def _quality(quality: ModelQuality) -> dict[str, float | bool | None]:

@@ -4,26 +4,38 @@ from __future__ import annotations
 
 import math
 
-# Not settings: fitted by logistic regression to the buildings of the tiles that docs/reference/records.md names, over
-# which benchmarks/detection_confidence.py measures how reliable the result is.
-PER_LOG_POINT = 0.53
-"""Log-odds per e-fold of the number of points: few points may lie level by chance."""
-PER_SHARE_WITHIN = 3.9
-"""Log-odds of a roof whose points all lie within 0.2 m of planes: crowns are not planar."""
-PER_SHARE_THROUGH = -16.0
-"""Log-odds of an object through which all pulses go: they go through leaves and not through roofs."""
-PRIOR_POINTS, PRIOR_THROUGH = 5, 1
-"""Few points show a share badly: so many are added, and so many pulses of theirs go on."""
+from pipeline.model import BuildingResult
+
+# Not settings: fitted by logistic regression to the surveys that docs/reference/records.md names;
+# benchmarks/detection_confidence.py and benchmarks/trust.py measure how reliable the result is.
+PER_LOG_NOISE = -4.0
+"""Log-odds per e-fold of the scatter about the roof: crowns are rough."""
+PER_SHARE_WITHIN = 14.0
+"""Log-odds of a roof whose returns all lie within 0.2 m of planes: crowns are not planar."""
+PER_LOG_PLANE_AREA = 3.5
+"""Log-odds per e-fold of the plan area per roof plane: a crown takes many small planes."""
+AT_ONE = -30.0
+"""Log-odds of no share, 1 m of scatter and planes of 1 m2."""
+LEAST_NOISE_M = 0.005
+"""Less scatter shows nothing more."""
 
 
-def detection_confidence(n_points: int, share_within: float, through_share: float) -> float:
-    """Probability from 0 to 1 that an object with a model is a building; nan if a figure is not known.
+def detection_confidence(noise_m: float, share_within: float, plane_area_m2: float) -> float:
+    """Probability from 0 to 1 that an object with a model of planes is a building; nan if a figure is not known.
 
-    Logistic in the logarithm of the number of points, in the share of points within 0.2 m of the roof, and in the
-    share of points whose pulse went on to a later return.
+    Logistic in the share of roof returns within 0.2 m of the roof, and in the logarithms of their scatter and of the
+    plan area per roof plane. These mean the same in every survey, however many returns a pulse has.
     """
-    if n_points < 1 or math.isnan(share_within) or math.isnan(through_share):
+    if math.isnan(noise_m) or math.isnan(share_within) or not plane_area_m2 > 0.0:
         return math.nan
-    through = (through_share * n_points + PRIOR_THROUGH) / (n_points + PRIOR_POINTS)
-    odds = PER_LOG_POINT * math.log(n_points) + PER_SHARE_WITHIN * share_within + PER_SHARE_THROUGH * through
+    odds = AT_ONE + PER_LOG_NOISE * math.log(max(LEAST_NOISE_M, noise_m))
+    odds += PER_SHARE_WITHIN * share_within + PER_LOG_PLANE_AREA * math.log(plane_area_m2)
     return 1.0 / (1.0 + math.exp(-odds))
+
+
+def confidence_of(record: BuildingResult) -> float:
+    """The same of a delivered model; nan for a block and without a model."""
+    if record.footprint is None or not record.planes:
+        return math.nan
+    quality = record.quality
+    return detection_confidence(quality.noise_m, quality.share_within, record.footprint.area / len(record.planes))

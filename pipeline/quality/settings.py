@@ -30,6 +30,12 @@ class SupportSettings(Parameters):
     min_returns_per_face: float = parameter(
         2.0, "Roof returns per roof face; below it the reason is `too_many_faces`.", minimum=0.0, maximum=1000.0
     )
+    min_confidence: float = parameter(
+        0.5,
+        "Confidence that an object found in the points alone is a building; below it the reason is `uncertain`.",
+        minimum=0.0,
+        maximum=1.0,
+    )
     block_loss: float = parameter(
         0.05,
         "A block replaces a doubtful model if it explains at most this share of the roof returns less.",

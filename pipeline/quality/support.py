@@ -7,6 +7,7 @@ import math
 from typing import TYPE_CHECKING
 
 from pipeline.model import BuildingResult, Decision, DecisionKind, Outcome, Reason
+from pipeline.quality.detection import confidence_of
 
 if TYPE_CHECKING:
     from pipeline.quality.settings import SupportSettings
@@ -24,6 +25,8 @@ class Support:
     """Share of the roof's plan area without a point on the roof nearby."""
     returns_per_face: float
     """Roof returns over roof faces."""
+    confidence: float = math.nan
+    """Probability that it is a building; nan where it is known to be one."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,8 +41,8 @@ class Doubt:
     """The same as an entry of the decisions."""
 
 
-def support_of(record: BuildingResult) -> Support:
-    """What the points say of a delivered model."""
+def support_of(record: BuildingResult, *, is_known: bool) -> Support:
+    """What the points say of a delivered model; `is_known` says that it is certainly of a building."""
     quality, n_faces = record.quality, len(record.faces)
     area_m2 = math.fsum(face.polygon.area for face in record.faces)
     return Support(
@@ -47,6 +50,7 @@ def support_of(record: BuildingResult) -> Support:
         scatter_m=quality.noise_m,
         unseen_share=quality.unexplained_m2 / area_m2 if area_m2 > 0.0 else math.nan,
         returns_per_face=record.n_points * (1.0 - quality.share_below_roof) / n_faces if n_faces else math.nan,
+        confidence=math.nan if is_known else confidence_of(record),
     )
 
 
@@ -71,6 +75,10 @@ def doubt_of(support: Support, settings: SupportSettings) -> Doubt | None:
     if returns < least:
         words = f"{returns:.1f} roof returns per roof face, less than {least:g}"
         return _doubt(Reason.TOO_MANY_FACES, words, "returns_per_face", returns, least)
+    confidence, least = support.confidence, settings.min_confidence
+    if confidence < least:
+        words = f"the confidence that it is a building is {confidence:.2f}, less than {least:g}"
+        return _doubt(Reason.UNCERTAIN, words, "detection_confidence", confidence, least)
     return None
 
 

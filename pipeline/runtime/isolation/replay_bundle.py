@@ -226,6 +226,7 @@ def _bundle(
         given=None if document.get("given") is None else GivenHeights(**document["given"]),
         outline=outline,
         touches_data_edge=bool(document["touches_data_edge"]),
+        is_known=bool(document.get("is_known", False)),
         strip_offset_m=math.nan if document.get("strip_offset_m") is None else float(document["strip_offset_m"]),
         guides=tuple(_guide(kind, line) for kind, line in document.get("guides", ())),
     )

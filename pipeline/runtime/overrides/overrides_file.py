@@ -75,6 +75,11 @@ class Override:
         return ", ".join(word for word in words if word)
 
     @property
+    def says_building(self) -> bool:
+        """Whether it says that there is a building: it is accepted, or has an outline."""
+        return self.action == "accept" or self.footprint is not None
+
+    @property
     def fingerprint(self) -> str:
         """sha256 over what it does, without the place in the file and the way in which the building is named."""
         content = {

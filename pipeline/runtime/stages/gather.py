@@ -275,6 +275,7 @@ def gather(
         beside=_in_metres(beside_mm, origin_mm),
         beside_later=_in_metres(later_mm, origin_mm),
         touches_data_edge=touches_data_edge,
+        is_known=is_given or (site.override is not None and site.override.says_building),
         strip_offset_m=strip_offset_m,
         guides=_near(guides, low, high, origin_mm) if guides and len(points) else (),
     )

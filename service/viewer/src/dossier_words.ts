@@ -165,6 +165,7 @@ const CHECKS: Record<string, Check> = {
   share_on_roof: { label: "Points on the roof", show: percent, met: "enough", missed: "too few: the model is doubtful" },
   unseen_share: { label: "Roof without points", show: percent, met: "little", missed: "too much: the model is doubtful" },
   returns_per_face: { label: "Points per roof face", show: (v) => measure(v, 1), met: "enough", missed: "too few: the model is doubtful" },
+  detection_confidence: { label: "Confidence that it is a building", show: percent, met: "enough", missed: "too low: the model is doubtful" },
   explained_share: { label: "Roof points that the model explains", show: percent, met: "enough for so few points", missed: "too few: the model is not delivered" },
 };
 

@@ -11,6 +11,7 @@ const REASONS: Record<string, string> = {
   poor_fit: "too few of its points lie on the model",
   scattered: "its points scatter about the model more than those of a roof",
   not_seen: "too much of the roof has no points",
+  uncertain: "it may not be a building",
   too_many_faces: "too few points for so many faces",
   internal_error: "a fault of the program in this one building",
   crashed: "it crashed its process; a bundle for a replay is kept",
