@@ -131,7 +131,7 @@ def vertical_residuals_m(points: FloatArray, coefficients: tuple[float, float, f
 
 
 @kernel
-def _grid_shape(points: FloatArray, cell_size_m: float) -> tuple[float, float, float, int, int]:
+def grid_shape(points: FloatArray, cell_size_m: float) -> tuple[float, float, float, int, int]:
     """Lower left corner, cell size and shape of a grid; cells grow until there are few more of them than points."""
     x_min = points[0, 0]
     y_min = points[0, 1]
@@ -152,7 +152,7 @@ def _grid_shape(points: FloatArray, cell_size_m: float) -> tuple[float, float, f
 
 
 @kernel
-def _sort_into_grid(
+def sorted_into_grid(
     points: FloatArray, x_min: float, y_min: float, cell_size_m: float, columns: int, rows: int
 ) -> tuple[LabelArray, LabelArray]:
     """Points by cell, ascending within one: where each cell starts (columns * rows + 1), and the indices."""
@@ -228,8 +228,8 @@ def _nearest_neighbours(
     if n == 0 or k == 0:
         return neighbours, squares
     size = wanted_cell_size_m if wanted_cell_size_m > 0.0 else _cell_for_few(points)
-    x_min, y_min, size, columns, rows = _grid_shape(points, size)
-    start, members = _sort_into_grid(points, x_min, y_min, size, columns, rows)
+    x_min, y_min, size, columns, rows = grid_shape(points, size)
+    start, members = sorted_into_grid(points, x_min, y_min, size, columns, rows)
     sorted_x, sorted_y, sorted_z = points[members, 0], points[members, 1], np.zeros(n)
     if dimensions == 3:
         sorted_z = points[members, 2]
@@ -403,8 +403,8 @@ def _covered(xyz_mm: IntArray, points: FloatArray, radius_mm: int, height_mm: in
     """Whether a point has another one more than `height_mm` above it within the radius in plan."""
     n = len(points)
     covered = np.zeros(n, np.bool_)
-    x_min, y_min, size, columns, rows = _grid_shape(points, radius_mm / 1000.0 + 0.001)
-    start, members = _sort_into_grid(points, x_min, y_min, size, columns, rows)
+    x_min, y_min, size, columns, rows = grid_shape(points, radius_mm / 1000.0 + 0.001)
+    start, members = sorted_into_grid(points, x_min, y_min, size, columns, rows)
     top = np.full(columns * rows, _LOWEST)
     for c in range(columns * rows):
         for q in range(start[c], start[c + 1]):
@@ -445,8 +445,8 @@ def top_visible(points: FloatArray, radius_m: float = 0.5, height_m: float = 1.1
 def _surrounded(places_mm: IntArray, xyz_mm: IntArray, points: FloatArray, radius_mm: int, height_mm: int) -> BoolArray:
     """Whether the points more than `height_mm` above each place within the radius lie on no one side of it."""
     surrounded = np.zeros(len(places_mm), np.bool_)
-    x_min, y_min, size, columns, rows = _grid_shape(points, radius_mm / 1000.0 + 0.001)
-    start, members = _sort_into_grid(points, x_min, y_min, size, columns, rows)
+    x_min, y_min, size, columns, rows = grid_shape(points, radius_mm / 1000.0 + 0.001)
+    start, members = sorted_into_grid(points, x_min, y_min, size, columns, rows)
     dx, dy = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
     for i in range(len(places_mm)):
         column = math.floor((places_mm[i, 0] * 1e-3 - x_min) / size)

@@ -410,9 +410,11 @@ class ModelQuality:
     point_spacing_m: float = math.nan
     """Typical distance of neighbouring roof points in plan, metres."""
     noise_m: float = math.nan
-    """Robust standard deviation of the points about the roof, vertical; nan for a block."""
+    """Robust standard deviation of the roof returns about the roof, vertical; nan for a block."""
     share_within: float = math.nan
-    """Share of all points that have a roof within 0.2 m above or below them."""
+    """Share of the roof returns that have a roof within 0.2 m above or below them."""
+    share_below_roof: float = math.nan
+    """Share of all points that are not roof returns: on facades, below the roof."""
     unexplained_m2: float = math.nan
     """Plan area of roof without a point within 0.2 m of it nearby, square metres."""
     largest_hole_m: float = math.nan
@@ -585,11 +587,12 @@ class BuildingResult:
     density_per_m2: float
     """Points a square metre of footprint; nan without one."""
     rmse_m: float = math.nan
-    """Root mean square vertical distance of all covered points to the top surface; nan without a model."""
+    """Root mean square vertical distance of the covered roof returns to the top surface, with few far ones limited;
+    nan without a model."""
     p95_m: float = math.nan
     """95th percentile of the absolute vertical distances; nan without a model."""
     coverage: float = 0.0
-    """Share of points that have a roof above or below them; 0 without a model, nan for one by attributes."""
+    """Share of the roof returns that have a roof above or below them; 0 without a model, nan for one by attributes."""
     quality: ModelQuality = ModelQuality()
     """How well the points support the model."""
     touches_data_edge: bool

@@ -191,25 +191,39 @@ BUILDINGS = (
         "rmse_m",
         FLOAT64,
         "m",
-        "root mean square vertical distance of the candidate's original points to the model's top surface",
+        "root mean square vertical distance of the roof returns to the model's top surface; no distance counts "
+        "more than 1 m, or than the 90th percentile if that is larger, so a chimney does not decide",
+        page="records.md#figures-of-fit",
     ),
-    Column("p95_m", FLOAT64, "m", "95th percentile of the absolute distances"),
+    Column("p95_m", FLOAT64, "m", "95th percentile of the absolute distances of the roof returns"),
     Column(
         "coverage",
         FLOAT64,
         SHARE,
-        "share of the points that have a roof above or below them; null if the height is an attribute",
+        "share of the roof returns that have a roof above or below them; null if the height is an attribute",
     ),
     Column("point_spacing_m", FLOAT64, "m", "typical distance of neighbouring roof points in plan"),
     Column(
         "noise_m",
         FLOAT64,
         "m",
-        "robust standard deviation of the points about the roof (1.4826 times the median absolute residual); "
+        "robust standard deviation of the roof returns about the roof (1.4826 times the median absolute residual); "
         "null for a block",
     ),
     Column(
-        "share_within_0_2m", FLOAT64, SHARE, "share of all points that have a roof within 0.2 m above or below them"
+        "share_within_0_2m",
+        FLOAT64,
+        SHARE,
+        "share of the roof returns that have a roof within 0.2 m above or below them",
+        page="records.md#figures-of-fit",
+    ),
+    Column(
+        "share_below_roof",
+        FLOAT64,
+        SHARE,
+        "share of all points that are not roof returns: on facades, below the roof; null in older runs, whose "
+        "figures of fit are of all points",
+        page="records.md#figures-of-fit",
     ),
     Column(
         "unexplained_m2",

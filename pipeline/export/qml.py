@@ -142,13 +142,13 @@ STATUS_CLASSES = (
 """Statuses of buildings."""
 
 DISTANCE_CLASSES = (
-    Range(lower=0.0, upper=0.05, label="up to 0.05 m", fill=Fill(colour=(44, 123, 182, 255))),
-    Range(lower=0.05, upper=0.1, label="0.05 to 0.1 m", fill=Fill(colour=(128, 191, 213, 255))),
-    Range(lower=0.1, upper=0.2, label="0.1 to 0.2 m", fill=Fill(colour=(255, 238, 170, 255))),
-    Range(lower=0.2, upper=0.5, label="0.2 to 0.5 m", fill=Fill(colour=(253, 174, 97, 255))),
-    Range(lower=0.5, upper=1e6, label="more than 0.5 m", fill=Fill(colour=(202, 54, 47, 255))),
+    Range(lower=0.0, upper=0.5, label="up to 50 % within 0.2 m", fill=Fill(colour=(202, 54, 47, 255))),
+    Range(lower=0.5, upper=0.75, label="50 to 75 %", fill=Fill(colour=(253, 174, 97, 255))),
+    Range(lower=0.75, upper=0.9, label="75 to 90 %", fill=Fill(colour=(255, 238, 170, 255))),
+    Range(lower=0.9, upper=0.95, label="90 to 95 %", fill=Fill(colour=(128, 191, 213, 255))),
+    Range(lower=0.95, upper=1.0, label="more than 95 % within 0.2 m", fill=Fill(colour=(44, 123, 182, 255))),
 )
-"""Distances of the points from the model."""
+"""Shares of the roof returns near the model, as on the page of the service: a chimney has few of them."""
 
 SLOPE_CLASSES = (
     Range(lower=0.0, upper=5.0, label="flat: up to 5 degrees", fill=Fill(colour=(247, 241, 221, 255))),
@@ -184,8 +184,8 @@ STYLES = (
     Style(
         layer="buildings",
         name="distance of the points",
-        description="Root mean square distance of the points from the model; buildings without one are not drawn",
-        qml=graduated("rmse_m", DISTANCE_CLASSES),
+        description="Share of the roof returns within 0.2 m of the model; buildings without one are not drawn",
+        qml=graduated("share_within_0_2m", DISTANCE_CLASSES),
     ),
     Style(
         layer="planes",

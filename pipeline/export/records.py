@@ -120,7 +120,8 @@ def _confidence(result: BuildingResult, facts: CandidateFacts) -> float | None:
     """How probably it is a building; None without a model, and where a footprint or the user says that it is one."""
     if result.source_id is not None or _SAYS_BUILDING & set((facts.overridden or "").split(", ")):
         return None
-    return _or_none(detection_confidence(result.n_points, result.quality.share_within, facts.through_share))
+    share_of_all = result.quality.share_within * (1.0 - result.quality.share_below_roof)
+    return _or_none(detection_confidence(result.n_points, share_of_all, facts.through_share))
 
 
 def _quality(quality: ModelQuality) -> dict[str, float | bool | None]:
@@ -129,6 +130,7 @@ def _quality(quality: ModelQuality) -> dict[str, float | bool | None]:
         "point_spacing_m": _or_none(quality.point_spacing_m),
         "noise_m": _or_none(quality.noise_m),
         "share_within_0_2m": _or_none(quality.share_within, 4),
+        "share_below_roof": _or_none(quality.share_below_roof, 4),
         "unexplained_m2": _or_none(quality.unexplained_m2),
         "largest_hole_m": _or_none(quality.largest_hole_m),
         "ridge_z_sigma_m": _or_none(quality.ridge_z_sigma_m),

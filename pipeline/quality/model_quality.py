@@ -14,16 +14,13 @@ from pipeline.model import FloatArray, ModelQuality, Plane, RoofFace, Solid
 from pipeline.quality.curved_roof import is_curved_roof
 from pipeline.quality.residuals import ResidualSummary, TopSurface, summarise, surface_of
 from pipeline.quality.ridge_height import ridge_height_sigma_m
+from pipeline.quality.roof_returns import MAD_TO_SIGMA, TOLERANCE_M, roof_returns
 from pipeline.quality.unseen_roof import Raster
 
-TOLERANCE_M = 0.2
-"""A point within this vertical distance of the roof is explained by it."""
 GAP_SPACINGS = 1.5
 """A place farther than this from all points is seen by none: of points strewn at random one place in a thousand is."""
 DRAWN_OUTLINE_SPACINGS = 0.2
 """Standard deviation in plan of a drawn outline: pent roofs of the simulated suites, whose ridge is their outline."""
-_MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution over the median of its absolute values."""
 _MIN_CELL_M = 0.25
 """Places on the roof are looked at on a raster of one point spacing, or of this where points are denser."""
 _MAX_CELLS = 20_000
@@ -47,18 +44,19 @@ def model_quality(
     outline's place in plan, 0 if it was given. `is_planar` says that the faces follow the roof's planes (LoD2):
     residuals of a block are the roof's form, not noise, and the top of a block is not a ridge, so both figures are nan.
 
-    Residuals are summarised with `TOLERANCE_M`. Figures are nan if no points say anything; `bic_margin` is passed on.
+    The summary, with `TOLERANCE_M`, is of the roof returns. Figures are nan if no points say anything; `bic_margin` is
+    passed on.
     """
     surface = surface_of(faces, planes)
     residuals, face_of_point = surface.residuals(points)
-    summary = summarise(residuals, TOLERANCE_M)
+    summary = summarise(residuals[roof_returns(points, residuals, spacing_m)], TOLERANCE_M)
     unexplained = hole = math.nan
     if summary.coverage > 0.0 and spacing_m > 0.0:
         area_m2 = math.fsum(face.polygon.area for face in faces)
         unexplained, hole = _seen(points, surface, residuals, area_m2, spacing_m)
     noise = sigma = math.nan
     if is_planar:
-        noise = _MAD_TO_SIGMA * summary.median_m
+        noise = MAD_TO_SIGMA * summary.median_m
         # -1, no face, takes the last one: no plane
         plane_of_point = np.array([*(face.plane for face in faces), -1], np.int32)[face_of_point]
         reach = max(TOLERANCE_M, 3.0 * noise)
@@ -67,6 +65,7 @@ def model_quality(
         point_spacing_m=spacing_m,
         noise_m=noise,
         share_within=summary.share_within if summary.n_points else math.nan,
+        share_below_roof=1.0 - summary.n_points / len(points) if len(points) else math.nan,
         unexplained_m2=unexplained,
         largest_hole_m=hole,
         ridge_z_sigma_m=sigma,

@@ -19,6 +19,8 @@ from pipeline.quality.unseen_roof import Raster, middles_of_cells, unseen_cells
 
 _MAX_CELLS = 1_000_000
 """Cells of the raster over a roof: bounds the memory."""
+_FAR_M = 1.0
+"""Of the farthest tenth of the points no distance counts more than this, unless the other nine tenths reach farther."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,7 +28,8 @@ class ResidualSummary:
     """Figures of the residuals of a building."""
 
     rmse_m: float
-    """Root mean square over the covered points; nan without any."""
+    """Root mean square over the covered points; nan without any. A chimney does not decide: no distance counts more
+    than 1 m, or than the 90th percentile if that is larger."""
     median_m: float
     """Median of the absolute residuals of the covered points; nan without any."""
     p95_m: float
@@ -359,8 +362,11 @@ def _quantile(ascending: FloatArray, share: float) -> float:
 
 
 @kernel
-def _distances(residuals: FloatArray, tolerance_m: float) -> tuple[FloatArray, float, int]:
-    """The absolute residuals of the covered points, the sum of their squares, and how many are within the tolerance."""
+def _distances(residuals: FloatArray, tolerance_m: float, limit_m: float) -> tuple[FloatArray, float, int]:
+    """The absolute residuals of the covered points, the sum of their squares, and how many are within the tolerance.
+
+    Squares are of at most the limit.
+    """
     distances = np.empty(len(residuals))
     covered = within = 0
     for residual in residuals:
@@ -369,7 +375,8 @@ def _distances(residuals: FloatArray, tolerance_m: float) -> tuple[FloatArray, f
             within += distances[covered] <= tolerance_m
             covered += 1
     distances = distances[:covered]
-    return distances, exact_sum(distances * distances), within
+    limited = np.minimum(distances, limit_m)
+    return distances, exact_sum(limited * limited), within
 
 
 def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummary:
@@ -383,13 +390,16 @@ def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummar
     (0.5, 0.75)
     """
     n = len(residuals)
-    distances, squares, within = _distances(residuals, tolerance_m)
+    distances, squares, within = _distances(residuals, tolerance_m, _FAR_M)
     distances.sort()
     covered = len(distances)
     if covered == 0:
         return ResidualSummary(
             rmse_m=math.nan, median_m=math.nan, p95_m=math.nan, share_within=0.0, coverage=0.0, n_points=n
         )
+    nine_tenths_m = float(distances[covered - covered // 10 - 1])
+    if nine_tenths_m > _FAR_M:
+        _, squares, _ = _distances(residuals, tolerance_m, nine_tenths_m)
     return ResidualSummary(
         rmse_m=math.sqrt(squares / covered),
         median_m=_quantile(distances, 0.5),

@@ -38,9 +38,11 @@ _COLUMNS = (
     *("footprint_area_m2", "n_points", "n_planes", "tile"),
 )
 _FIGURES = {
-    "rmse_m": "RMSE of the points, m",
-    "p95_m": "95 % of the points within, m",
-    "coverage": "share of points with a roof",
+    "rmse_m": "RMSE of the roof returns, m",
+    "p95_m": "95 % of the roof returns within, m",
+    "share_within_0_2m": "share of the roof returns within 0.2 m",
+    "share_below_roof": "share of points on facades and below the roof",
+    "coverage": "share of the roof returns with a roof",
     "density_per_m2": "points per m²",
     "height_m": "height, m",
 }

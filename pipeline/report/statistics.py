@@ -16,7 +16,7 @@ from pipeline.model import RoofType, Status
 
 QUANTILES = (("p10", 0.1), ("p50", 0.5), ("p90", 0.9), ("max", 1.0))
 """Quantiles of a figure over the buildings."""
-_FIGURES = ("rmse_m", "p95_m", "coverage", "density_per_m2", "height_m")
+_FIGURES = ("rmse_m", "p95_m", "share_within_0_2m", "share_below_roof", "coverage", "density_per_m2", "height_m")
 _SUMS = ("footprint_area_m2", "roof_area_m2", "volume_m3", "n_planes", "n_points")
 _COLUMNS = ("status", "reason", "roof_type", "lod", "validity_codes", "touches_data_edge", *_FIGURES, *_SUMS)
 

@@ -15,6 +15,8 @@ import scipy.spatial
 
 from pipeline.export.building_points import building_points
 from pipeline.export.point_glb import NO_BUILDING, NO_PLANE, NO_RESIDUAL, ModelledPoints, read_points_glb
+from pipeline.quality.residuals import summarise
+from pipeline.quality.roof_returns import roof_returns
 from pipeline.runtime.classify import ClassifySummary
 from pipeline.runtime.manifest import RunStatus, read_manifest
 from pipeline.runtime.request import RunRequest
@@ -172,22 +174,29 @@ def records(out: Path) -> list[dict[str, Any]]:
 
 
 def test_residuals_and_planes_are_those_of_the_records(out: Path) -> None:
-    """Residuals in the points give the figures of the table of buildings."""
-    _, found = all_points(out / "points")
+    """Residuals in the points, those of the roof returns, give the figures of the table of buildings."""
+    places, found = all_points(out / "points")
     residuals: dict[str, list[np.ndarray]] = {}
-    for points in found:
+    own_places: dict[str, list[np.ndarray]] = {}
+    starts = np.cumsum([0, *map(len, found)]).tolist()
+    for points, start, stop in zip(found, starts[:-1], starts[1:], strict=True):
         assert ((points.plane == NO_PLANE) == (points.residual_mm == NO_RESIDUAL)).all()
         assert (points.plane[points.building == NO_BUILDING] == NO_PLANE).all()
         for k, name in enumerate(points.buildings):
             residuals.setdefault(name, []).append(points.residual_mm[points.building == k])
+            own_places.setdefault(name, []).append(places[start:stop][points.building == k])
     compared = 0
     for record in records(out):
         own = np.concatenate(residuals.pop(record["building_id"], [np.empty(0, np.int16)]))
         assert len(own) == record["n_points"]
-        covered = own[own != NO_RESIDUAL] / MM
-        assert len(covered) / len(own) == pytest.approx(record["coverage"], abs=1e-4)
         if record["rmse_m"] is not None and record["strip_offset_m"] is None:
-            assert np.sqrt(np.mean(covered**2)) == pytest.approx(record["rmse_m"], abs=1e-3)
+            xyz = np.concatenate(own_places[record["building_id"]])
+            distances = np.where(own == NO_RESIDUAL, np.nan, own / MM)
+            returns = roof_returns((xyz - xyz.min(axis=0)) / MM, distances, record["point_spacing_m"])
+            assert 1.0 - returns.mean() == pytest.approx(record["share_below_roof"], abs=2.5 / len(own))
+            summary = summarise(distances[returns])
+            assert summary.coverage == pytest.approx(record["coverage"], abs=2.5 / len(own))
+            assert summary.rmse_m == pytest.approx(record["rmse_m"], abs=1e-3)
             compared += 1
     assert compared > 2
     assert not residuals

@@ -81,6 +81,7 @@ QUALITY = ModelQuality(
     point_spacing_m=0.48,
     noise_m=0.029,
     share_within=0.981,
+    share_below_roof=0.0625,
     unexplained_m2=1.25,
     largest_hole_m=1.4,
     ridge_z_sigma_m=0.017,

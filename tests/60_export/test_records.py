@@ -28,8 +28,8 @@ geometry, lod, solid, solid_parts, solid_surfaces, solid_planes, solid_lod12, so
 solid_lod13, solid_lod13_parts, solid_lod13_surfaces, solid_lod23, solid_lod23_parts, solid_lod23_surfaces,
 solid_lod23_planes, ground_z, ground_source, eave_z, ridge_z, h_min, h_50p, h_70p, h_max, height_m, height_source,
 footprint_area_m2, footprint_share, roof_area_m2, volume_m3, n_points, density_per_m2, through_share,
-detection_confidence, n_planes, rmse_m, p95_m, coverage, point_spacing_m, noise_m, share_within_0_2m, unexplained_m2,
-largest_hole_m, ridge_z_sigma_m, bic_margin,
+detection_confidence, n_planes, rmse_m, p95_m, coverage, point_spacing_m, noise_m, share_within_0_2m, share_below_roof,
+unexplained_m2, largest_hole_m, ridge_z_sigma_m, bic_margin,
 is_curved, valid, validity_codes, touches_data_edge, strip_offset_m, wall_outline, overhang_m, overhang_sigma_m,
 overhang_source, lod23_reason, guides_followed, guides_not_followed, acquired_from, acquired_to, mesh_path, input_hash,
 settings_hash, engine_version"""
@@ -66,8 +66,8 @@ def test_the_share_of_a_given_footprint_is_reported_and_null_without_one(context
 
 def test_the_quality_of_a_model_is_reported_as_it_was_measured(contexts: Contexts) -> None:
     row = building_row(small.gable(), contexts["US feet"])
-    supported = [row[name] for name in ("point_spacing_m", "noise_m", "share_within_0_2m", "unexplained_m2")]
-    assert supported == [0.48, 0.029, 0.981, 1.25]
+    figures = ("point_spacing_m", "noise_m", "share_within_0_2m", "share_below_roof", "unexplained_m2")
+    assert [row[name] for name in figures] == [0.48, 0.029, 0.981, 0.0625, 1.25]
     known = [row[name] for name in ("largest_hole_m", "ridge_z_sigma_m", "bic_margin", "is_curved")]
     assert known == [1.4, 0.017, 12.5, False]
     curved = dataclasses.replace(small.gable(), quality=dataclasses.replace(small.QUALITY, is_curved=True))
@@ -98,6 +98,7 @@ def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts: Contexts) 
         *("source_id", "geometry", "lod", "eave_z", "ridge_z", "h_min", "h_50p", "h_70p", "h_max", "height_m"),
         *("footprint_area_m2", "footprint_share", "roof_area_m2", "volume_m3", "density_per_m2", "rmse_m", "p95_m"),
         *("point_spacing_m", "noise_m", "share_within_0_2m", "unexplained_m2", "largest_hole_m", "ridge_z_sigma_m"),
+        *("share_below_roof",),
         *("strip_offset_m", "wall_outline", "overhang_m", "overhang_sigma_m"),
         *("overhang_source", "lod23_reason"),
         *("through_share", "detection_confidence", "ground_source", "height_source"),
@@ -128,7 +129,8 @@ def test_only_a_building_found_in_the_points_alone_has_a_confidence(contexts: Co
         found: float | None = row["detection_confidence"]
         return found
 
-    expected = detection_confidence(small.gable().n_points, small.QUALITY.share_within, 0.1)
+    share_of_all = small.QUALITY.share_within * (1.0 - small.QUALITY.share_below_roof)
+    expected = detection_confidence(small.gable().n_points, share_of_all, 0.1)
     assert confidence() == confidence("method") == pytest.approx(expected, abs=5e-4)
     assert confidence("accept, method") is confidence("footprint") is None
     assert confidence(source_id="parcel 7") is None

@@ -97,6 +97,18 @@ def test_a_handful_of_points_counts_as_by_hand() -> None:
     assert (measured["coverage"].n, measured["rmse"].n) == (5, 4)
 
 
+def test_points_on_facades_and_below_roofs_are_counted_apart() -> None:
+    truth = house("a", 0, 0)
+    roof = lattice(truth, 0.5)
+    below = roof[::4] - np.array([0.0, 0.0, 2.0])
+    reference = reference_of([truth], [tile(np.vstack((roof, below)), zeros(len(roof) + len(below)))])
+    measured = figures(building_residuals([truth], reference), reference)
+    assert measured["below_roof"].value == pytest.approx(len(below) / (len(roof) + len(below)))
+    assert measured["below_roof"].n == len(roof) + len(below)
+    assert measured["within_0_2m_top_visible"].value == 1.0
+    assert measured["within_0_2m"].value == pytest.approx(1.0 - measured["below_roof"].value)
+
+
 def zeros(n: int) -> LabelArray:
     return np.zeros(n, np.int32)
 

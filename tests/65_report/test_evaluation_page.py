@@ -30,6 +30,7 @@ from processes import program
 
 from pipeline.report.maps import BAD, GOOD, MISSING, Map
 from pipeline.ruler.evaluation.chapters import printed
+from pipeline.ruler.evaluation.counts import visible_share
 from pipeline.ruler.evaluation.definitions import DEFINITIONS as ALL
 from pipeline.ruler.evaluation.evaluate import Evaluation
 from pipeline.ruler.evaluation.models import RoofSurface
@@ -223,6 +224,21 @@ def test_in_a_shifted_survey_a_model_that_misses_its_points_is_worse_than_one_be
         for name, n in (("shifted", 50), ("broken", 10), ("unknown", None))
     ]
     assert [row["building_id"] for row in chosen_rows(pa.Table.from_pylist(rows))] == ["unknown", "broken", "shifted"]
+
+
+def test_a_building_with_many_facade_points_is_judged_by_those_that_are_seen_from_above() -> None:
+    """On maps, in charts and among the worst cases; tables of older versions have all points only."""
+    walls = {"building_id": "walls", "model_id": "m", "n_points": 100, "n_within": 60}
+    seen = {"top_n_points": 60, "top_n_within": 60, "top_rmse_m": 0.02, "point_rmse_m": 2.0}
+    poor = {"building_id": "poor", "model_id": "m", "n_points": 100, "n_within": 80}
+    bad = {"top_n_points": 90, "top_n_within": 72, "top_rmse_m": 0.4, "point_rmse_m": 0.5}
+    table = pa.Table.from_pylist([walls | seen, poor | bad])
+    assert [row["building_id"] for row in chosen_rows(table)] == ["poor"]
+    assert visible_share(table).tolist() == [1.0, 0.8]
+    older = pa.Table.from_pylist([walls, poor, {**poor, "n_points": 0, "n_within": 0}])
+    assert [row["building_id"] for row in chosen_rows(older)][:2] == ["walls", "poor"]
+    assert visible_share(older).tolist() == pytest.approx([0.6, 0.8, math.nan], nan_ok=True)
+    assert visible_share(older.drop_columns(["n_points"])) is None
 
 
 def test_worst_cases_are_drawn_with_the_points_in_the_colours_of_their_distances() -> None:

@@ -74,9 +74,9 @@ def test_colours_of_roofs_are_chosen_and_explained(visit: Open, service: str, ga
     classes = page.get_by_role("list", name="Colours")
 
     choice.select_option("Residual")
-    wanted = next(name for end, name in ((0.05, "up to 0.05 m"), (0.1, "to 0.1 m")) if record["rmse_m"] <= end)
+    assert record["share_within_0_2m"] >= 0.95
     expect(classes.get_by_role("listitem")).to_have_count(1)
-    expect(classes).to_contain_text(wanted)
+    expect(classes).to_contain_text("95 % or more within 0.2 m")
     expect(page.locator("#status")).to_have_text("The roofs are coloured by residual.")
     assert not of_hue(opened.pixels(), "gable").any()
 

@@ -221,6 +221,20 @@ def floats(table: pa.Table, name: str) -> FloatArray:
     return np.array(table[name].cast(pa.float64()).to_numpy(zero_copy_only=False), np.float64)
 
 
+def visible_share(table: pa.Table) -> FloatArray | None:
+    """Share of each building's top-visible points within 0.2 m, nan without any; of all points in older tables.
+
+    None if the table has no points.
+    """
+    for prefix in ("top_", ""):
+        if {f"{prefix}n_points", f"{prefix}n_within"} <= set(table.column_names):
+            n_points, n_within = floats(table, f"{prefix}n_points"), floats(table, f"{prefix}n_within")
+            shares = np.full(table.num_rows, np.nan)
+            np.divide(n_within, n_points, out=shares, where=n_points > 0.0)
+            return shares
+    return None
+
+
 def _bools(table: pa.Table, name: str) -> BoolArray:
     """A column as bool, False where null."""
     return np.array([bool(value) for value in table[name].to_pylist()], bool)

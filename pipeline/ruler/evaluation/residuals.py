@@ -306,10 +306,21 @@ _FORMULAS = (
 )
 _MEANING = "dz: elevation of a point less that of the highest roof face of all models there; covered: there is one"
 
-DEFINITIONS = tuple(
-    defined(f"residuals.{name}{suffix}", f"{label}{suffix_label}", f"{formula}; P: {points}; {_MEANING}", better, unit)
-    for suffix, (suffix_label, points) in _SUFFIXES.items()
-    for name, label, unit, better, formula in _FORMULAS
+DEFINITIONS = (
+    *(
+        defined(
+            f"residuals.{name}{suffix}", f"{label}{suffix_label}", f"{formula}; P: {points}; {_MEANING}", better, unit
+        )
+        for suffix, (suffix_label, points) in _SUFFIXES.items()
+        for name, label, unit, better, formula in _FORMULAS
+    ),
+    defined(
+        "residuals.below_roof",
+        "points on facades and below roofs",
+        f"1 - count(top-visible points) / count(P); P: {_ROOF_POINTS}; top-visible: {_HIDDEN}",
+        Better.NEITHER,
+        "share",
+    ),
 )
 """The measures."""
 
@@ -342,4 +353,8 @@ def residual_measures(rows: Sequence[BuildingResiduals], subset: Subset) -> list
         ]
         rmse = np.array([tally.rmse_m for tally in tallies if tally.n_covered])
         found.append(measured_median(f"residuals.building_rmse{suffix}", rmse, subset))
+    everything = np.array([row.all_points.n_points for row in counted], np.float64)
+    below = {"n_points": everything, "n_below": everything - [row.top_visible.n_points for row in counted]}
+    statistic = share("n_below", "n_points")
+    found.append(measured("residuals.below_roof", below, statistic, n=everything.sum(), subset=subset))
     return found

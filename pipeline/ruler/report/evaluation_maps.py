@@ -10,9 +10,9 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from pipeline.model import Status
+from pipeline.model import FloatArray, Status
 from pipeline.report.maps import BAD, FAIR, GOOD, MISSING, UNJUDGED, Entry, Layer, Map, draw_map
-from pipeline.ruler.evaluation.counts import floats
+from pipeline.ruler.evaluation.counts import visible_share
 from pipeline.ruler.evaluation.evaluate import Evaluation
 
 SHARES = ((0.95, "#3f86b5"), (0.9, "#8bb8d0"), (0.75, "#e3c15c"), (0.5, "#de8a3e"), (-1.0, "#c2401f"))
@@ -31,8 +31,9 @@ def maps(evaluation: Evaluation) -> list[Map]:
         false = _false_models(evaluation)
         if "outcome" in buildings.column_names and evaluation.reference.has_faces:
             made.append(draw_map("Buildings by outcome", [*_outcome_layers(buildings, geometries), false]))
-        if {"n_points", "n_within"} <= set(buildings.column_names):
-            layers = [*_share_layers(buildings, geometries), false]
+        shares = visible_share(buildings)
+        if shares is not None:
+            layers = [*_share_layers(buildings, shares, geometries), false]
             made.append(draw_map("Buildings by share of points within 0.2 m", layers))
         if not made:
             made.append(draw_map("Buildings found", [*_found_layers(buildings, geometries), false]))
@@ -79,11 +80,8 @@ def _outcome_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Laye
     return [_layer(label, colour, geometries, [kind == name for kind in kinds]) for name, label, colour in named]
 
 
-def _share_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]:
-    """Classes of the share of points within 0.2 m."""
-    n_points = floats(buildings, "n_points")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.where(n_points > 0.0, floats(buildings, "n_within") / n_points, np.nan)
+def _share_layers(buildings: pa.Table, shares: FloatArray, geometries: Sequence[Any]) -> list[Layer]:
+    """Classes of the share (n,) of top-visible points within 0.2 m."""
     missing, cut = np.array(_missing(buildings), bool), np.array(_cut(buildings), bool)
     unjudged = np.isnan(shares) | cut
     layers = [_layer("not judged (no points, or cut by the edge of the data)", UNJUDGED, geometries, unjudged)]

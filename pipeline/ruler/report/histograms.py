@@ -12,7 +12,7 @@ import pyarrow as pa
 from markupsafe import Markup
 
 from pipeline.model import BoolArray, FloatArray
-from pipeline.ruler.evaluation.counts import floats
+from pipeline.ruler.evaluation.counts import floats, visible_share
 from pipeline.ruler.report.svg_chart import Axis, Ordinate, category_svg, histogram_svg, rebinned
 
 GOOD_M = 0.2
@@ -132,16 +132,14 @@ def _of_buildings(table: pa.Table) -> list[Chart | None]:
     """Agreement building by building."""
     names = set(table.column_names)
     made: list[Chart | None] = []
-    if {"n_within", "n_points"} <= names:
-        n_points = floats(table, "n_points")
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.where(n_points > 0.0, floats(table, "n_within") / n_points, np.nan)
+    shares = visible_share(table)
+    if shares is not None:
         made.append(
             _plain(
                 shares,
                 np.linspace(0.0, 1.0, 41),
                 title="Points within 0.2 m, by building",
-                x_name="share of the building's points",
+                x_name="share of the building's top-visible points",
                 what="buildings",
                 percent=True,
             )

@@ -58,7 +58,8 @@ class Case:
 def worst_cases(evaluation: Evaluation) -> list[Case]:
     """The worst buildings with their pictures; empty without a reference. Each tile is read at most once.
 
-    Buildings without a model and false ones come first, then by the mean of the shares of roof and points within 0.2 m.
+    Buildings without a model and false ones come first, then by the mean of the shares of roof and top-visible
+    points within 0.2 m.
     """
     reference, table = evaluation.reference, evaluation.tables.get("buildings")
     if reference is None or table is None:
@@ -109,10 +110,16 @@ def _within(row: Mapping[str, Any]) -> float:
     share = row.get("surface_within")
     if share is not None and math.isfinite(share):
         known.append(float(share))
-    points, within = row.get("n_points"), row.get("n_within")
+    prefix = _points_of_row(row)
+    points, within = row.get(f"{prefix}n_points"), row.get(f"{prefix}n_within")
     if points and within is not None:
         known.append(float(within / points))
     return sum(known) / len(known) if known else 1.0
+
+
+def _points_of_row(row: Mapping[str, Any]) -> str:
+    """Prefix of the columns on points: top-visible ones, since facades do not make a model bad; older rows have all."""
+    return "top_" if row.get("top_n_points") is not None else ""
 
 
 def _points_of(reference: Reference, wanted: Sequence[int]) -> dict[int, FloatArray]:
@@ -181,13 +188,15 @@ def _figures(row: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
         figures.append(
             ("faces", f"{row['faces_found']} of {row['faces_to_find']} found, {row.get('faces_wrong') or 0} wrong")
         )
-    if known("n_points") and row["n_points"]:
-        share = f"{100.0 * row['n_within'] / row['n_points']:.1f} % of {row['n_points']:,}"
-        figures.append(("points within 0.2 m", share))
+    prefix = _points_of_row(row)
+    if known(f"{prefix}n_points") and (n_points := row[f"{prefix}n_points"]):
+        share = f"{100.0 * row[f'{prefix}n_within'] / n_points:.1f} % of {n_points:,}"
+        figures.append(("top points within 0.2 m" if prefix else "points within 0.2 m", share))
     if known("surface_within"):
         figures.append(("roof within 0.2 m", f"{100.0 * row['surface_within']:.1f} %"))
-    if known("point_rmse_m"):
-        figures.append(("point RMSE", f"{row['point_rmse_m']:.3f} m"))
+    rmse = "top_rmse_m" if prefix else "point_rmse_m"
+    if known(rmse):
+        figures.append(("RMSE of the top points" if prefix else "point RMSE", f"{row[rmse]:.3f} m"))
     if known("iou"):
         figures.append(("footprint IoU", f"{row['iou']:.2f}"))
     if known("footprint_area_m2"):

@@ -22,8 +22,8 @@ export interface Batch {
   ids: string[];
   /** Of each building; null for buildings that are `ok`. */
   reasons: (string | null)[];
-  /** RMSE of each building in metres; null if unknown. */
-  rmseM: (number | null)[];
+  /** Share of the roof returns of each building within 0.2 m of its roof; null if unknown. */
+  withinShare: (number | null)[];
   /** Corner at which each building begins, and the number of corners after the last. */
   starts: Uint32Array;
   /** The same for the ends of the edges. */
@@ -58,7 +58,7 @@ export class Batcher {
     if (mesh.positions.length > 0) {
       const gathered = this.open.get(category) ?? new Gathered(category);
       this.open.set(category, gathered);
-      gathered.meshes.push({ id: building.id, reason, rmseM: figures.residual ?? null, mesh });
+      gathered.meshes.push({ id: building.id, reason, withinShare: figures.within ?? null, mesh });
       this.outlines.add(building, category, this.frame);
     }
     return {
@@ -88,7 +88,7 @@ export class Batcher {
 }
 
 class Gathered {
-  readonly meshes: { id: string; reason: string | null; rmseM: number | null; mesh: ReturnType<typeof buildingMesh> }[] = [];
+  readonly meshes: { id: string; reason: string | null; withinShare: number | null; mesh: ReturnType<typeof buildingMesh> }[] = [];
 
   constructor(private readonly category: Category) {}
 
@@ -105,7 +105,7 @@ class Gathered {
       category: this.category,
       ids: this.meshes.map(({ id }) => id),
       reasons: this.meshes.map(({ reason }) => reason),
-      rmseM: this.meshes.map(({ rmseM }) => rmseM),
+      withinShare: this.meshes.map(({ withinShare }) => withinShare),
       starts,
       edgeStarts,
       boxes: new Float32Array(6 * n),

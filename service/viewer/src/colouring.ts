@@ -30,14 +30,14 @@ const PLAIN = "#cbc3b6"; // of roofs below coloured points
 /** Colours of things without an order, from the palette of Okabe and Ito (2008); they repeat. */
 export const CYCLE = ["#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#0072b2", "#d55e00", "#f0e442"] as const;
 
-/** RMSE of the points about the roof, from small to large. */
-const RESIDUALS: readonly (ColourClass & { upToM: number })[] = [
-  { label: "up to 0.05 m", colour: "#0072b2", upToM: 0.05 },
-  { label: "to 0.1 m", colour: "#56b4e9", upToM: 0.1 },
-  { label: "to 0.2 m", colour: "#f0e442", upToM: 0.2 },
-  { label: "to 0.5 m", colour: "#e69f00", upToM: 0.5 },
-  { label: "above 0.5 m", colour: "#d55e00", upToM: Infinity },
-  { label: "unknown", colour: GREY, upToM: NaN },
+/** Share of the roof returns within 0.2 m of the roof, from large to small: a chimney or a mast has few of them. */
+const RESIDUALS: readonly (ColourClass & { fromShare: number })[] = [
+  { label: "95 % or more within 0.2 m", colour: "#0072b2", fromShare: 0.95 },
+  { label: "90 to 95 %", colour: "#56b4e9", fromShare: 0.9 },
+  { label: "75 to 90 %", colour: "#f0e442", fromShare: 0.75 },
+  { label: "50 to 75 %", colour: "#e69f00", fromShare: 0.5 },
+  { label: "under 50 %", colour: "#d55e00", fromShare: 0 },
+  { label: "unknown", colour: GREY, fromShare: NaN },
 ];
 
 const STATUSES: readonly ColourClass[] = [
@@ -69,7 +69,7 @@ export type Counted = ColourClass & { count: number };
 export function classesOf(colouring: "residual" | "status" | "reason", buildings: readonly Listed[]): Counted[] {
   const counts = new Map<ColourClass, number>();
   for (const building of buildings) {
-    const one = classOf(colouring, building.category, building.reason, building.figures.residual ?? null);
+    const one = classOf(colouring, building.category, building.reason, building.figures.within ?? null);
     counts.set(one, (counts.get(one) ?? 0) + 1);
   }
   const order: readonly ColourClass[] =
@@ -81,12 +81,12 @@ function classOf(
   colouring: "residual" | "status" | "reason",
   category: Category,
   reason: string | null,
-  rmseM: number | null,
+  withinShare: number | null,
 ): ColourClass {
   if (category === "rejected") return LEFT_OUT;
   switch (colouring) {
     case "residual":
-      return RESIDUALS.find(({ upToM }) => rmseM !== null && rmseM <= upToM) ?? RESIDUALS[RESIDUALS.length - 1];
+      return RESIDUALS.find(({ fromShare }) => withinShare !== null && withinShare >= fromShare) ?? RESIDUALS[RESIDUALS.length - 1];
     case "status":
       return STATUSES[category === "fallback" ? 1 : category === "failed" ? 2 : 0];
     case "reason":
@@ -103,7 +103,7 @@ export function coloursOf(batch: Batch, colouring: Colouring): Uint8Array {
     if (colouring === "type") roof = linear(CATEGORIES[batch.category].colour);
     else if (colouring === "plain") roof = linear(PLAIN);
     else if (colouring !== "plane") {
-      roof = linear(classOf(colouring, batch.category, batch.reasons[building], batch.rmseM[building]).colour);
+      roof = linear(classOf(colouring, batch.category, batch.reasons[building], batch.withinShare[building]).colour);
     }
     for (let corner = batch.starts[building]; corner < batch.starts[building + 1]; corner++) {
       const surface = batch.surfaces[corner];

@@ -9,7 +9,7 @@ import { CYCLE } from "./colouring";
 import { histogramDrawing, planDrawing, planeColour, sectionDrawing, type Colouring, type Rings } from "./dossier_drawings";
 import { histogram, modelOf, roofEdges, sectionOf, strip, stripWidth, type Points } from "./dossier_geometry";
 import { pointsIn } from "./dossier_points";
-import { checkRows, formRows, LEAD, trust, trustFigures, type Decision } from "./dossier_words";
+import { checkRows, formRows, LEAD, trust, trustFigures, withinWords, type Decision } from "./dossier_words";
 import { el, svg } from "./elements";
 import { capital } from "./fields";
 import { asProblem, problemNotice } from "./notices";
@@ -170,7 +170,7 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
       figure("Plan", section === null ? "North is up." : "North is up; A to B is the line of the section.", plan),
       section === null ? null : figure("Section", `${capital(section.through)}, not exaggerated.${stripWords}`, profile),
       space,
-      points === null ? null : figure("Residuals", residualWords(points), el("div", { class: "dossier-drawing" }, histogramDrawing(points.residuals))),
+      points === null ? null : figure("Residuals", residualWords(points, properties), el("div", { class: "dossier-drawing" }, histogramDrawing(points.residuals))),
     ),
     figuresTable(properties, decisions ?? []),
     formsTable(properties, decisions),
@@ -230,13 +230,13 @@ function colourKey(points: Points, colouring: Colouring): HTMLElement[] {
   ];
 }
 
-function residualWords(points: Points): string {
+function residualWords(points: Points, properties: Feature["properties"]): string {
   const { total, uncovered, below, above, reachM } = histogram(points.residuals);
   const within = points.residuals.filter((residual) => Math.abs(residual) <= 0.2).length;
   const share = points.residuals.length === 0 ? 0 : within / points.residuals.length;
   const beyond = below + above > 0 ? ` ${count(below + above)} differ by more than ${measure(reachM, 1, "m")} and are not drawn.` : "";
   const bare = uncovered > 0 ? ` ${count(uncovered)} have no roof above or below them.` : "";
-  return `${counted(total, "point")} over the roof; ${measure(100 * share, 0, "%")} of all lie within 0.2 m.${beyond}${bare}`;
+  return `${counted(total, "point")} over the roof; ${withinWords(share, properties)}.${beyond}${bare}`;
 }
 
 function figure(title: string, words: string, content: HTMLElement): HTMLElement {

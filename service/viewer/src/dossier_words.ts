@@ -77,12 +77,13 @@ export function trustFigures(properties: Properties): Figure[] {
   const metres = (digits: number) => (value: number) => measure(value, digits, "m");
   const squares = (value: number): string => measure(value, 1, "m²");
   const area = number(properties["footprint_area_m2"]) ?? 0;
-  add("share_within_0_2m", "Points within 0.2 m of the roof", percent, WITHIN_SHARE, true,
-    (shown) => `${shown} of the points lie within 0.2 m of the roof.`,
-    (shown) => `Only ${shown} of the points lie within 0.2 m of the roof: its form is not the measured one everywhere.`);
-  add("rmse_m", "RMSE of all points", metres(3), RMSE_M, false,
-    (shown) => `The points differ from the roof by ${shown} (RMSE).`,
-    (shown) => `The points differ from the roof by ${shown} (RMSE): dormers, chimneys or trees are not modelled.`);
+  const judged = judgedPoints(properties);
+  add("share_within_0_2m", `${capital(judged)} within 0.2 m of the roof`, percent, WITHIN_SHARE, true,
+    (shown) => `${shown} of the ${judged} lie within 0.2 m of the roof.`,
+    (shown) => `Only ${shown} of the ${judged} lie within 0.2 m of the roof: its form is not the measured one everywhere.`);
+  add("rmse_m", `RMSE of the ${judged}`, metres(3), RMSE_M, false,
+    (shown) => `The ${judged} differ from the roof by ${shown} (RMSE).`,
+    (shown) => `The ${judged} differ from the roof by ${shown} (RMSE): dormers, chimneys or trees are not modelled.`);
   add("unexplained_m2", "Roof without a point near it", squares, Math.max(2, UNEXPLAINED_SHARE * area), false,
     (shown) => (shown.startsWith("0.0") ? "Points lie on all of the roof." : `Points lie on nearly all of the roof; ${shown} have none.`),
     (shown) => `${shown} of the roof have no point near them: the form there is assumed.`);
@@ -102,6 +103,19 @@ export function trustFigures(properties: Properties): Figure[] {
     (shown) => `The model fills ${shown} of the given footprint.`,
     (shown) => `The model fills only ${shown} of the given footprint: the rest has no points.`);
   return figures;
+}
+
+/** The points that the figures of fit are of: older runs did not leave out facades. */
+function judgedPoints(properties: Properties): string {
+  return number(properties["share_below_roof"]) === null ? "points" : "roof returns";
+}
+
+/** How many of all points lie near the roof, and what the record says of the roof returns among them. */
+export function withinWords(shareOfAll: number, properties: Properties): string {
+  const [within, below] = [number(properties["share_within_0_2m"]), number(properties["share_below_roof"])];
+  const all = `${percent(shareOfAll)} of all lie within 0.2 m`;
+  if (within === null || below === null || below === 0) return all;
+  return `${all}; without the ${percent(below)} on facades and below the roof, ${percent(within)}`;
 }
 
 /** What deserves trust and what does not, in sentences. */

@@ -16,6 +16,7 @@ interface Figure {
 export const FIGURES = {
   height: { label: "Height", column: "height_m", unit: "m", digits: 1 },
   area: { label: "Area", column: "footprint_area_m2", ofRejected: "area_m2", unit: "m²", digits: 0 },
+  within: { label: "Within 0.2 m of the roof", column: "share_within_0_2m", unit: "%", digits: 1, factor: 100 },
   residual: { label: "Residual (RMSE)", column: "rmse_m", unit: "m", digits: 3 },
   planes: { label: "Roof faces", column: "n_planes", unit: "", digits: 0 },
   confidence: { label: "Confidence", column: "detection_confidence", unit: "%", digits: 1, factor: 100 },

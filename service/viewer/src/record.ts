@@ -47,11 +47,12 @@ function groups(verticalUnit: string): [string, Row[]][] {
     [
       "Fit to the points",
       [
+        { label: "Within 0.2 m of the roof", column: "share_within_0_2m", show: percent },
         { label: "RMSE", column: "rmse_m", show: metres(3) },
         { label: "95th percentile", column: "p95_m", show: metres(3) },
         { label: "Points covered", column: "coverage", show: percent },
+        { label: "Points on facades and below", column: "share_below_roof", show: percent },
         { label: "Given footprint covered", column: "footprint_share", show: percent },
-        { label: "Within 0.2 m of the roof", column: "share_within_0_2m", show: percent },
         { label: "Noise of the points", column: "noise_m", show: metres(3) },
         { label: "Ridge uncertainty (one sigma)", column: "ridge_z_sigma_m", show: metres(3) },
         { label: "Roof unexplained by points", column: "unexplained_m2", show: (v) => measure(v, 1, "m²") },

@@ -14,9 +14,9 @@ function house(id: string, attributes: Record<string, unknown>): Building {
 }
 
 const HOUSES = [
-  house("a", { rmse_m: 0.04 }),
-  house("b", { rmse_m: 0.3, status: "fallback", reason: "no_plane" }),
-  house("c", { rmse_m: null, status: "fallback", reason: "crashed" }),
+  house("a", { share_within_0_2m: 0.97, rmse_m: 1.2 }),
+  house("b", { share_within_0_2m: 0.6, status: "fallback", reason: "no_plane" }),
+  house("c", { share_within_0_2m: null, rmse_m: 0.04, status: "fallback", reason: "crashed" }),
 ];
 
 function batched(): { batches: Batch[]; listed: ReturnType<Batcher["add"]>[] } {
@@ -71,7 +71,7 @@ test("residual, status and reason colour a whole roof as the legend says", () =>
 test("the legend counts the buildings of each class and leaves out empty ones", () => {
   const { listed } = batched();
   const counts = (colouring: "residual" | "status" | "reason") => classesOf(colouring, listed).map(({ label, count }) => [label, count]);
-  expect(counts("residual")).toEqual([["up to 0.05 m", 1], ["to 0.5 m", 1], ["unknown", 1]]);
+  expect(counts("residual")).toEqual([["95 % or more within 0.2 m", 1], ["50 to 75 %", 1], ["unknown", 1]]);
   expect(counts("status")).toEqual([["Modelled", 1], ["Fallback block", 2]]);
   expect(counts("reason")).toEqual([
     ["none: modelled in full", 1],
@@ -81,10 +81,17 @@ test("the legend counts the buildings of each class and leaves out empty ones", 
   expect(classesOf("status", [])).toEqual([]);
 });
 
-test("a residual on the border of two classes belongs to the better one", () => {
+test("a share on the border of two classes belongs to the better one", () => {
   const { listed } = batched();
-  const label = (rmseM: number) => classesOf("residual", [{ ...listed[0], figures: { residual: rmseM } }])[0].label;
-  expect([0.05, 0.0501, 0.1, 0.2, 0.5, 0.51].map(label)).toEqual([
-    "up to 0.05 m", "to 0.1 m", "to 0.1 m", "to 0.2 m", "to 0.5 m", "above 0.5 m",
+  const label = (within: number) => classesOf("residual", [{ ...listed[0], figures: { within } }])[0].label;
+  expect([1, 0.95, 0.9499, 0.9, 0.75, 0.5, 0.4999, 0].map(label)).toEqual([
+    "95 % or more within 0.2 m", "95 % or more within 0.2 m", "90 to 95 %", "90 to 95 %", "75 to 90 %", "50 to 75 %",
+    "under 50 %", "under 50 %",
   ]);
+});
+
+test("a chimney does not turn a roof red: its few points leave the class, however high they are", () => {
+  const { listed } = batched();
+  expect(listed[0].figures.residual).toBe(1.2);
+  expect(classesOf("residual", listed.slice(0, 1))[0].colour).toBe("#0072b2");
 });

@@ -5,7 +5,7 @@ import { pointColour, tickStep } from "../src/dossier_drawings";
 import { cutModel, histogram, modelOf, roofEdges, sectionOf, strip, stripWidth, type Points } from "../src/dossier_geometry";
 import { dossierAddress, isDossier } from "../src/dossier_link";
 import { pointsIn } from "../src/dossier_points";
-import { checkRows, formRows, trust, trustFigures, type Decision } from "../src/dossier_words";
+import { checkRows, formRows, trust, trustFigures, withinWords, type Decision } from "../src/dossier_words";
 import { palette } from "../src/points_colouring";
 import { GABLE, METADATA } from "./gable";
 
@@ -153,6 +153,19 @@ test("a dossier says what to rely on and what not, in sentences", () => {
   expect(said.bad.join(" ")).toMatch(/curved.*12\u202f% of the plan were made level/);
   expect(trust({ status: "failed", reason: "no_plane" }, []).bad).toEqual(["There is no model: no roof plane was found in its points."]);
   expect(trustFigures({ bic_margin: 12 }).map(({ label }) => label)).toEqual(["Lead over the next form"]);
+});
+
+test("the figures of fit name the points that they are of: older runs did not leave out facades", () => {
+  const figures = { share_within_0_2m: 0.97, rmse_m: 0.04 };
+  expect(trustFigures(figures).map(({ label }) => label)).toEqual(["Points within 0.2 m of the roof", "RMSE of the points"]);
+  const now = { ...figures, share_below_roof: 0.3 };
+  expect(trustFigures(now).map(({ label }) => label)).toEqual(["Roof returns within 0.2 m of the roof", "RMSE of the roof returns"]);
+  expect(trust({ ...now, status: "ok" }, []).good[0]).toBe("97\u202f% of the roof returns lie within 0.2 m of the roof.");
+  expect(withinWords(0.68, now)).toBe(
+    "68\u202f% of all lie within 0.2 m; without the 30\u202f% on facades and below the roof, 97\u202f%",
+  );
+  expect(withinWords(0.68, figures)).toBe("68\u202f% of all lie within 0.2 m");
+  expect(withinWords(0.97, { ...figures, share_below_roof: 0 })).toBe("97\u202f% of all lie within 0.2 m");
 });
 
 test("figures are shown beside their limits, forms with their outcome", () => {
