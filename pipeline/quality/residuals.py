@@ -362,8 +362,11 @@ def _quantile(ascending: FloatArray, share: float) -> float:
 
 
 @kernel
-def _distances(residuals: FloatArray, tolerance_m: float) -> tuple[FloatArray, int]:
-    """The absolute residuals of the covered points, and how many are within the tolerance."""
+def _distances(residuals: FloatArray, tolerance_m: float, limit_m: float) -> tuple[FloatArray, float, int]:
+    """The absolute residuals of the covered points, the sum of their squares, and how many are within the tolerance.
+
+    Squares are of at most the limit.
+    """
     distances = np.empty(len(residuals))
     covered = within = 0
     for residual in residuals:
@@ -371,15 +374,9 @@ def _distances(residuals: FloatArray, tolerance_m: float) -> tuple[FloatArray, i
             distances[covered] = abs(residual)
             within += distances[covered] <= tolerance_m
             covered += 1
-    return distances[:covered], within
-
-
-@kernel
-def _mean_square(ascending: FloatArray) -> float:
-    """Mean square of distances (n,) metres, at least one; those of the farthest tenth are limited."""
-    n = len(ascending)
-    limited = np.minimum(ascending, max(_FAR_M, ascending[n - n // 10 - 1]))
-    return exact_sum(limited * limited) / n
+    distances = distances[:covered]
+    limited = np.minimum(distances, limit_m)
+    return distances, exact_sum(limited * limited), within
 
 
 def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummary:
@@ -393,15 +390,18 @@ def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummar
     (0.5, 0.75)
     """
     n = len(residuals)
-    distances, within = _distances(residuals, tolerance_m)
+    distances, squares, within = _distances(residuals, tolerance_m, _FAR_M)
     distances.sort()
     covered = len(distances)
     if covered == 0:
         return ResidualSummary(
             rmse_m=math.nan, median_m=math.nan, p95_m=math.nan, share_within=0.0, coverage=0.0, n_points=n
         )
+    nine_tenths_m = float(distances[covered - covered // 10 - 1])
+    if nine_tenths_m > _FAR_M:
+        _, squares, _ = _distances(residuals, tolerance_m, nine_tenths_m)
     return ResidualSummary(
-        rmse_m=math.sqrt(_mean_square(distances)),
+        rmse_m=math.sqrt(squares / covered),
         median_m=_quantile(distances, 0.5),
         p95_m=_quantile(distances, 0.95),
         share_within=within / n,
