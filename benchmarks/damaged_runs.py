@@ -20,7 +20,6 @@ from pathlib import Path
 from benchmarks.damage import damaged
 from benchmarks.undamaged_inputs import Kind, write_inputs
 from pipeline.console import ExitCode
-from pipeline.io import apart
 from pipeline.runtime.isolation.child_pool import ChildPool
 from pipeline.runtime.isolation.messages import Finished
 from pipeline.runtime.isolation.supervision import EndCause
@@ -109,8 +108,6 @@ def run_here(order: tuple[Case, Path]) -> int:
     for stream in (1, 2):
         os.dup2(output, stream)
     os.chdir(folder)
-    # a command's process has one thread; this one has another, which waits for orders
-    apart.has_one_thread = lambda: True
     code: object = _NOT_JUDGED
     try:
         from pipeline.cli import app

@@ -449,11 +449,12 @@ def columns() -> str:
         NOTE,
         "# Columns",
         "",
-        "The columns of every table of a run. A column has the same name, meaning and unit in every format. What the",
-        "tables are and how to read them: [records](records.md).",
+        "The columns of every table of a run. A column has the same name and meaning in every format. What the tables",
+        "are and how to read them: [records](records.md).",
         "",
-        "**Units.** *CRS* is the horizontal unit of the run's CRS, *CRS, vertical* its vertical unit. Metres are",
-        "metres for any CRS. *Null* says whether a row may lack a value.",
+        "**Units.** *CRS* is the horizontal unit of the run's CRS, *CRS, vertical* its vertical unit; some formats",
+        "have [another unit for elevations](formats.md#crs-and-units). Metres are metres for any CRS. *Null* says",
+        "whether a row may lack a value.",
     ]
     for name, columns_of_table in COLUMNS.items():
         lines += ["", f"## {name}", "", TITLES_OF_TABLES[name], ""]

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import httpx
 
 from pipeline.errors import CrsError, UnreadableInputError
-from pipeline.io.crs import parse_crs
+from pipeline.io.crs import BARE_CODE, parse_crs
 from service.errors import InputRefusedError, StartUpError
 from service.settings import ServiceSettings
 
@@ -32,6 +32,7 @@ PORTS = {"https": 443, "http": 80}
 LONGEST_URL = 4096
 
 CRS_FORMS = (
+    BARE_CODE,
     re.compile(r"[A-Za-z_]{2,20}:{1,2}[A-Za-z0-9_.]{1,20}(\+\d{4,6})?"),  # EPSG:28992, EPSG:28992+5709
     re.compile(r"urn:ogc:def:crs:\w{2,20}:[\d.]{0,20}:\w{1,20}|urn:ogc:def:crs(,crs:\w{2,20}:[\d.]{0,20}:\w{1,20}){2}"),
     re.compile(
@@ -41,7 +42,7 @@ CRS_FORMS = (
     re.compile(r"\{.*\}", re.DOTALL),
     re.compile(r"\+proj=[A-Za-z0-9_+=.,\s-]*"),
 )
-"""Authority and code, URN, WKT, the OGC's URI, PROJJSON, and PROJ strings without paths of files."""
+"""An EPSG code, authority and code, URN, WKT, the OGC's URI, PROJJSON, and PROJ strings without paths of files."""
 CRS_FILES = re.compile(r"grids|\+init|PARAMETERFILE", re.IGNORECASE)
 """Words that make PROJ open files."""
 

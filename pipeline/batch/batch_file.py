@@ -259,6 +259,8 @@ def read_batch(path: str | Path) -> Batch:
     )
     tables = {name: table if isinstance(table, Mapping) else {} for name, table in tables.items()}
     inputs = dict(tables["inputs"])
+    if type(inputs.get("crs")) is int:  # an EPSG code without quotes
+        inputs["crs"] = str(inputs["crs"])
     paths, bbox = _paths(inputs.pop("paths", None), faults), _bbox(inputs.pop("bbox", None), faults)
     built = {
         name: build(kind, name, inputs if name == "inputs" else tables[name], faults) for name, kind in TABLES.items()

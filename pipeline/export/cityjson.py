@@ -44,6 +44,8 @@ def cityjson_lines(
 ) -> Iterable[str]:
     """The lines of a CityJSONSeq file, in the units of the reference and, with an EPSG code, its referenceSystem.
 
+    The format states no unit beside that code, so the reference is that of `one_unit`, and the rows are made with it.
+
     Vertices are integers: the transform's scale is 0.001 in metres (finer in other units, to keep 1 mm), its
     translation whole units at the lower corner of all solids. For lines that continue a file it is that file's, which
     is given as `corner`. The record of each building (`building_row`) becomes its attributes; buildings without a solid
@@ -84,6 +86,8 @@ def heading(
     code = epsg_code(reference)
     if code is not None:
         metadata["referenceSystem"] = f"https://www.opengis.net/def/crs/EPSG/0/{code}"
+    elif reference.horizontal_unit_m != 1.0:
+        metadata["title"] = f"{title} (one unit is {reference.horizontal_unit_m:.12g} m)"
     if extent is not None:
         metadata["geographicalExtent"] = [float(v) for edge in extent for v in edge]
     return {

@@ -49,6 +49,14 @@ class Column:
         """
         return f"{self.meaning} [{self.unit}]" if self.unit else self.meaning
 
+    def comment_in(self, units: Mapping[str, str]) -> str:
+        """The comment with the units of a run's CRS, by `HORIZONTAL` and `VERTICAL`.
+
+        >>> Column("ridge_z", FLOAT64, VERTICAL, "highest roof point").comment_in({VERTICAL: "US survey foot"})
+        'highest roof point [US survey foot]'
+        """
+        return dataclasses.replace(self, unit=units.get(self.unit, self.unit)).comment
+
 
 BUILDINGS = (
     Column(
@@ -452,6 +460,11 @@ COLUMNS: Mapping[str, tuple[Column, ...]] = {
     "decisions": DECISIONS,
 }
 """The columns of each table, in the order of its files, without `bbox`, which only covers the geometry."""
+
+ELEVATIONS: Mapping[str, frozenset[str]] = {
+    table: frozenset(column.name for column in columns if column.unit == VERTICAL) for table, columns in COLUMNS.items()
+}
+"""The columns of each table that are elevations, in the vertical unit of the run's CRS."""
 
 TILE_COLUMN = Column("tile", TEXT, NONE, "key of the tile on the lattice, such as `x85_y447`", required=True)
 """The column that the names of a run's folders hold; other formats have it as a column of its own."""

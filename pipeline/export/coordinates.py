@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -32,6 +34,40 @@ class SpatialReference(Protocol):
     @property
     def projjson(self) -> dict[str, Any] | None:
         """The CRS as PROJJSON; None where it is unknown."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _OneUnit:
+    """A reference whose elevations are in the unit of its eastings."""
+
+    horizontal_unit_m: float
+    epsg: int | None
+    projjson: dict[str, Any] | None
+
+    @property
+    def vertical_unit_m(self) -> float:
+        return self.horizontal_unit_m
+
+
+def one_unit(reference: SpatialReference) -> SpatialReference:
+    """The reference for formats that name a CRS by one EPSG code, and no unit beside it.
+
+    Elevations are in the unit of eastings and northings, unless the code is that of a CRS with a vertical axis. The
+    reference itself where that is so already.
+    """
+    stated = reference.epsg is not None and _has_elevations(reference.projjson)
+    if stated or math.isclose(reference.horizontal_unit_m, reference.vertical_unit_m, rel_tol=1e-9):
+        return reference
+    return _OneUnit(reference.horizontal_unit_m, reference.epsg, reference.projjson)
+
+
+def _has_elevations(projjson: Mapping[str, Any] | None) -> bool:
+    """Whether a CRS has a vertical axis."""
+    part = projjson or {}
+    axes = (part.get("coordinate_system") or {}).get("axis") or ()
+    return (
+        len(axes) > 2 or bool(part.get("components")) or ("source_crs" in part and _has_elevations(part["source_crs"]))
+    )
 
 
 def decimals(unit_m: float) -> int:

@@ -79,9 +79,13 @@ class Layer:
 
     @property
     def schema(self) -> pa.Schema:
-        """The schema of what is written: the columns in their stored types, then `tile`; each with its meaning."""
+        """The schema of what is written: the columns in their stored types, then `tile`."""
+        return self.schema_in({})
+
+    def schema_in(self, units: Mapping[str, str]) -> pa.Schema:
+        """The schema with the meaning of each column, in the units of a run's CRS (`Column.comment_in`)."""
         fields = [*map(stored_field, map(self.table.field, self.columns)), pa.field(TILE, pa.string(), nullable=False)]
-        comments = {one.name: one.comment for one in (*COLUMNS[self.name], TILE_COLUMN)}
+        comments = {one.name: one.comment_in(units) for one in (*COLUMNS[self.name], TILE_COLUMN)}
         return pa.schema(
             [field.with_metadata({**(field.metadata or {}), _COMMENT: comments[field.name]}) for field in fields]
         )
@@ -179,6 +183,8 @@ class GeoPackage:
     """When the content was made, with a time zone."""
     facts: Mapping[str, str]
     """Facts about the run, stored as metadata of each layer."""
+    units: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Names of the units of the CRS, by `columns.HORIZONTAL` and `VERTICAL`, for the comments of columns."""
 
     def write(self, layer: Layer, batches: Iterable[pa.RecordBatch]) -> int:
         """Add a layer; returns the number of its rows.
@@ -197,7 +203,8 @@ class GeoPackage:
             options["layer_options"]["GEOMETRY_NAME"] = GEOMETRY
             options |= {"geometry_name": GEOMETRY, "geometry_type": layer.geometry_type, "crs": self.wkt}
         # of the layers: where the dataset has metadata, GDAL's readers leave a file .aux.xml beside it
-        return self._write(layer.name, layer.schema, batches, layer_metadata=dict(self.facts), **options)
+        schema = layer.schema_in(self.units)
+        return self._write(layer.name, schema, batches, layer_metadata=dict(self.facts), **options)
 
     def write_styles(self, styles: Sequence[Style]) -> None:
         """Store styles where QGIS looks for them; the first one of a layer is what QGIS draws it with.

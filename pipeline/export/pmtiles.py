@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 import shapely
 
 from pipeline.errors import RunError
-from pipeline.export.columns import COLUMNS, TILE_COLUMN, kind_of
+from pipeline.export.columns import COLUMNS, ELEVATIONS, TILE_COLUMN, kind_of
 from pipeline.export.gdal_layers import write_layer
 from pipeline.export.projection import Project
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
@@ -71,8 +71,8 @@ SCHEMA = pa.schema(
 """The schema of what is written."""
 
 
-def map_batch(batch: pa.RecordBatch, tile: str, project: Project) -> pa.RecordBatch:
-    """The rows that have a footprint, with the columns of the layer.
+def map_batch(batch: pa.RecordBatch, tile: str, project: Project, vertical_unit_m: float = 1.0) -> pa.RecordBatch:
+    """The rows that have a footprint, with the columns of the layer; elevations in metres, as web maps have all else.
 
     Parameters
     ----------
@@ -82,10 +82,19 @@ def map_batch(batch: pa.RecordBatch, tile: str, project: Project) -> pa.RecordBa
         Their tile.
     project : callable
         From the run's horizontal CRS to `CRS`.
+    vertical_unit_m : float
+        Metres per unit of the elevations in the table.
     """
     rows = batch.filter(pc.is_valid(batch.column(GEOMETRY)))
-    columns = [_property(rows.column(name), name, project) for name in READ]
+    columns = [_property(in_metres(rows.column(name), name, vertical_unit_m), name, project) for name in READ]
     return pa.record_batch([*columns, pa.array([tile] * rows.num_rows, pa.string())], schema=SCHEMA)
+
+
+def in_metres(column: pa.Array, name: str, vertical_unit_m: float) -> pa.Array:
+    """The values of a column of `buildings`; those of an elevation in metres, to 1 mm."""
+    if vertical_unit_m == 1.0 or name not in ELEVATIONS[LAYER]:
+        return column
+    return pc.round(pc.multiply(column, vertical_unit_m), ndigits=3)
 
 
 def _property(column: pa.Array, name: str, project: Project) -> pa.Array:

@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
+from pipeline.export.coordinates import one_unit
 from pipeline.export.decisions import decision_rows, decisions_path, decisions_table
 from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.geoparquet import geo_table, parquet_bytes
@@ -65,6 +66,28 @@ def building_rows(
     ]
 
 
+def city_lines(
+    results: Sequence[BuildingResult],
+    rows: Sequence[Mapping[str, Any]],
+    context: RecordContext,
+    title: str,
+    corner: Sequence[float] | None = None,
+) -> Iterator[str]:
+    """The lines of the CityJSONSeq file of buildings with their rows; elevations in the unit of the file."""
+    reference = one_unit(context.reference)
+    if reference is not context.reference:
+        own = dataclasses.replace(context, reference=reference)
+        rows = [
+            {
+                name: value
+                for name, value in building_row(result, own, mesh_path=row.get("mesh_path")).items()
+                if name in row
+            }
+            for result, row in zip(results, rows, strict=True)
+        ]
+    yield from cityjson_lines(list(zip(results, rows, strict=True)), reference, title, corner)
+
+
 def mesh_files(
     tile_key: str, results: Sequence[BuildingResult], lines: Sequence[str], context: RecordContext, meshes: str
 ) -> Iterator[tuple[str, bytes]]:
@@ -72,7 +95,8 @@ def mesh_files(
 
     GLB files are made of the lines of the tile's CityJSONSeq. `meshes` is one of `pipeline.export.mesh_kinds.MESHES`.
     """
-    units_m = context.reference.horizontal_unit_m, context.reference.vertical_unit_m
+    reference = one_unit(context.reference)
+    units_m = reference.horizontal_unit_m, reference.vertical_unit_m
     for lod in (None, *context.further_lods):
         modelled = [result for result in results if model_at(result, lod) is not None]
         groups = [[result] for result in modelled] if meshes == "building" else [modelled] if modelled else []
@@ -160,7 +184,7 @@ def _tile_files(
     """
     reference = context.reference
     rows = building_rows(results, context, tile_key, meshes)
-    lines = list(cityjson_lines(list(zip(results, rows, strict=True)), reference, f"buildings of tile {tile_key}"))
+    lines = list(city_lines(results, rows, context, f"buildings of tile {tile_key}"))
     yield from mesh_files(tile_key, results, lines, context, meshes)
     yield f"cityjson/tile={tile_key}/part-0.city.jsonl", "".join(f"{line}\n" for line in lines).encode()
     decisions = decisions_table(row for result in results for row in decision_rows(result))

@@ -17,13 +17,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.errors import RunError
-from pipeline.export.cityjson import cityjson_lines, lines_of
+from pipeline.export.cityjson import lines_of
 from pipeline.export.decisions import DECISIONS, decision_rows, decisions_path, decisions_table
 from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.obj import obj_text
 from pipeline.export.records import KEYS, SCHEMAS, plane_rows, rejected_row
-from pipeline.export.tile import building_rows, mesh_files, mesh_path
+from pipeline.export.tile import building_rows, city_lines, mesh_files, mesh_path
 from pipeline.model import BuildingResult
 
 
@@ -61,7 +61,7 @@ def updated_tile(
     results = sorted(results, key=lambda result: result.building_id)
     rows = building_rows(results, context, tile_key, meshes)
     path = f"cityjson/tile={tile_key}/part-0.city.jsonl"
-    fresh = cityjson_lines(list(zip(results, rows, strict=True)), context.reference, "")
+    fresh = city_lines(results, rows, context, "")
     text = _merged_cityjson(_text(root / path), names, fresh)
     files = {path: text.encode(), **dict(mesh_files(tile_key, results, lines_of(text), context, meshes))}
     gone: list[str] = []

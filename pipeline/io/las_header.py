@@ -11,7 +11,7 @@ import struct
 from typing import TYPE_CHECKING, BinaryIO
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
-from pipeline.io.crs import EPSG_UNITS_M
+from pipeline.io.geotiff_keys import crs_of_keys, keys_of
 from pipeline.io.readable import Readable
 
 if TYPE_CHECKING:
@@ -31,14 +31,6 @@ WKT_RECORD_ID = 2112
 WKT_SIZE_LIMIT = 1 << 20
 """A longer text is not a CRS."""
 COMPRESSED_BIT = 0x80
-
-GEOKEY_MODEL_TYPE = 1024
-GEOKEY_PROJECTED_CRS = 3072
-GEOKEY_LINEAR_UNITS = 3076
-GEOKEY_VERTICAL_CRS = 4096
-GEOKEY_VERTICAL_UNITS = 4099
-MODEL_PROJECTED = 1
-USER_DEFINED = 32767
 
 REWRITE = "Get the file again, or rewrite it with a tool that repairs headers"
 
@@ -214,12 +206,7 @@ def header_crs(path: Readable, header: laspy.LasHeader, block: HeaderBlock) -> H
     if block.evlr_count:
         with path.open("rb") as stream:
             texts.append(_wkt_of_extended_records(stream, block) or "")
-    keys = {}
-    for vlr in header.vlrs.get("GeoKeyDirectoryVlr"):
-        # laspy counts padding as keys: id 0.
-        keys.update({key.id: key.value_offset for key in vlr.geo_keys if key.id and key.tiff_tag_location == 0})
-    horizontal_m = EPSG_UNITS_M.get(keys.get(GEOKEY_LINEAR_UNITS, 0))
-    vertical_m = EPSG_UNITS_M.get(keys.get(GEOKEY_VERTICAL_UNITS, 0))
+    keys = keys_of(header)
     crs = None
     for text in texts:
         if crs is None and text.strip(" \0"):
@@ -227,27 +214,12 @@ def header_crs(path: Readable, header: laspy.LasHeader, block: HeaderBlock) -> H
                 crs = pyproj.CRS.from_wkt(text)
             except pyproj.exceptions.CRSError as fault:
                 warnings.append(f"the header's WKT is not understood ({str(fault)[:120]})")
-    if crs is None and keys:
-        crs, more = _crs_of_geokeys(header, keys)
+    if crs is None and keys.codes:
+        crs, more = crs_of_keys(header, keys)
         warnings.extend(more)
-    return HeaderCrs(crs=crs, horizontal_unit_m=horizontal_m, vertical_unit_m=vertical_m, warnings=tuple(warnings))
-
-
-def _crs_of_geokeys(header: laspy.LasHeader, keys: dict[int, int]) -> tuple[pyproj.CRS | None, list[str]]:
-    """The CRS of GeoTIFF keys, with the vertical CRS where a key names it; laspy reads the horizontal one only."""
-    import pyproj
-
-    if keys.get(GEOKEY_MODEL_TYPE) == MODEL_PROJECTED and keys.get(GEOKEY_PROJECTED_CRS, USER_DEFINED) == USER_DEFINED:
-        return None, ["the header's GeoTIFF keys describe a user-defined projected CRS without WKT"]
-    try:
-        plane = header.parse_crs()
-    except pyproj.exceptions.CRSError as fault:
-        return None, [f"the header's GeoTIFF keys are not understood ({str(fault)[:120]})"]
-    code = keys.get(GEOKEY_VERTICAL_CRS, 0)
-    if plane is None or plane.is_compound or not 1024 <= code < USER_DEFINED:
-        return plane, []
-    try:
-        vertical = pyproj.CRS.from_epsg(code)
-        return pyproj.crs.CompoundCRS(f"{plane.name} + {vertical.name}", [plane, vertical]), []
-    except pyproj.exceptions.CRSError:
-        return plane, [f"the header's vertical CRS key {code} is not known"]
+    return HeaderCrs(
+        crs=crs,
+        horizontal_unit_m=keys.horizontal_unit_m,
+        vertical_unit_m=keys.vertical_unit_m,
+        warnings=tuple(warnings),
+    )

@@ -308,9 +308,10 @@ class Source:
 
     @property
     def crs_given(self) -> bool:
-        """Whether the user's CRS replaces that of the header, or a missing one."""
+        """Whether the CRS or unit that the user gives makes another CRS than the header's, or a missing one."""
         own, used = self._file.facts.crs, self._info.reference.crs
-        return self._options.crs is not None and (own is None or own != used)
+        given = self._options.crs is not None or self._options.vertical_unit is not None
+        return given and used is not None and own != used
 
     def select(self, records: PointRecords) -> tuple[BoolArray, PointCloud]:
         """Which of some records `chunks` keeps, (m,) bool, and these in metres, as `chunks` gives them."""

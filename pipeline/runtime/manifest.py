@@ -114,7 +114,8 @@ class RunManifest:
     finished_at: dt.datetime | None = None
     """With a time zone; None while running."""
     crs: Mapping[str, Any] | None = None
-    """epsg, name, wkt, horizontal_unit_m, vertical_unit_m of the outputs; wkt is None where it is unknown."""
+    """epsg, name, wkt, horizontal_unit_m, vertical_unit_m of the outputs; wkt is None where it is unknown. And
+    cityjson_vertical_unit_m, the unit of elevations in CityJSON and GLB."""
     inputs: tuple[InputFile, ...] = ()
     """Point clouds and footprints."""
     request: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -207,6 +208,17 @@ class RunManifest:
             return cls(**values)
         except (KeyError, TypeError, ValueError) as error:
             raise RunError(f"{source} is no manifest of a run ({error}): the run directory is damaged") from error
+
+
+def city_unit_m(crs: Mapping[str, Any] | None) -> float:
+    """Metres per vertical unit of a run's CityJSON and GLB, by the entry `crs` of its run.json.
+
+    >>> city_unit_m({"vertical_unit_m": 0.3048}), city_unit_m({"vertical_unit_m": 0.3, "cityjson_vertical_unit_m": 1.0})
+    (0.3048, 1.0)
+    """
+    facts = crs or {}
+    # older runs have the unit of the tables there, too
+    return float(facts.get("cityjson_vertical_unit_m") or facts.get("vertical_unit_m") or 1.0)
 
 
 def _input_file(entry: Mapping[str, Any]) -> InputFile:

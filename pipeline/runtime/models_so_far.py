@@ -57,7 +57,7 @@ class ModelsSoFar:
             scratch=Scratch(str(roots[0])),
             stage=stage_of_models(manifest.settings_hash),
             context=RecordContext(
-                reference=SpatialReference() if crs is None else SpatialReference(**crs),
+                reference=SpatialReference.of_facts(crs),
                 settings_hash=manifest.settings_hash,
                 engine_version=manifest.engine_version,
             ),

@@ -20,6 +20,7 @@ from pipeline.errors import (
 )
 from pipeline.io import ReadOptions, SourceInfo, SpatialReference, is_url, open_source, shown
 from pipeline.io.area_of_use import refuse_far_outside
+from pipeline.io.crs import with_one_vertical
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.io.records import Share
 from pipeline.io.source import IMPOSSIBLE_DENSITY
@@ -31,6 +32,10 @@ from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
+_ONE_CRS = (
+    "Run inputs of different CRS apart, or give --crs if one header is wrong, with its vertical part (such as "
+    "EPSG:28992+5709) if their elevations differ"
+)
 _MOST_TILES = 500_000
 """Tiles that a file may lie over: 700 by 700 km in tiles of 1 km, which take ten seconds to plan."""
 _POINTS_PER_WINDOW = 4_000_000
@@ -110,6 +115,10 @@ def make_plan(
     Raises InputError if an input cannot be used, or two inputs disagree about their CRS.
     """
     sources = (look or looked_at)(sorted(paths), options)
+    if options.crs is not None:
+        references = with_one_vertical([info.reference for info in sources])
+        pairs = zip(sources, references, strict=True)
+        sources = tuple(dataclasses.replace(info, reference=reference) for info, reference in pairs)
     first = sources[0].reference
     odd: dict[str, list[str]] = {}
     for info in sources:
@@ -129,7 +138,7 @@ def make_plan(
             fault = CrsError(
                 info.path,
                 f"its CRS is {other.name}, that of {sources[0].path} is {first.name}",
-                "Run inputs of different CRS apart, or give --crs if one header is wrong",
+                _ONE_CRS,
             )
             faults.append(fault)
     if faults:

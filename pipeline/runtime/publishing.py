@@ -22,6 +22,7 @@ from pipeline.errors import RunError, SettingsError
 from pipeline.export import pmtiles, stac
 from pipeline.export.cityjson import lines_of
 from pipeline.export.cityjson_file import city_of
+from pipeline.export.columns import HORIZONTAL, VERTICAL
 from pipeline.export.decisions import NAME as DECISIONS_NAME
 from pipeline.export.geopackage import LAYERS, SUFFIX, TILE, GeoPackage, stored_batch
 from pipeline.export.geoparquet import table_batches, table_files
@@ -29,7 +30,8 @@ from pipeline.export.projection import Project, projection_to
 from pipeline.export.qml import STYLES
 from pipeline.export.terrain import FOLDER as TERRAIN
 from pipeline.export.terrain import terrain_path
-from pipeline.io import LocalStorage, arrow_at, is_url, storage_at
+from pipeline.io import LocalStorage, SpatialReference, arrow_at, is_url, storage_at
+from pipeline.io.crs_units import unit_name
 from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
 from pipeline.runtime.monitoring.events import Event, Listener, ignore
 
@@ -90,6 +92,7 @@ def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_ev
             wkt=(manifest.crs or {}).get("wkt"),
             at=manifest.finished_at or manifest.started_at,
             facts=facts_of(manifest),
+            units=_unit_names(SpatialReference.of_facts(manifest.crs)),
         )
         rows = {}
         for layer in LAYERS:
@@ -125,6 +128,7 @@ def publish_pmtiles(run_dir: str, out: str, *, overwrite: bool = False, on_event
     refuse_existing(target, overwrite)
     manifest = finished_run(run_dir)
     project = projection_to(manifest.crs, pmtiles.CRS)
+    unit_m = SpatialReference.of_facts(manifest.crs).vertical_unit_m
     stated = stated_files(run_dir, {pmtiles.LAYER})
     filesystem, place = arrow_at(run_dir)
     read = 0
@@ -133,7 +137,7 @@ def publish_pmtiles(run_dir: str, out: str, *, overwrite: bool = False, on_event
         nonlocal read
         for tile, batch in _batches(place, pmtiles.LAYER, pmtiles.READ, filesystem, on_event):
             read += batch.num_rows
-            yield pmtiles.map_batch(batch, tile, project)
+            yield pmtiles.map_batch(batch, tile, project, unit_m)
 
     with (
         disk_at(target),
@@ -530,6 +534,11 @@ def facts_of(manifest: RunManifest) -> dict[str, str]:
         "finished_at": None if manifest.finished_at is None else manifest.finished_at.isoformat(),
     }
     return {name: value for name, value in facts.items() if value}
+
+
+def _unit_names(reference: SpatialReference) -> dict[str, str]:
+    """The names of the units of a run's coordinates."""
+    return {HORIZONTAL: unit_name(reference.horizontal_unit_m), VERTICAL: unit_name(reference.vertical_unit_m)}
 
 
 def check_complete(run_dir: str, manifest: RunManifest, rows: Mapping[str, int], stated: Collection[str]) -> None:

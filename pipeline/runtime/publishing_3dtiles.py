@@ -11,6 +11,7 @@ from typing import Any
 
 from pipeline.errors import RunError
 from pipeline.export.cityjson import lines_of
+from pipeline.export.columns import ELEVATIONS
 from pipeline.export.geoparquet import table_batches
 from pipeline.export.glb import Frame, SolidMesh, solid_mesh
 from pipeline.export.globe_glb import Content, Placed, block_feature, globe_glb, local_axes, placed, region_of
@@ -22,6 +23,7 @@ from pipeline.io import LocalStorage, arrow_at, storage_at
 from pipeline.io.crs import SpatialReference
 from pipeline.io.globe import Geodesy, geodesy
 from pipeline.model import FloatArray
+from pipeline.runtime.manifest import city_unit_m
 from pipeline.runtime.monitoring.events import Event, Listener, ignore
 from pipeline.runtime.publishing import (
     ROWS,
@@ -84,7 +86,7 @@ def publish_3dtiles(
     """
     target = path_outside(run_dir, out, "3D Tiles are")
     manifest, stated = finished_run(run_dir), stated_files(run_dir, {"cityjson", "buildings"})
-    reference = SpatialReference(**(manifest.crs or {}))
+    reference = SpatialReference.of_facts(manifest.crs)
     way = geodesy(reference, geoid_height_m)
     keys = {Tile.from_key(name): key for name, key in sequences_of(run_dir).items()}
     with disk_at(target):
@@ -93,7 +95,7 @@ def publish_3dtiles(
         with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
             made = LocalStorage(root=Path(folder, "new"))
             made.make()
-            tiles = _Tiles(run_dir, reference, way, made, on_event, len(keys), {})
+            tiles = _Tiles(run_dir, reference, city_unit_m(manifest.crs), way, made, on_event, len(keys), {})
             tree = grown(sorted(keys), lambda tile: tiles.leaf(tile, keys[tile]), tiles.skyline) if keys else None
             check_complete(run_dir, manifest, {"buildings": tiles.counts.get("buildings", 0)}, stated)
             if tree is None:
@@ -133,11 +135,17 @@ class _Tiles:
 
     run_dir: str
     reference: SpatialReference
+    city_m: float
     geodesy: Geodesy
     made: LocalStorage
     on_event: Listener
     total: int
     counts: dict[str, int]
+
+    @property
+    def units_m(self) -> tuple[float, float, float]:
+        """Metres per unit of the axes of the run's CityJSON."""
+        return self.reference.horizontal_unit_m, self.reference.horizontal_unit_m, self.city_m
 
     def leaf(self, tile: Tile, key: str) -> Branch | None:
         """A tile's models and, above them, its blocks; None if it has no models."""
@@ -157,17 +165,23 @@ class _Tiles:
         return RunError(f"{problem}: run it again")
 
     def _records(self, tile: Tile) -> dict[str, dict[str, Any]]:
-        """The records of a tile by their ids."""
+        """The records of a tile by their ids, elevations in metres."""
         filesystem, place = arrow_at(self.run_dir)
         names = [column.name for column in COLUMNS if column.name != TILE]
         batches = table_batches(place, "buildings", names, filesystem, [tile.key], ROWS)
-        return {row["building_id"]: {**row, TILE: tile.key} for batch in batches for row in batch.to_pylist()}
+        rows = (row for batch in batches for row in batch.to_pylist())
+        return {row["building_id"]: {**row, **self._elevations_m(row), TILE: tile.key} for row in rows}
+
+    def _elevations_m(self, row: Mapping[str, Any]) -> dict[str, float]:
+        """The elevations of a record in metres, as all else on a globe."""
+        unit_m = self.reference.vertical_unit_m
+        known = {name: row[name] for name in ELEVATIONS["buildings"] if row[name] is not None}
+        return {} if unit_m == 1.0 else {name: round(value * unit_m, 3) for name, value in known.items()}
 
     def _meshes(self, key: str, records: Mapping[str, Mapping[str, Any]]) -> tuple[_Meshes, _Meshes]:
         """The models of a tile, and the blocks in their place, with their records."""
         heading, *features = map(json.loads, lines_of(storage_at(self.run_dir).get(key).decode()))
-        units_m = (*[self.reference.horizontal_unit_m] * 2, self.reference.vertical_unit_m)
-        frame = Frame.of(heading["transform"], units_m)
+        frame = Frame.of(heading["transform"], self.units_m)
         models: _Meshes = []
         blocks: _Meshes = []
         for feature in features:
@@ -175,7 +189,7 @@ class _Tiles:
             if mesh is None:
                 continue
             record = records[feature["id"]]
-            block = solid_mesh(block_feature(feature, frame, record["h_70p"]), frame, None)
+            block = solid_mesh(block_feature(feature, frame, record["h_70p"] / self.units_m[2]), frame, None)
             models.append((record, mesh))
             if block is not None:
                 blocks.append(({column.name: record[column.name] for column in BLOCK_COLUMNS}, block))
@@ -187,7 +201,7 @@ class _Tiles:
         fine = self._store(f"{_MODELS}/{tile.key}.glb", models, COLUMNS, region)
         coarse = self._store(f"{_BLOCKS}/{tile.key}.glb", blocks, BLOCK_COLUMNS, region)
         away = [max(m.record["h_max"] - m.record["h_70p"], m.record["h_70p"] - m.record["h_min"]) for m in models]
-        error_m = round(max(LEAST_ERROR_M, max(away) * self.reference.vertical_unit_m), 3)
+        error_m = round(max(LEAST_ERROR_M, *away), 3)
         child = Node(region=region, error_m=0.0, uri=fine.uri, matrix=fine.matrix)
         node = Node(region=region, error_m=error_m, uri=coarse.uri, matrix=coarse.matrix, children=(child,))
         return Branch(nodes=(node,), blocks=blocks_of(blocks), buildings=len(models))
@@ -211,8 +225,7 @@ class _Tiles:
 
     def _terrain(self, read: TerrainTriangles) -> PlacedTerrain:
         """The terrain of a tile on the globe."""
-        units_m = (*[self.reference.horizontal_unit_m] * 2, self.reference.vertical_unit_m)
-        return placed_terrain(read.vertices * units_m, read.triangles, self.geodesy)
+        return placed_terrain(read.vertices * self.units_m, read.triangles, self.geodesy)
 
     def skyline(self, name: str, blocks: Sequence[Placed], region: FloatArray) -> Content:
         """Store the largest blocks of a square of tiles."""

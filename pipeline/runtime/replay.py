@@ -10,11 +10,11 @@ from typing import Any
 
 from pipeline import __version__
 from pipeline.errors import RunError
-from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.facts import RecordContext
 from pipeline.export.obj import obj_text
 from pipeline.export.records import building_row
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
+from pipeline.export.tile import city_lines
 from pipeline.model import BuildingResult, Reason
 from pipeline.reconstruct import failed_building
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
@@ -56,9 +56,12 @@ def _failed(bundle: Bundle, reason: Reason, detail: str) -> BuildingResult:
 
 def replay_row(bundle: Bundle, replayed: Replayed) -> Mapping[str, Any]:
     """The building's record, without the columns that only a run has."""
-    context = RecordContext(reference=bundle.reference, settings_hash="", engine_version=__version__)
-    row = building_row(replayed.result, context)
+    row = building_row(replayed.result, _context(bundle))
     return {name: value for name, value in row.items() if name not in _OF_THE_RUN}
+
+
+def _context(bundle: Bundle) -> RecordContext:
+    return RecordContext(reference=bundle.reference, settings_hash="", engine_version=__version__)
 
 
 def write_replay(folder: str, bundle: Bundle, replayed: Replayed) -> tuple[Path, ...]:
@@ -69,7 +72,7 @@ def write_replay(folder: str, bundle: Bundle, replayed: Replayed) -> tuple[Path,
     result, row = replayed.result, replay_row(bundle, replayed)
     texts = {".json": json.dumps(row, indent=1) + "\n"}
     if result.solids:
-        lines = cityjson_lines([(result, row)], bundle.reference, f"building {result.building_id}")
+        lines = city_lines([result], [row], _context(bundle), f"building {result.building_id}")
         texts |= {
             ".obj": obj_text([result], bundle.reference),
             ".city.jsonl": "".join(f"{line}\n" for line in lines),

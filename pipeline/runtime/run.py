@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from pipeline import __version__
 from pipeline.errors import InputError, RunCancelledError, RunError
+from pipeline.export.coordinates import one_unit
 from pipeline.export.point_files import FOLDER as POINTS_FOLDER
 from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
 from pipeline.io import SourceInfo, SpatialReference, Storage, is_url, shown, storage_at
@@ -666,4 +667,5 @@ def _crs_facts(reference: SpatialReference) -> dict[str, object]:
         "horizontal_unit_m": reference.horizontal_unit_m,
         "vertical_unit_m": reference.vertical_unit_m,
         "vertical_unit_assumed": reference.vertical_unit_assumed,
+        "cityjson_vertical_unit_m": one_unit(reference).vertical_unit_m,
     }

@@ -24,10 +24,7 @@ class RunTiles:
         self._filesystem: pafs.FileSystem
         self._filesystem, self._place = arrow_at(run_dir)
         self._table = table
-        crs = manifest.crs or {}
-        self.reference = SpatialReference(
-            **{name: crs[name] for name in ("wkt", "name", "horizontal_unit_m", "vertical_unit_m") if name in crs}
-        )
+        self.reference = SpatialReference.of_facts(manifest.crs)
         files = table_files(self._place, table, self._filesystem)
         self.tiles = [path.split("/")[-2].removeprefix("tile=") for path in files]
         self.bounds = np.array([self._bounds(tile) for tile in self.tiles]).reshape(-1, 4)

@@ -22,7 +22,6 @@ import numpy.typing as npt
 
 from pipeline.errors import GableworkError, RunError
 from pipeline.io import ReadOptions, Source, SourceInfo, SpatialReference, is_url, open_source, shown
-from pipeline.io.crs import UNITS_M
 from pipeline.io.records import Share
 from pipeline.model import PointCloud
 from pipeline.runtime.cluster.local_executor import LocalExecutor
@@ -248,7 +247,7 @@ def sample_window(task: SampleTask, clock: Callable[[], float] | None = None) ->
             aoi=None,
             bbox=None,
             crs=source.info.reference.wkt,
-            vertical_unit=_unit_name(source.info.reference),
+            vertical_unit=None,  # the CRS states it
         )
         deadline = clock() + _RUN_S
         try:
@@ -327,7 +326,9 @@ def _cut(clouds: Sequence[PointCloud], at: float, side_m: float) -> tuple[PointC
 
 
 def _write(path: Path, points: PointCloud, reference: SpatialReference) -> None:
-    """Write points as PLY, in the units of their CRS."""
+    """Write points as PLY, in the units of their CRS; in metres if it is unknown, since PLY states no units."""
+    if reference.wkt is None:
+        reference = SpatialReference()
     units = (reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m)
     columns: dict[str, npt.NDArray[Any]] = {name: points.xyz[:, k] / units[k] for k, name in enumerate("xyz")}
     columns |= {"return_number": points.return_number, "number_of_returns": points.return_count}
@@ -340,11 +341,6 @@ def _write(path: Path, points: PointCloud, reference: SpatialReference) -> None:
     for name, column in columns.items():
         records[name] = column
     path.write_bytes("\n".join(header).encode() + records.tobytes())
-
-
-def _unit_name(reference: SpatialReference) -> str | None:
-    """The word for a vertical unit."""
-    return next((name for name, metres in UNITS_M.items() if metres == reference.vertical_unit_m), None)
 
 
 def scaled(work: Expected, found: Sequence[Sampled], buildings: int | None = None) -> Expected | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import threading
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -58,7 +59,10 @@ def _without_place(run: str, crs: str) -> NoSuchCollectionError:
 
 
 class CollectionCrs:
-    """The CRS of a run and those into which its features are transformed. Heights stay as they are.
+    """The CRS of a run and those into which its features are transformed.
+
+    Third coordinates become metres; in the run's own CRS, which is named without its vertical part, they are in its
+    horizontal unit.
 
     Parameters
     ----------
@@ -77,6 +81,10 @@ class CollectionCrs:
         if crs is None or crs.get("wkt") is None:
             raise _without_place(run, "unknown")
         whole = pyproj.CRS.from_wkt(crs["wkt"])
+        self.horizontal_unit_m = float(crs.get("horizontal_unit_m") or 1.0)
+        """Metres per unit of coordinates that are properties."""
+        self.vertical_unit_m = float(crs.get("vertical_unit_m") or 1.0)
+        """Metres per unit of elevations that are properties."""
         self._own = (whole.sub_crs_list[0] if whole.is_compound else whole).to_2d()
         if to_degrees(self._own) is None:
             raise _without_place(run, f"local ({whole.name})")
@@ -130,7 +138,7 @@ class CollectionCrs:
         Rounded, exterior rings counter-clockwise with the easting first, axes in the order of the CRS. One without
         coordinates there becomes None.
         """
-        moved = self.moved(geometries, target)
+        moved = self._with_heights(self.moved(geometries, target), target)
         if moved is not geometries:
             moved = np.asarray(_transformed(moved, lambda xyz: np.round(xyz, target.decimals) + 0.0), dtype=object)
         moved = np.asarray(shapely.orient_polygons(moved), dtype=object)
@@ -138,6 +146,14 @@ class CollectionCrs:
         if target.is_northing_first:
             moved = np.asarray(_transformed(moved, _swapped), dtype=object)
         return moved
+
+    def _with_heights(self, geometries: Geometries, target: NamedCrs) -> Geometries:
+        """Geometries with the third coordinate in the unit that the target has."""
+        unit_m = self.horizontal_unit_m if target.uri == self.storage_uri else 1.0
+        factor = self.vertical_unit_m / unit_m
+        if math.isclose(factor, 1.0, rel_tol=1e-9) or not shapely.has_z(geometries).any():
+            return geometries
+        return np.asarray(_transformed(geometries, lambda xyz: xyz * [1.0, 1.0, factor]), dtype=object)
 
     def window(self, box: Box, source: NamedCrs) -> Box | None:
         """A box of another CRS, easting first, enclosed in the run's own; None if it cannot be."""

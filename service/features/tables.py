@@ -15,9 +15,11 @@ import pyarrow as pa
 import pyarrow.fs as pafs
 
 from pipeline.errors import RunError, causes
+from pipeline.export.columns import COLUMNS, HORIZONTAL, NONE, VERTICAL
 from pipeline.export.records import SCHEMAS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
 from pipeline.io import arrow_at, is_url
+from pipeline.io.crs_units import unit_name
 from pipeline.model import Reason, RoofType, Status
 from pipeline.runtime.manifest import NAME as MANIFEST_NAME
 from pipeline.runtime.manifest import RunStatus, read_manifest
@@ -41,9 +43,11 @@ _WORDS: Mapping[tuple[str, str], type[Status | RoofType | Reason]] = {
     ("rejected", "reason"): Reason,
 }
 """Columns with a closed list of words."""
+_UNITS = {table: {column.name: column.unit for column in columns} for table, columns in COLUMNS.items()}
 _TITLES = {
     "buildings": "footprints of all candidates, with status and figures",
-    "planes": "roof planes: faces, slope and aspect; the third coordinate is the elevation as in the run",
+    "planes": "roof planes: faces, slope and aspect; the third coordinate is the elevation: in metres, in the storage "
+    "CRS in its unit",
     "rejected": "objects that are not buildings, each with its reason",
 }
 
@@ -84,13 +88,13 @@ class Layer:
             return f"{row['building_id']}.{row['plane_id']}"
         return str(row["object_id" if self.table == "rejected" else "building_id"])
 
-    def filter_schema(self) -> dict[str, Any]:
+    def filter_schema(self, crs: CollectionCrs) -> dict[str, Any]:
         """The JSON schemas of the properties that filters can name, and of the geometry."""
-        found = {name: self._property(name) for name in self.queryables}
+        found = {name: self._property(name, crs) for name in self.queryables}
         role = {"x-ogc-role": "primary-geometry", "format": "geometry-polygon-or-multipolygon"}
         return {**found, GEOMETRY: {"title": GEOMETRY, **role}}
 
-    def feature_schema(self) -> dict[str, Any]:
+    def feature_schema(self, crs: CollectionCrs) -> dict[str, Any]:
         """The JSON schemas of the members of a feature.
 
         Types are single words with `nullable`, as in OpenAPI 3.0: GDAL takes a list of types for a text. For the same
@@ -98,7 +102,7 @@ class Layer:
         """
         listed = [name for name, kind in self.properties.items() if not _is_float_list(kind)]
         nullable = {field.name for field in SCHEMAS[self.table] if field.nullable}
-        found = {name: self._property(name) | ({"nullable": True} if name in nullable else {}) for name in listed}
+        found = {name: self._property(name, crs) | ({"nullable": True} if name in nullable else {}) for name in listed}
         return {
             "type": {"type": "string", "enum": ["Feature"]},
             "id": {"type": "string"},
@@ -106,11 +110,26 @@ class Layer:
             "properties": {"type": "object", "properties": found, "required": listed},
         }
 
-    def _property(self, name: str) -> dict[str, Any]:
+    def _property(self, name: str, crs: CollectionCrs) -> dict[str, Any]:
+        """The JSON schema of a property; of a coordinate with its unit as UCUM (OGC API - Features, part 5)."""
         found = {"title": name, **json_type(self.properties[name])}
+        own = {HORIZONTAL: crs.horizontal_unit_m, VERTICAL: crs.vertical_unit_m}
+        unit_m = own.get(_UNITS[self.table].get(name, NONE))
+        if unit_m is not None:
+            found["x-ogc-unit"] = ucum(unit_m)
         if (self.table, name) in _WORDS:
             found["enum"] = [str(word) for word in _WORDS[self.table, name]]
         return found
+
+
+def ucum(unit_m: float) -> str:
+    """A unit of length in the Unified Code for Units of Measure.
+
+    >>> ucum(1.0), ucum(0.3048), ucum(1200.0 / 3937.0)
+    ('m', '[ft_i]', '[ft_us]')
+    """
+    known = {"metre": "m", "foot": "[ft_i]", "US survey foot": "[ft_us]"}
+    return known.get(unit_name(unit_m), f"{unit_m:.12g}.m")
 
 
 LAYERS: Mapping[str, Layer] = {table: Layer(table) for table in TABLES}

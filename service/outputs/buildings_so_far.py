@@ -14,10 +14,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
-from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.facts import RecordContext
 from pipeline.export.records import plane_rows
-from pipeline.export.tile import building_rows
+from pipeline.export.tile import building_rows, city_lines
 from pipeline.io.storage import LocalStorage
 from pipeline.runtime.stages.model_batch import StoredResult
 from service.outputs.building_index import FEATURES_NAME, NAME, GrowingIndexFile
@@ -78,13 +77,8 @@ class BuildingsSoFar:
         # meshes are written only when the whole tile is published
         rows = building_rows(results, context, tile, "none")
         with self._city_file(tile) as stream:
-            lines = cityjson_lines(
-                list(zip(results, rows, strict=True)),
-                context.reference,
-                f"buildings of tile {tile}",
-                self._corners.get(tile),
-            )
-            places = self._add_city(tile, stream, iter(lines))
+            lines = city_lines(results, rows, context, f"buildings of tile {tile}", self._corners.get(tile))
+            places = self._add_city(tile, stream, lines)
         for result, feature in zip(
             results, feature_texts([{**row, "tile": tile} for row in rows], self._to_wgs84), strict=True
         ):

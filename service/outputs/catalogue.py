@@ -37,6 +37,8 @@ class ResultsCrs:
     """PROJ's description of the transformation to WGS 84; None if the CRS is unknown."""
     accuracy_m: float | None
     """Accuracy of that transformation in metres; None if PROJ gives none."""
+    vertical_unit_m: float | None = None
+    """Metres per unit of the columns that are elevations; None if unknown, as in older results."""
 
     @classmethod
     def unknown(cls) -> ResultsCrs:

@@ -46,8 +46,9 @@ class Wgs84Transformation:
 
         A compound CRS is reduced to its horizontal part: footprints have no elevation.
         """
+        unit_m = None if crs is None else crs.get("vertical_unit_m")
         if crs is None or crs.get("wkt") is None:
-            unknown = ResultsCrs(name=None, uri=None, to_wgs84=None, accuracy_m=None)
+            unknown = ResultsCrs(name=None, uri=None, to_wgs84=None, accuracy_m=None, vertical_unit_m=unit_m)
             return cls(crs=unknown, transformer=None, projjson=None)
         whole = pyproj.CRS.from_wkt(crs["wkt"])
         flat = (whole.sub_crs_list[0] if whole.is_compound else whole).to_2d()
@@ -59,6 +60,7 @@ class Wgs84Transformation:
             uri=None if code is None else f"http://www.opengis.net/def/crs/EPSG/0/{code}",
             to_wgs84=None if transformer is None else transformer.description,
             accuracy_m=None if accuracy_m is None or accuracy_m < 0 else float(accuracy_m),
+            vertical_unit_m=unit_m,
         )
         return cls(crs=results_crs, transformer=transformer, projjson=whole.to_json_dict())
 
@@ -173,6 +175,8 @@ class FeatureCollectionFile:
         self._put(b'{"type":"FeatureCollection",')
         if not crs.is_known:
             self._put(b'"coordRefSys":null,"note":' + _json(_UNKNOWN) + b",")
+        if crs.vertical_unit_m is not None:
+            self._put(b'"verticalUnitM":' + _json(crs.vertical_unit_m) + b",")
         self._put(b'"features":[')
         self._first = True
 

@@ -112,7 +112,8 @@ _OF_A_RUN = (
         output_id="geojson",
         title="Footprints as GeoJSON",
         description="RFC 7946: footprints in WGS 84 with all columns as properties; one without an outline has a null "
-        "geometry. If the CRS of the tiles is unknown, the coordinates are in that CRS, and `coordRefSys` is null.",
+        "geometry. If the CRS of the tiles is unknown, the coordinates are in that CRS, and `coordRefSys` is null. "
+        "`verticalUnitM` has the unit of the columns that are elevations.",
         media_type=GEOJSON,
         filename="buildings.geojson",
         schema={"type": "object", "format": "geojson-feature-collection", "contentMediaType": GEOJSON},

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.model import Status
+from pipeline.runtime.manifest import city_unit_m
 from service.outputs.catalogue import ResultsCrs
 from service.wording import as_inputs
 
@@ -89,6 +90,7 @@ def report(
         "source_licence": manifest.get("source_licence"),
         "crs": {
             **{name: facts.get(name) for name in ("name", "epsg", "horizontal_unit_m", "vertical_unit_m", "wkt")},
+            "cityjson_vertical_unit_m": city_unit_m(facts),
             "uri": crs.uri,
             "to_wgs84": crs.to_wgs84,
             "to_wgs84_accuracy_m": crs.accuracy_m,

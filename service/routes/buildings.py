@@ -377,8 +377,9 @@ def _feature(found: StoredBuilding, finished: FinishedJob, base: str, *, native:
 
 
 def _crs_members(crs: ResultsCrs, *, native: bool) -> dict[str, Any]:
-    """The member for coordinates that are not CRS84; null if the CRS is unknown."""
-    return {"coordRefSys": crs.uri or crs.name} if native else {}
+    """The members for coordinates that are not CRS84, null if the CRS is unknown, and for elevations."""
+    found: dict[str, Any] = {"coordRefSys": crs.uri or crs.name} if native else {}
+    return found if crs.vertical_unit_m is None else {**found, "verticalUnitM": crs.vertical_unit_m}
 
 
 def _state(finished: FinishedJob) -> dict[str, Any]:

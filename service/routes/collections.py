@@ -16,6 +16,8 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import AfterValidator
 
+from pipeline.export.columns import ELEVATIONS
+from pipeline.io.crs_units import unit_name
 from service.auth import Principal
 from service.errors import (
     NoSuchCollectionError,
@@ -263,13 +265,21 @@ def _described(run: OpenRun, layer: Layer, base: str) -> Collection:
     return Collection(
         id=run.run.collection_id(layer.table),
         title=f"{run.run.name}: {layer.table}",
-        description=layer.title + licence,
+        description=layer.title + _elevations(run, layer) + licence,
         itemType="feature",
         extent=Extent(spatial=spatial, temporal=temporal) if spatial or temporal else None,
         crs=run.crs.uris,
         storageCrs=run.crs.storage_uri,
         links=links,
     )
+
+
+def _elevations(run: OpenRun, layer: Layer) -> str:
+    """Half a sentence about the unit of the properties that are elevations, where it is not the metre."""
+    unit_m = run.crs.vertical_unit_m
+    if unit_m == 1.0 or not ELEVATIONS[layer.table]:
+        return ""
+    return f"; elevations that are properties are in units of {unit_m:.12g} m ({unit_name(unit_m)})"
 
 
 _SCHEMA_ANSWER = {
@@ -308,7 +318,7 @@ def _schema(runs: Catalogue, base: str, collection_id: str, kind: Literal["query
         type="object",
         title=f"{run.run.name}: {layer.table}",
         additionalProperties=kind == "schema",
-        properties=layer.filter_schema() if kind == "queryables" else layer.feature_schema(),
+        properties=layer.filter_schema(run.crs) if kind == "queryables" else layer.feature_schema(run.crs),
     )
     return respond(found, media_type=SCHEMA_TYPE)
 

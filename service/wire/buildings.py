@@ -17,6 +17,9 @@ class Outline(Answer):
     coordinates: list[Any]
 
 
+_VERTICAL_UNIT = Field(None, description="Metres per unit of the properties that are elevations, such as `ridge_z`.")
+
+
 class Feature(Answer):
     """A building."""
 
@@ -24,6 +27,7 @@ class Feature(Answer):
     id: str = Field(pattern=ID_PATTERN)
     geometry: Outline | None
     properties: dict[str, Any] = Field(description="The columns of the table buildings, and `tile`.")
+    verticalUnitM: float | None = _VERTICAL_UNIT
     links: list[Link] | None = None
 
 
@@ -45,6 +49,7 @@ class FeaturePage(Answer):
         description="Present if the coordinates are not CRS84; null if their CRS is unknown.",
         json_schema_extra={"nullable": True},
     )
+    verticalUnitM: float | None = _VERTICAL_UNIT
     links: list[Link]
     features: list[Feature]
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, WithJsonSchema, field_validator
 
 from pipeline.errors import CrsError
-from pipeline.io.crs import LARGEST_COORDINATE, UNITS_M, horizontal_unit_of
+from pipeline.io.crs import LARGEST_COORDINATE, UNITS_M, horizontal_unit_of, with_authority
 from service.drafts import Draft, Inline
 from service.errors import RequestError, within
 from service.input_policy import checked_crs
@@ -53,7 +53,7 @@ def _projected(text: str) -> str:
         horizontal_unit_of(checked_crs(text, path="crs"), path="crs")
     except CrsError as error:
         raise FaultsError([f"crs: {error.problem}. Give a projected CRS, such as EPSG:28992"]) from error
-    return text
+    return with_authority(text)
 
 
 Crs = Annotated[str, Field(max_length=20_000), AfterValidator(_printable), AfterValidator(_projected)]

@@ -1,5 +1,6 @@
 """Coordinate reference systems and units, from headers and from the user."""
 
+import ctypes
 import dataclasses
 import pickle
 import struct
@@ -8,7 +9,7 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
-from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct, WktCoordinateSystemVlr
+from laspy.vlrs.known import GeoDoubleParamsVlr, GeoKeyDirectoryVlr, GeoKeyEntryStruct, WktCoordinateSystemVlr
 
 from pipeline.errors import CrsError
 from pipeline.io import ReadOptions, open_source
@@ -51,8 +52,83 @@ def test_the_order_of_precedence_of_the_vertical_unit():
     reference, reported = resolve("EPSG:28992", header_vertical_unit_m=FOOT_M)
     assert (reference.vertical_unit_m, reported) == (FOOT_M, ())
     assert resolve("EPSG:7415", header_vertical_unit_m=FOOT_M)[0].vertical_unit_m == 1.0
-    # The header's unit belongs to the header's CRS.
-    assert resolve("EPSG:2992", crs="EPSG:28992", header_vertical_unit_m=FOOT_M)[0].vertical_unit_m == 1.0
+    # a CRS without a vertical part says nothing about elevations
+    assert resolve("EPSG:2992", crs="EPSG:28992", header_vertical_unit_m=FOOT_M)[0].vertical_unit_m == FOOT_M
+    assert resolve("EPSG:2992", crs="EPSG:7415", header_vertical_unit_m=FOOT_M)[0].vertical_unit_m == 1.0
+
+
+@pytest.mark.parametrize("given", ["EPSG:26910", "26910", " 26910 ", pyproj.CRS("EPSG:26910").to_wkt(), "EPSG:32610"])
+def test_a_given_horizontal_crs_keeps_the_header_s_vertical_one_and_says_where_units_are_mixed(given):
+    reference, reported = resolve("EPSG:26910+6360", crs=given)
+    assert reference.horizontal_unit_m == 1.0
+    assert reference.vertical_unit_m == pytest.approx(US_SURVEY_FOOT_M, rel=1e-12)
+    assert not reference.vertical_unit_assumed
+    assert [part.to_epsg() for part in reference.crs.sub_crs_list] == [pyproj.CRS(given.strip()).to_epsg(), 6360]
+    assert sum("units are mixed" in warning and "US survey foot" in warning for warning in reported) == 1
+    # a user who states both parts knows, and without a mixture there is nothing to say
+    assert resolve("EPSG:26910+6360", crs="EPSG:26910+6360")[1] == ()
+    assert resolve("EPSG:26910+6360", crs="EPSG:26910", vertical_unit="us-ft")[1] == ()
+    assert not any("mixed" in warning for warning in resolve("EPSG:2263+6360", crs="EPSG:2263")[1])
+    reference, reported = resolve("EPSG:7415", crs="EPSG:28992")
+    assert (reference.epsg, reference.named, reported) == (7415, "EPSG:28992", ())
+
+
+def test_an_option_that_overrides_the_header_s_vertical_unit_says_so():
+    for more in ({"vertical_unit": "m"}, {"crs": "EPSG:26910+5703"}):
+        reference, reported = resolve("EPSG:26910+6360", **more)
+        assert reference.vertical_unit_m == 1.0
+        assert [w for w in reported if "metre, replaces the header's US survey foot" in w] == list(reported)
+    # in its own datum
+    assert reference.crs.sub_crs_list[1].to_epsg() == 5703
+    assert resolve("EPSG:26910+6360", vertical_unit="m")[0].crs.sub_crs_list[1].to_epsg() == 5703
+    assert resolve("EPSG:28992", vertical_unit="ft")[1] == ()
+    assert any("replaces" in w for w in resolve(header_vertical_unit_m=FOOT_M, vertical_unit="m")[1])
+
+
+@pytest.mark.parametrize(
+    ("crs", "more"),
+    [
+        ("EPSG:28992", {"vertical_unit": "ft"}),
+        ("EPSG:7415", {"vertical_unit": "ft"}),
+        ("EPSG:2263", {"vertical_unit": "m"}),
+        ("EPSG:2992", {"header_vertical_unit_m": 1.0}),
+        ("EPSG:26910+6360", {"vertical_unit": "ft"}),
+        ("+proj=utm +zone=33 +ellps=bessel +towgs84=598,73,418,0.2,0.05,-2.5,6.7 +units=m", {"vertical_unit": "us-ft"}),
+    ],
+)
+def test_the_crs_of_the_outputs_states_every_vertical_unit_that_is_not_its_horizontal_one(crs, more):
+    reference, _ = resolve(crs, **more)
+    again, reported = resolve_reference(path="a", header_crs=pyproj.CRS.from_json_dict(reference.projjson))
+    assert again.vertical_unit_m == pytest.approx(reference.vertical_unit_m, rel=1e-12)
+    assert (again.horizontal_unit_m, reported) == (reference.horizontal_unit_m, ())
+    assert reference.vertical_unit_m != reference.horizontal_unit_m
+    # ids of buildings are those of before
+    code = pyproj.CRS(crs).to_epsg()
+    assert reference.named == (pyproj.CRS(crs).name if code is None else f"EPSG:{code}")
+
+
+def test_a_vertical_crs_alone_is_kept_too(tmp_path):
+    reference, reported = resolve("EPSG:6360", crs="EPSG:26910")
+    assert [part.to_epsg() for part in reference.crs.sub_crs_list] == [26910, 6360]
+    assert any("units are mixed" in warning for warning in reported)
+    # the vertical key beside a user-defined plan
+    write_keys(tmp_path / "a.las", {1024: 1, 3072: 32767, 3076: 9003, 4096: 6360})
+    info = open_source(tmp_path / "a.las", ReadOptions(crs="EPSG:26910")).info
+    assert info.reference.vertical_unit_m == pytest.approx(US_SURVEY_FOOT_M)
+    assert any("units are mixed" in warning for warning in info.warnings)
+
+
+def test_a_3d_crs_of_the_header_keeps_its_vertical_unit_too():
+    reference, reported = resolve(pyproj.CRS("EPSG:26910").to_3d(), crs="EPSG:2992")
+    assert (reference.horizontal_unit_m, reference.vertical_unit_m) == (FOOT_M, 1.0)
+    assert any("units are mixed" in warning for warning in reported)
+    assert resolve(pyproj.CRS("EPSG:26910").to_3d(), crs="EPSG:26910")[0].epsg == 26910
+
+
+def test_the_facts_of_an_older_run_make_a_reference():
+    facts = {"wkt": None, "name": "unknown", "epsg": None, "horizontal_unit_m": FOOT_M, "vertical_unit_m": FOOT_M}
+    assert SpatialReference.of_facts({**facts, "of_a_later_version": 1}).vertical_unit_m == FOOT_M
+    assert SpatialReference.of_facts(None) == SpatialReference()
 
 
 def test_no_crs_is_unknown_and_reported_with_its_fix():
@@ -101,16 +177,24 @@ def test_a_reference_is_frozen_hashable_survives_pickling_and_is_the_same_by_wkt
         reference.epsg = 1
 
 
-def write_keys(path, keys, wkt=None):
-    """A LAS file with GeoTIFF keys, and WKT beside where given."""
+def write_keys(path, keys, wkt=None, doubles=()):
+    """A LAS file with GeoTIFF keys, and WKT beside where given; `doubles` are pairs of a key and its number."""
     header = laspy.LasHeader(version="1.2", point_format=0)
     header.scales = np.full(3, 0.01)
     vlr = GeoKeyDirectoryVlr()
     vlr.geo_keys = [
         GeoKeyEntryStruct(id=key, tiff_tag_location=0, count=1, value_offset=value) for key, value in keys.items()
     ]
-    vlr.geo_keys_header.number_of_keys = len(keys)
+    vlr.geo_keys += [
+        GeoKeyEntryStruct(id=key, tiff_tag_location=34736, count=1, value_offset=place)
+        for place, (key, _) in enumerate(doubles)
+    ]
+    vlr.geo_keys_header.number_of_keys = len(vlr.geo_keys)
     header.vlrs.append(vlr)
+    if doubles:
+        numbers = GeoDoubleParamsVlr()
+        numbers.doubles = [ctypes.c_double(number) for _, number in doubles]
+        header.vlrs.append(numbers)
     if wkt:
         header.vlrs.append(WktCoordinateSystemVlr(wkt))
     las = laspy.LasData(header)
@@ -121,10 +205,70 @@ def write_keys(path, keys, wkt=None):
 
 def test_geotiff_keys_give_the_crs_and_the_vertical_unit(tmp_path):
     info = write_keys(tmp_path / "a.las", {1024: 1, 3072: 2992, 4099: 9001})
-    assert (info.reference.epsg, info.reference.vertical_unit_m, info.warnings) == (2992, 1.0, ())
+    assert (info.reference.named, info.reference.vertical_unit_m, info.warnings) == ("EPSG:2992", 1.0, ())
     info = write_keys(tmp_path / "b.las", {1024: 1, 3072: 2263, 4096: 6360})
     assert info.reference.vertical_unit_m == pytest.approx(US_SURVEY_FOOT_M)
     assert (info.reference.projjson["type"], info.warnings) == ("CompoundCRS", ())
+
+
+@pytest.mark.parametrize(
+    ("code", "unit", "found", "unit_m"),
+    [
+        (32128, 9003, 2271, US_SURVEY_FOOT_M),  # Pennsylvania North
+        (32119, 9003, 2264, US_SURVEY_FOOT_M),  # North Carolina, whose false eastings differ by 0.8 mm
+        (2285, 9001, 32148, 1.0),  # Washington North
+        (2992, 9001, 2991, 1.0),  # Oregon, by another name
+        (26910, 9002, None, FOOT_M),  # no such zone in the registry
+        (2263, 9002, None, FOOT_M),
+    ],
+)
+def test_a_units_key_overrides_the_unit_of_its_pcs_code_and_names_the_crs_that_has_it(
+    tmp_path, code, unit, found, unit_m
+):
+    info = write_keys(tmp_path / "a.las", {1024: 1, 3072: code, 3076: unit, 4099: unit})
+    reference = info.reference
+    assert reference.epsg == found
+    assert [reference.horizontal_unit_m, reference.vertical_unit_m] == pytest.approx([unit_m] * 2, rel=1e-12)
+    (warning,) = info.warnings
+    assert "key 3076" in warning
+    assert (reference.name if found is None else f"EPSG:{found} ({reference.name})") in warning
+    assert "--crs EPSG:n" in warning
+    # the same places as by the code itself
+    own = pyproj.CRS.from_epsg(code)
+    x, y = pyproj.Transformer.from_crs(own.geodetic_crs, own, always_xy=True).transform(*own.area_of_use.bounds[:2])
+    factor = own.axis_info[0].unit_conversion_factor / unit_m
+    ways = [(own, x, y), (reference.horizontal_crs, x * factor, y * factor)]
+    places = [pyproj.Transformer.from_crs(crs, own.geodetic_crs, always_xy=True).transform(*xy) for crs, *xy in ways]
+    assert np.abs(np.subtract(*places)).max() < 1e-7
+
+
+def test_units_keys_that_agree_with_their_codes_change_nothing(tmp_path):
+    info = write_keys(tmp_path / "a.las", {1024: 1, 3072: 2271, 3076: 9003, 4096: 6360, 4099: 9003})
+    assert [part.to_epsg() for part in info.reference.crs.sub_crs_list] == [2271, 6360]
+    assert info.warnings == ()
+
+
+def test_a_vertical_units_key_overrides_the_unit_of_its_vertical_crs(tmp_path):
+    info = write_keys(tmp_path / "a.las", {1024: 1, 3072: 26910, 4096: 5703, 4099: 9003})
+    assert [part.to_epsg() for part in info.reference.crs.sub_crs_list] == [26910, 6360]
+    assert info.reference.vertical_unit_m == pytest.approx(US_SURVEY_FOOT_M, rel=1e-12)
+    (warning,) = info.warnings
+    assert "key 4099" in warning
+    assert "EPSG:6360 (NAVD88 height (ftUS))" in warning
+
+
+def test_units_of_keys_may_be_any_of_the_registry_or_a_number_and_others_are_reported(tmp_path):
+    clarke_m = 0.3047972654
+    info = write_keys(tmp_path / "a.las", {1024: 1, 3072: 26910, 3076: 9005, 4099: 9005})
+    assert info.reference.horizontal_unit_m == pytest.approx(clarke_m, rel=1e-9)
+    keys = {1024: 1, 3072: 26910, 3076: 32767}
+    info = write_keys(tmp_path / "b.las", keys, doubles=[(3077, 0.5)])
+    assert (info.reference.horizontal_unit_m, info.reference.name) == (0.5, "NAD83 / UTM zone 10N (unit of 0.5 m)")
+    for more in ({3076: 32767}, {3076: 9102}, {4099: 17}):
+        info = write_keys(tmp_path / "c.las", {1024: 1, 3072: 26910, **more})
+        assert info.reference.epsg == 26910
+        ((key, code),) = more.items()
+        assert any(f"units key {key} has {code}" in warning for warning in info.warnings)
 
 
 def test_wkt_stands_above_geotiff_keys(tmp_path):
@@ -161,7 +305,8 @@ def test_wkt_in_an_extended_record_is_found_behind_a_large_one(tmp_path, points,
 def test_options_reach_the_reference(tmp_path, points, write_las):
     path = write_las(tmp_path / "a.laz", points(20))
     reference = open_source(path, ReadOptions(crs="EPSG:28992", vertical_unit="ft")).info.reference
-    assert (reference.epsg, reference.vertical_unit_m) == (28992, FOOT_M)
+    assert (reference.named, reference.vertical_unit_m) == ("EPSG:28992", FOOT_M)
+    assert reference.crs.sub_crs_list[0].to_epsg() == 28992
 
 
 def test_degrees_without_a_crs_are_not_taken_for_metres(tmp_path):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RunError, UnreadableInputError
-from pipeline.io import ReadOptions
+from pipeline.io import ReadOptions, SpatialReference
 from pipeline.runtime import forecast as forecasts
 from pipeline.runtime import sample
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
@@ -240,11 +240,12 @@ def test_a_sample_finds_about_as_many_buildings_as_the_run(
 
 def test_a_window_is_written_in_the_units_of_its_crs(town: Path, tmp_path: Path) -> None:
     (cloud,) = sample.open_source(town).chunks()
-    for name, unit, vertical in (("EPSG:2992", "ft", 0.3048), ("EPSG:28992", "m", 1.0), (None, None, 1.0)):
-        options = ReadOptions(crs=name, vertical_unit=unit)
-        reference = dataclasses.replace(sample.open_source(town, options).info.reference, vertical_unit_m=vertical)
+    feet_unknown = SpatialReference(horizontal_unit_m=0.3048, vertical_unit_m=0.3048)
+    given = (("EPSG:2992", "ft"), ("EPSG:2992", "m"), ("EPSG:28992", "us-ft"), ("EPSG:28992", None), (None, None))
+    options = [ReadOptions(crs=name, vertical_unit=unit) for name, unit in given]
+    for reference in (feet_unknown, *(sample.open_source(town, one).info.reference for one in options)):
         sample._write(tmp_path / "window.ply", cloud, reference)
-        again = ReadOptions(crs=reference.wkt, vertical_unit=sample._unit_name(reference))
+        again = ReadOptions(crs=reference.wkt)
         (read,) = sample.open_source(tmp_path / "window.ply", again).chunks()
         assert np.abs(read.xyz - cloud.xyz).max() < 1e-4
         for field in ("return_number", "return_count", "classification", "gps_time", "source_id"):

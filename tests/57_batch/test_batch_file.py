@@ -6,6 +6,7 @@ import pytest
 
 from pipeline.batch.batch_file import read_batch
 from pipeline.errors import SettingsError
+from pipeline.io.crs import parse_crs
 
 LEAST = '[inputs]\npaths = ["tiles/*.laz"]\n[output]\npath = "models"\n'
 
@@ -41,6 +42,14 @@ def test_what_is_not_said_is_as_in_reconstruct(tmp_path: Path) -> None:
     assert request.resources.isolation is not None
     assert request.settings.general.method == "arrangement"
     assert (request.crs, request.footprints, request.bbox) == (None, None, None)
+
+
+@pytest.mark.parametrize("crs", ["28992", '"28992"', '"EPSG:28992"'])
+def test_a_crs_is_a_code_with_or_without_its_authority(tmp_path: Path, crs: str) -> None:
+    text = f'[inputs]\npaths = ["a.laz"]\ncrs = {crs}\n[output]\npath = "out"\n'
+    given = read_batch(written(tmp_path, text)).request().crs
+    assert given is not None
+    assert parse_crs(given, path="crs").to_epsg() == 28992
 
 
 def test_all_that_can_be_said_reaches_the_engine(tmp_path: Path) -> None:

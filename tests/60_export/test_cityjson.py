@@ -1,8 +1,10 @@
 """CityJSONSeq: its rules, the official schema, cjio, and the geometry that comes back."""
 
 import copy
+import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -12,6 +14,7 @@ from pathlib import Path
 import cityjson_rules
 import jsonschema
 import numpy as np
+import pyproj
 import pytest
 import referencing
 import small_buildings as small
@@ -20,8 +23,10 @@ from small_buildings import Builder, Contexts
 
 from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.cityjson_file import city_of
+from pipeline.export.coordinates import one_unit
 from pipeline.export.records import RecordContext, building_row
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
+from pipeline.export.tile import write_tile
 
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
 BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent, small.levelled)
@@ -103,6 +108,53 @@ def test_integer_vertices_give_back_the_coordinates(contexts: Contexts, crs: str
         )
         wanted = np.vstack([solid.vertices for solid in solids]) if solids else np.empty((0, 3))
         assert np.array_equal(np.round(xyz * units - small.ORIGIN, 3), wanted)
+
+
+@pytest.mark.parametrize("crs", CRSES)
+def test_the_files_of_a_tile_have_one_unit_for_all_axes_and_attributes(
+    contexts: Contexts, tmp_path: Path, crs: str
+) -> None:
+    context = contexts[crs]
+    unit_m = context.reference.horizontal_unit_m
+    results = [build() for build in BUILT]
+    write_tile(tmp_path, "t", results, [], context, meshes="glb")
+    lines = (tmp_path / "cityjson/tile=t/part-0.city.jsonl").read_text().splitlines()
+    first, *features = map(json.loads, lines)
+    built = {result.building_id: result for result in results}
+    checked = 0
+    for feature in features:
+        solids = built[feature["id"]].solids
+        if not solids:
+            continue
+        z = np.array(feature["vertices"])[:, 2] * first["transform"]["scale"][2] + first["transform"]["translate"][2]
+        wanted = np.concatenate([solid.vertices[:, 2] for solid in solids]) + small.ORIGIN[2]
+        assert np.abs(z[: len(wanted)] * unit_m - wanted).max() < 5.1e-4
+        attributes = feature["CityObjects"][feature["id"]]["attributes"]
+        assert attributes["ridge_z"] * unit_m == pytest.approx(wanted.max(), abs=1e-3)
+        assert attributes["mesh_path"] == "meshes/t/t.glb"
+        checked += 1
+    assert checked > 3
+    data = (tmp_path / "meshes/t/t.glb").read_bytes()
+    place = re.search(rb'"vertical_unit_m":([0-9.]+)', data)
+    assert place is not None
+    assert float(place[1]) == unit_m
+    # without a code for the CRS the title is where a reader can find the unit
+    stated = dataclasses.replace(context.reference, epsg=None, projjson=None)
+    write_tile(tmp_path / "own", "t", results, [], dataclasses.replace(context, reference=stated))
+    heading = json.loads((tmp_path / "own/cityjson/tile=t/part-0.city.jsonl").read_text().splitlines()[0])
+    assert (f"one unit is {unit_m:.12g} m" in heading["metadata"]["title"]) == (unit_m != 1.0)
+    assert "referenceSystem" not in heading["metadata"]
+
+
+def test_a_code_with_a_vertical_axis_keeps_its_own_units() -> None:
+    wkt = pyproj.CRS("EPSG:26910+6360").to_json_dict()
+    feet = small.Reference(epsg=1, vertical_unit_m=0.3048, projjson=wkt)  # as if the registry had a code for it
+    assert one_unit(feet) is feet
+    assert one_unit(dataclasses.replace(feet, epsg=None)).vertical_unit_m == 1.0
+    flat = pyproj.CRS("EPSG:26910").to_json_dict()
+    assert one_unit(dataclasses.replace(feet, projjson=flat)).vertical_unit_m == 1.0
+    solid = dataclasses.replace(feet, projjson=pyproj.CRS("EPSG:26910").to_3d().to_json_dict())
+    assert one_unit(solid) is solid
 
 
 def test_the_scale_is_a_millimetre_in_metres(contexts: Contexts) -> None:

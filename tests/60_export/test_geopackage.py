@@ -1,5 +1,6 @@
 """GeoPackage: every column reads back as the documented types say, with its CRS and with styles that QGIS finds."""
 
+import dataclasses
 import datetime as dt
 import json
 import sqlite3
@@ -19,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import RunError
-from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, kind_of
+from pipeline.export.columns import COLUMNS, HORIZONTAL, KINDS, TILE_COLUMN, VERTICAL, kind_of
 from pipeline.export.geopackage import (
     GEOMETRY,
     LAYERS,
@@ -122,6 +123,18 @@ def test_the_file_has_the_documented_types_and_says_what_each_column_means(tmp_p
             assert columns[name] == STORED_TYPES[kind_of(layer.table.field(name).type)], name
         meant = {one.name: one.comment for one in (*COLUMNS[layer.name], TILE_COLUMN)}
         assert comments == {name: meant[name] for name in (*layer.columns, TILE) if name != GEOMETRY}
+
+
+def test_comments_name_the_units_of_the_run_s_crs(tmp_path: Path) -> None:
+    layer = BY_NAME["planes"]
+    units = {HORIZONTAL: "metre", VERTICAL: "US survey foot"}
+    made = dataclasses.replace(package(tmp_path / "a.gpkg"), units=units)
+    made.write(layer, [stored_batch(batch, layer, "t") for batch in layer.table.empty_table().to_batches()])
+    with sqlite3.connect(tmp_path / "a.gpkg") as file:
+        comments = dict(file.execute("SELECT column_name, description FROM gpkg_data_columns"))
+    assert comments["origin_z"] == "elevation of the local origin [US survey foot]"
+    assert comments["origin_x"] == "easting of the local origin [metre]"
+    assert comments["rmse_m"].endswith("[m]")
 
 
 def test_a_column_that_no_type_can_hold_is_refused_by_name() -> None:

@@ -96,6 +96,14 @@ def test_every_column_is_a_property_of_the_documented_type(
             assert isinstance(properties[name], types[kind]), name
 
 
+def test_elevations_are_in_metres_and_heights_stay() -> None:
+    schema = pa.schema([pa.field(name, BUILDINGS[name].kind) for name in pmtiles.READ])
+    known = {"geometry": shapely.to_wkb(shapely.box(0, 0, 9, 9)), "ridge_z": 1000.0, "ground_z": None, "height_m": 5.0}
+    batch = pa.RecordBatch.from_pylist([dict.fromkeys(schema.names) | known], schema=schema)
+    (row,) = pmtiles.map_batch(batch, "t", lambda xy: xy, 1200.0 / 3937.0).to_pylist()
+    assert (row["ridge_z"], row["ground_z"], row["height_m"]) == (304.801, None, 5.0)
+
+
 def test_all_columns_are_there_or_left_out_by_name() -> None:
     missing = {name for name in BUILDINGS if name not in pmtiles.READ}
     shapes = {name for name in missing if name.startswith("solid") or name == "wall_outline"}

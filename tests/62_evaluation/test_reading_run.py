@@ -38,7 +38,7 @@ def manifest(status: RunStatus = RunStatus.FINISHED, **crs: object) -> RunManife
 def test_the_manifest_has_the_units(tmp_path: Path) -> None:
     metres = read_models(files.write_run(tmp_path / "metres", files.village()))
     feet = files.write_run(tmp_path / "feet", files.village(), files.reference(None, FOOT_M, 1.0))
-    write_manifest(feet, manifest(horizontal_unit_m=FOOT_M))
+    write_manifest(feet, manifest(horizontal_unit_m=FOOT_M, cityjson_vertical_unit_m=FOOT_M))
     read = read_models(feet)
     files.assert_same_models(metres, read)
     assert (read.crs, read.notes) == (None, ("made by gablework 0 with settings ab",))

@@ -175,6 +175,10 @@ def test_files_of_two_crs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InconsistentInputError, match=r"b\.laz"):
         read_points_reference(paths)
     assert len(read_points_reference(paths, crs="EPSG:32632", read_options=ReadOptions()).tiles) == 2
+    # a header that adds its vertical CRS to the given one makes no other CRS
+    las.header.add_crs(pyproj.CRS("EPSG:32633+5773"))
+    las.write(paths[1])
+    assert read_points_reference(paths, crs="EPSG:32632").crs == "WGS 84 / UTM zone 32N + EGM96 height"
 
 
 def test_the_real_tiles_of_delft(shared_data: Path) -> None:

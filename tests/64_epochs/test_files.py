@@ -9,6 +9,7 @@ import geoparquet_validator
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pyproj
 import pytest
 import shapely
 from epochs_by_hand import EXTENT, UTM, house, write_epoch
@@ -17,6 +18,7 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.errors import CrsError, RunError, SettingsError
 from pipeline.io import storage_at
+from pipeline.io.crs_units import with_vertical_unit
 from pipeline.ruler.epochs.diff import DiffRequest, diff
 from pipeline.ruler.epochs.records import CHANGES, COLUMNS, DOUBTS, INCOMPARABLE, RELATIONS, Change
 from pipeline.ruler.epochs.settings import DiffSettings, read_settings
@@ -172,6 +174,14 @@ def test_runs_of_other_reference_systems_or_units_are_refused(tmp_path: Path, cr
     with pytest.raises(CrsError, match=words):
         diff(DiffRequest(old=str(old), new=str(new), out=str(tmp_path / "out")))
     assert not (tmp_path / "out").exists()
+
+
+def test_a_vertical_part_that_states_a_unit_alone_is_no_other_datum(tmp_path: Path) -> None:
+    feet = with_vertical_unit(pyproj.CRS("EPSG:25832"), 0.3048)
+    old = write_epoch(tmp_path / "old", [house("a1")], crs="EPSG:25832+8228")
+    new = write_epoch(tmp_path / "new", [house("a2")], crs=feet.to_wkt())
+    found = run((str(old), str(new)), tmp_path / "out")
+    assert "the vertical reference system of NEW is unknown: taken as that of the other" in found["warnings"]
 
 
 def test_what_is_no_ended_run_is_refused_and_the_runs_themselves_are_no_place_for_results(

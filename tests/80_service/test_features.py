@@ -297,6 +297,32 @@ def test_published_runs_are_checked_at_the_start(tmp_path: Path) -> None:
             published_runs(entries, tmp_path)
 
 
+def test_elevations_in_feet_are_stated_and_third_coordinates_are_in_the_unit_of_their_crs(
+    starting: Callable[..., Any], tmp_path: Path
+) -> None:
+    run_dir = runs.write_run(tmp_path / "feet")
+    manifest = json.loads((run_dir / "run.json").read_text())
+    manifest["crs"]["vertical_unit_m"] = 0.3048
+    (run_dir / "run.json").write_text(json.dumps(manifest))
+    local = starting(publish=(str(run_dir),))
+    place = "/collections/feet.planes"
+    schema = local.client.get(f"{place}/schema").json()["properties"]["properties"]["properties"]
+    assert (schema["origin_z"]["x-ogc-unit"], schema["origin_x"]["x-ogc-unit"]) == ("[ft_i]", "m")
+    assert local.client.get(f"{place}/queryables").json()["properties"]["origin_z"]["x-ogc-unit"] == "[ft_i]"
+    assert "units of 0.3048 m (foot)" in local.client.get(place).json()["description"]
+    assert "units of" not in local.client.get("/collections/feet.rejected").json()["description"]
+    stored = {f"{r['building_id']}.{r['plane_id']}": r for r in read_table(str(run_dir), "planes").to_pylist()}
+    for crs in ({}, {"crs": CRS[1]}, {"crs": "http://www.opengis.net/def/crs/EPSG/0/3857"}):
+        features = local.client.get(f"{place}/items", params=crs).json()["features"]
+        assert len(features) == len(stored) > 3
+        for feature in features:
+            row = stored[feature["id"]]
+            assert feature["properties"]["origin_z"] == row["origin_z"]  # as filters compare it
+            z = shapely.get_coordinates(shapely.from_geojson(json.dumps(feature["geometry"])), include_z=True)[:, 2]
+            own = shapely.get_coordinates(shapely.from_wkb(row["geometry"]), include_z=True)[:, 2]
+            assert sorted({*z}) == pytest.approx(sorted({*np.round(own * 0.3048, 3)}), abs=1e-3)
+
+
 def test_a_run_that_is_replaced_is_read_again(starting: Callable[..., Any], tmp_path: Path) -> None:
     run_dir = runs.write_run(tmp_path / "town")
     local = starting(publish=(str(run_dir),))

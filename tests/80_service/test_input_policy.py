@@ -107,6 +107,8 @@ def test_no_text_gets_by_that_is_not_of_a_listed_host(text: str) -> None:
     "text",
     [
         "EPSG:28992",
+        "28992",
+        " 28992+5709 ",
         " epsg:28992 ",
         "EPSG:28992+5709",
         "IGNF:LAMB93",

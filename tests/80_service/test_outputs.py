@@ -351,6 +351,16 @@ def test_elevations_in_feet_do_not_move_footprints(tmp_path: Path) -> None:
         assert back.transform(*shapes[name].centroid.coords[0]) == pytest.approx(geometry.centroid.coords[0], abs=0.01)
 
 
+def test_footprints_and_report_state_the_unit_of_elevations(tmp_path: Path) -> None:
+    for epsg, unit_m in ((2225, 1200 / 3937), (7415, 1.0), (None, 1.0)):
+        write_outputs(runs.write_run(tmp_path / f"run-{epsg}", epsg=epsg), tmp_path / f"out-{epsg}")
+        found = json.loads((tmp_path / f"out-{epsg}/buildings.geojson").read_text())
+        assert found["verticalUnitM"] == read_catalogue(tmp_path / f"out-{epsg}").crs.vertical_unit_m
+        assert found["verticalUnitM"] == pytest.approx(unit_m)
+        crs = json.loads(output_file(tmp_path / f"out-{epsg}", "report").read_text())["crs"]
+        assert crs["cityjson_vertical_unit_m"] == crs["vertical_unit_m"] == found["verticalUnitM"]
+
+
 def test_a_footprint_without_a_place_on_earth_is_a_feature_without_geometry(tmp_path: Path) -> None:
     lost = runs.placed(small.gable(), "lost", 1e9, 0.0)
     found = runs.placed(small.gable(), "found", 500_000.0, 5_000_000.0)

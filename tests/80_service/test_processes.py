@@ -140,6 +140,16 @@ def test_a_job_of_an_upload_waits_as_soon_as_the_answer_is_there(local_service) 
     assert reported["request"]["inputs"]["title"] == "Straße 1"
 
 
+def test_a_crs_may_be_a_bare_code(local_service) -> None:
+    for given, taken in (("28992", "EPSG:28992"), (" 28992+5709 ", "EPSG:28992+5709")):
+        inputs = {**of_an_upload(local_service), "crs": given}
+        inputs["bbox"] = {"bbox": [0, 0, 10, 10], "crs": given}
+        reported = execute(local_service, inputs).json()
+        assert local_service.store.get(reported["jobID"]).request.crs == taken
+        assert reported["request"]["inputs"]["crs"] == taken
+    assert "is geographic" in faults_of(execute(local_service, {**of_an_upload(local_service), "crs": "4326"}))
+
+
 def test_the_request_that_a_job_says_can_be_sent_again(local_service) -> None:
     first = execute(local_service, of_an_upload(local_service, priority=-3)).json()
     second = local_service.client.post("/processes/reconstruct/execution", json=first["request"]).json()

@@ -7,6 +7,7 @@ from typing import Any
 
 from pipeline.errors import CrsError
 from pipeline.io.crs import horizontal_part
+from pipeline.io.crs_units import states_unit_alone, vertical_part
 from pipeline.ruler.epochs.epoch import Epoch
 
 
@@ -70,10 +71,9 @@ def _check_reference(old: Epoch, new: Epoch) -> list[str]:
 
 
 def _vertical_part(crs: Any) -> Any | None:
-    """The vertical CRS of a compound one; None without one."""
-    if crs.is_bound and crs.source_crs is not None:
-        return _vertical_part(crs.source_crs)
-    return next((part for part in crs.sub_crs_list if part.is_vertical), None)
+    """The vertical CRS of a compound one; None without one, and for one that states a unit alone."""
+    part = vertical_part(crs)
+    return None if part is None or states_unit_alone(part) else part
 
 
 def _differing(before: Mapping[str, Any], after: Mapping[str, Any], most: int = 6) -> str:

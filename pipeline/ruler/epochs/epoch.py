@@ -135,14 +135,7 @@ def open_epoch(name: str, run_dir: str) -> Epoch:
     manifest = read_manifest(run_dir)
     if manifest.status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
         raise RunError(f"{name}, the run in {run_dir}, is {manifest.status.value}: compare runs that ended")
-    facts = dict(manifest.crs or {})
-    reference = SpatialReference(
-        **{
-            key: facts[key]
-            for key in ("wkt", "name", "epsg", "horizontal_unit_m", "vertical_unit_m")
-            if facts.get(key) is not None
-        }
-    )
+    reference = SpatialReference.of_facts(manifest.crs)
     filesystem, path = arrow_at(run_dir)
     buildings = table_dataset(path, "buildings", filesystem)
     planes = table_dataset(path, "planes", filesystem)

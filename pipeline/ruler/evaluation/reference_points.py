@@ -15,7 +15,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import InconsistentInputError, InputError, SettingsError
 from pipeline.io import ReadOptions, open_source
-from pipeline.io.crs import SpatialReference
+from pipeline.io.crs import SpatialReference, with_one_vertical
 from pipeline.io.footprints import read_footprints
 from pipeline.io.readable import Readable
 from pipeline.io.remote_file import file_at
@@ -60,7 +60,7 @@ def read_points_reference(
     options = read_options or ReadOptions()
     options = dataclasses.replace(options, crs=crs or options.crs, vertical_unit=vertical_unit or options.vertical_unit)
     sources = [open_source(path, options) for path in tiles]
-    reference = _one_reference(sources)
+    reference = _one_reference(sources, is_given=options.crs is not None)
     bounds = tuple(_plan_bounds(source) for source in sources)
     extent = _extent(bounds)
     notes = list(dict.fromkeys(warning for source in sources for warning in source.info.warnings))
@@ -162,17 +162,19 @@ def _has_object_classes(classes: Counts) -> bool:
     return bool(named.any())
 
 
-def _one_reference(sources: Sequence[Source]) -> SpatialReference:
+def _one_reference(sources: Sequence[Source], *, is_given: bool) -> SpatialReference:
     """The CRS of all files."""
-    first = sources[0].info
-    for source in sources[1:]:
-        if source.info.reference != first.reference:
+    found = [source.info.reference for source in sources]
+    if is_given:
+        found = with_one_vertical(found)
+    for source, reference in zip(sources, found, strict=True):
+        if reference != found[0]:
             raise InconsistentInputError(
                 source.info.path,
-                f"its CRS is {source.info.reference.name}, that of {first.path} is {first.reference.name}",
+                f"its CRS is {reference.name}, that of {sources[0].info.path} is {found[0].name}",
                 "Give reference points of one CRS, or --crs where the headers are wrong",
             )
-    return first.reference
+    return found[0]
 
 
 def _plan_bounds(source: Source) -> tuple[float, float, float, float]:

@@ -267,7 +267,7 @@ def join(
     The outlines of touching units are drawn, unless nothing needs them.
     """
     plan = context.plan
-    crs_name = f"EPSG:{plan.reference.epsg}" if plan.reference.epsg is not None else plan.reference.name
+    crs_name = plan.reference.named
     if footprints is not None:
         with context.progress.stage(_STAGE, 1) as counter:
             found = join_footprints(

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from pipeline.export.raster import BLOCK, Cells, RasterLattice, write_cog
 from pipeline.io import LocalStorage, SpatialReference
-from pipeline.io.crs import INTERNATIONAL_FOOT_M, US_SURVEY_FOOT_M
+from pipeline.io.crs_units import unit_name
 from pipeline.model import BoolArray
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.surroundings import Surroundings, surroundings_of
@@ -32,7 +32,6 @@ RASTERS = {
     "height": "height of the surface above the terrain (nDSM)",
 }
 """What is written, as `<name>.tif`."""
-_UNITS = {1.0: "metre", INTERNATIONAL_FOOT_M: "foot", US_SURVEY_FOOT_M: "US survey foot"}
 
 
 def default_cell(unit_m: float) -> float:
@@ -168,7 +167,7 @@ def write_mosaic(task: MosaicTask) -> str:
             _windows(task),
             crs_wkt=None if crs is None else crs.to_wkt("WKT2_2019"),
             description=RASTERS[task.name],
-            unit=_UNITS.get(reference.vertical_unit_m, f"{reference.vertical_unit_m:g} m"),
+            unit=unit_name(reference.vertical_unit_m),
         )
     return str(storage.path(key))
 

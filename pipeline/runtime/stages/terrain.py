@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.errors import RunCancelledError, RunError
-from pipeline.export.coordinates import SpatialReference
+from pipeline.export.coordinates import SpatialReference, one_unit
 from pipeline.export.terrain import FOLDER, in_crs, terrain_lines, terrain_obj, terrain_path
 from pipeline.io import storage_at
 from pipeline.model import BuildingResult, FaceKind
@@ -261,14 +261,18 @@ def _contents(task: TerrainTask, mesh: TerrainMesh, core: Window) -> tuple[str, 
     origin_mm = np.array([core.x0_mm // MM * MM, core.y0_mm // MM * MM, 0])
     east, north, _ = (origin_mm / MM).tolist()
     local = (mesh.vertices_mm - origin_mm) / MM
-    terrain = in_crs(local, (east, north, 0.0), mesh.triangles, task.reference)
+    reference = one_unit(task.reference)
+    terrain = in_crs(local, (east, north, 0.0), mesh.triangles, reference)
     attributes = {
         "tolerance_m": task.tolerance_m,
         "max_error_m": round(mesh.max_error_mm / MM, 3),
         "rms_error_m": round(math.sqrt(mesh.squares_mm2 / max(mesh.n_cells, 1)) / MM, 3),
     }
-    lines = "".join(f"{line}\n" for line in terrain_lines(terrain, task.tile.key, attributes, task.reference))
-    return lines, *((terrain_obj(terrain, task.tile.key, task.reference),) if task.obj else ())
+    lines = "".join(f"{line}\n" for line in terrain_lines(terrain, task.tile.key, attributes, reference))
+    if not task.obj:
+        return (lines,)
+    own = in_crs(local, (east, north, 0.0), mesh.triangles, task.reference)
+    return lines, terrain_obj(own, task.tile.key, task.reference)
 
 
 def floors_of(result: BuildingResult) -> list[Outline]:

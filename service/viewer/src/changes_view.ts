@@ -3,6 +3,7 @@
 import { hashOf, ofRun, partsOf, type Address } from "./address";
 import { getJson, type StatusInfo } from "./api";
 import type { Batch, Listed } from "./batching";
+import { originInMetres } from "./building_mesh";
 import { colourSwatch, el } from "./elements";
 import { choice, field } from "./form_fields";
 import type { Hooks } from "./job_view";
@@ -14,6 +15,7 @@ import { CHANGES, LIMITS, pairs, type Change, type Pair, type Placed } from "./p
 import { CATEGORIES } from "./roof_types";
 import { ModelScene } from "./scene";
 import { nothing, table } from "./tables";
+import { modelUnits, type Units } from "./units";
 import type { View } from "./views";
 import "./changes_view.css";
 import "./dialogs.css";
@@ -30,11 +32,9 @@ interface Side {
   method: string | null;
 }
 
-interface Crs {
+interface Crs extends Units {
   name?: string | null;
   wkt?: string | null;
-  horizontal_unit_m?: number | null;
-  vertical_unit_m?: number | null;
 }
 
 /** What was read of a side; places are metres from its own origin. */
@@ -349,7 +349,7 @@ async function read({ job, method }: Side, signal: AbortSignal): Promise<Loaded>
   });
   const crs = report.crs ?? {};
   const loaded: Loaded = { origin: [0, 0, 0], crs, listed: [], batches: [] };
-  const reading = { horizontalUnitM: crs.horizontal_unit_m ?? 1, verticalUnitM: crs.vertical_unit_m ?? 1, lod: null };
+  const reading = { ...modelUnits(crs), lod: null };
   await loadModels(
     ofRun(`${path}/results/cityjson`, run),
     reading,
@@ -366,12 +366,8 @@ async function read({ job, method }: Side, signal: AbortSignal): Promise<Loaded>
 
 /** From the origin of the left side to that of the right one, in metres. */
 function shiftOf({ origin, crs }: Loaded, other: Loaded): [number, number, number] {
-  const [horizontal, vertical] = [crs.horizontal_unit_m ?? 1, crs.vertical_unit_m ?? 1];
-  return [
-    (other.origin[0] - origin[0]) * horizontal,
-    (other.origin[1] - origin[1]) * horizontal,
-    (other.origin[2] - origin[2]) * vertical,
-  ];
+  const [from, to] = [originInMetres({ origin, ...modelUnits(crs) }), originInMetres({ origin: other.origin, ...modelUnits(other.crs) })];
+  return [to[0] - from[0], to[1] - from[1], to[2] - from[2]];
 }
 
 function placed({ listed, batches }: Loaded, [x, y]: readonly number[]): Placed[] {

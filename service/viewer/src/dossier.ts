@@ -17,9 +17,10 @@ import { count, counted, measure } from "./numbers";
 import { RESIDUALS } from "./points_colouring";
 import { ringsOf } from "./rings";
 import { CATEGORIES, categoryOf } from "./roof_types";
+import { elevationUnitM, inMetres, modelUnits, type Units } from "./units";
 
 interface Report {
-  crs?: { name?: string | null; horizontal_unit_m?: number | null; vertical_unit_m?: number | null };
+  crs?: Units & { name?: string | null };
 }
 
 interface Loaded {
@@ -95,12 +96,9 @@ async function load(jobPath: string, method: string | null, buildingId: string, 
   if (building === null) throw new Error("the model of the building cannot be read");
   const rings = ringsOf(feature.geometry);
   const [x, y] = rings[0]?.[0] ?? [building.vertices[0] ?? 0, building.vertices[1] ?? 0];
-  const ground = feature.properties["ground_z"];
-  const frame: SceneFrame = {
-    origin: [Math.floor(x), Math.floor(y), typeof ground === "number" ? ground : 0],
-    horizontalUnitM: report?.crs?.horizontal_unit_m ?? 1,
-    verticalUnitM: report?.crs?.vertical_unit_m ?? 1,
-  };
+  const units = modelUnits(report?.crs);
+  const groundM = inMetres(feature.properties["ground_z"], elevationUnitM(report?.crs)) ?? 0;
+  const frame: SceneFrame = { origin: [Math.floor(x), Math.floor(y), groundM / units.verticalUnitM], ...units };
   const outline = rings.map((ring) =>
     ring.map(([e, n]) => [(e - frame.origin[0]) * frame.horizontalUnitM, (n - frame.origin[1]) * frame.horizontalUnitM] as const),
   );

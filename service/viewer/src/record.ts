@@ -8,6 +8,7 @@ import { asProblem, problemNotice, warningNotice } from "./notices";
 import { count, measure } from "./numbers";
 import { reasonWords } from "./reasons";
 import { CATEGORIES, categoryOf } from "./roof_types";
+import { inMetres } from "./units";
 
 type Record_ = Feature["properties"];
 
@@ -22,8 +23,8 @@ const percent = (value: unknown): string => (typeof value === "number" ? measure
 const whole = (value: unknown): string => (typeof value === "number" ? count(value) : "–");
 
 /** The most important columns of the record; the file has all of them. */
-function groups(verticalUnit: string): [string, Row[]][] {
-  const elevation = (value: unknown): string => measure(value, 2, verticalUnit);
+function groups(elevationUnitM: number): [string, Row[]][] {
+  const elevation = (value: unknown): string => measure(inMetres(value, elevationUnitM), 2, "m");
   return [
     [
       "Height",
@@ -71,7 +72,7 @@ export function showRecord(
   jobPath: string,
   method: string | null,
   buildingId: string,
-  verticalUnit: string,
+  elevationUnitM: number,
   onProblem: (problem: Problem) => void,
 ): () => void {
   const calledOff = new AbortController();
@@ -80,7 +81,7 @@ export function showRecord(
     place.replaceChildren(el("p", { class: "loading" }, "Loading…"));
     getJson<Feature>(ofRun(path, method), { signal: calledOff.signal, headers: { Accept: "application/geo+json" } }).then(
       ({ properties }) => {
-        if (!calledOff.signal.aborted) place.replaceChildren(...record(properties, path, method, buildingId, verticalUnit));
+        if (!calledOff.signal.aborted) place.replaceChildren(...record(properties, path, method, buildingId, elevationUnitM));
       },
       (error: unknown) => {
         if (calledOff.signal.aborted) return;
@@ -100,7 +101,7 @@ function record(
   path: string,
   method: string | null,
   buildingId: string,
-  verticalUnit: string,
+  elevationUnitM: number,
 ): HTMLElement[] {
   const { status, reason, reason_detail: detail, lod, valid } = properties;
   const category = categoryOf(status, properties["roof_type"]);
@@ -124,7 +125,7 @@ function record(
       ? warningNotice(`${capital(reasonWords(reason))}${typeof detail === "string" && detail !== "" ? `: ${detail}` : "."}`)
       : null;
   const codes = Array.isArray(properties["validity_codes"]) ? properties["validity_codes"] : [];
-  const tables = groups(verticalUnit).map(([title, rows]) =>
+  const tables = groups(elevationUnitM).map(([title, rows]) =>
     el(
       "section",
       {},

@@ -23,11 +23,12 @@ import { rejectedRecord } from "./rejected_record";
 import { CATEGORY_NAMES, type Category } from "./roof_types";
 import { ModelScene } from "./scene";
 import { USUAL, isFiltered, queryWith, selected, tallies, wantedOf, type Wanted } from "./selection";
+import { elevationUnitM, modelUnits, type Units } from "./units";
 import { ViewTools } from "./view_tools";
 
 /** The part of the report that the page reads. */
 interface Report {
-  crs?: { name?: string | null; to_wgs84?: string | null; horizontal_unit_m?: number | null; vertical_unit_m?: number | null };
+  crs?: Units & { name?: string | null; to_wgs84?: string | null };
   counts?: Record<string, number>;
   timings_s?: Record<string, number>;
   warnings?: string[];
@@ -203,7 +204,7 @@ class ResultsView {
   /** Read the models at a level of detail, null for the finest of each; returns the available levels. */
   private load(lod: string | null, onMessage: (message: FromLoading) => void, signal: AbortSignal): Promise<string[]> {
     const { crs } = this.report;
-    const reading = { horizontalUnitM: crs?.horizontal_unit_m ?? 1, verticalUnitM: crs?.vertical_unit_m ?? 1, lod };
+    const reading = { ...modelUnits(crs), lod };
     return loadModels(ofRun(`${this.jobPath}/results/cityjson`, this.method), reading, onMessage, signal);
   }
 
@@ -266,7 +267,7 @@ class ResultsView {
   /** The scene in the coordinates of the job. */
   private frame(): SceneFrame {
     const { crs } = this.report;
-    return { origin: this.origin, horizontalUnitM: crs?.horizontal_unit_m ?? 1, verticalUnitM: crs?.vertical_unit_m ?? 1 };
+    return { origin: this.origin, ...modelUnits(crs) };
   }
 
   /** Draw the footprints of buildings without a model: only the records have their place. */
@@ -562,13 +563,8 @@ class ResultsView {
       this.stopRecord = () => undefined;
       return;
     }
-    this.stopRecord = showRecord(body, this.jobPath, this.method, id, unitName(this.report.crs?.vertical_unit_m), this.hooks.onProblem);
+    this.stopRecord = showRecord(body, this.jobPath, this.method, id, elevationUnitM(this.report.crs), this.hooks.onProblem);
   }
-}
-
-function unitName(metres: number | null | undefined): string {
-  if (metres == null || metres === 1) return "m";
-  return Math.abs(metres - 0.3048) < 1e-5 ? "ft" : "";
 }
 
 /** A corner of the first outline, in whole units; null without outlines. */

@@ -15,6 +15,7 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import RunError, UnreadableInputError
+from pipeline.export.coordinates import one_unit
 from pipeline.export.geoparquet import read_table
 from pipeline.io import arrow_at, is_url, place_below, storage_at
 from pipeline.io.crs import resolve_reference
@@ -26,7 +27,7 @@ from pipeline.ruler.evaluation.reading.cityjson_geometry import chosen, parts_of
 from pipeline.ruler.evaluation.reading.collected import Collected
 from pipeline.ruler.evaluation.reading.raw import MILLIMETRES_PER_METRE, RawPart
 from pipeline.ruler.evaluation.reading.surfaces import GRID_M
-from pipeline.runtime.manifest import NAME, RunStatus, read_manifest
+from pipeline.runtime.manifest import NAME, RunStatus, city_unit_m, read_manifest
 
 _CONDITIONS = "conditions.parquet"
 Solids = dict[str, tuple[tuple[Solid, ...], tuple[float, float, float]]]
@@ -47,11 +48,12 @@ def read_run(place: str | Path) -> ModelSet:
     Raises RunError if the tables are missing or damaged, and InputError if CityJSONSeq or conditions are damaged.
     """
     into = Collected()
-    units_m = _units_m(place, into)
+    horizontal_m, vertical_m, city_m = _units_m(place, into)
+    units_m = horizontal_m, vertical_m
     filesystem, folder = arrow_at(place)
     rows = read_table(folder, "buildings", filesystem).to_pylist()
     surfaces = _surfaces(place, units_m)
-    solids = _solids(place, units_m, into)
+    solids = _solids(place, (horizontal_m, city_m), into)
     for row in rows:
         shapes, origin = solids.get(row["building_id"], ((), (0.0, 0.0, 0.0)))
         into.add(
@@ -78,8 +80,11 @@ def _method(place: str | Path) -> str:
     return read_manifest(place).method if storage_at(place).has(NAME) else PurePosixPath(place).name
 
 
-def _units_m(place: str | Path, into: Collected) -> tuple[float, float]:
-    """Metres per horizontal and per vertical unit, from run.json, else from the metadata of the tables."""
+def _units_m(place: str | Path, into: Collected) -> tuple[float, float, float]:
+    """Metres per horizontal unit, per vertical unit, and per vertical unit of the solids' CityJSON.
+
+    From run.json, else from the metadata of the tables.
+    """
     storage = storage_at(place)
     if storage.has(NAME):
         manifest = read_manifest(place)
@@ -89,10 +94,10 @@ def _units_m(place: str | Path, into: Collected) -> tuple[float, float]:
         crs: Mapping[str, Any] = manifest.crs or {}
         if crs.get("wkt"):
             into.is_at(f"EPSG:{crs['epsg']}" if crs.get("epsg") else str(crs.get("name")))
-        return float(crs.get("horizontal_unit_m", 1.0)), float(crs.get("vertical_unit_m", 1.0))
+        return float(crs.get("horizontal_unit_m", 1.0)), float(crs.get("vertical_unit_m", 1.0)), city_unit_m(crs)
     key = next((key for key in storage.keys("buildings") if key.endswith(".parquet")), None)
     if key is None:
-        return 1.0, 1.0
+        return 1.0, 1.0, 1.0
     part = place_below(place, key)
     filesystem, file = arrow_at(part)
     try:
@@ -102,12 +107,12 @@ def _units_m(place: str | Path, into: Collected) -> tuple[float, float]:
         raise UnreadableInputError(part, str(error), "Write the folder again") from error
     if projjson is None:
         into.note("no coordinate reference system in the tables: coordinates are taken as metres")
-        return 1.0, 1.0
+        return 1.0, 1.0, 1.0
     import pyproj
 
     reference, _ = resolve_reference(path=part, header_crs=pyproj.CRS.from_json_dict(projjson))
     into.is_at(reference.name if reference.epsg is None else f"EPSG:{reference.epsg}")
-    return reference.horizontal_unit_m, reference.vertical_unit_m
+    return reference.horizontal_unit_m, reference.vertical_unit_m, one_unit(reference).vertical_unit_m
 
 
 def _in_metres(wkb: bytes | None, units_m: tuple[float, float]) -> Polygon | MultiPolygon:
