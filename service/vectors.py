@@ -21,7 +21,7 @@ import numpy as np
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io.crs import parse_crs
-from pipeline.io.gdal_layer import refuse_links
+from pipeline.io.gdal_source import refuse_links
 from pipeline.io.library_faults import in_our_words, shortened
 from service.errors import TooLargeError
 from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES, PARQUET_SUFFIXES
