@@ -19,6 +19,7 @@ from pipeline.runtime.monitoring.machine import cores, memory_bytes
 from pipeline.runtime.plan import Plan, make_plan
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
+from pipeline.runtime.stages.ingested import without_roofs
 from pipeline.settings import RunSettings
 
 RAISED_M = 2.5
@@ -93,7 +94,10 @@ class Inspection:
                 f"horizontal {reference.horizontal_unit_m:g} m, vertical {reference.vertical_unit_m:g} m{assumed}",
             ),
             ("extent", f"{x1 - x0:.1f} x {y1 - y0:.1f} m"),
-            ("elevation", f"{self.elevation_m[0]:.2f} to {self.elevation_m[1]:.2f} m"),
+            (
+                "elevation",
+                f"{self.elevation_m[0]:.2f} to {self.elevation_m[1]:.2f} m" if self.used_points else "unknown",
+            ),
             ("density", f"{self.density_per_m2:.2f} points/m2 where there are points"),
             ("returns a pulse", pulses),
             ("acquired", acquired),
@@ -135,7 +139,7 @@ def inspect(
         on_progress(used, source.info.point_count)
     plan = make_plan([str(path)], options, settings)
     run = _forecast(path, options, plan, settings)
-    return _inspection(source, raster, classes, returns, used, (lowest, highest), run)
+    return _inspection(source, raster, classes, returns, (lowest, highest), run, settings)
 
 
 def _forecast(path: str | Path, options: ReadOptions, plan: Plan, settings: RunSettings) -> Forecast:
@@ -153,14 +157,14 @@ def _inspection(
     raster: _Raster,
     classes: np.ndarray[tuple[int], np.dtype[np.int64]],
     returns: np.ndarray[tuple[int], np.dtype[np.int64]],
-    used: int,
     elevation_m: tuple[float, float],
     run: Forecast,
+    settings: RunSettings,
 ) -> Inspection:
-    area = raster.occupied_area_m2()
+    area, used = raster.occupied_area_m2(), int(classes.sum())
     return Inspection(
         info=source.info,
-        warnings=source.warnings + _outside(source.info),
+        warnings=(*_about_use(source, classes, settings), *source.warnings, *_outside(source.info)),
         location=source.info.location,
         used_points=used,
         dropped=source.dropped,
@@ -176,6 +180,17 @@ def _inspection(
         estimated_from_sample=run.sampled,
         estimated_gib=run.memory_bytes / 2**30,
     )
+
+
+def _about_use(
+    source: Source, classes: np.ndarray[tuple[int], np.dtype[np.int64]], settings: RunSettings
+) -> tuple[str, ...]:
+    """A warning about a tile of which a run would use no point, or find no building for its classes."""
+    found = {code: int(classes[code]) for code in np.flatnonzero(classes).tolist()}
+    if not found:
+        causes = ", ".join(f"{count} {cause}" for cause, count in source.dropped.items() if count)
+        return (f"a run would use none of its points ({causes})",)
+    return tuple(filter(None, [without_roofs(found, trust=settings.general.classes == "trust")]))
 
 
 def _outside(info: SourceInfo) -> tuple[str, ...]:

@@ -393,6 +393,8 @@ def show_summary(console: Console, summary: RunSummary) -> None:
     """The results of a run, as tables."""
     from pipeline.cli.measuring import show_statistics
 
+    if summary.headline:
+        console.say(f"warning: {summary.headline}")
     show_statistics(console, _statistics_of(summary.run_dir))
     console.table(
         "Time", ["stage", "wall clock"], [(k, f"{seconds:.1f} s") for k, seconds in summary.timings_s.items()]

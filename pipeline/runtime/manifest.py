@@ -141,6 +141,8 @@ class RunManifest:
     """The buildings that took longest, the slowest first."""
     warnings: tuple[str, ...] = ()
     """The warnings of the run."""
+    headline: str = ""
+    """The first warning, where it says why the result is empty; else empty."""
     content_sha256: str | None = None
     """`gablework digest` of the finished run; None where it was not computed."""
 

@@ -296,12 +296,13 @@ class _Search:
             return None
         boxes.extend((*o.point_m, *o.point_m) for o in overrides if o.point_m is not None)
         boxes.extend(o.footprint.bounds for o in overrides if o.footprint is not None)
-        given = {}
+        given: dict[str, list[tuple[float, ...]]] = {}
         if self.footprints is not None:
-            given = dict(zip(self.footprints.ids, self.footprints.polygons, strict=True))
+            for name, polygon in zip(self.footprints.ids, self.footprints.polygons, strict=True):
+                given.setdefault(name, []).append(polygon.bounds)
         for record in records.values():
             if record.source_id in given:
-                boxes.append(given[record.source_id].bounds)
+                boxes.extend(given[record.source_id])
             elif record.box is not None:
                 boxes.append(tuple(value * unit for value in record.box))
             else:

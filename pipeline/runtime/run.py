@@ -54,7 +54,7 @@ from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints
 from pipeline.runtime.stages.given_guides import GivenGuides, given_guides
 from pipeline.runtime.stages.ground import Ground, find_ground
 from pipeline.runtime.stages.ingest import ingest
-from pipeline.runtime.stages.ingested import Ingested
+from pipeline.runtime.stages.ingested import Ingested, without_roofs
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.publish import Published, RunOutput, publish
 from pipeline.runtime.stages.reconstruct import QUARANTINE, Models, models_stage, reconstruct
@@ -101,6 +101,8 @@ class RunSummary:
     """Largest resident size by process."""
     warnings: tuple[str, ...]
     """What was odd but usable."""
+    headline: str = ""
+    """The first warning, where it says why the result is empty; else empty."""
     failed_tiles: tuple[str, ...] = ()
     """Tiles that could not be published."""
     tiles_without_points: tuple[str, ...] = ()
@@ -293,7 +295,21 @@ def _find_candidates(
     ground = find_ground(context, settings, ingested, footprints=footprints is not None)
     splits = split(context, settings, ingested, ground, footprints)
     joined = join(context, settings.scene, settings.building.roof, splits, footprints)
+    if headline := _about_emptiness(settings, ingested, joined):
+        context.progress.warn_first("join", headline)
     return _Candidates(ingested=ingested, ground=ground, splits=splits, joined=joined)
+
+
+def _about_emptiness(settings: RunSettings, ingested: Sequence[Ingested], joined: Joined) -> str:
+    """Why no building can be modelled, or that none was found; empty where some were."""
+    classes: Counter[int] = Counter()
+    for found in ingested:
+        classes.update(found.classes)
+    by_classes = without_roofs(classes, trust=settings.general.classes == "trust")
+    if by_classes or joined.candidates:
+        return by_classes
+    rejected = sum(listed.figures.count for listed in joined.rejected)
+    return f"no building was found in {classes.total()} points; {rejected} objects were rejected, each with its reason"
 
 
 def _override(
@@ -515,6 +531,7 @@ class _VariantRun:
             peak_memory_bytes=self.progress.peaks,
             slowest=self.counted.slowest,
             warnings=tuple(self.progress.warnings),
+            headline=self.progress.headline,
             content_sha256=self.digest,
         )
         write_manifest(self.run_dir, manifest, self.storage.put)
@@ -532,6 +549,7 @@ class _VariantRun:
             timings_s=timings,
             peak_memory_bytes=self.progress.peaks,
             warnings=manifest.warnings,
+            headline=self.progress.headline,
             failed_tiles=failed_tiles,
             tiles_without_points=self.without_points,
             tiles_without_terrain=without_terrain,
