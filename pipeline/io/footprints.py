@@ -18,6 +18,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.io.crs import LARGEST_COORDINATE, SpatialReference
+from pipeline.io.nearby import AREAS, POLYGONS, Shape
 from pipeline.io.placed_features import NOT_ELSEWHERE, Elsewhere, boxes_around, in_metres
 from pipeline.io.repairs import EDGES_LIMIT, LOOKS_OF_FILE, Repairs, crossings
 from pipeline.io.urls import shown
@@ -122,6 +123,7 @@ def read_footprints(
     crs: str | None = None,
     area: shapely.Geometry | None = None,
     largest_m: float = LARGEST_OUTLINE_M,
+    shape: Shape = POLYGONS,
 ) -> Footprints:
     """Footprints of a vector file, reprojected where its CRS is not the run's.
 
@@ -139,6 +141,8 @@ def read_footprints(
         Overrides the file's CRS.
     largest_m : float
         Size in metres above which a polygon is left out.
+    shape : Shape
+        What the polygons are to the reader of a message.
     area : Geometry, optional
         Where footprints are wanted, in metres of the run's CRS. Of a file that covers a country all others are passed
         over unread, but for features whose place is not known. The boxes around its parts decide, 100 m wider: who
@@ -161,7 +165,7 @@ def read_footprints(
     def boxes(own: str | None) -> npt.NDArray[np.float64] | None:
         return None if area is None else boxes_around(area, own if crs is None else crs, reference, name)
 
-    found = read_layer(path, layer, None if area is None else boxes)
+    found = read_layer(path, layer, None if area is None else boxes, shape)
     warnings += found.warnings
     problems: dict[int, tuple[str, str]] = {}
     actions: dict[int, str] = {}
@@ -171,7 +175,7 @@ def read_footprints(
         lost = f"none of the {len(found.geometries)} features is a polygon"
         raise EmptyInputError(name, lost, "Give polygons of buildings")
     polygons = shapely.force_2d(geometries[kept])
-    polygons = in_metres(name, "footprints", polygons, found.crs if crs is None else crs, reference, warnings)
+    polygons = in_metres(name, shape.named, polygons, found.crs if crs is None else crs, reference, warnings)
     whole = _within(polygons, LARGEST_COORDINATE)
     for row in kept[~whole].tolist():
         problems[row] = ("outside_crs", "it cannot be reprojected to the run's CRS")
@@ -373,7 +377,7 @@ def _plain(value: Any) -> Any:
 
 def read_area(path: str | Path, reference: SpatialReference) -> Polygon | MultiPolygon:
     """The area of interest that the polygons of a vector file cover together, in the units of the run's CRS."""
-    found = read_footprints(path, reference, largest_m=math.inf)
+    found = read_footprints(path, reference, largest_m=math.inf, shape=AREAS)
     for issue in found.issues:
         # an area without one of its parts is another area
         if issue.problem == "tangled":

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import UnreadableInputError
-from pipeline.io.gdal_source import NAME_LAYER, VALID, WHAT, GdalSource, gdal_source
+from pipeline.io.gdal_source import VALID, WHAT, GdalSource, gdal_source
 from pipeline.io.library_faults import in_our_words
 from pipeline.io.nearby import BATCH, Boxes, Nearby, Shape, cells_limit
 from pipeline.io.reading import moved
@@ -84,7 +84,7 @@ def _chosen(path: Path, layers: dict[str, str | None], layer: str | None, shape:
         raise UnreadableInputError(
             str(path),
             f"layer {layer!r} is not there" if layer else f"{len(found)} layers could be the {shape.named}",
-            f"{NAME_LAYER} {', '.join(sorted(layers)) or '(there are none)'}",
+            f"{shape.choose}: {', '.join(sorted(layers)) or '(there are none)'}",
         )
     return found[0]
 

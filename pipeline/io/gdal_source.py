@@ -9,11 +9,9 @@ import contextlib
 import json
 import mmap
 import re
-import shutil
 import tempfile
-import zipfile
-from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.errors import UnreadableInputError
@@ -27,28 +25,19 @@ VALID = (
 )
 WHAT = "vector data"
 GEOJSON, GEOJSON_LINES = "GeoJSON:", "GeoJSONSeq:"
-SHAPE_MAGIC, FLATGEOBUF_MAGIC, ZIP_MAGIC = b"\0\0\x27\x0a", b"fgb\x03fgb", b"PK\x03\x04"
+SHAPE_MAGIC, FLATGEOBUF_MAGIC = b"\0\0\x27\x0a", b"fgb\x03fgb"
 PREFIXES = {b"SQLi": "GPKG:", SHAPE_MAGIC: "", FLATGEOBUF_MAGIC: ""}
 """What GDAL is given before the path, by a file's first bytes; text in braces is GeoJSON, and in angles GML."""
 RECORD = b"\x1e"
 """Begins each line of GeoJSON text sequences (RFC 8142), if their writer keeps to it."""
 LINE_LIMIT = 2**24
 """Bytes of a first line that may be a feature of its own."""
-UNPACKED_LIMIT = 2**32
-"""Maximum number of bytes of what is read of a zip archive, when it is unpacked."""
-_ENCRYPTED = 1
-"""The flag of an encrypted member."""
-SHAPE_PARTS = (".shp", ".shx", ".dbf", ".prj", ".cpg", ".cst")
-"""Files that make a Shapefile."""
-VECTOR_MEMBERS = (".shp", ".gpkg", ".geojson", ".json", ".geojsonl", ".geojsons", ".ndjson", ".fgb", ".gml", ".parquet")
-"""Endings of vector files in a zip archive; Parquet is read without GDAL, but unpacked here."""
 _GML = re.compile(rb"opengis\.net/gml\b")
+_ENTITIES = re.compile(rb"<!(?:DOCTYPE|ENTITY)")
 _POINTER = re.compile(rb"<OGR[A-Z]")
 """Begins XML that names other files or servers; GDAL looks for it anywhere in the first bytes."""
 HEAD_BYTES = 2**16
 """Bytes in which a namespace is looked for, and such XML: more than GDAL looks at."""
-NAME_LAYER = "Name one of the layers by --layer (`footprints_layer` of a batch or a job):"
-"""The fix where it is not clear which layer is meant; their names follow."""
 _CRS = re.compile(rb'"(?:c|\\u00[46]3)(?:r|\\u00[57]2)(?:s|\\u00[57]3)"\s*:\s*(?=\{)', re.IGNORECASE)
 """A member `crs` of GeoJSON, its letters escaped or not; GDAL takes small and capital ones."""
 _CRS_BYTES = 4096
@@ -111,6 +100,9 @@ def _beside_its_schema(path: Path) -> Iterator[str]:
     """
     import pyogrio
 
+    with path.open("rb") as stream:
+        if _ENTITIES.search(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)):
+            raise UnreadableInputError(str(path), "it is XML with entities of its own, which GML does not need", VALID)
     with tempfile.TemporaryDirectory(prefix="gablework-vector-") as folder:
         name = Path(folder, f"{path.stem}.gml")
         name.symlink_to(path)
@@ -133,68 +125,6 @@ def is_lines(path: Path) -> bool:
         except (ValueError, RecursionError):
             return False
         return isinstance(first, dict) and any(more.strip() for more in stream)
-
-
-@contextlib.contextmanager
-def unpacked(path: Path, layer: str | None) -> Iterator[tuple[Path, str | None]]:
-    """The vector file in a zip archive, for as long as it is read, and the layer in it; any other file as it is.
-
-    Of several files the layer names one. Raises UnreadableInputError if the archive is damaged, encrypted or too
-    large, or if it is not clear which file is meant.
-    """
-    if not first_bytes(path).startswith(ZIP_MAGIC):
-        yield path, layer
-        return
-    with tempfile.TemporaryDirectory(prefix="gablework-vector-") as folder:
-        with in_our_words(path, "a zip archive", "Pack it again, or give the file in it"):
-            with zipfile.ZipFile(path) as archive:
-                members, of_several = chosen_members(path, archive.infolist(), layer)
-                for member in members:
-                    place = PurePosixPath(member.filename)
-                    with (
-                        archive.open(member) as packed,
-                        Path(folder, place.stem + place.suffix.lower()).open("wb") as to,
-                    ):
-                        shutil.copyfileobj(packed, to)
-            first = PurePosixPath(members[0].filename)
-        yield Path(folder, first.stem + first.suffix.lower()), None if of_several else layer
-
-
-def chosen_members(
-    path: Path, members: Sequence[zipfile.ZipInfo], layer: str | None
-) -> tuple[list[zipfile.ZipInfo], bool]:
-    """The vector file of an archive and what belongs to it, and whether the layer chose it among several.
-
-    Raises UnreadableInputError as `unpacked`.
-    """
-    found = [
-        one for one in members if one.filename.lower().endswith(VECTOR_MEMBERS) and "__MACOSX/" not in one.filename
-    ]
-    # a Shapefile often comes with JSON about it
-    found = [one for one in found if not one.filename.lower().endswith(".json")] or found
-    of_several = len(found) > 1
-    names = sorted(PurePosixPath(one.filename).stem for one in found)
-    if of_several and layer is not None:
-        found = [one for one in found if PurePosixPath(one.filename).stem == layer]
-    if len(found) != 1:
-        there = ", ".join(names[:20]) or "(none)"
-        raise UnreadableInputError(
-            str(path),
-            f"it is a zip archive with {len(names)} vector files",
-            f"{NAME_LAYER} {there}" if names else VALID,
-        )
-    stem = PurePosixPath(found[0].filename).with_suffix("")
-    parts = [
-        one
-        for one in members
-        if one.filename.lower().endswith(SHAPE_PARTS) and PurePosixPath(one.filename).with_suffix("") == stem
-    ]
-    chosen = [found[0], *(one for one in parts if one is not found[0])]
-    size = sum(one.file_size for one in chosen)
-    if size > UNPACKED_LIMIT or any(one.flag_bits & _ENCRYPTED for one in chosen):
-        problem = f"it unpacks to {size} bytes" if size > UNPACKED_LIMIT else "it is encrypted"
-        raise UnreadableInputError(str(path), problem, "Unpack it, and give the file in it")
-    return chosen, of_several
 
 
 def refuse_links(path: Path) -> None:

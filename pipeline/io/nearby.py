@@ -43,10 +43,19 @@ class Shape(NamedTuple):
     """The single one and the multiple one."""
     named: str
     """What they are to the reader of a message."""
+    choose: str = "Give a file with one of its layers"
+    """What to do where several layers hold such features; their names follow."""
 
 
-POLYGONS = Shape("Polygon", (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON), "footprints")
+POLYGONS = Shape(
+    "Polygon",
+    (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON),
+    "footprints",
+    "Name one of its layers with --layer",
+)
 """The default."""
+AREAS = POLYGONS._replace(named="area", choose=Shape._field_defaults["choose"])
+"""Polygons of areas of interest."""
 
 
 class Nearby:

@@ -18,10 +18,10 @@ import shapely
 from pipeline.errors import InputError, UnreadableInputError
 from pipeline.io.formats import first_bytes
 from pipeline.io.gdal_layer import read_by_gdal
-from pipeline.io.gdal_source import unpacked
 from pipeline.io.nearby import POLYGONS, Boxes, Shape
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.urls import is_url, shown
+from pipeline.io.vector_archive import unpacked
 from pipeline.io.wkb import geometries_of
 
 PARQUET_MAGIC = b"PAR1"
@@ -73,7 +73,7 @@ def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None, 
     with on_this_machine(path) as file:
         inner = file
         try:
-            with unpacked(file, layer) as (inner, name):
+            with unpacked(file, layer, shape) as (inner, name):
                 return _read(inner, name, boxes, shape)
         except InputError as fault:
             raise fault.of(label, str(inner)) from fault

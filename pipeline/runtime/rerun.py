@@ -154,7 +154,7 @@ def _rerun(
     if unknown:
         raise RunError(f"{', '.join(unknown)}: no building of {earlier.run_dir}. Give ids of its buildings table")
     plan, paths = plan_inputs(dataclasses.replace(wanted, resources=request.resources), progress, cancelled, executor)
-    footprints = footprints_of_run(wanted.footprints, plan, wanted.settings.footprints)
+    footprints = footprints_of_run(wanted.footprints, plan, wanted.settings.footprints, wanted.footprints_layer)
     guides = None
     if wanted.guides is not None:
         guides = given_guides(wanted.guides, plan, wanted.settings.building.guides.kind_column)

@@ -219,7 +219,7 @@ def run_variants(
     progress = Progress(on_event)
     progress.tell("run", "plan", f"run into {request.out}")
     plan, paths = plan_inputs(request, progress, cancelled, executor)
-    footprints = footprints_of_run(request.footprints, plan, request.settings.footprints)
+    footprints = footprints_of_run(request.footprints, plan, request.settings.footprints, request.footprints_layer)
     for warning in () if footprints is None else footprints.warnings:
         progress.warn("plan", warning)
     guides = None

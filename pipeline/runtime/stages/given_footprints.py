@@ -62,25 +62,30 @@ def data_area(plan: Plan) -> shapely.Geometry:
     return area
 
 
-def footprints_of_run(path: str | None, plan: Plan, settings: FootprintSettings) -> GivenFootprints | None:
+def footprints_of_run(
+    path: str | None, plan: Plan, settings: FootprintSettings, layer: str | None = None
+) -> GivenFootprints | None:
     """The footprints within the bounds of a run's inputs, cut by --bbox and --aoi; None without a file.
 
-    `settings` name the columns of heights. Raises InputError if the file cannot be used or lacks one of these columns,
-    and SettingsError if columns are named, but no file.
+    `settings` name the columns of heights, `layer` that of a file with several. Raises InputError if the file cannot
+    be used, lacks one of these columns, or has no footprint on the data, and SettingsError if columns or a layer are
+    named, but no file.
     """
     if path is not None:
         with one_input(shown(path)):
-            return _given_footprints(path, plan, settings)
+            return _given_footprints(path, plan, settings, layer)
+    if layer is not None:
+        raise SettingsError([f"--layer {layer} names a layer of footprints, and none are given: give --footprints"])
     if settings.columns:
         names = ", ".join(settings.columns)
         raise SettingsError([f"[footprints] {names} name columns of given footprints, and none are given: give them"])
     return None
 
 
-def _given_footprints(path: str, plan: Plan, settings: FootprintSettings) -> GivenFootprints:
+def _given_footprints(path: str, plan: Plan, settings: FootprintSettings, layer: str | None) -> GivenFootprints:
     """The footprints of a file."""
     area = data_area(plan)
-    found = read_footprints(path, plan.reference, area=area)
+    found = read_footprints(path, plan.reference, layer=layer, area=area)
     _check_columns(path, found, settings)
     shapely.prepare(area)  # many inputs give it many corners, and every footprint is tested against it
     inside = [k for k, polygon in enumerate(found.polygons) if area.intersects(polygon)]
