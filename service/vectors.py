@@ -22,6 +22,7 @@ import numpy as np
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io.crs import parse_crs
+from pipeline.io.formats import LAS_SUFFIXES
 from pipeline.io.gdal_source import (
     FLATGEOBUF_MAGIC,
     RECORD,
@@ -162,6 +163,8 @@ def _archive(path: Path, head: bytes) -> dict[str, Any]:
     if size > GEOPACKAGE_LIMIT:
         raise TooLargeError(f"{path.name} unpacks to {size} bytes, it may have {GEOPACKAGE_LIMIT}: cut out the area")
     layers = sorted(vector_members(members))
+    if not layers and any(one.filename.lower().endswith(LAS_SUFFIXES) for one in members):
+        raise UnreadableInputError(str(path), "it is a zip archive of point clouds", "Send each point cloud unpacked")
     if not 0 < len(layers) <= ARCHIVED_LIMIT:
         problem = f"it is a zip archive with {len(layers)} vector files: it may have 1 to {ARCHIVED_LIMIT}"
         raise UnreadableInputError(str(path), problem, FIX)

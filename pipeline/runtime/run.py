@@ -49,12 +49,12 @@ from pipeline.runtime.stages.batch_figures import Counted
 from pipeline.runtime.stages.cleanup import OVERRIDDEN, publishing, tidy
 from pipeline.runtime.stages.content_digest import STAGE as DIGEST
 from pipeline.runtime.stages.content_digest import content_digest
-from pipeline.runtime.stages.counts import run_counts
+from pipeline.runtime.stages.counts import about_emptiness, run_counts
 from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints_of_run
 from pipeline.runtime.stages.given_guides import GivenGuides, given_guides
 from pipeline.runtime.stages.ground import Ground, find_ground
 from pipeline.runtime.stages.ingest import ingest
-from pipeline.runtime.stages.ingested import Ingested, without_roofs
+from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.publish import Published, RunOutput, publish
 from pipeline.runtime.stages.reconstruct import QUARANTINE, Models, models_stage, reconstruct
@@ -295,21 +295,9 @@ def _find_candidates(
     ground = find_ground(context, settings, ingested, footprints=footprints is not None)
     splits = split(context, settings, ingested, ground, footprints)
     joined = join(context, settings.scene, settings.building.roof, splits, footprints)
-    if headline := _about_emptiness(settings, ingested, joined):
+    if headline := about_emptiness(ingested, ground, joined, trust=settings.general.classes == "trust"):
         context.progress.warn_first("join", headline)
     return _Candidates(ingested=ingested, ground=ground, splits=splits, joined=joined)
-
-
-def _about_emptiness(settings: RunSettings, ingested: Sequence[Ingested], joined: Joined) -> str:
-    """Why no building can be modelled, or that none was found; empty where some were."""
-    classes: Counter[int] = Counter()
-    for found in ingested:
-        classes.update(found.classes)
-    by_classes = without_roofs(classes, trust=settings.general.classes == "trust")
-    if by_classes or joined.candidates:
-        return by_classes
-    rejected = sum(listed.figures.count for listed in joined.rejected)
-    return f"no building was found in {classes.total()} points; {rejected} objects were rejected, each with its reason"
 
 
 def _override(
@@ -325,6 +313,9 @@ def _override(
     for entry in applied.outcomes:
         if entry.warning:
             context.progress.warn("join", entry.warning)
+    if applied.outcomes and all(entry.effective is None for entry in applied.outcomes):
+        what = f"none of the {len(applied.outcomes)} overrides took effect; overrides.json says why of each"
+        context.progress.warn_first("join", what)
     for one in runs:
         put_json(one.run_dir, OVERRIDES, [entry.as_dict() for entry in applied.outcomes])
     changed = joined_of(store_sites(context, OVERRIDDEN, applied.sites), 0, {})

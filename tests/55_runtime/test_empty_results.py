@@ -70,8 +70,30 @@ def test_a_run_that_finds_no_building_says_so_first(reconstruct: Any, tmp_path: 
         (rng.uniform(400_000, 400_040, 8_000), rng.uniform(5_000_000, 5_000_040, 8_000), rng.normal(100, 0.01, 8_000))
     )
     summary = reconstruct(write_las(tmp_path / "a.laz", flat, crs="EPSG:25832"))
-    assert summary.headline.startswith("no building was found in 8000 points; 0 objects were rejected")
+    assert summary.headline == "no building was found in 8000 points"
     assert summary.warnings[0] == summary.headline
+
+
+def test_scattered_points_that_are_all_outliers_are_named(reconstruct: Any, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    few = np.column_stack((rng.uniform(400_000, 403_000, (60, 2)), rng.uniform(100, 300, 60)))
+    summary = reconstruct(write_las(tmp_path / "a.laz", few, crs="EPSG:32632"), allow_outside_area_of_use=True)
+    assert "no building was found in 60 points, 60 of which are outliers" in summary.headline
+
+
+def test_overrides_of_which_none_takes_effect_are_named_first(
+    suburb: Path, houses: list[Polygon], reconstruct: Any, tmp_path: Path
+) -> None:
+    x, y = houses[0].centroid.coords[0]
+    far, near, farther = (f'[[building]]\npoint = [{x + d}, {y}]\naction = "reject"\n' for d in (5_000.0, 0.0, 6_000.0))
+    for text, headline in (
+        (far + farther, "none of the 2 overrides took effect; overrides.json says why"),
+        (far + near, ""),
+    ):
+        (tmp_path / "o.toml").write_text(text)
+        summary = reconstruct(suburb, overrides=str(tmp_path / "o.toml"))
+        assert summary.headline.startswith(headline)
+        assert bool(summary.headline) == bool(headline)
 
 
 def test_a_run_with_buildings_has_no_such_line(suburb: Path, reconstruct: Any) -> None:

@@ -89,6 +89,9 @@ def test_what_is_refused_alone_is_refused_in_an_archive(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("x")
     with pytest.raises(InputError, match="a zip archive with 0 vector files"):
         examine(zipped(tmp_path / "b.zip", tmp_path / "a.txt"), max_points=1)
+    (tmp_path / "a.laz").write_bytes(las_bytes(10))
+    with pytest.raises(InputError, match="a zip archive of point clouds"):
+        examine(zipped(tmp_path / "d.zip", tmp_path / "a.laz"), max_points=1)
     (tmp_path / "c.zip").write_bytes(b"PK\x03\x04 damaged")
     with pytest.raises(InputError, match="cannot be read as a zip archive"):
         examine(tmp_path / "c.zip", max_points=1)
