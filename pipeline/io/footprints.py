@@ -60,8 +60,8 @@ PROBLEMS = {
 LARGEST_OUTLINE_M = 20_000.0
 """Longest side of an outline. Not a setting: the longest buildings have 3 km, and a wrong coordinate makes an outline
 that reaches over thousands of tiles."""
-_MOST_APART = 0.5
-"""Smallest share of rows that a column of ids must tell apart: a column of zeros, which some programs add, does not."""
+_LEAST_DISTINCT = 0.5
+"""Smallest share of rows that a column of ids must distinguish: some programs add one of zeros."""
 AREA_CROSSINGS = 1_000_000
 """Maximum number of crossings between the edges of an area of interest; uniting more takes a minute and gigabytes."""
 
@@ -310,7 +310,7 @@ def _ids(
 ) -> tuple[str, ...]:
     """The ids of all rows: of a column, with the file's own number of the feature where it is empty, else that number.
 
-    A column that tells nearly all of the rows that are kept apart is taken as it is, with a warning.
+    A column that distinguishes most of the rows that are kept is taken as it is, with a warning.
     """
     by_lower = {field.lower(): field for field in reversed(list(table))}
     if id_column is not None and id_column not in table:
@@ -325,9 +325,9 @@ def _ids(
         raise InconsistentInputError(
             name, f"the ids in column {id_column!r} are empty or not unique", "Name another column, or none"
         )
-    # of the columns that tell most apart the first
+    # the first of those that distinguish most
     chosen = max(single, key=lambda field: single[field], default=None)
-    if chosen is not None and single[chosen] < _MOST_APART * len(kept):
+    if chosen is not None and single[chosen] < _LEAST_DISTINCT * len(kept):
         chosen = None
     if chosen is not None and single[chosen] < len(kept):
         warnings.append(_repeated(chosen, [table[chosen][row] for row in kept]))
