@@ -118,13 +118,15 @@ def is_lines(path: Path) -> bool:
     """Whether text that begins with a brace has a feature in each line, and is not one document."""
     with path.open("rb") as stream:
         line = stream.readline(LINE_LIMIT).removeprefix(b"\xef\xbb\xbf").strip()
-        if line.startswith(RECORD):
-            return True
-        try:
-            first = json.loads(line)
-        except (ValueError, RecursionError):
-            return False
-        return isinstance(first, dict) and any(more.strip() for more in stream)
+        has_more = bool(stream.read(HEAD_BYTES).strip())
+    if line.startswith(RECORD):
+        return True
+    if not (has_more and line.endswith(b"}")):
+        return False
+    try:
+        return isinstance(json.loads(line), dict)
+    except (ValueError, RecursionError):
+        return False
 
 
 def refuse_links(path: Path) -> None:

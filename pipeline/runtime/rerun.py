@@ -50,8 +50,9 @@ from pipeline.runtime.run_context import RunContext, run_context
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import run_scratch
-from pipeline.runtime.stages.apply_overrides import WARNING, EntryOutcome, apply_overrides
+from pipeline.runtime.stages.apply_overrides import WARNING, EntryOutcome, about_no_effect, apply_overrides
 from pipeline.runtime.stages.batch_figures import REJECTED, Modelled
+from pipeline.runtime.stages.counts import NOTHING_FOUND
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints_of_run
 from pipeline.runtime.stages.given_guides import given_guides
@@ -463,6 +464,13 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
     if request.overrides is not None:
         inputs.append(input_file(request.overrides))
     warnings = [text for text in earlier.manifest.warnings if not text.startswith(WARNING)]
+    headline = "" if earlier.manifest.headline not in warnings else earlier.manifest.headline
+    if headline.startswith(NOTHING_FOUND) and counts["candidates"]:
+        warnings.remove(headline)
+        headline = ""
+    if without_effect := about_no_effect(found.outcomes):
+        headline = without_effect
+        warnings.insert(0, headline)
     warnings.extend(outcome.warning for outcome in found.outcomes if outcome.warning)
     if earlier.manifest.request.get("points"):
         warnings.append(_POINTS_GONE)
@@ -485,6 +493,7 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
         counts=dict(counts),
         slowest=_slowest(earlier, found, modelled),
         warnings=tuple(warnings),
+        headline=headline,
     )
 
 

@@ -44,7 +44,7 @@ from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import check_scratch, run_scratch
 from pipeline.runtime.scratch.outcomes import Place
 from pipeline.runtime.scratch.work_folder import is_known, locked_work
-from pipeline.runtime.stages.apply_overrides import apply_overrides
+from pipeline.runtime.stages.apply_overrides import about_no_effect, apply_overrides
 from pipeline.runtime.stages.batch_figures import Counted
 from pipeline.runtime.stages.cleanup import OVERRIDDEN, publishing, tidy
 from pipeline.runtime.stages.content_digest import STAGE as DIGEST
@@ -313,9 +313,8 @@ def _override(
     for entry in applied.outcomes:
         if entry.warning:
             context.progress.warn("join", entry.warning)
-    if applied.outcomes and all(entry.effective is None for entry in applied.outcomes):
-        what = f"none of the {len(applied.outcomes)} overrides took effect; overrides.json says why of each"
-        context.progress.warn_first("join", what)
+    if headline := about_no_effect(applied.outcomes):
+        context.progress.warn_first("join", headline)
     for one in runs:
         put_json(one.run_dir, OVERRIDES, [entry.as_dict() for entry in applied.outcomes])
     changed = joined_of(store_sites(context, OVERRIDDEN, applied.sites), 0, {})

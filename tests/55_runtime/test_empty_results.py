@@ -87,13 +87,23 @@ def test_overrides_of_which_none_takes_effect_are_named_first(
     x, y = houses[0].centroid.coords[0]
     far, near, farther = (f'[[building]]\npoint = [{x + d}, {y}]\naction = "reject"\n' for d in (5_000.0, 0.0, 6_000.0))
     for text, headline in (
-        (far + farther, "none of the 2 overrides took effect; overrides.json says why"),
+        (far + farther, "overrides: none of 2 took effect; overrides.json says why"),
         (far + near, ""),
     ):
         (tmp_path / "o.toml").write_text(text)
         summary = reconstruct(suburb, overrides=str(tmp_path / "o.toml"))
         assert summary.headline.startswith(headline)
         assert bool(summary.headline) == bool(headline)
+    (tmp_path / "o.toml").write_text(far)
+    rerun(RerunRequest(run_dir=summary.run_dir, overrides=str(tmp_path / "o.toml"), resources=SERIAL))
+    assert (
+        read_manifest(summary.run_dir).headline == "overrides: none of 1 took effect; overrides.json says why of each"
+    )
+    (tmp_path / "o.toml").write_text(near)
+    rerun(RerunRequest(run_dir=summary.run_dir, overrides=str(tmp_path / "o.toml"), resources=SERIAL))
+    manifest = read_manifest(summary.run_dir)
+    assert manifest.headline == ""
+    assert not [warning for warning in manifest.warnings if "took effect" in warning]
 
 
 def test_a_run_with_buildings_has_no_such_line(suburb: Path, reconstruct: Any) -> None:

@@ -129,6 +129,13 @@ def apply_overrides(
     return Overridden(before=before, owners=owners, sites=sites, outcomes=outcomes)
 
 
+def about_no_effect(outcomes: Sequence[EntryOutcome]) -> str:
+    """A warning where no override took effect; empty where one did, or there are none."""
+    if not outcomes or any(entry.effective is not None for entry in outcomes):
+        return ""
+    return f"{WARNING}none of {len(outcomes)} took effect; overrides.json says why of each"
+
+
 def _id_of(site: CandidateSite | RejectedSite) -> str:
     return site.building_id if isinstance(site, CandidateSite) else site.object_id
 

@@ -13,6 +13,9 @@ from pipeline.runtime.stages.ingested import Ingested, without_roofs
 from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import Splits
 
+NOTHING_FOUND = "no building was found"
+"""Begins the first warning of a run without candidates."""
+
 
 def run_counts(
     plan: Plan, ingested: Sequence[Ingested], ground: Ground, splits: Splits, joined: Joined, found: Counted
@@ -55,4 +58,4 @@ def about_emptiness(ingested: Sequence[Ingested], ground: Ground, joined: Joined
     outliers = sum(cells.outliers for cells in ground.cells.values())
     lone = f", {outliers} of which are outliers: are they too few, or is a unit wrong" if outliers else ""
     left = f"; {rejected} objects were rejected, each with its reason" if rejected else ""
-    return f"no building was found in {classes.total()} points{lone}{left}"
+    return f"{NOTHING_FOUND} in {classes.total()} points{lone}{left}"
