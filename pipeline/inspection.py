@@ -50,6 +50,8 @@ class Inspection:
     """Used points by class: the file's own codes, or ASPRS codes if the settings say what the file's codes mean."""
     returns: dict[int, int]
     """Used points by the number of returns of their pulse."""
+    extent_m: tuple[float, float]
+    """Width and depth of the used points; bounds in a header may be wider."""
     elevation_m: tuple[float, float]
     """Lowest and highest used point."""
     occupied_area_m2: float
@@ -73,7 +75,7 @@ class Inspection:
         """The facts as pairs of name and value, for people."""
         info, reference = self.info, self.info.reference
         assumed = " (assumed: the file states none; --vertical-unit sets it)" if reference.vertical_unit_assumed else ""
-        x0, y0, _, x1, y1, _ = info.bounds_m
+        width, depth = self.extent_m
         kept_out = ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in self.dropped.items() if n)
         pulses = ", ".join(f"{n}: {100.0 * k / self.used_points:.0f} %" for n, k in self.returns.items())
         basis = "as in a sample" if self.estimated_from_sample else "as many as such an area often has"
@@ -93,7 +95,7 @@ class Inspection:
                 "units",
                 f"horizontal {reference.horizontal_unit_m:g} m, vertical {reference.vertical_unit_m:g} m{assumed}",
             ),
-            ("extent", f"{x1 - x0:.1f} x {y1 - y0:.1f} m"),
+            ("extent", f"{width:.1f} x {depth:.1f} m" if self.used_points else "unknown"),
             (
                 "elevation",
                 f"{self.elevation_m[0]:.2f} to {self.elevation_m[1]:.2f} m" if self.used_points else "unknown",
@@ -128,18 +130,17 @@ def inspect(
     raster = _Raster(source.info)
     classes = np.zeros(256, dtype=np.int64)
     returns = np.zeros(256, dtype=np.int64)
-    used, lowest, highest = 0, math.inf, -math.inf
+    used, low, high = 0, np.full(3, np.inf), np.full(3, -np.inf)
     for cloud in source.chunks():
         classes += np.bincount(cloud.classification, minlength=256)
         returns += np.bincount(cloud.return_count, minlength=256)
         raster.add(cloud.xyz)
         used += len(cloud)
-        lowest = min(lowest, float(cloud.xyz[:, 2].min()))
-        highest = max(highest, float(cloud.xyz[:, 2].max()))
+        low, high = np.minimum(low, cloud.xyz.min(axis=0)), np.maximum(high, cloud.xyz.max(axis=0))
         on_progress(used, source.info.point_count)
     plan = make_plan([str(path)], options, settings)
     run = _forecast(path, options, plan, settings)
-    return _inspection(source, raster, classes, returns, (lowest, highest), run, settings)
+    return _inspection(source, raster, classes, returns, (low, high), run, settings)
 
 
 def _forecast(path: str | Path, options: ReadOptions, plan: Plan, settings: RunSettings) -> Forecast:
@@ -157,10 +158,11 @@ def _inspection(
     raster: _Raster,
     classes: np.ndarray[tuple[int], np.dtype[np.int64]],
     returns: np.ndarray[tuple[int], np.dtype[np.int64]],
-    elevation_m: tuple[float, float],
+    bounds_m: tuple[FloatArray, FloatArray],
     run: Forecast,
     settings: RunSettings,
 ) -> Inspection:
+    low, high = bounds_m
     area, used = raster.occupied_area_m2(), int(classes.sum())
     return Inspection(
         info=source.info,
@@ -170,7 +172,8 @@ def _inspection(
         dropped=source.dropped,
         classes={int(k): int(classes[k]) for k in np.flatnonzero(classes)},
         returns={int(k): int(returns[k]) for k in np.flatnonzero(returns)},
-        elevation_m=elevation_m,
+        extent_m=(float(high[0] - low[0]), float(high[1] - low[1])),
+        elevation_m=(float(low[2]), float(high[2])),
         occupied_area_m2=area,
         density_per_m2=used / area if area > 0.0 else math.nan,
         raised_objects=raster.raised_objects(),

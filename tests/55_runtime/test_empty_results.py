@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +115,18 @@ def test_a_run_with_buildings_has_no_such_line(suburb: Path, reconstruct: Any) -
 def test_a_tile_of_which_no_point_would_be_used_is_inspected_with_a_warning(suburb: Path, tmp_path: Path) -> None:
     found = inspect(of_class(suburb, tmp_path / "a.laz", 7), None, lambda _done, _total: None)
     assert found.warnings[0].startswith("a run would use none of its points (")
-    assert dict(found.rows())["elevation"] == "unknown"
+    assert (dict(found.rows())["elevation"], dict(found.rows())["extent"]) == ("unknown", "unknown")
+
+
+def test_the_extent_of_a_tile_is_that_of_its_points_whatever_its_header_says(suburb: Path, tmp_path: Path) -> None:
+    las = laspy.read(suburb)
+    wanted = f"{np.ptp(las.x):.1f} x {np.ptp(las.y):.1f} m"
+    raw = bytearray(suburb.read_bytes())
+    for place, value in ((179, las.x.max() + 900.0), (187, las.x.min() - 900.0)):
+        struct.pack_into("<d", raw, place, value)
+    (tmp_path / "wide.laz").write_bytes(raw)
+    for path in (suburb, tmp_path / "wide.laz"):
+        assert dict(inspect(path, None, lambda _done, _total: None).rows())["extent"] == wanted
 
 
 def test_footprints_of_which_none_lies_on_the_data_end_the_run_and_leave_nothing(
