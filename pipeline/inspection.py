@@ -19,6 +19,7 @@ from pipeline.runtime.monitoring.machine import cores, memory_bytes
 from pipeline.runtime.plan import Plan, make_plan
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
+from pipeline.runtime.stages.ingested import without_roofs
 from pipeline.settings import RunSettings
 from pipeline.terrain.settings import StripSettings
 from pipeline.terrain.survey_strips import SQUARE_MM, compared_strips, moves_of, offsets_of, strips_warning
@@ -54,6 +55,8 @@ class Inspection:
     """Used points by class: the file's own codes, or ASPRS codes if the settings say what the file's codes mean."""
     returns: dict[int, int]
     """Used points by the number of returns of their pulse."""
+    extent_m: tuple[float, float]
+    """Width and depth of the used points; bounds in a header may be wider."""
     elevation_m: tuple[float, float]
     """Lowest and highest used point."""
     occupied_area_m2: float
@@ -77,7 +80,7 @@ class Inspection:
         """The facts as pairs of name and value, for people."""
         info, reference = self.info, self.info.reference
         assumed = " (assumed: the file states none; --vertical-unit sets it)" if reference.vertical_unit_assumed else ""
-        x0, y0, _, x1, y1, _ = info.bounds_m
+        width, depth = self.extent_m
         kept_out = ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in self.dropped.items() if n)
         pulses = ", ".join(f"{n}: {100.0 * k / self.used_points:.0f} %" for n, k in self.returns.items())
         basis = "as in a sample" if self.estimated_from_sample else "as many as such an area often has"
@@ -97,8 +100,11 @@ class Inspection:
                 "units",
                 f"horizontal {reference.horizontal_unit_m:g} m, vertical {reference.vertical_unit_m:g} m{assumed}",
             ),
-            ("extent", f"{x1 - x0:.1f} x {y1 - y0:.1f} m"),
-            ("elevation", f"{self.elevation_m[0]:.2f} to {self.elevation_m[1]:.2f} m"),
+            ("extent", f"{width:.1f} x {depth:.1f} m" if self.used_points else "unknown"),
+            (
+                "elevation",
+                f"{self.elevation_m[0]:.2f} to {self.elevation_m[1]:.2f} m" if self.used_points else "unknown",
+            ),
             ("density", f"{self.density_per_m2:.2f} points/m2 where there are points"),
             ("returns a pulse", pulses),
             ("acquired", acquired),
@@ -129,7 +135,7 @@ def inspect(
     raster = _Raster(source.info)
     classes = np.zeros(256, dtype=np.int64)
     returns = np.zeros(256, dtype=np.int64)
-    used, lowest, highest = 0, math.inf, -math.inf
+    used, low, high = 0, np.full(3, np.inf), np.full(3, -np.inf)
     strips = _Strips(source.info.point_count)
     for cloud in source.chunks():
         classes += np.bincount(cloud.classification, minlength=256)
@@ -137,12 +143,11 @@ def inspect(
         raster.add(cloud.xyz)
         strips.add(cloud)
         used += len(cloud)
-        lowest = min(lowest, float(cloud.xyz[:, 2].min()))
-        highest = max(highest, float(cloud.xyz[:, 2].max()))
+        low, high = np.minimum(low, cloud.xyz.min(axis=0)), np.maximum(high, cloud.xyz.max(axis=0))
         on_progress(used, source.info.point_count)
     plan = make_plan([str(path)], options, settings)
     run = _forecast(path, options, plan, settings)
-    found = _inspection(source, raster, classes, returns, used, (lowest, highest), run)
+    found = _inspection(source, raster, classes, returns, (low, high), run, settings)
     return dataclasses.replace(found, warnings=found.warnings + strips.warnings(settings.scene.strips))
 
 
@@ -161,20 +166,22 @@ def _inspection(
     raster: _Raster,
     classes: np.ndarray[tuple[int], np.dtype[np.int64]],
     returns: np.ndarray[tuple[int], np.dtype[np.int64]],
-    used: int,
-    elevation_m: tuple[float, float],
+    bounds_m: tuple[FloatArray, FloatArray],
     run: Forecast,
+    settings: RunSettings,
 ) -> Inspection:
-    area = raster.occupied_area_m2()
+    low, high = bounds_m
+    area, used = raster.occupied_area_m2(), int(classes.sum())
     return Inspection(
         info=source.info,
-        warnings=source.warnings + _outside(source.info),
+        warnings=(*_about_use(source, classes, settings), *source.warnings, *_outside(source.info)),
         location=source.info.location,
         used_points=used,
         dropped=source.dropped,
         classes={int(k): int(classes[k]) for k in np.flatnonzero(classes)},
         returns={int(k): int(returns[k]) for k in np.flatnonzero(returns)},
-        elevation_m=elevation_m,
+        extent_m=(float(high[0] - low[0]), float(high[1] - low[1])),
+        elevation_m=(float(low[2]), float(high[2])),
         occupied_area_m2=area,
         density_per_m2=used / area if area > 0.0 else math.nan,
         raised_objects=raster.raised_objects(),
@@ -184,6 +191,17 @@ def _inspection(
         estimated_from_sample=run.sampled,
         estimated_gib=run.memory_bytes / 2**30,
     )
+
+
+def _about_use(
+    source: Source, classes: np.ndarray[tuple[int], np.dtype[np.int64]], settings: RunSettings
+) -> tuple[str, ...]:
+    """A warning about a tile of which a run would use no point, or find no building for its classes."""
+    found = {code: int(classes[code]) for code in np.flatnonzero(classes).tolist()}
+    if not found:
+        causes = ", ".join(f"{count} {cause}" for cause, count in source.dropped.items() if count)
+        return (f"a run would use none of its points ({causes})",)
+    return tuple(filter(None, [without_roofs(found, trust=settings.general.classes == "trust")]))
 
 
 def _outside(info: SourceInfo) -> tuple[str, ...]:

@@ -18,6 +18,8 @@ from pipeline.cli.options import (
     Bbox,
     Classes,
     Crs,
+    Footprints,
+    Layer,
     Licence,
     Lods,
     Method,
@@ -165,9 +167,8 @@ def submit(
         str | None,
         typer.Option(metavar="NAME", help="reconstruct (default), compare (default with --methods) or classify."),
     ] = None,
-    footprints: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Building outlines (GeoPackage, GeoJSON, GeoParquet) to model.")
-    ] = None,
+    footprints: Footprints = None,
+    layer: Layer = None,
     guides: Annotated[
         str | None, typer.Option(metavar="FILE", help="Lines of roofs (GeoPackage, GeoJSON, GeoParquet) to follow.")
     ] = None,
@@ -226,6 +227,7 @@ def submit(
 ) -> None:
     """Send tiles to a service and start a job. Run it again to continue after an interruption."""
     inputs = {
+        "footprintsLayer": layer,
         "crs": crs,
         "verticalUnit": vertical_unit,
         "allowOutsideAreaOfUse": allow_outside_area_of_use or None,

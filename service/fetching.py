@@ -142,11 +142,23 @@ def _check_upload(
     _check_shape(upload, kind)
     far = _outside_area(upload, request.crs)
     problems = [str(problem) for problem in upload.preflight.get("problems", ()) if problem != far]
+    if kind == "file of footprints" and request.footprints_layer is not None:
+        _check_layer(upload, request.footprints_layer)
+        problems = []  # several layers are one of them
     if problems and request.crs is None:
         raise RequestError([f"upload {upload.upload_id} ({upload.filename}): {'; '.join(problems)}"])
     if far is not None and not request.allow_outside_area_of_use:
         raise OutsideAreaError([f"{upload.filename}: {far}"])
     return int(upload.preflight.get("pointCount") or 0)
+
+
+def _check_layer(upload: Upload, layer: str) -> None:
+    """Refuse a layer that a file does not have; not all formats say before they are read."""
+    layers = upload.preflight.get("layers")
+    if layers and layer not in layers:
+        there = ", ".join(map(str, layers))
+        problem = f"upload {upload.upload_id} ({upload.filename}) has no layer {layer[:80]!r}"
+        raise RequestError([f"footprintsLayer: {problem}: name one of {there}"])
 
 
 def _outside_area(upload: Upload, crs: str | None) -> str | None:

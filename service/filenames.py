@@ -12,8 +12,10 @@ GEOJSON_SUFFIXES = (".geojson", ".json")
 """Endings of GeoJSON."""
 PARQUET_SUFFIXES = (".parquet", ".geoparquet")
 """Endings of GeoParquet."""
-FOOTPRINT_SUFFIXES = (".gpkg", *GEOJSON_SUFFIXES, *PARQUET_SUFFIXES)
-"""Endings of footprints in one file; a Shapefile is several files and is accepted by path only."""
+LINES_SUFFIXES = (".geojsonl", ".geojsons", ".ndjson")
+"""Endings of GeoJSON with one feature per line."""
+FOOTPRINT_SUFFIXES = (".gpkg", *GEOJSON_SUFFIXES, *LINES_SUFFIXES, *PARQUET_SUFFIXES, ".fgb", ".gml", ".zip")
+"""Endings of footprints in one file; a Shapefile is several files and is accepted in a zip archive, or by path."""
 SUFFIXES = (*POINT_SUFFIXES, *FOOTPRINT_SUFFIXES)
 """Endings of the files that are accepted."""
 NAME_LIMIT = 120

@@ -108,6 +108,8 @@ class JobRequest:
     """Point clouds."""
     footprints: InputReference | None = None
     """A vector file of building outlines."""
+    footprints_layer: str | None = None
+    """Their layer, where the file has several."""
     guides: InputReference | None = None
     """A vector file of lines of roofs; not for `classify`."""
     crs: str | None = None

@@ -101,6 +101,7 @@ def execute_request(request: JobRequest, base: str, priority: int) -> Execute:
         **(request.echo or {}),
         "tiles": [reference(tile) for tile in request.tiles] or None,
         "footprints": None if request.footprints is None else reference(request.footprints),
+        "footprintsLayer": request.footprints_layer,
         "guides": None if request.guides is None else reference(request.guides),
         "crs": request.crs,
         "verticalUnit": request.vertical_unit,

@@ -12,7 +12,8 @@ import json
 import math
 import re
 import sqlite3
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -21,10 +22,20 @@ import numpy as np
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io.crs import parse_crs
-from pipeline.io.gdal_layer import refuse_links
+from pipeline.io.formats import LAS_SUFFIXES
+from pipeline.io.gdal_source import (
+    FLATGEOBUF_MAGIC,
+    RECORD,
+    SHAPE_MAGIC,
+    is_gml,
+    is_lines,
+    refuse_links,
+)
 from pipeline.io.library_faults import in_our_words, shortened
+from pipeline.io.nearby import POLYGONS as SHAPE_OF_FOOTPRINTS
+from pipeline.io.vector_archive import ZIP_MAGIC, unpacked, vector_members
 from service.errors import TooLargeError
-from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES, PARQUET_SUFFIXES
+from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES, LINES_SUFFIXES, PARQUET_SUFFIXES
 
 VECTOR_SUFFIXES = (*FOOTPRINT_SUFFIXES, ".shp")
 """Endings of footprints and guides."""
@@ -44,11 +55,12 @@ HEAD_BYTES = 65_536
 BLOCK_BYTES = 1 << 20
 
 FIX = (
-    "Give a GeoPackage (.gpkg), GeoJSON (.geojson, .json) or GeoParquet (.parquet) with polygons of buildings, "
-    "or with lines of roofs"
+    "Give a GeoPackage (.gpkg), GeoJSON (.geojson, .json, .geojsonl), GeoParquet (.parquet), FlatGeobuf (.fgb), GML "
+    "(.gml) or a zip archive (.zip) with polygons of buildings, or with lines of roofs"
 )
+ARCHIVED_LIMIT = 20
+"""Maximum number of vector files in a zip archive: each is examined."""
 SQLITE_MAGIC = b"SQLite format 3\0"
-SHAPE_MAGIC = b"\0\0\x27\x0a"
 APPLICATION_IDS = (b"GPKG", b"GP10", b"GP11")
 POLYGONAL = ("POLYGON", "MULTIPOLYGON", "CURVEPOLYGON", "GEOMETRY", "GEOMETRYCOLLECTION", "SURFACE", "MULTISURFACE")
 """Types of geometry columns that can hold polygons."""
@@ -78,7 +90,7 @@ def examine_vector(path: Path) -> dict[str, Any]:
         More bytes than allowed.
     """
     suffix = path.suffix.lower()
-    limit = GEOJSON_LIMIT if suffix in GEOJSON_SUFFIXES else GEOPACKAGE_LIMIT
+    limit = GEOJSON_LIMIT if suffix in (*GEOJSON_SUFFIXES, *LINES_SUFFIXES, ".gml") else GEOPACKAGE_LIMIT
     size = path.stat().st_size
     if size > limit:
         raise TooLargeError(
@@ -91,6 +103,16 @@ def examine_vector(path: Path) -> dict[str, Any]:
         if not head.startswith(SHAPE_MAGIC):
             raise UnreadableInputError(str(path), f"not a Shapefile: it begins with {head[:4]!r}", FIX)
         return _facts("shapefile", None, None, None, [], (POLYGONS, LINES))
+    if suffix == ".fgb":
+        if not head.startswith(FLATGEOBUF_MAGIC):
+            raise UnreadableInputError(str(path), f"not a FlatGeobuf: it begins with {head[:8]!r}", FIX)
+        return _facts("flatgeobuf", None, None, None, [], (POLYGONS, LINES))
+    if suffix == ".gml":
+        if not is_gml(head):
+            raise UnreadableInputError(str(path), f"not GML: it begins with {head[:16]!r}", FIX)
+        return _facts("gml", None, None, None, [], (POLYGONS, LINES))
+    if suffix == ".zip":
+        return _archive(path, head)
     if suffix == ".gpkg":
         if not head.startswith(SQLITE_MAGIC) or head[68:72] not in APPLICATION_IDS:
             raise UnreadableInputError(str(path), f"not a GeoPackage: it begins with {head[:16]!r}", FIX)
@@ -129,6 +151,39 @@ def _facts(
         "usable": not problems,
         "problems": problems,
     }
+
+
+def _archive(path: Path, head: bytes) -> dict[str, Any]:
+    """A zip archive, by the vector files in it: the only one, or layers."""
+    if not head.startswith(ZIP_MAGIC):
+        raise UnreadableInputError(str(path), f"not a zip archive: it begins with {head[:4]!r}", FIX)
+    with in_our_words(path, "a zip archive", FIX), zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+    size = sum(one.file_size for one in members)
+    if size > GEOPACKAGE_LIMIT:
+        raise TooLargeError(f"{path.name} unpacks to {size} bytes, it may have {GEOPACKAGE_LIMIT}: cut out the area")
+    layers = sorted(vector_members(members))
+    if not layers and any(one.filename.lower().endswith(LAS_SUFFIXES) for one in members):
+        raise UnreadableInputError(str(path), "it is a zip archive of point clouds", "Send each point cloud unpacked")
+    if not 0 < len(layers) <= ARCHIVED_LIMIT:
+        problem = f"it is a zip archive with {len(layers)} vector files: it may have 1 to {ARCHIVED_LIMIT}"
+        raise UnreadableInputError(str(path), problem, FIX)
+    found = []
+    for layer in layers:
+        with unpacked(path, layer if len(layers) > 1 else None, SHAPE_OF_FOOTPRINTS) as (file, _):
+            found.append(examine_vector(file))
+    if len(found) == 1:
+        return found[0]
+    shapes = _shapes(*(any(shape in one["shapes"] for one in found) for shape in (POLYGONS, LINES)))
+    return _facts("zip", None, layers, None, [_several(layers, has_polygons=POLYGONS in shapes)], shapes)
+
+
+def _several(layers: Sequence[str], *, has_polygons: bool) -> str:
+    """What to do about several layers."""
+    if has_polygons:
+        named = ", ".join(layers)
+        return f"{len(layers)} layers could be the footprints: give the input footprintsLayer, one of {named}"
+    return f"{len(layers)} layers could be the guides: give a file with one of them"
 
 
 def _geopackage(path: Path) -> dict[str, Any]:
@@ -182,8 +237,7 @@ def _contents(path: Path, database: sqlite3.Connection) -> dict[str, Any]:
         _check_table(path, database, str(row[0]))
     layers = [str(row[0]) for row in found]
     if len(found) != 1:
-        named = "footprints" if polygons else "guides"
-        return _facts("geopackage", None, layers, None, [f"{len(found)} layers could be the {named}: give one"], shapes)
+        return _facts("geopackage", None, layers, None, [_several(layers, has_polygons=bool(polygons))], shapes)
     table = layers[0].replace('"', '""')
     count = int(database.execute(f'SELECT count(*) FROM "{table}"').fetchone()[0])  # noqa: S608 - quoted; SQLite takes no names as parameters
     if count == 0:
@@ -205,7 +259,7 @@ def _check_table(path: Path, database: sqlite3.Connection, name: str) -> None:
 
 def _geojson(path: Path, head: bytes) -> dict[str, Any]:
     """GeoJSON, by one pass over its brackets."""
-    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip().removeprefix(RECORD)
     if not text.startswith(b"{"):
         raise UnreadableInputError(str(path), f"not GeoJSON: it begins with {head[:16]!r}", FIX)
     member = MEMBER.search(text)
@@ -225,7 +279,8 @@ def _geojson(path: Path, head: bytes) -> dict[str, Any]:
         raise UnreadableInputError(str(path), f"truncated: {depth} brackets are not closed", FIX)
     if member[1] == b"FeatureCollection" and count == 0:
         raise EmptyInputError(str(path), "the collection has no features", FIX)
-    shapes = _shapes_within(path) if path.stat().st_size <= PARSED_BYTES else (POLYGONS, LINES)
+    is_parsed = path.stat().st_size <= PARSED_BYTES and not is_lines(path)
+    shapes = _shapes_within(path) if is_parsed else (POLYGONS, LINES)
     named = CRS_NAME.search(text)
     name = named[1].decode() if named else "WGS 84 (CRS84)"
     code = re.search(r"EPSG:(?:[\d.]*:)?(\d{4,6})$", name)

@@ -15,6 +15,7 @@ INPUTS: Mapping[str, str] = {
     "--bbox and --aoi": "the input bbox",
     "--bbox": "the input bbox",
     "--footprints": "the input footprints",
+    "--layer": "the input footprintsLayer",
     "--guides": "the input guides",
     "--classes": "the input classes",
     "--allow-outside-area-of-use": "the input allowOutsideAreaOfUse",

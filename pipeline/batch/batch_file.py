@@ -43,6 +43,7 @@ class InputsTable(Parameters):
         False, "Accept inputs that lie far outside the area of use of their CRS."
     )
     footprints: str = parameter("", "Building outlines to model; empty finds the buildings in the points.")
+    footprints_layer: str = parameter("", "Layer of the outlines, where their file has several.")
     guides: str = parameter("", "Lines of roofs that models follow.")
     overrides: str = parameter("", "File with manual overrides for single buildings.")
     aoi: str = parameter("", "Vector file with polygons; only points inside them are used.")
@@ -216,6 +217,7 @@ class Batch:
             out=self.out,
             settings=self.settings,
             footprints=given(self.inputs.footprints),
+            footprints_layer=self.inputs.footprints_layer or None,
             guides=given(self.inputs.guides),
             overrides=given(self.inputs.overrides),
             crs=self.inputs.crs or None,

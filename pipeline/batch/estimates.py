@@ -126,7 +126,7 @@ def _estimated(batch: Batch, worth_s: float, known: tuple[int, int]) -> Estimate
             shown(paths[0]), f"all {len(paths)} inputs lie off --bbox and --aoi", "Check them, and their CRS"
         )
     buildings, known_from = None, None
-    given = footprints_of_run(request.footprints, plan, request.settings.footprints)
+    given = footprints_of_run(request.footprints, plan, request.settings.footprints, request.footprints_layer)
     if given is not None:
         buildings, known_from = len(given.polygons), "the given footprints"
         work = dataclasses.replace(work, buildings=buildings)

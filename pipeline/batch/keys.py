@@ -18,6 +18,7 @@ KEYS: Mapping[str, str] = {
     "--vertical-unit": "[inputs] vertical_unit",
     "--allow-outside-area-of-use": "[inputs] allow_outside_area_of_use = true",
     "--footprints": "[inputs] footprints",
+    "--layer": "[inputs] footprints_layer",
     "--guides": "[inputs] guides",
     "--workers 1": "[cluster] workers = 1",
     "--workers": "[cluster] workers",

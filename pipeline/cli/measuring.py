@@ -13,6 +13,7 @@ from pipeline.cli.options import (
     AsJson,
     AsSurveyed,
     Crs,
+    Layer,
     Points,
     Quiet,
     SettingsFile,
@@ -117,6 +118,7 @@ def evaluate(
     truth: Truth = None,
     points: Points = None,
     footprints: Annotated[str | None, typer.Option(metavar="FILE", help="Building outlines for the points.")] = None,
+    layer: Layer = None,
     ground: Annotated[
         list[str] | None,
         typer.Option(metavar="FILE", help="The same points, classified by another program: judge its ground."),
@@ -153,6 +155,7 @@ def evaluate(
             truth=truth,
             points=tuple(points or ()),
             footprints=footprints,
+            footprints_layer=layer,
             ground=tuple(ground or ()),
             wireframes=wireframes,
             crs=crs,

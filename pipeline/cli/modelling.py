@@ -24,6 +24,7 @@ from pipeline.cli.options import (
     Guides,
     InputTimeout,
     Isolate,
+    Layer,
     Licence,
     Lods,
     Meshes,
@@ -67,6 +68,7 @@ def reconstruct(
     ] = None,
     lods: Lods = None,
     footprints: Footprints = None,
+    layer: Layer = None,
     guides: Guides = None,
     overrides: Annotated[
         str | None,
@@ -116,6 +118,7 @@ def reconstruct(
                 settings, method=method, preset=preset, classes=classes, lods=_in_order(lods), terrain=terrain
             ),
             footprints=footprints,
+            footprints_layer=layer,
             guides=guides,
             overrides=overrides,
             crs=crs,
@@ -209,6 +212,7 @@ def compare(
     ],
     out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: one run per method, and the page.")],
     footprints: Footprints = None,
+    layer: Layer = None,
     guides: Guides = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
@@ -260,6 +264,7 @@ def compare(
                 out=out,
                 settings=RunSettings.from_mapping(table),
                 footprints=footprints,
+                footprints_layer=layer,
                 guides=guides,
                 crs=crs,
                 vertical_unit=vertical_unit,
@@ -289,6 +294,7 @@ def compare(
                 truth=truth,
                 points=tuple(points or ()),
                 footprints=footprints if points else None,
+                footprints_layer=layer if points else None,
                 crs=crs,
                 vertical_unit=vertical_unit,
                 as_surveyed=as_surveyed,
@@ -394,6 +400,8 @@ def show_summary(console: Console, summary: RunSummary) -> None:
     """The results of a run, as tables."""
     from pipeline.cli.measuring import show_statistics
 
+    if summary.headline:
+        console.say(f"warning: {summary.headline}")
     show_statistics(console, _statistics_of(summary.run_dir))
     console.table(
         "Time", ["stage", "wall clock"], [(k, f"{seconds:.1f} s") for k, seconds in summary.timings_s.items()]

@@ -69,7 +69,13 @@ Lods = Annotated[
 ]
 Footprints = Annotated[
     str | None,
-    typer.Option(metavar="FILE", help="Building outlines (GeoPackage, GeoJSON, Shapefile, GeoParquet) to model."),
+    typer.Option(
+        metavar="FILE",
+        help="Building outlines to model: GeoPackage, GeoJSON, Shapefile and others; docs/reference/formats.md.",
+    ),
+]
+Layer = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Layer of the footprints, where their file has several.")
 ]
 Guides = Annotated[
     str | None,

@@ -1,8 +1,8 @@
 """Points as text, one row each: `x y z [intensity] ...`, or first and last echo of a pulse side by side in a row.
 
 Columns are parted by white space, commas or semicolons, decimals by points. Rows that begin with `#`, `//` or `%` are
-comments; lines of words above the first row of numbers are a header, and where the last of them names as many columns
-as the rows have, the names are used. The form with two echoes, `x1 y1 z1 [i1] x2 y2 z2 [i2]`, is recognised by what a
+comments; lines of words above the first row of numbers are a header, and the names of columns in it are used
+(`pipeline.io.ascii_names`). The form with two echoes, `x1 y1 z1 [i1] x2 y2 z2 [i2]`, is recognised by what a
 pulse can do, or set by `ascii_columns`.
 """
 
@@ -16,27 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, SettingsError, UnreadableInputError
+from pipeline.io.ascii_names import COMMENT, SEPARATORS, columns_of, header_columns, is_complete
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.readable import Readable
 from pipeline.io.reading import moved
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
 from pipeline.io.strays import thinned, typical_bounds
 from pipeline.model import FloatArray
-
-COLUMN_NAMES = {
-    "x": ("x", "easting", "east", "x1"),
-    "y": ("y", "northing", "north", "y1"),
-    "z": ("z", "elevation", "z1"),
-    "x2": ("x2",),
-    "y2": ("y2",),
-    "z2": ("z2",),
-    "return_number": ("return_number", "returnnumber", "rn"),
-    "return_count": ("return_count", "number_of_returns", "numberofreturns", "nr"),
-    "classification": ("classification", "class", "c"),
-    "gps_time": ("gps_time", "gpstime", "t"),
-    "source_id": ("source_id", "point_source_id", "pointsourceid"),
-}
-"""What a column can be called; any other name, such as intensity or `-`, is read over."""
 
 SAMPLE_ROWS = 20_000
 HEADER_LINES = 50
@@ -54,8 +40,6 @@ BEAM_TAN = 1.0
 SHARE_OF_ROWS = 0.99
 """Rows that must look like one pulse before a file is read as pulses."""
 
-COMMENT = re.compile(rb"\s*(#|//|%)")
-SEPARATORS = bytes.maketrans(b",;", b"  ")
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
 
@@ -73,7 +57,7 @@ class AsciiFile:
     Raises
     ------
     UnreadableInputError
-        If there are no rows of numbers, or a row differs from the others.
+        If there are no rows of numbers, a row differs from the others, or a header is not understood.
     InconsistentInputError
         If a coordinate is NaN or infinite.
     SettingsError
@@ -85,8 +69,8 @@ class AsciiFile:
         self._width = 0
         self._separator: str | None = None
         self._promised: int | None = None
-        self._header_lines, names, sample = self._look(path)
-        self._columns = self._choose(columns, names, sample)
+        self._header_lines, header, sample = self._look(path)
+        self._columns = self._choose(columns, header, sample)
         self._is_pairs = "x2" in self._columns
         self.facts = self._measure(sample) if facts is None else facts
 
@@ -143,9 +127,9 @@ class AsciiFile:
             problem = f"line {number} is {line[:60].decode(errors='replace').strip()!r}, not {self._width} numbers"
             raise UnreadableInputError(str(self._path), problem, "Remove or repair the line") from fault
 
-    def _look(self, path: Readable) -> tuple[int, list[str], FloatArray]:
-        """Lines of header, the names that the last of them gives, and the first rows."""
-        names: list[str] = []
+    def _look(self, path: Readable) -> tuple[int, list[bytes], FloatArray]:
+        """The number of lines above the rows, those of them that are not blank, and the first rows."""
+        header: list[bytes] = []
         with path.open("rb") as stream:
             for skipped in range(HEADER_LINES):
                 line = stream.readline(LINE_LIMIT).removeprefix(BYTE_ORDER_MARK)
@@ -154,10 +138,9 @@ class AsciiFile:
                     self._separator = self._separator_of(line)
                     self._width = len(fields)
                     sample = self._parse([line, *_some_lines(stream, SAMPLE_ROWS * BYTES_A_ROW)], skipped)
-                    return skipped, names, sample
+                    return skipped, header, sample
                 if fields:
-                    names = [word.decode(errors="replace").strip("#/%\"'").lower() for word in fields]
-                    names = [name for name in names if name]
+                    header.append(line)
                     lonely = path.suffix.lower() == ".pts" and len(fields) == 1 and fields[0].isdigit()
                     self._promised = int(fields[0]) if lonely else None
         raise UnreadableInputError(
@@ -179,19 +162,19 @@ class AsciiFile:
             )
         return None
 
-    def _choose(self, wanted: str | None, names: list[str], sample: FloatArray) -> dict[str, int]:
+    def _choose(self, wanted: str | None, header: list[bytes], sample: FloatArray) -> dict[str, int]:
         """Column by field: as set, else as the header names them, else x y z, else a row of two echoes."""
         if wanted is not None:
-            columns = _columns_of(wanted.lower().replace(",", " ").split())
+            columns = columns_of(wanted.lower().replace(",", " ").split())
             count = len(wanted.replace(",", " ").split())
-            if not _is_complete(columns) or count != self._width:
+            if not is_complete(columns) or count != self._width:
                 raise SettingsError(
                     [f"ascii_columns is {wanted!r}: name x y z (or x1 y1 z1 x2 y2 z2) among the {self._width} columns"]
                 )
             return columns
-        columns = _columns_of(names) if len(names) == self._width else {}
-        if _is_complete(columns):
-            return columns
+        named = header_columns(str(self._path), header, self._separator, self._width)
+        if named is not None:
+            return named
         half = self._width // 2
         if self._width in {6, 8} and looks_like_pulses(sample[:, :3], sample[:, half : half + 3]):
             return {"x": 0, "y": 1, "z": 2, "x2": half, "y2": half + 1, "z2": half + 2}
@@ -307,15 +290,3 @@ def _is_numbers(fields: list[bytes]) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _columns_of(names: list[str]) -> dict[str, int]:
-    """Column by field, of those names that are known."""
-    fields = {alias: field for field, aliases in COLUMN_NAMES.items() for alias in aliases}
-    return {fields[name]: at for at, name in reversed(list(enumerate(names))) if name in fields}
-
-
-def _is_complete(columns: dict[str, int]) -> bool:
-    """Whether a point, and a second one where one is begun, has all coordinates."""
-    second = [name in columns for name in ("x2", "y2", "z2")]
-    return all(name in columns for name in ("x", "y", "z")) and all(second) == any(second)

@@ -18,7 +18,8 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.io.crs import LARGEST_COORDINATE, SpatialReference
-from pipeline.io.placed_features import boxes_around, in_metres
+from pipeline.io.nearby import AREAS, POLYGONS, Shape
+from pipeline.io.placed_features import NOT_ELSEWHERE, Elsewhere, boxes_around, in_metres
 from pipeline.io.repairs import EDGES_LIMIT, LOOKS_OF_FILE, Repairs, crossings
 from pipeline.io.urls import shown
 from pipeline.io.vector_layer import VectorLayer, read_layer
@@ -39,7 +40,7 @@ ID_COLUMNS = (
     "ogc_fid",
     "objectid",
 )
-"""Columns that hold a building's own id, in this order; one with gaps or repeats is passed over."""
+"""Columns that hold a building's own id. The first one without gaps and repeats counts, else the one with fewest."""
 
 PROBLEMS = {
     "no_geometry": "without a geometry",
@@ -53,11 +54,14 @@ PROBLEMS = {
     "invalid": "invalid",
     "tangled": "invalid with too many crossings to be repaired",
     "bad_value": "with an attribute that cannot be used",
+    "overlap": "covered by another one",
 }
 """What can be wrong with a footprint, and how a message counts it."""
 LARGEST_OUTLINE_M = 20_000.0
 """Longest side of an outline. Not a setting: the longest buildings have 3 km, and a wrong coordinate makes an outline
 that reaches over thousands of tiles."""
+_LEAST_DISTINCT = 0.5
+"""Smallest share of rows that a column of ids must distinguish: some programs add one of zeros."""
 AREA_CROSSINGS = 1_000_000
 """Maximum number of crossings between the edges of an area of interest; uniting more takes a minute and gigabytes."""
 
@@ -89,7 +93,7 @@ class Footprints:
     """Given outlines of buildings. All tuples have one length."""
 
     ids: tuple[str, ...]
-    """The buildings' own ids, each once."""
+    """The buildings' own ids; several have one where the file says so."""
     polygons: tuple[Polygon | MultiPolygon, ...]
     """2D, valid, in metres of the run's CRS."""
     attributes: tuple[dict[str, Any], ...]
@@ -102,8 +106,8 @@ class Footprints:
     """What was repaired, left out or assumed, one sentence each."""
     issues: tuple[FootprintIssue, ...] = ()
     """Every feature that was repaired or left out, in the file's order."""
-    elsewhere: int = 0
-    """Polygons of the file that were passed over, since they lie off the area that was asked for."""
+    elsewhere: Elsewhere = NOT_ELSEWHERE
+    """Polygons of the file that were passed over."""
 
     def __len__(self) -> int:
         """Number of footprints."""
@@ -119,6 +123,7 @@ def read_footprints(
     crs: str | None = None,
     area: shapely.Geometry | None = None,
     largest_m: float = LARGEST_OUTLINE_M,
+    shape: Shape = POLYGONS,
 ) -> Footprints:
     """Footprints of a vector file, reprojected where its CRS is not the run's.
 
@@ -136,6 +141,8 @@ def read_footprints(
         Overrides the file's CRS.
     largest_m : float
         Size in metres above which a polygon is left out.
+    shape : Shape
+        What the polygons are to the reader of a message.
     area : Geometry, optional
         Where footprints are wanted, in metres of the run's CRS. Of a file that covers a country all others are passed
         over unread, but for features whose place is not known. The boxes around its parts decide, 100 m wider: who
@@ -158,7 +165,7 @@ def read_footprints(
     def boxes(own: str | None) -> npt.NDArray[np.float64] | None:
         return None if area is None else boxes_around(area, own if crs is None else crs, reference, name)
 
-    found = read_layer(path, layer, None if area is None else boxes)
+    found = read_layer(path, layer, None if area is None else boxes, shape)
     warnings += found.warnings
     problems: dict[int, tuple[str, str]] = {}
     actions: dict[int, str] = {}
@@ -168,7 +175,7 @@ def read_footprints(
         lost = f"none of the {len(found.geometries)} features is a polygon"
         raise EmptyInputError(name, lost, "Give polygons of buildings")
     polygons = shapely.force_2d(geometries[kept])
-    polygons = in_metres(name, "footprints", polygons, found.crs if crs is None else crs, reference, warnings)
+    polygons = in_metres(name, shape.named, polygons, found.crs if crs is None else crs, reference, warnings)
     whole = _within(polygons, LARGEST_COORDINATE)
     for row in kept[~whole].tolist():
         problems[row] = ("outside_crs", "it cannot be reprojected to the run's CRS")
@@ -183,7 +190,7 @@ def read_footprints(
         size = f" of at most {largest_m:g} m" if len(small) > small.sum() else ""
         raise EmptyInputError(name, f"no polygon{size} has an area", "Give polygons of buildings")
     table = {field: [_plain(value) for value in column] for field, column in found.columns.items()}
-    ids, ids_of_all = _ids(name, table, found.feature_ids, kept, id_column)
+    ids_of_all = _ids(name, table, found.feature_ids, kept, id_column, warnings)
     issues = tuple(
         FootprintIssue(
             feature=int(found.feature_ids[row]),
@@ -196,14 +203,14 @@ def read_footprints(
         for row, (problem, detail) in sorted(problems.items())
     )
     return Footprints(
-        ids=ids,
+        ids=tuple(ids_of_all[row] for row in kept),
         polygons=tuple(polygons.tolist()),
         attributes=tuple({field: table[field][row] for field in table} for row in kept.tolist()),
         features=tuple(found.feature_ids[kept].tolist()),
         columns=tuple(found.columns),
         warnings=(*warnings, *_summary(issues)),
         issues=issues,
-        elsewhere=found.elsewhere,
+        elsewhere=Elsewhere(found.elsewhere, found.bounds_elsewhere, found.crs if crs is None else crs),
     )
 
 
@@ -299,38 +306,54 @@ def _ids(
     feature_ids: npt.NDArray[np.int64],
     kept: npt.NDArray[np.int64],
     id_column: str | None,
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The ids of the rows that are kept, and of all rows; of a column, or the file's own feature ids."""
+    warnings: list[str],
+) -> tuple[str, ...]:
+    """The ids of all rows: of a column, with the file's own number of the feature where it is empty, else that number.
+
+    A column that distinguishes most of the rows that are kept is taken as it is, with a warning.
+    """
     by_lower = {field.lower(): field for field in reversed(list(table))}
-    if id_column is not None:
-        if id_column not in table:
-            raise UnreadableInputError(
-                name, f"column {id_column!r} is not there", f"Name one of the columns {', '.join(table) or '(none)'}"
-            )
-        if not _identifies([table[id_column][row] for row in kept]):
-            raise InconsistentInputError(
-                name, f"the ids in column {id_column!r} are empty or not unique", "Name another column, or none"
-            )
-    chosen = id_column or next(
-        (
-            by_lower[common]
-            for common in ID_COLUMNS
-            if common in by_lower and _identifies([table[by_lower[common]][row] for row in kept])
-        ),
-        None,
-    )
+    if id_column is not None and id_column not in table:
+        raise UnreadableInputError(
+            name, f"column {id_column!r} is not there", f"Name one of the columns {', '.join(table) or '(none)'}"
+        )
+    common = [by_lower[one] for one in ID_COLUMNS if one in by_lower]
+    single = {
+        field: _single([table[field][row] for row in kept]) for field in (common if not id_column else [id_column])
+    }
+    if id_column is not None and single[id_column] < len(kept):
+        raise InconsistentInputError(
+            name, f"the ids in column {id_column!r} are empty or not unique", "Name another column, or none"
+        )
+    # the first of those that distinguish most
+    chosen = max(single, key=lambda field: single[field], default=None)
+    if chosen is not None and single[chosen] < _LEAST_DISTINCT * len(kept):
+        chosen = None
+    if chosen is not None and single[chosen] < len(kept):
+        warnings.append(_repeated(chosen, [table[chosen][row] for row in kept]))
     own = [None] * len(feature_ids) if chosen is None else table[chosen]
-    of_all = tuple(
+    return tuple(
         str(int(number)) if value in (None, "") else str(value) for value, number in zip(own, feature_ids, strict=True)
     )
-    return tuple(of_all[row] for row in kept), of_all
 
 
-def _identifies(values: list[Any]) -> bool:
-    """Whether values are whole numbers or text, without gaps, each once."""
-    return all(isinstance(value, int | str) and value != "" for value in values) and len(set(map(str, values))) == len(
-        values
-    )
+def _single(values: list[Any]) -> int:
+    """How many of some values are whole numbers or text that no other one repeats; 0 where there are other values."""
+    if not all(value is None or isinstance(value, int | str) for value in values):
+        return 0
+    return sum(count == 1 for value, count in Counter(map(str, values)).items() if value not in ("None", ""))
+
+
+def _repeated(column: str, values: list[Any]) -> str:
+    """The warning about ids that are empty or repeated."""
+    counts = Counter("" if value is None else str(value) for value in values)
+    empty = counts.pop("", 0)
+    repeated = [f"{value!r} {count} times" for value, count in counts.items() if count > 1]
+    found = [f"is empty {empty} times"] if empty else []
+    if repeated:
+        more = f" and {len(repeated) - 3} more" if len(repeated) > 3 else ""
+        found.append(f"holds {', '.join(repeated[:3])}{more}")
+    return f"column {column!r} {' and '.join(found)}: source_id is what it says, or else the number of the feature"
 
 
 def _plain(value: Any) -> Any:
@@ -354,7 +377,7 @@ def _plain(value: Any) -> Any:
 
 def read_area(path: str | Path, reference: SpatialReference) -> Polygon | MultiPolygon:
     """The area of interest that the polygons of a vector file cover together, in the units of the run's CRS."""
-    found = read_footprints(path, reference, largest_m=math.inf)
+    found = read_footprints(path, reference, largest_m=math.inf, shape=AREAS)
     for issue in found.issues:
         # an area without one of its parts is another area
         if issue.problem == "tangled":

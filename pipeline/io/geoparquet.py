@@ -110,7 +110,15 @@ def read_geoparquet(
         for field, values in zip(table.column_names, table.columns, strict=True):
             if field != about.name and field not in attributes:  # of two columns of one name the first
                 attributes[field] = _values(values, field, numbers, texts)
-    return EncodedLayer(about.crs, numbers, np.concatenate(geometries), attributes, nearby.elsewhere, texts.warnings)
+    return EncodedLayer(
+        about.crs,
+        numbers,
+        np.concatenate(geometries),
+        attributes,
+        nearby.elsewhere,
+        texts.warnings,
+        nearby.bounds_elsewhere,
+    )
 
 
 def _check_size(path: Path, what: str, count: int, limit: int) -> None:

@@ -16,7 +16,7 @@ from shapely import LineString
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io.crs import LARGEST_COORDINATE, SpatialReference
 from pipeline.io.nearby import Shape
-from pipeline.io.placed_features import boxes_around, in_metres
+from pipeline.io.placed_features import Elsewhere, boxes_around, in_metres
 from pipeline.io.urls import shown
 from pipeline.io.vector_layer import VectorLayer, read_layer
 from pipeline.model import Guide, GuideKind
@@ -63,8 +63,8 @@ class GivenLines:
     """What was left out or assumed, one sentence each."""
     issues: tuple[GuideIssue, ...]
     """Every feature that was left out, in the file's order."""
-    elsewhere: int
-    """Lines of the file that were passed over, since they lie off the area that was asked for."""
+    elsewhere: Elsewhere
+    """Lines of the file that were passed over."""
 
 
 def read_guides(
@@ -115,7 +115,8 @@ def read_guides(
         GuideIssue(feature=int(found.feature_ids[row]), problem=problem, detail=detail)
         for row, (problem, detail) in sorted(problems.items())
     )
-    return GivenLines(guides=guides, warnings=(*warnings, *_summary(issues)), issues=issues, elsewhere=found.elsewhere)
+    elsewhere = Elsewhere(found.elsewhere, found.bounds_elsewhere, found.crs)
+    return GivenLines(guides=guides, warnings=(*warnings, *_summary(issues)), issues=issues, elsewhere=elsewhere)
 
 
 def _lines_only(layer: VectorLayer, problems: dict[int, tuple[str, str]]) -> npt.NDArray[np.object_]:

@@ -36,7 +36,8 @@ from pipeline.io.readable import Readable
 from pipeline.io.reading import moved
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Share, Window
 from pipeline.io.remote_file import bytes_of
-from pipeline.io.strays import typical_bounds
+from pipeline.io.strays import Bounds, header_box_problem, typical_bounds
+from pipeline.model import FloatArray
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -355,7 +356,7 @@ class LasFile:
         return FileFacts(
             format="copc" if self._copc is not None else "laz" if block.compressed else "las",
             point_count=block.point_count,
-            bounds=self._bounds(),
+            bounds=self._bounds(sample.xyz),
             crs=found.crs,
             horizontal_unit_m=found.horizontal_unit_m,
             vertical_unit_m=found.vertical_unit_m,
@@ -370,14 +371,16 @@ class LasFile:
             warnings=tuple(self._warnings),
         )
 
-    def _bounds(self) -> tuple[float, float, float, float, float, float]:
-        """The header's bounds; if they are impossible, those of a pass over the points."""
+    def _bounds(self, sample: FloatArray) -> Bounds:
+        """The header's bounds; those of a pass over the points where they cannot be, or some points contradict them."""
         lows, highs = np.array(self._header.mins), np.array(self._header.maxs)
-        if not (np.isfinite(lows).all() and np.isfinite(highs).all() and (lows <= highs).all()):
-            self._warnings.append(
-                f"the header's bounds {lows.tolist()} to {highs.tolist()} cannot be: taken from the points"
-            )
-            lows, highs = apart(self._bounds_of_points, str(self._path))
+        problem = header_box_problem(lows, highs, sample)
+        if problem is not None:
+            measured = apart(self._bounds_of_points, str(self._path))
+            if not np.allclose((lows, highs), measured, rtol=0.0, atol=1.0):
+                box = f"the header's bounds {lows.tolist()} to {highs.tolist()}"
+                self._warnings.append(f"{box} {problem}: taken from the points")
+            lows, highs = measured
         x_min, y_min, z_min, x_max, y_max, z_max = (float(value) for value in (*lows, *highs))
         return x_min, y_min, z_min, x_max, y_max, z_max
 

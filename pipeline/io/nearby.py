@@ -43,10 +43,19 @@ class Shape(NamedTuple):
     """The single one and the multiple one."""
     named: str
     """What they are to the reader of a message."""
+    choose: str = "Give a file with one of its layers"
+    """What to do where several layers hold such features; their names follow."""
 
 
-POLYGONS = Shape("Polygon", (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON), "footprints")
+POLYGONS = Shape(
+    "Polygon",
+    (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON),
+    "footprints",
+    "Name one of its layers with --layer",
+)
 """The default."""
+AREAS = POLYGONS._replace(named="area", choose=Shape._field_defaults["choose"])
+"""Polygons of areas of interest."""
 
 
 class Nearby:
@@ -65,6 +74,8 @@ class Nearby:
         self._tree = None if boxes is None else shapely.STRtree(shapely.box(*np.reshape(boxes, (-1, 4)).T))
         self.elsewhere = 0
         """Polygons, or what the shape says, that were passed over."""
+        self.bounds_elsewhere: tuple[float, ...] | None = None
+        """xmin, ymin, xmax, ymax of these in the layer's CRS; None where there are none."""
 
     @property
     def all(self) -> bool:
@@ -80,6 +91,10 @@ class Nearby:
         placed = np.isfinite(shapely.bounds(geometries)).all(axis=-1)
         near[placed] = False
         near[np.flatnonzero(placed)[np.unique(self._tree.query(geometries[placed])[0])]] = True
-        kinds = shapely.get_type_id(geometries[~near])
-        self.elsewhere += int(np.isin(kinds, self._kinds).sum())
+        far = geometries[~near]
+        far = far[np.isin(shapely.get_type_id(far), self._kinds)]
+        self.elsewhere += len(far)
+        if len(far):
+            known = [] if self.bounds_elsewhere is None else [shapely.box(*self.bounds_elsewhere)]
+            self.bounds_elsewhere = tuple(shapely.total_bounds([*far, *known]).tolist())
         return near

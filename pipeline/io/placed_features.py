@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import shapely
 
-from pipeline.errors import CrsError
+from pipeline.errors import CrsError, EmptyInputError, InputError
 from pipeline.io.crs import SpatialReference, horizontal_part, horizontal_unit_of, parse_crs
 
 if TYPE_CHECKING:
@@ -17,8 +19,26 @@ if TYPE_CHECKING:
 
 ACCURACY_LIMIT_M = 0.5
 """A coarser reprojection gives a warning."""
+LARGEST_LONGITUDE = 360.0
+"""Degrees; no coordinate of a place on the globe is larger, by any habit of counting."""
 AROUND_M = 100.0
 """How far off an area features are still read: more than its edges bend, and operations differ, between two CRS."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Elsewhere:
+    """The features of a file that were passed over, since they lie off the area that was asked for."""
+
+    count: int = 0
+    """Their number."""
+    bounds: tuple[float, ...] | None = None
+    """xmin, ymin, xmax, ymax of all in the file's CRS; None where there are none."""
+    crs: str | None = None
+    """That CRS; None where it is unknown."""
+
+
+NOT_ELSEWHERE = Elsewhere()
+"""None."""
 
 
 def boxes_around(
@@ -40,6 +60,53 @@ def boxes_around(
         if not np.isfinite(boxes).all() or (boxes[:, :2] > boxes[:, 2:]).any():
             return None
     return boxes
+
+
+def off_the_data(
+    name: str,
+    what: str,
+    found: Elsewhere,
+    area: shapely.Geometry,
+    reference: SpatialReference,
+) -> InputError:
+    """The error for a file of which no feature lies on the data, with both places and what may be wrong.
+
+    `area` is that of the data in metres of the run's CRS; `what` names the features.
+    """
+    own = None if found.crs is None else horizontal_part(parse_crs(found.crs, path=name))
+    if own is not None and found.bounds is not None and (fault := _not_degrees(name, what, found.bounds, own)):
+        return fault
+    there = (
+        "" if found.bounds is None else f": they lie at {_place(found.bounds)}{'' if own is None else f' ({own.name})'}"
+    )
+    boxes = None if area.is_empty else boxes_around(area, found.crs, reference, name)
+    data = None if boxes is None else (*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist())
+    problem = f"none of its {what} lies on the data{there}"
+    fix = f"Check the CRS of the {what} and that of the points, and --bbox and --aoi where they are given"
+    if data is not None and found.bounds is not None:
+        problem += f", the data at {_place(data)}"
+        if shapely.box(*(found.bounds[k] for k in (1, 0, 3, 2))).intersects(shapely.box(*data)):
+            fix = f"Write x before y, longitude before latitude: the {what} have them swapped"
+    return EmptyInputError(name, problem, fix)
+
+
+def _place(bounds: Sequence[float]) -> str:
+    """Bounds in words."""
+    x_min, y_min, x_max, y_max = bounds
+    return f"x {x_min:.9g} to {x_max:.9g}, y {y_min:.9g} to {y_max:.9g}"
+
+
+def _not_degrees(name: str, what: str, bounds: Sequence[float], own: pyproj.CRS) -> CrsError | None:
+    """The error for coordinates in a geographic CRS that cannot be degrees; None where they can."""
+    x_min, y_min, x_max, y_max = bounds
+    most = LARGEST_LONGITUDE
+    if not own.is_geographic or (x_min <= most and y_min <= most and x_max >= -most and y_max >= -most):
+        return None
+    return CrsError(
+        name,
+        f"the {what} are in {own.name!r}, in degrees, which x {x_max:.9g}, y {y_max:.9g} cannot be",
+        "Write their CRS into the file: GeoJSON without a member crs is in degrees",
+    )
 
 
 def in_metres(
@@ -67,6 +134,8 @@ def in_metres(
             )
         warnings.append(f"the points' CRS is unknown: that of the {what}, {own.name!r}, is assumed to be the same")
     elif len(features) and not own.equals(target, ignore_axis_order=True):
+        if fault := _not_degrees(name, what, shapely.total_bounds(features).tolist(), own):
+            raise fault
         features = _reprojected(name, what, features, own, target, warnings)
     if reference.horizontal_unit_m == 1.0:
         return features

@@ -21,7 +21,7 @@ from pipeline.io.readable import Readable
 from pipeline.io.reading import one_input
 from pipeline.io.records import DivisibleFile, FileFacts, PointFile, PointRecords, Share, Window
 from pipeline.io.remote_file import RemoteFile, etag_of, file_at
-from pipeline.io.strays import MOST_STRAYS, off_earth, without_strays
+from pipeline.io.strays import MOST_STRAYS, ROUNDING, off_earth, without_strays
 from pipeline.model import BoolArray, ByteArray, FloatArray, PointCloud
 
 if TYPE_CHECKING:
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 NOISE_CLASSES = (7, 18)
 """ASPRS low point (noise) and high noise."""
-ROUNDING = 0.02
-"""Units of the CRS by which writers round the bounds in their headers."""
 IMPOSSIBLE_DENSITY = 1e5
 """Points a square unit that no airborne survey has in metres or feet; one point a square metre is 1e10 a degree."""
 

@@ -29,6 +29,8 @@ MARGIN_M = 1e4
 _OUTERMOST = 0.01
 """Share of a sample that is left out at either end of an axis; strays are rarer."""
 _PER_PIECE = 2_000
+ROUNDING = 0.02
+"""Units of the CRS by which writers round the bounds in their headers."""
 
 
 def off_earth(xyz: FloatArray, factors: FloatArray) -> BoolArray | None:
@@ -58,6 +60,26 @@ def typical_bounds(samples: Iterable[FloatArray]) -> Bounds:
     if (low > high).any():  # two points or fewer
         low, high = ordered[0], ordered[-1]
     return float(low[0]), float(low[1]), float(low[2]), float(high[0]), float(high[1]), float(high[2])
+
+
+def header_box_problem(lows: FloatArray, highs: FloatArray, sample: FloatArray) -> str | None:
+    """What is wrong with the bounds in a header, (3,) each, by some points of the file (n, 3); None if nothing is.
+
+    >>> some = np.array([[5.0, 5.0, 1.0], [6.0, 7.0, 2.0]])
+    >>> header_box_problem(np.zeros(3), np.zeros(3), some)
+    'do not hold the points, such as x 5, y 5, z 1'
+    >>> header_box_problem(some[0], some[1], some) is None
+    True
+    """
+    if not (np.isfinite(lows).all() and np.isfinite(highs).all() and (lows <= highs).all()):
+        return "cannot be"
+    outside = ((sample < lows - ROUNDING) | (sample > highs + ROUNDING)).any(axis=1)
+    if outside.mean() > MOST_STRAYS:
+        x, y, z = sample[np.argmax(outside)].tolist()
+        return f"do not hold the points, such as x {x:.10g}, y {y:.10g}, z {z:.10g}"
+    extent = np.ptp(sample, axis=0)
+    wide = (highs - lows > WIDE_M) & (highs - lows > TIMES_WIDER * extent)
+    return "are far wider than the points" if wide.any() else None
 
 
 def without_strays(bounds: Bounds, typical: Bounds | None, factors: FloatArray) -> tuple[Bounds, tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""One layer of a vector file, unchanged: GeoPackage, GeoJSON, Shapefile or GeoParquet.
+"""One layer of a vector file, unchanged: GeoParquet, or a format that GDAL reads.
 
 Of a file that covers a country, only what lies near the data is kept: its geometries go by in batches, and the columns
 of the others are never read (GDAL), or let go batch by batch (GeoParquet).
@@ -21,6 +21,7 @@ from pipeline.io.gdal_layer import read_by_gdal
 from pipeline.io.nearby import POLYGONS, Boxes, Shape
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.urls import is_url, shown
+from pipeline.io.vector_archive import unpacked
 from pipeline.io.wkb import geometries_of
 
 PARQUET_MAGIC = b"PAR1"
@@ -42,6 +43,8 @@ class VectorLayer:
     """All columns but the geometry, by name."""
     elsewhere: int = 0
     """Features of the wanted shape that were passed over, since they lie off the boxes."""
+    bounds_elsewhere: tuple[float, ...] | None = None
+    """xmin, ymin, xmax, ymax of these in the layer's CRS; None where there are none."""
     warnings: tuple[str, ...] = ()
     """What is odd but usable, one sentence each."""
 
@@ -64,12 +67,16 @@ def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None, 
     """
     label = shown(str(path))
     if is_url(path) and label.lower().endswith(".shp"):
-        raise UnreadableInputError(label, "a Shapefile is several files", "Give a GeoPackage, or fetch its files first")
+        raise UnreadableInputError(
+            label, "a Shapefile is several files", "Give a GeoPackage or a zip archive, or fetch its files first"
+        )
     with on_this_machine(path) as file:
+        inner = file
         try:
-            return _read(file, layer, boxes, shape)
+            with unpacked(file, layer, shape) as (inner, name):
+                return _read(inner, name, boxes, shape)
         except InputError as fault:
-            raise fault.of(label, str(file)) from fault
+            raise fault.of(label, str(inner)) from fault
 
 
 def _read(path: Path, layer: str | None, boxes: Boxes | None, shape: Shape) -> VectorLayer:
@@ -89,5 +96,6 @@ def _read(path: Path, layer: str | None, boxes: Boxes | None, shape: Shape) -> V
         unreadable=there & shapely.is_missing(geometries),
         columns=found.columns,
         elsewhere=found.elsewhere,
+        bounds_elsewhere=found.bounds_elsewhere,
         warnings=found.warnings,
     )

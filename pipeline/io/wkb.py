@@ -39,6 +39,8 @@ class EncodedLayer(NamedTuple):
     """Features of the wanted shape off the boxes, which were passed over."""
     warnings: tuple[str, ...]
     """What is odd but usable, one sentence each."""
+    bounds_elsewhere: tuple[float, ...] | None = None
+    """xmin, ymin, xmax, ymax of the features that were passed over, in the layer's CRS."""
 
 
 def geometries_of(wkb: npt.NDArray[np.object_]) -> npt.NDArray[np.object_]:

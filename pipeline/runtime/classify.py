@@ -71,6 +71,8 @@ class ClassifyRequest:
     """All settings; those of methods have no effect."""
     footprints: str | None = None
     """A vector file of building outlines; then only points inside them become buildings."""
+    footprints_layer: str | None = None
+    """Their layer, where the file has several; None for the only one."""
     crs: str | None = None
     """Overrides the CRS in the headers, and is written."""
     vertical_unit: str | None = None
@@ -155,7 +157,7 @@ def classify(
             raise InputError(shown(path), "classify reads files of this machine only", "Fetch it first")
     for info in plan.sources:
         check_writable(info)
-    footprints = footprints_of_run(request.footprints, plan, request.settings.footprints)
+    footprints = footprints_of_run(request.footprints, plan, request.settings.footprints, request.footprints_layer)
     for warning in () if footprints is None else footprints.warnings:
         progress.warn("plan", warning)
     unit_m = plan.reference.horizontal_unit_m

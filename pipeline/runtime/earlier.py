@@ -133,6 +133,7 @@ def request_of(manifest: RunManifest) -> RunRequest:
         out="",
         settings=settings,
         footprints=asked["footprints"],
+        footprints_layer=asked.get("footprints_layer"),
         guides=asked.get("guides"),
         crs=asked["crs"],
         vertical_unit=asked["vertical_unit"],

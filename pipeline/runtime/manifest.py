@@ -144,6 +144,8 @@ class RunManifest:
     """The warnings of the run."""
     strip_moves_m: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """By how many metres each flight strip (`point_source_id`) was moved up; empty where all strips fit."""
+    headline: str = ""
+    """The first warning, where it says why the result is empty; else empty."""
     content_sha256: str | None = None
     """`gablework digest` of the finished run; None where it was not computed."""
 

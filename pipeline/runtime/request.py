@@ -40,6 +40,8 @@ class RunRequest:
     """What the run runs with."""
     footprints: str | None = None
     """A vector file of the building outlines to model."""
+    footprints_layer: str | None = None
+    """Their layer, where the file has several; None for the only one."""
     guides: str | None = None
     """A vector file of lines of roofs."""
     overrides: str | None = None
@@ -143,6 +145,7 @@ def request_record(request: RunRequest) -> dict[str, object]:
     }
     return {
         **{name: None if path is None else _whole(path) for name, path in files.items()},
+        "footprints_layer": request.footprints_layer,
         "crs": request.crs,
         "vertical_unit": request.vertical_unit,
         "bbox": None if request.bbox is None else list(request.bbox),

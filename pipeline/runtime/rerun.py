@@ -50,8 +50,9 @@ from pipeline.runtime.run_context import RunContext, run_context
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import run_scratch
-from pipeline.runtime.stages.apply_overrides import WARNING, EntryOutcome, apply_overrides
+from pipeline.runtime.stages.apply_overrides import WARNING, EntryOutcome, about_no_effect, apply_overrides
 from pipeline.runtime.stages.batch_figures import REJECTED, Modelled
+from pipeline.runtime.stages.counts import NOTHING_FOUND
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints_of_run
 from pipeline.runtime.stages.given_guides import given_guides
@@ -154,7 +155,7 @@ def _rerun(
     if unknown:
         raise RunError(f"{', '.join(unknown)}: no building of {earlier.run_dir}. Give ids of its buildings table")
     plan, paths = plan_inputs(dataclasses.replace(wanted, resources=request.resources), progress, cancelled, executor)
-    footprints = footprints_of_run(wanted.footprints, plan, wanted.settings.footprints)
+    footprints = footprints_of_run(wanted.footprints, plan, wanted.settings.footprints, wanted.footprints_layer)
     guides = None
     if wanted.guides is not None:
         guides = given_guides(wanted.guides, plan, wanted.settings.building.guides.kind_column)
@@ -298,12 +299,13 @@ class _Search:
             return None
         boxes.extend((*o.point_m, *o.point_m) for o in overrides if o.point_m is not None)
         boxes.extend(o.footprint.bounds for o in overrides if o.footprint is not None)
-        given = {}
+        given: dict[str, list[tuple[float, ...]]] = {}
         if self.footprints is not None:
-            given = dict(zip(self.footprints.ids, self.footprints.polygons, strict=True))
+            for name, polygon in zip(self.footprints.ids, self.footprints.polygons, strict=True):
+                given.setdefault(name, []).append(polygon.bounds)
         for record in records.values():
             if record.source_id in given:
-                boxes.append(given[record.source_id].bounds)
+                boxes.extend(given[record.source_id])
             elif record.box is not None:
                 boxes.append(tuple(value * unit for value in record.box))
             else:
@@ -464,6 +466,13 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
     if request.overrides is not None:
         inputs.append(input_file(request.overrides))
     warnings = [text for text in earlier.manifest.warnings if not text.startswith(WARNING)]
+    headline = "" if earlier.manifest.headline not in warnings else earlier.manifest.headline
+    if headline.startswith(NOTHING_FOUND) and counts["candidates"]:
+        warnings.remove(headline)
+        headline = ""
+    if without_effect := about_no_effect(found.outcomes):
+        headline = without_effect
+        warnings.insert(0, headline)
     warnings.extend(outcome.warning for outcome in found.outcomes if outcome.warning)
     if earlier.manifest.request.get("points"):
         warnings.append(_POINTS_GONE)
@@ -486,6 +495,7 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
         counts=dict(counts),
         slowest=_slowest(earlier, found, modelled),
         warnings=tuple(warnings),
+        headline=headline,
     )
 
 

@@ -45,12 +45,12 @@ from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import check_scratch, run_scratch
 from pipeline.runtime.scratch.outcomes import Place
 from pipeline.runtime.scratch.work_folder import is_known, locked_work
-from pipeline.runtime.stages.apply_overrides import apply_overrides
+from pipeline.runtime.stages.apply_overrides import about_no_effect, apply_overrides
 from pipeline.runtime.stages.batch_figures import Counted
 from pipeline.runtime.stages.cleanup import OVERRIDDEN, publishing, tidy
 from pipeline.runtime.stages.content_digest import STAGE as DIGEST
 from pipeline.runtime.stages.content_digest import content_digest
-from pipeline.runtime.stages.counts import run_counts
+from pipeline.runtime.stages.counts import about_emptiness, run_counts
 from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints_of_run
 from pipeline.runtime.stages.given_guides import GivenGuides, given_guides
 from pipeline.runtime.stages.ground import Ground, find_ground
@@ -102,6 +102,8 @@ class RunSummary:
     """Largest resident size by process."""
     warnings: tuple[str, ...]
     """What was odd but usable."""
+    headline: str = ""
+    """The first warning, where it says why the result is empty; else empty."""
     failed_tiles: tuple[str, ...] = ()
     """Tiles that could not be published."""
     tiles_without_points: tuple[str, ...] = ()
@@ -218,7 +220,7 @@ def run_variants(
     progress = Progress(on_event)
     progress.tell("run", "plan", f"run into {request.out}")
     plan, paths = plan_inputs(request, progress, cancelled, executor)
-    footprints = footprints_of_run(request.footprints, plan, request.settings.footprints)
+    footprints = footprints_of_run(request.footprints, plan, request.settings.footprints, request.footprints_layer)
     for warning in () if footprints is None else footprints.warnings:
         progress.warn("plan", warning)
     guides = None
@@ -295,6 +297,8 @@ def _find_candidates(
     ground = find_ground(context, settings, inputs.cells)
     splits = split(context, settings, inputs.ingested, ground, footprints)
     joined = join(context, settings.scene, settings.building.roof, splits, footprints)
+    if headline := about_emptiness(inputs.ingested, ground, joined, trust=settings.general.classes == "trust"):
+        context.progress.warn_first("join", headline)
     return _Candidates(ingested=inputs.ingested, moves_mm=inputs.moves_mm, ground=ground, splits=splits, joined=joined)
 
 
@@ -311,6 +315,8 @@ def _override(
     for entry in applied.outcomes:
         if entry.warning:
             context.progress.warn("join", entry.warning)
+    if headline := about_no_effect(applied.outcomes):
+        context.progress.warn_first("join", headline)
     for one in runs:
         put_json(one.run_dir, OVERRIDES, [entry.as_dict() for entry in applied.outcomes])
     changed = joined_of(store_sites(context, OVERRIDDEN, applied.sites), 0, {})
@@ -518,6 +524,7 @@ class _VariantRun:
             slowest=self.counted.slowest,
             strip_moves_m={str(strip): move / MM for strip, move in sorted(found.moves_mm.items())},
             warnings=tuple(self.progress.warnings),
+            headline=self.progress.headline,
             content_sha256=self.digest,
         )
         write_manifest(self.run_dir, manifest, self.storage.put)
@@ -535,6 +542,7 @@ class _VariantRun:
             timings_s=timings,
             peak_memory_bytes=self.progress.peaks,
             warnings=manifest.warnings,
+            headline=self.progress.headline,
             failed_tiles=failed_tiles,
             tiles_without_points=self.without_points,
             tiles_without_terrain=without_terrain,

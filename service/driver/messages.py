@@ -55,8 +55,11 @@ class Scrubber:
 
 
 def outcome(summary: RunSummary, unpublished: Collection[str] = ()) -> str:
-    """The result of a run, in one sentence; with the formats that could not be published."""
-    sentence = f"{_buildings(summary)}: {_by_status(summary)}"
+    """The result of a run, in one sentence; with the formats that could not be published.
+
+    Where it is empty, a sentence before that says why.
+    """
+    sentence = f"{_headline(summary)}{_buildings(summary)}: {_by_status(summary)}"
     rejected = sum(summary.rejected.values())
     if rejected:
         sentence += f"; {rejected} {'object' if rejected == 1 else 'objects'} rejected"
@@ -77,6 +80,12 @@ def outcome(summary: RunSummary, unpublished: Collection[str] = ()) -> str:
     return sentence
 
 
+def _headline(summary: RunSummary) -> str:
+    """Why a result is empty, as a sentence before others; empty where it is not."""
+    text = as_inputs(summary.headline)
+    return f"{text[0].upper()}{text[1:]}. " if text else ""
+
+
 def _buildings(summary: RunSummary) -> str:
     total = sum(summary.statuses.values())
     return f"{total} {'building' if total == 1 else 'buildings'}"
@@ -90,7 +99,7 @@ def comparison_outcome(summary: CompareSummary) -> str:
     """The result of every method, in one sentence."""
     first = next(iter(summary.runs.values()))
     parts = [f"{label} {_by_status(run)}" for label, run in summary.runs.items()]
-    sentence = f"{len(summary.runs)} methods on {_buildings(first)}: {'; '.join(parts)}"
+    sentence = f"{_headline(first)}{len(summary.runs)} methods on {_buildings(first)}: {'; '.join(parts)}"
     broken = [label for label, run in summary.runs.items() if run.failed_tiles]
     return f"{sentence}; tiles of {', '.join(broken)} are missing" if broken else sentence
 
@@ -138,6 +147,7 @@ def digest_of(summary: RunSummary, scrub: Scrubber, engine_version: str) -> dict
         "failed_tiles": list(summary.failed_tiles),
         "tiles_without_points": list(summary.tiles_without_points),
         "tiles_without_terrain": list(summary.tiles_without_terrain),
+        "headline": as_inputs(summary.headline),
         **_measured(summary, scrub),
     }
 

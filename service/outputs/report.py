@@ -114,6 +114,7 @@ def report(
             "without_terrain": list(manifest.get("tiles_without_terrain", ())),
         },
         "counts": dict(manifest["counts"]),
+        "headline": clean(manifest.get("headline", "")),
         "warnings": [clean(warning) for warning in manifest["warnings"]],
         "timings_s": dict(manifest["timings_s"]),
         "largest_process_bytes": max(manifest["peak_memory_bytes"].values(), default=None),

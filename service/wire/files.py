@@ -21,7 +21,13 @@ LAS, LAZ, PLY, TEXT, CSV = "application/vnd.las", "application/vnd.laszip", "app
 ENDINGS: Mapping[str, str] = {LAZ: ".laz", LAS: ".las", PLY: ".ply", TEXT: ".xyz", CSV: ".csv"}
 """Media types of point clouds sent by value, and the endings of their files."""
 
-_OUTLINE_ENDINGS = {b"SQLite format 3": ".gpkg", b"PAR1": ".parquet"}
+_OUTLINE_ENDINGS = {
+    b"SQLite format 3": ".gpkg",
+    b"PAR1": ".parquet",
+    b"fgb": ".fgb",
+    b"PK": ".zip",
+    b"<": ".gml",
+}
 """Endings of footprints and guides that are sent by value, by their first bytes; others are GeoJSON."""
 
 Source = InputReference | Inline
@@ -178,7 +184,13 @@ _OF_VECTORS = WithJsonSchema(
                 "format": "geojson-feature-collection",
                 "contentMediaType": "application/geo+json",
             },
-            *_encoded("application/geopackage+sqlite3", "application/vnd.apache.parquet"),
+            *_encoded(
+                "application/geopackage+sqlite3",
+                "application/vnd.apache.parquet",
+                "application/flatgeobuf",
+                "application/gml+xml",
+                "application/zip",
+            ),
         ]
     }
 )

@@ -212,7 +212,11 @@ class Inputs(JobInputs):
     footprints: Outlines | None = Field(
         None,
         title="Footprints",
-        description=f"Building outlines to be modelled, as GeoJSON, GeoPackage or GeoParquet. {GIVEN_BY}",
+        description="Building outlines to be modelled, as GeoJSON, GeoPackage, GeoParquet, FlatGeobuf, GML or a zip "
+        f"archive with one of them or a Shapefile. {GIVEN_BY}",
+    )
+    footprintsLayer: Text | None = Field(
+        None, title="Layer of the footprints", description="The layer to use, where the file of footprints has several."
     )
     crs: Crs | None = Field(
         None,
@@ -242,6 +246,7 @@ class Inputs(JobInputs):
             for n, tile in enumerate(self.tiles)
         )
         values = {
+            "footprints_layer": self.footprintsLayer,
             "crs": self.crs,
             "vertical_unit": self.verticalUnit,
             "allow_outside_area_of_use": self.allowOutsideAreaOfUse,

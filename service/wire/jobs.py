@@ -122,6 +122,7 @@ class JobForm(Answer):
         list[File], Field(min_length=1, description="Point clouds. A field without a file name contains an href.")
     ]
     footprints: File | None = Field(None, description="Building outlines, as a file or an href.")
+    footprintsLayer: str | None = Field(None, description="Layer of the outlines, where their file has several.")
     guides: File | None = Field(None, description="Lines of roofs, as a file or an href.")
     crs: str | None = None
     verticalUnit: Annotated[str, OneOf(*UNITS_M)] | None = None

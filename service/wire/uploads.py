@@ -46,7 +46,20 @@ class Preflight(BaseModel):
     model_config = ConfigDict(json_schema_extra=_nullable, extra="allow")
 
     kind: Literal["points", "footprints", "guides"]
-    format: Literal["las", "laz", "copc", "ply", "ascii", "geopackage", "geojson", "geoparquet"]
+    format: Literal[
+        "las",
+        "laz",
+        "copc",
+        "ply",
+        "ascii",
+        "geopackage",
+        "geojson",
+        "geoparquet",
+        "flatgeobuf",
+        "gml",
+        "shapefile",
+        "zip",
+    ]
     usable: bool = Field(description="Whether a job can use it without further inputs.")
     problems: list[str] = Field(description="Problems that a job can fix, such as degrees with `crs`.")
     warnings: list[str]

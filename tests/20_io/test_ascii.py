@@ -196,3 +196,70 @@ def test_a_file_without_line_ends_is_refused_without_reading_it_whole(tmp_path):
     message = "a line after line 0 has more than 65536 bytes"
     with memory_below(3e6), pytest.raises(UnreadableInputError, match=message):
         next(open_source(path).chunks(1_000))
+
+
+SWAPPED = "5402000.5{0}513000.25{0}300{0}17\n5402001{0}513001.5{0}301.25{0}80\n5402003{0}513002{0}299.5{0}3\n"
+
+
+@pytest.mark.parametrize(
+    ("header", "separator"),
+    [
+        ("northing,easting,height,intensity", ","),
+        ("N;E;H;Intensity", ";"),
+        ("Y,X,Alt,i", ","),
+        ("Hochwert;Rechtswert;Höhe;Intensität", ";"),
+        ('"Y [m]","X [m]","Z [m]","I"', ","),
+        ("Y_m,X_m,Height_m,i", ","),
+        ("Y-Coordinate,X-Coordinate,Elevation (ft),red light", ","),
+        ("//Y X Z Intensity", " "),
+        ("# Columns: n e h i", " "),
+        ("northing easting height i\n# in metres\n", " "),
+    ],
+)
+def test_columns_are_read_by_the_names_of_their_coordinates(tmp_path, header, separator):
+    path = write(tmp_path / "a.csv", f"{header}\n{SWAPPED.format(separator)}")
+    (cloud,) = open_source(path).chunks()
+    np.testing.assert_array_equal(cloud.xyz, ROWS[:, :3])
+
+
+@pytest.mark.parametrize(
+    ("header", "separator", "named"),
+    [
+        ("northing,easting,level,i", ",", "which of them is z is not known"),
+        ("lat;lon;ell;i", ";", "which of them is x or y or z is not known"),
+        ("#northing;b;c;d", ";", "which of them is x or z is not known"),
+        ("north east up i", " ", "which of them is z is not known"),
+        ("y x z", " ", "its header names 3 columns ('y', 'x', 'z'), its rows have 4"),
+        ("y,x,z,i,class,", ",", "its header names 5 columns"),
+        ("# y x z", " ", "its header names 3 columns"),
+        ("northing,easting,level,i\nm,m,m,-", ",", "is not known"),
+    ],
+)
+def test_a_header_that_is_half_understood_is_refused_with_its_names(tmp_path, header, separator, named):
+    path = write(tmp_path / "a.csv", f"{header}\n{SWAPPED.format(separator)}")
+    with pytest.raises(UnreadableInputError, match=r"Name the columns x, y and z") as caught:
+        open_source(path)
+    assert named in caught.value.problem
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "# exported by some tool",
+        "// height above the sea",
+        "# x y z of all returns",
+        "Survey of 2023, block 7",
+        "3",
+        "A title\n\n# north of the river",
+    ],
+)
+def test_words_above_the_rows_that_name_no_columns_change_nothing(tmp_path, words):
+    rows = "513000.25 5402000.5 300 17\n513001.5 5402001 301.25 80\n513002 5402003 299.5 3\n"
+    (cloud,) = open_source(write(tmp_path / "a.xyz", f"{words}\n{rows}")).chunks()
+    np.testing.assert_array_equal(cloud.xyz, ROWS[:, :3])
+
+
+def test_the_surest_of_several_names_of_a_coordinate_counts(tmp_path):
+    path = write(tmp_path / "a.csv", "id,easting,height,y,x,z\n1,7,9,2,1,3\n2,8,9,3,2,4\n")
+    (cloud,) = open_source(path).chunks()
+    assert cloud.xyz.tolist() == [[1, 2, 3], [2, 3, 4]]

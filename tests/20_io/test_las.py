@@ -117,29 +117,56 @@ def test_feet_become_metres_in_plan_and_elevation_apart(tmp_path, points, write_
     np.testing.assert_allclose(in_metres_up, xyz * [0.3048, 0.3048, 1.0], atol=1e-6)
 
 
-def test_header_bounds_that_cannot_be_are_measured_and_reported(tmp_path, points, write_las):
-    xyz = points(500)
-    for suffix in (".las", ".laz"):
-        path = write_las(tmp_path / f"a{suffix}", xyz)
-        raw = bytearray(path.read_bytes())
-        struct.pack_into("<d", raw, 179, float("nan"))
-        path.write_bytes(raw)
-        info = open_source(path).info
-        np.testing.assert_allclose(info.bounds_m, (*xyz.min(axis=0), *xyz.max(axis=0)), atol=1e-6)
-        assert any("bounds" in warning for warning in info.warnings)
-
-
-def test_points_beyond_the_header_bounds_are_used_and_reported(tmp_path, points, write_las):
-    xyz = points(500)
-    path = write_las(tmp_path / "a.las", xyz)
+def with_header_box(path, **values):
+    """Write other bounds into a header."""
     raw = bytearray(path.read_bytes())
-    middle = 84_050.0
-    struct.pack_into("<d", raw, 179, middle)
+    for name, value in values.items():
+        struct.pack_into("<d", raw, 179 + 8 * ("x_max", "x_min", "y_max", "y_min", "z_max", "z_min").index(name), value)
     path.write_bytes(raw)
-    source = open_source(path)
+    return path
+
+
+ZEROS = dict.fromkeys(("x_max", "x_min", "y_max", "y_min", "z_max", "z_min"), 0.0)
+MILLIMETRES = {"x_min": 84e6, "x_max": 84.1e6, "y_min": 447e6, "y_max": 447.1e6, "z_min": 0.0, "z_max": 2e4}
+
+
+@pytest.mark.parametrize(
+    ("box", "named"),
+    [
+        ({"x_max": float("nan")}, "cannot be"),
+        ({"y_max": -1.0}, "cannot be"),
+        (ZEROS, "do not hold the points, such as x 8"),
+        (MILLIMETRES, "do not hold the points"),
+        ({"x_max": 84_050.0}, "do not hold the points"),
+        ({"z_min": 0.0, "z_max": 0.0}, "do not hold the points"),
+        ({"y_min": 0.0}, "are far wider than the points"),
+        ({"x_max": 84e6}, "are far wider than the points"),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_header_bounds_that_the_points_contradict_are_measured_and_reported(
+    tmp_path, points, write_las, box, named, suffix
+):
+    xyz = points(500)
+    info = open_source(with_header_box(write_las(tmp_path / f"a{suffix}", xyz), **box)).info
+    np.testing.assert_allclose(info.bounds_m, (*xyz.min(axis=0), *xyz.max(axis=0)), atol=1e-6)
+    (warning,) = (warning for warning in info.warnings if "the header's bounds" in warning)
+    assert named in warning
+    assert warning.endswith("taken from the points")
+
+
+def test_a_header_that_is_right_costs_no_pass_and_no_word(tmp_path, points, write_las, monkeypatch):
+    monkeypatch.delattr("pipeline.io.las.LasFile._bounds_of_points")
+    xyz = points(500)
+    assert not [w for w in open_source(write_las(tmp_path / "a.laz", xyz)).info.warnings if "bounds" in w]
+
+
+def test_single_points_beyond_the_header_bounds_are_used_and_reported(tmp_path, points, write_las):
+    xyz = points(500)
+    second = float(np.sort(xyz[:, 0])[-2])
+    source = open_source(with_header_box(write_las(tmp_path / "a.las", xyz), x_max=second + 0.01))
     assert sum(map(len, source.chunks(100))) == 500
-    expected = int((xyz[:, 0] > middle + 0.02).sum())
-    assert any(f"{expected} points lie outside the bounds" in warning for warning in source.warnings)
+    assert any("1 points lie outside the bounds" in warning for warning in source.warnings)
 
 
 def test_gps_times_give_dates_only_where_they_have_one(tmp_path, points, write_las):

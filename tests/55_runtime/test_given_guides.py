@@ -10,7 +10,7 @@ import shapely
 from run_tables import rows_by_id
 from shapely import LineString, Point, Polygon
 
-from pipeline.errors import InputError, RunError
+from pipeline.errors import EmptyInputError, InputError, RunError
 from pipeline.io.crs import SpatialReference
 from pipeline.runtime.overrides.overrides_file import read_overrides
 from pipeline.runtime.request import RunRequest
@@ -75,14 +75,19 @@ def test_an_eave_moves_the_outline_and_the_record_counts_it(
     )
 
 
-def test_guides_far_from_all_buildings_leave_the_digest(
-    suburb: Path, plain: Any, houses: dict[str, Polygon], reconstruct: Any, tmp_path: Path
+def test_guides_off_the_data_leave_the_digest_and_are_refused_where_none_lies_on_it(
+    suburb: Path, houses: dict[str, Polygon], reconstruct: Any, tmp_path: Path
 ) -> None:
-    everything = shapely.union_all(list(houses.values())).bounds
-    far = LineString([(everything[2] + 5_000.0, everything[3]), (everything[2] + 5_010.0, everything[3])])
-    found = reconstruct(suburb, guides=write(tmp_path / "a.gpkg", [far]))
-    assert found.digest == plain.digest
-    assert "1 of 1 guides lie off the data" in found.warnings
+    outlines = list(houses.values())
+    east, north = shapely.union_all(outlines).bounds[2:]
+    far = LineString([(east + 5_000.0, north), (east + 5_010.0, north)])
+    near = longest_edge(outlines[0], 0.2)
+    alone = reconstruct(suburb, guides=write(tmp_path / "a.gpkg", [near]))
+    found = reconstruct(suburb, guides=write(tmp_path / "b.gpkg", [near, far]))
+    assert found.digest == alone.digest
+    assert "1 of 2 guides lie off the data" in found.warnings
+    with pytest.raises(EmptyInputError, match="none of its guides lies on the data: they lie at x"):
+        reconstruct(suburb, guides=write(tmp_path / "c.gpkg", [far]))
 
 
 def test_the_digest_with_guides_does_not_depend_on_tiles_or_on_the_order_of_lines(

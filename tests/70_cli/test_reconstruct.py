@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import laspy
 import pytest
 from command_line import invoke
 
@@ -199,3 +200,40 @@ def test_a_tile_that_lacks_something_is_exit_code_1(
     code, _, log = invoke("reconstruct", str(scene / "gable.laz"), *words)
     assert code == 1
     assert [line for line in log.splitlines() if "x1_y2" in line] == [f"warning: {said}"]
+
+
+def test_points_of_class_2_alone_are_named_on_the_first_line(scene: Path, tmp_path: Path) -> None:
+    las = laspy.read(scene / "gable.laz")
+    las.classification[:] = 2
+    las.write(tmp_path / "ground.laz")
+    code, said, _ = invoke(
+        "reconstruct", str(tmp_path / "ground.laz"), "--out", str(tmp_path / "run"), "--workers", "0"
+    )
+    assert code == 0
+    first = said.splitlines()[0]
+    assert first.startswith(f"warning: all {len(las.points)} points are of class 2 (ground), so none can be a roof")
+    arguments = ("--out", str(tmp_path / "again"), "--workers", "0", "--json")
+    summary = json.loads(invoke("reconstruct", str(tmp_path / "ground.laz"), *arguments)[1])
+    assert summary["headline"] == summary["warnings"][0] == first.removeprefix("warning: ")
+
+
+@pytest.mark.parametrize(
+    ("crs", "words"),
+    [("EPSG:25832", "none of its footprints lies on the data"), (None, "in degrees, which x 0, y 5e+06 cannot be")],
+)
+def test_footprints_off_the_data_end_with_the_exit_code_of_an_input(
+    scene: Path, tmp_path: Path, crs: str | None, words: str
+) -> None:
+    ring = [[0.0, 5e6], [10.0, 5e6], [10.0, 5_000_010.0], [0.0, 5e6]]
+    feature = {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+    named = {} if crs is None else {"crs": {"type": "name", "properties": {"name": crs}}}
+    given = tmp_path / "a.geojson"
+    given.write_text(json.dumps({"type": "FeatureCollection", "features": [feature], **named}))
+    tile, out = str(scene / "gable.laz"), str(tmp_path / "run")
+    code, _, error = invoke("reconstruct", tile, "--out", out, "--workers", "0", "--footprints", str(given))
+    assert code == ExitCode.INPUT
+    assert words.replace("x 0, y 5e+06", "x 10, y 5000010") in " ".join(error.split())
+    assert not Path(out).exists()
+    code, _, error = invoke("reconstruct", tile, "--out", out, "--workers", "0", "--layer", "sheds")
+    assert code == ExitCode.USAGE
+    assert "--layer sheds names a layer of footprints, and none are given" in error

@@ -617,3 +617,20 @@ def test_a_tile_that_reads_as_a_tile_index_leads_nowhere(tmp_path: Path) -> None
     with pytest.raises(InputError, match=r"tiles\.txt: ") as refused:
         plan_inputs(request, Progress(lambda _: None))
     assert "others.laz" not in str(refused.value)
+
+
+LAYERS = {
+    "kind": "footprints",
+    "shapes": ["polygons"],
+    "layers": ["houses", "sheds"],
+    "problems": ["2 layers: give one"],
+}
+
+
+def test_a_layer_that_an_upload_does_not_have_is_refused_with_its_layers(world: World) -> None:
+    tile, given = upload(world.add_upload()), upload(world.add_upload("a.gpkg", b"x", pointCount=None, **LAYERS))
+    world.resolve(tile, footprints=given, footprints_layer="sheds")
+    with pytest.raises(RequestError, match="2 layers: give one"):
+        world.resolve(tile, footprints=given)
+    with pytest.raises(RequestError, match=r"footprintsLayer: .* has no layer 'barns': name one of houses, sheds"):
+        world.resolve(tile, footprints=given, footprints_layer="barns")

@@ -55,7 +55,7 @@ def test_a_geopackage_may_hold_both_and_one_with_two_layers_of_lines_is_ambiguou
     assert examine(path, max_points=1)["shapes"] == ["polygons", "lines"]
     write(tmp_path / "b.gpkg", LINE, layer="one")
     found = examine(write(tmp_path / "b.gpkg", LINE, layer="other"), max_points=1)
-    assert found["problems"] == ["2 layers could be the guides: give one"]
+    assert found["problems"] == ["2 layers could be the guides: give a file with one of them"]
 
 
 def test_requests_of_both_processes_carry_the_guides(tmp_path: Path) -> None:

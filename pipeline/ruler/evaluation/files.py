@@ -33,6 +33,8 @@ class EvaluationRequest:
     """Classified point files."""
     footprints: str | None = None
     """Outlines of buildings, with points."""
+    footprints_layer: str | None = None
+    """Their layer, where the file has several."""
     ground: tuple[str, ...] = ()
     """Point files whose class 2 is the ground to be judged; by default that of the ground stage of the run."""
     crs: str | None = None
@@ -53,6 +55,8 @@ class EvaluationRequest:
             faults.append("both a truth and points are given as the reference: use one of --truth and --points")
         if self.footprints is not None and not self.points:
             faults.append(f"footprints are {self.footprints} without points: give the classified tile by --points")
+        if self.footprints_layer is not None and self.footprints is None:
+            faults.append(f"the layer {self.footprints_layer} is given without footprints: give --footprints")
         if self.as_surveyed and self.truth is None:
             faults.append("as-surveyed is given without a truth: only simulated strips have known shifts")
         if self.ground and self.truth is None and not self.points:
@@ -67,7 +71,9 @@ def read_reference(request: EvaluationRequest) -> Reference | None:
         return read_truth_reference(request.truth, as_surveyed=request.as_surveyed)
     if request.points:
         options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit)
-        return read_points_reference(request.points, footprints=request.footprints, read_options=options)
+        return read_points_reference(
+            request.points, footprints=request.footprints, layer=request.footprints_layer, read_options=options
+        )
     return None
 
 

@@ -14,9 +14,10 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import InconsistentInputError, InputError, SettingsError
-from pipeline.io import ReadOptions, open_source
+from pipeline.io import ReadOptions, open_source, shown
 from pipeline.io.crs import SpatialReference, with_one_vertical
 from pipeline.io.footprints import read_footprints
+from pipeline.io.placed_features import off_the_data
 from pipeline.io.readable import Readable
 from pipeline.io.remote_file import file_at
 from pipeline.io.source import Source
@@ -43,6 +44,7 @@ def read_points_reference(
     tiles: Sequence[str | Path],
     *,
     footprints: str | Path | None = None,
+    layer: str | None = None,
     crs: str | None = None,
     vertical_unit: str | None = None,
     read_options: ReadOptions | None = None,
@@ -66,7 +68,7 @@ def read_points_reference(
     notes = list(dict.fromkeys(warning for source in sources for warning in source.info.warnings))
     areas: dict[str, Area]
     if footprints is not None:
-        areas, classes, more = _given_areas(sources, footprints, reference)
+        areas, classes, more = _given_areas(sources, footprints, reference, layer)
     else:
         areas, classes, more = _raster_areas(sources, bounds)
     notes += more
@@ -97,10 +99,13 @@ def read_points_reference(
 
 
 def _given_areas(
-    sources: Sequence[Source], footprints: str | Path, reference: SpatialReference
+    sources: Sequence[Source], footprints: str | Path, reference: SpatialReference, layer: str | None
 ) -> tuple[dict[str, Area], Counts, list[str]]:
     """The given footprints with enough points of class 6 by name, the number of points of each class, and notes."""
-    given = read_footprints(footprints, reference)
+    given = read_footprints(footprints, reference, layer=layer)
+    area = shapely.union_all([shapely.box(*_plan_bounds(source)) for source in sources])
+    if not any(area.intersects(polygon) for polygon in given.polygons):
+        raise off_the_data(shown(str(footprints)), "footprints", given.elsewhere, area, reference)
     notes = list(given.warnings)
     index = plan_index(list(given.polygons))
     counts, classes = np.zeros(len(given.polygons) + 1, np.int64), np.zeros(256, np.int64)

@@ -30,6 +30,8 @@ class Progress:
         self.timings: dict[str, float] = {}
         self.peaks: dict[str, int] = {}
         self.warnings: list[str] = []
+        self.headline = ""
+        """The first of the warnings, where a reader must know it before any figure."""
         self._part, self._parts, self._label = 0, 1, ""
 
     def part(self, number: int, parts: int, label: str) -> Progress:
@@ -39,6 +41,7 @@ class Progress:
         """
         own = Progress(self.listener, self.watch)
         own.timings, own.peaks, own.warnings = dict(self.timings), dict(self.peaks), list(self.warnings)
+        own.headline = self.headline
         own._part, own._parts, own._label = number, parts, label
         return own
 
@@ -51,6 +54,12 @@ class Progress:
         if message not in self.warnings:
             self.warnings.append(message)
             self.tell("warning", stage, message)
+
+    def warn_first(self, stage: str, message: str) -> None:
+        """Store and send a warning that comes before all others, and before the figures of the run."""
+        self.headline = message
+        self.warnings.insert(0, message)
+        self.tell("warning", stage, message)
 
     def detail(self, stage: str, message: str, **facts: str | float) -> None:
         """Send what only logs need: something about one building or task."""

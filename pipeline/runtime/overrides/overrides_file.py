@@ -286,6 +286,11 @@ class _Reading:
             problem = lost[0] if lost else f"none of its {len(found)} polygons has the id {quoted(wanted)}"
             faults.append(f"footprint: {path}: {problem}")
             return None
+        if (several := found.ids.count(wanted)) > 1:
+            faults.append(
+                f"footprint: {path}: {several} of its polygons have the id {quoted(wanted)}: name an id_column"
+            )
+            return None
         return found.polygons[found.ids.index(wanted)]
 
     def _of_wkt(self, text: str, faults: list[str]) -> Polygon | MultiPolygon | None:

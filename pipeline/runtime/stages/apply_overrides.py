@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -128,6 +129,13 @@ def apply_overrides(
     return Overridden(before=before, owners=owners, sites=sites, outcomes=outcomes)
 
 
+def about_no_effect(outcomes: Sequence[EntryOutcome]) -> str:
+    """A warning where no override took effect; empty where one did, or there are none."""
+    if not outcomes or any(entry.effective is not None for entry in outcomes):
+        return ""
+    return f"{WARNING}none of {len(outcomes)} took effect; overrides.json says why of each"
+
+
 def _id_of(site: CandidateSite | RejectedSite) -> str:
     return site.building_id if isinstance(site, CandidateSite) else site.object_id
 
@@ -202,6 +210,7 @@ def outcomes_of(
     candidates: Sites = {site.building_id: site for site in sites.candidates}
     rejected: Sites = {site.object_id: site for site in sites.rejected}
     by_source = {site.source_id: site.building_id for site in sites.candidates if site.source_id is not None}
+    of_several = Counter(site.source_id for site in sites.candidates)
     found: list[EntryOutcome] = []
     entry_of: dict[str, int] = {}
     nearest_id = _nearest_names(
@@ -215,6 +224,8 @@ def outcomes_of(
             name = by_source.get(override.source_id)
             if name is None:
                 fault = _unknown(nearest_source.get(override.source_id), "source_id of this run")
+            elif (several := of_several[override.source_id]) > 1:
+                name, fault = None, f"{several} footprints have this source_id: name the building by its building_id"
         elif override.point_m is not None:
             among = (rejected, "rejected object") if override.action == "accept" else (candidates, "building")
             name, fault = _at(override.point_m, *among, scratch, grid)

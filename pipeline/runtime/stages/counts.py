@@ -1,4 +1,4 @@
-"""The counts of a run, over all stages."""
+"""The counts of a run, over all stages, and why there is nothing to count."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ from pipeline.model import Status
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.stages.batch_figures import Counted
 from pipeline.runtime.stages.ground import Ground
-from pipeline.runtime.stages.ingested import Ingested
+from pipeline.runtime.stages.ingested import Ingested, without_roofs
 from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import Splits
+
+NOTHING_FOUND = "no building was found"
+"""Begins the first warning of a run without candidates."""
 
 
 def run_counts(
@@ -40,3 +43,18 @@ def run_counts(
         "other_classes_in_candidates": sum(s.audit[1] for s in splits.figures),
         "class_6_elsewhere": sum(s.audit[2] for s in splits.figures),
     }
+
+
+def about_emptiness(ingested: Sequence[Ingested], ground: Ground, joined: Joined, *, trust: bool) -> str:
+    """Why no building can be modelled, or that none was found; empty where some were."""
+    classes: Counter[int] = Counter()
+    for found in ingested:
+        classes.update(found.classes)
+    by_classes = without_roofs(classes, trust=trust)
+    if by_classes or joined.candidates:
+        return by_classes
+    rejected = sum(listed.figures.count for listed in joined.rejected)
+    outliers = sum(cells.outliers for cells in ground.cells.values())
+    lone = f", {outliers} of which are outliers: are they too few, or is a unit wrong" if outliers else ""
+    left = f"; {rejected} objects were rejected, each with its reason" if rejected else ""
+    return f"{NOTHING_FOUND} in {classes.total()} points{lone}{left}"

@@ -10,6 +10,7 @@ import shapely
 
 from pipeline.io import shown
 from pipeline.io.guides import read_guides
+from pipeline.io.placed_features import off_the_data
 from pipeline.io.reading import one_input
 from pipeline.model import Guide
 from pipeline.roof.settings import GUIDE_REACH_M
@@ -59,7 +60,9 @@ def given_guides(path: str, plan: Plan, kind_column: str) -> GivenGuides:
     warnings = [*found.warnings, *(str(issue) for issue in found.issues[:_ISSUES_NAMED])]
     if len(found.issues) > _ISSUES_NAMED:
         warnings.append(f"{len(found.issues) - _ISSUES_NAMED} more faults of guides, each in guides.json of a run")
-    lines = len(found.guides) + found.elsewhere
+    lines = len(found.guides) + found.elsewhere.count
+    if not inside:
+        raise off_the_data(shown(path), "guides", found.elsewhere, area, plan.reference)
     if len(inside) < lines:
         warnings.append(f"{lines - len(inside)} of {lines} guides lie off the data")
     inside.sort(key=lambda guide: (guide.line.wkb, guide.kind))

@@ -8,7 +8,7 @@ import hashlib
 import math
 import operator
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from pipeline.io import SourceInfo
 from pipeline.io.source import Findings
 from pipeline.model import FloatArray
 from pipeline.runtime.stages.tile_content import ZoneSums, zone_sums_of
-from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
+from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, VEGETATION_CLASSES
 from pipeline.terrain.scene_settings import ClassesInUse
 from pipeline.tiling import MM, Tile
 
@@ -138,6 +138,26 @@ def classes_in_use(ingested: Sequence[Ingested], *, trust: bool) -> tuple[Classe
         return ClassesInUse(), f"{why}: ground and buildings are found in the points alone"
     buildings = any(found.classes.get(BUILDING_CLASS, 0) for found in ingested)
     return ClassesInUse(ground=True, building=buildings, vegetation=True), ""
+
+
+def without_roofs(points_by_class: Mapping[int, int], *, trust: bool) -> str:
+    """A sentence on points whose classes leave none that could lie on a roof; empty where some could, by these classes.
+
+    >>> without_roofs({2: 990, 5: 10}, trust=True)
+    'all 1000 points are of classes 2 and 5, so none can be a roof: give --classes ignore if they are not what they say'
+    >>> without_roofs({2: 990, 1: 10}, trust=True) or without_roofs({2: 990}, trust=False)
+    ''
+    """
+    codes, points = sorted(code for code, count in points_by_class.items() if count), sum(points_by_class.values())
+    is_classified = points_by_class.get(GROUND_CLASS, 0) >= _CLASSIFIED_SHARE * points > 0
+    if not (trust and is_classified and {*codes} <= {GROUND_CLASS, *VEGETATION_CLASSES}):
+        return ""
+    named = f"class {GROUND_CLASS} (ground)" if len(codes) == 1 else "classes " + ", ".join(map(str, codes[:-1]))
+    named += f" and {codes[-1]}" if len(codes) > 1 else ""
+    return (
+        f"all {points} points are of {named}, so none can be a roof: "
+        "give --classes ignore if they are not what they say"
+    )
 
 
 def spread_m(results: Sequence[Ingested]) -> float:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import shapely
 
 from pipeline.kernels.union_find import united
-from pipeline.model import BoolArray, GivenHeights, IntArray
+from pipeline.model import BoolArray, IntArray
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
@@ -277,8 +277,7 @@ def join(
                 footprints.polygons,
                 footprints.ids,
                 crs_name,
-                footprints.attributes,
-                footprints.heights,
+                footprints,
             )
             counter.add(1)
         clear_units(context.scratch, ())
@@ -361,8 +360,7 @@ def join_footprints(
     footprints: Sequence[Outline],
     source_ids: Sequence[str],
     crs_name: str,
-    attributes: Sequence[str | None] | None = None,
-    heights: Sequence[GivenHeights | None] | None = None,
+    given: GivenFootprints | None = None,
 ) -> FoundSites:
     """The candidates where footprints were given: one per footprint, also where it holds no point; splits in any order.
 
@@ -373,11 +371,10 @@ def join_footprints(
     footprints, source_ids : sequences
         The given outlines in metres, in the order of their numbers, and their own ids.
     crs_name : str
-        Goes into the ids. A footprint without points is named by its smallest corner and its own id.
-    attributes : sequence of str or None, optional
-        Their columns, each as the text of a JSON object.
-    heights : sequence of GivenHeights or None, optional
-        Their heights by attributes.
+        Goes into the ids. A footprint without points is named by its smallest corner and its own id, and by its place
+        among those that share both.
+    given : GivenFootprints, optional
+        What else is known of them.
     """
     ranges: dict[int, list[PointRange]] = {}
     lowest: dict[int, tuple[int, ...]] = {}
@@ -391,11 +388,14 @@ def join_footprints(
             ranges.setdefault(owner, []).append(PointRange(tile=s.tile, start=starts[j], stop=starts[j + 1]))
             lowest[owner] = min(lowest.get(owner, tuple(point)), tuple(point))
     candidates = []
+    alike: collections.Counter[str] = collections.Counter()
     for number, (footprint, source_id) in enumerate(zip(footprints, source_ids, strict=True)):
         name, point = crs_name, lowest.get(number)
         if point is None:
             corner = min(map(tuple, shapely.get_coordinates(footprint).tolist()))
             name, point = f"{crs_name}|{source_id}", (round(corner[0] * MM), round(corner[1] * MM), 0)
+            alike[f"{name} {point}"] += 1
+            name += "|" * (alike[f"{name} {point}"] - 1)
         found = ranges.get(number, [])
         candidates.append(
             CandidateSite(
@@ -405,8 +405,9 @@ def join_footprints(
                 points=sum(r.stop - r.start for r in found),
                 footprint=footprint,
                 source_id=source_id,
-                source_attributes=None if attributes is None else attributes[number],
-                given=None if heights is None else heights[number],
+                source_attributes=None if given is None else given.attributes[number],
+                given=None if given is None else given.heights[number],
+                overlap="" if given is None else given.overlaps[number],
             )
         )
     return FoundSites(candidates=largest_first(candidates), rejected=())

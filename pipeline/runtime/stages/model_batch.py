@@ -285,10 +285,10 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     reused = False
     try:
         candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, task.settings.roof, task.guides)
-        made_from = key_of(candidate, task.way_key)
+        made_from = key_of(candidate, task.way_key, *filter(None, [site.overlap]))
         earlier = _modelled_before(task, site.building_id, made_from)
         reused = earlier is not None
-        result = earlier or reconstruct_building(candidate, task.method, task.settings)
+        result = earlier or _with_overlap(site, reconstruct_building(candidate, task.method, task.settings))
     except (MemoryError, OSError, GableworkError):
         raise
     except Exception as error:  # noqa: BLE001 - becomes the record
@@ -299,6 +299,13 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
         result = _quarantined(task, candidate, result, incident)
         made_from = ""
     return _packed(task, site, result, facts, seconds, made_from, reused=reused)
+
+
+def _with_overlap(site: CandidateSite, result: BuildingResult) -> BuildingResult:
+    """The result, whose reason names the footprint that has its points."""
+    if result.reason is None or not site.overlap:
+        return result
+    return dataclasses.replace(result, reason_detail="; ".join(filter(None, [result.reason_detail, site.overlap])))
 
 
 def _modelled_before(task: BatchTask, building_id: str, made_from: str) -> BuildingResult | None:

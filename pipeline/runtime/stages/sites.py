@@ -58,6 +58,8 @@ class CandidateSite:
     """The given footprint's columns as the text of a JSON object; None where none was given."""
     given: GivenHeights | None = None
     """Its heights by attributes, elevations in the vertical datum in metres; None where none is known."""
+    overlap: str = ""
+    """Which other footprint has points that lie in this one, in words; empty where none has."""
     block: str | None = None
     """The id of the candidate from which the unit was divided; None where it was not divided."""
     outline: MultiPolygon | None = None

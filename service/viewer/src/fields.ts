@@ -9,6 +9,7 @@ export const LABELS = {
   preset: "Preset",
   classes: "Classes of the file",
   footprints: "Footprints",
+  footprintsLayer: "Layer of the footprints",
   guides: "Guides",
   points: "Keep the points",
   publish: "Publish as",

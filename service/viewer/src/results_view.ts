@@ -10,6 +10,7 @@ import { FIGURE_NAMES } from "./figures";
 import { FilterPanel } from "./filter_panel";
 import type { Hooks } from "./job_view";
 import { jobMenu } from "./job_actions";
+import { capital } from "./fields";
 import { titleOf } from "./job_words";
 import { Legend } from "./legend";
 import { LevelChoice } from "./level_choice";
@@ -32,6 +33,8 @@ interface Report {
   counts?: Record<string, number>;
   timings_s?: Record<string, number>;
   warnings?: string[];
+  /** Why the result is empty; shown before all figures. */
+  headline?: string;
 }
 
 /** Show the results of a job: models, list, records and downloads. Returns a function that ends the view. */
@@ -413,7 +416,8 @@ class ResultsView {
       el("summary", {}, counted(warnings.length, "warning")),
       el("div", { class: "menu-list" }, warningNotice(...warnings)),
     );
-    this.facts.replaceChildren(facts, warnings.length === 0 ? "" : " · ", warnings.length === 0 ? "" : notice);
+    const headline = this.report.headline ?? "";
+    this.facts.replaceChildren(headline === "" ? "" : warningNotice(capital(headline)), facts, warnings.length === 0 ? "" : " · ", warnings.length === 0 ? "" : notice);
   }
 
   /** Say what to try if the result is empty. */
@@ -428,7 +432,7 @@ class ResultsView {
         {},
         rejected > 0
           ? `${counted(rejected, "object")} ${rejected === 1 ? "was" : "were"} looked at and left out: too small, too low, too narrow, or vegetation. Each is in the list under “Without a model”, and in the download “rejected”, with its reason and the measured figure.`
-          : "Nothing rises above the ground.",
+          : capital(this.report.headline || "Nothing rises above the ground."),
       ),
       el(
         "ul",

@@ -10,7 +10,7 @@ import { bytes, count, measure, placeWords } from "./numbers";
 import { SMALL_BYTES, send } from "./sending";
 
 const TILE_ENDINGS = ".las,.laz,.ply,.xyz,.txt,.csv,.asc,.pts";
-const VECTOR_ENDINGS = ".gpkg,.geojson,.json,.parquet,.geoparquet";
+const VECTOR_ENDINGS = ".gpkg,.geojson,.json,.geojsonl,.geojsons,.ndjson,.parquet,.geoparquet,.fgb,.gml,.zip";
 
 /** Inputs that are one vector file each. */
 const VECTORS = ["footprints", "guides"] as const;
@@ -44,6 +44,9 @@ export class Submission {
     footprints: el("ul", { class: "files" }),
     guides: el("ul", { class: "files" }),
   };
+  private readonly layer = el("input", { id: "footprints-layer", type: "text", list: "footprints-layers", autocomplete: "off" });
+  private readonly layers = el("datalist", { id: "footprints-layers" });
+  private readonly layerField = field(LABELS.footprintsLayer, this.layer, "Only where the file has several.");
   private readonly note = el("div");
   private readonly go = el("button", { type: "submit", class: "primary wide" }, "Reconstruct");
   private readonly crs = el("input", { id: "crs", type: "text", placeholder: "EPSG:28992", autocomplete: "off", spellcheck: "false" });
@@ -103,8 +106,10 @@ export class Submission {
       ),
       el("fieldset", { class: "field" }, el("legend", {}, "Compare with"), this.others),
       field(LABELS.classes, this.classes, "Trusted, only compared with the result, or ignored."),
-      field(LABELS.footprints, this.picker("footprints"), "GeoPackage, GeoJSON or GeoParquet: one model per polygon."),
+      field(LABELS.footprints, this.picker("footprints"), "GeoPackage, GeoJSON, GeoParquet, FlatGeobuf, GML or a zipped Shapefile: one model per polygon."),
       this.vectorRows.footprints,
+      this.layerField,
+      this.layers,
       field(LABELS.guides, this.picker("guides"), "Lines of roofs that models follow, in the same formats."),
       this.vectorRows.guides,
       el(
@@ -355,6 +360,7 @@ export class Submission {
       };
       const chosen: [string, string][] = [
         ["crs", this.crs.value.trim()],
+        ["footprintsLayer", this.layerField.hidden ? "" : this.layer.value.trim()],
         ["verticalUnit", this.verticalUnit.value],
         ["classes", this.classes.value],
       ];
@@ -392,12 +398,21 @@ export class Submission {
     }
   }
 
+  /** Offer the layers of the footprints, as far as the service knows them. */
+  private offerLayers(): void {
+    const footprints = this.vectors.footprints;
+    this.layerField.hidden = footprints === null;
+    const known = texts(footprints?.uploaded?.preflight["layers"]);
+    this.layers.replaceChildren(...known.map((value) => el("option", { value })));
+  }
+
   private clear(): void {
     this.tiles = [];
     for (const name of VECTORS) {
       this.vectors[name] = null;
       this.vectorRows[name].replaceChildren();
     }
+    this.layer.value = "";
     this.title.value = "";
     this.placeRefused = false;
     this.anywhere.checked = false;
@@ -421,6 +436,7 @@ export class Submission {
     this.anywhereField.hidden = !isFar && !this.placeRefused;
     if (this.anywhereField.hidden) this.anywhere.checked = false;
     // by another CRS the tiles lie elsewhere, which the service finds out
+    this.offerLayers();
     const unplaced = isFar && this.crs.value.trim() === "" && !this.anywhere.checked;
     const ready = this.tiles.length > 0 && !refused && !waiting && !noLevel && !unplaced && !this.starting;
     for (const box of [...levelBoxes, ...this.formats.querySelectorAll("input"), this.points]) box.disabled = comparison;

@@ -70,3 +70,9 @@ test("a place is shown with its latitude first", () => {
   expect(placeWords({ longitude: 99.206, latitude: -75.981 })).toBe("75.98°\u202fS, 99.21°\u202fE");
   expect(placeWords(null)).toBeNull();
 });
+
+test("a message about layers names the field of the page", () => {
+  expect(inFields("2 layers could be the footprints: give the input footprintsLayer, one of houses, sheds")).toBe(
+    "2 layers could be the footprints: set “Layer of the footprints” under Options, one of houses, sheds",
+  );
+});
