@@ -48,6 +48,7 @@ CLASSIFY_WEIGHTS = MappingProxyType(
 
 WORDS = MappingProxyType(
     {
+        "compile": "kernels are translated for this machine",
         "inputs": "inputs are prepared",
         "plan": "the run is planned",
         "ingest": "points are read",

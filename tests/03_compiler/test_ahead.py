@@ -1,6 +1,8 @@
 """The list of kernels to compile ahead, its signatures, and compiling them only once."""
 
+import functools
 import json
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -84,6 +86,31 @@ def test_kernels_are_compiled_in_other_processes_with_progress_and_never_again(
     before = times()
     assert warm_up.compile_kernels(lightest, processes=2) == 3
     assert times() == before
+
+
+@pytest.mark.slow
+def test_compiling_ends_when_it_is_cancelled_and_each_process_begins_as_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    kernels = warm_up.listed()[-6:]
+    left: list[float] = []
+    done = warm_up.compile_kernels(
+        kernels,
+        processes=1,
+        on_progress=lambda _done, _total, left_s: left.append(left_s),
+        cancelled=lambda: len(left) >= 1,
+        start=functools.partial(os.mkdir, "begun"),
+    )
+    assert 1 <= done < len(kernels)
+    assert (tmp_path / "begun").is_dir()
+    assert all(seconds > 0.0 for seconds in left[:1])
+
+
+def test_what_is_compiled_is_not_missing() -> None:
+    """The tests run where all is compiled; other kernels are named one by one."""
+    assert warm_up.uncompiled(["terrain", "solar"]) == []
 
 
 def test_a_folder_of_kernels_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
