@@ -24,7 +24,7 @@ _START_S, _KILOBYTE_S = 2.0, 0.006
 """Seconds until the processes work, and processor seconds per kilobyte of code: docs/results/start_up.md."""
 _KNOWN_SHARE = 0.3
 """Share of the work from which on it shows its own pace: before, the heaviest kernels are under way."""
-_TICK_S = 0.2
+_TICK_S, _SAY_S = 0.2, 2.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,8 +74,9 @@ def compile_kernels(
 ) -> int:
     """Compile those `listed` kernels that are not compiled yet; returns how many were compiled or loaded.
 
-    `on_progress` gets the numbers of finished and of all kernels, and an estimate of the seconds left. `start` is
-    called first in each process. Once `cancelled` returns True nothing more is begun, and what runs is not waited for.
+    `on_progress` gets the numbers of finished and of all kernels, and an estimate of the seconds left: whenever one is
+    finished, and every two seconds, since the heaviest take long and come first. `start` is called first in each
+    process. Once `cancelled` returns True nothing more is begun, and what runs is not waited for.
     """
     from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait  # most commands compile nothing
     from multiprocessing import get_context
@@ -84,18 +85,18 @@ def compile_kernels(
     whole = sum(one.weight for one in waiting) or 1
     about, began = about_s(waiting, processes), time.perf_counter()
     done = weight = 0
+    said = began
     pool = ProcessPoolExecutor(min(processes, len(waiting)) or 1, mp_context=get_context("spawn"), initializer=start)
     pending = {pool.submit(_compile, one) for one in waiting}
     try:
         while pending and not cancelled():
             ended, pending = wait(pending, _TICK_S, FIRST_COMPLETED)
-            for future in ended:
-                weight += future.result()
-                done += 1
-                if on_progress is not None:
-                    took = time.perf_counter() - began
-                    share = weight / whole
-                    on_progress(done, len(waiting), (1.0 - share) * max(about, took / max(share, _KNOWN_SHARE)))
+            done, weight = done + len(ended), weight + sum(future.result() for future in ended)
+            now = time.perf_counter()
+            if on_progress is not None and (ended or now - said >= _SAY_S):
+                share, said = weight / whole, now
+                left_s = (1.0 - share) * max(about, (now - began) / max(share, _KNOWN_SHARE))
+                on_progress(done, len(waiting), left_s)
     finally:
         pool.shutdown(wait=not pending, cancel_futures=True)
     return done
