@@ -46,11 +46,13 @@ def test_a_put_that_fails_is_made_again_and_is_there_once(storage, s3, what):
 
 
 def test_a_server_that_says_nothing_is_asked_again(storage, s3, monkeypatch):
-    monkeypatch.setattr(urls, "READ_S", 0.3)
     s3.script = first("silent")
-    storage.put("run.json", b"content")
-    # it had arrived the first time: to put it twice does no harm
-    assert s3.count(method="PUT") == 2
+    with monkeypatch.context() as short:
+        short.setattr(urls, "READ_S", 0.5)
+        storage.put("run.json", b"content")
+    # it had arrived the first time: to put it twice does no harm, and on a busy machine others may be late, too
+    assert s3.count("silent", method="PUT") == 1
+    assert s3.count("pass", method="PUT") >= 1
     assert storage.get("run.json") == b"content"
 
 
