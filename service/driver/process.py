@@ -155,6 +155,8 @@ class Driver:
             # jobs that wait for kernels say so, and workers start when they find them compiled
             self._start_all(threads)
             self._perform.wait_until_ready()
+            if self._stopping.is_set():
+                return
             try:
                 self._cluster.engine()
             except ClusterError as error:

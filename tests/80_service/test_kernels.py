@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from driver_bench import Bench
+from driver_bench import Bench, Engine
 from processes import LONG_S, wait_for
 
 from pipeline.errors import RunCancelledError
@@ -159,6 +159,19 @@ def test_workers_elsewhere_compile_for_themselves() -> None:
 )
 def test_what_most_jobs_need_is_enough_for_the_default(asked: dict[str, Any], all_of_them: bool) -> None:
     assert needs_all_kernels(Held(**asked).job.request) is all_of_them
+
+
+def test_a_driver_that_ends_while_it_compiles_starts_no_workers(bench: Bench) -> None:
+    compiler = Compiler()
+    kernels = Kernels(compiles=True, compile_groups=compiler)
+    bench.performs = lambda shop, name: InOwnProcess(shop, name, kernels=kernels)
+    started = Engine.started
+    driver = bench.driver()
+    wait_for(lambda: compiler.calls, "the compiler")
+    driver.stop()
+    wait_for(lambda: bench.codes, "the end of the driver")
+    assert (bench.codes, Engine.started) == ([0], started)
+    assert compiler.cancelled()
 
 
 @pytest.mark.slow
