@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compiler import store
-from pipeline.compiler.kernel import Kernel, is_off
+from pipeline.compiler.kernel import Kernel, is_off, kernel_named
 from pipeline.errors import RunError
 
 LIST = Path(__file__).with_name("kernels.json")
@@ -49,13 +49,6 @@ def listed(groups: Iterable[str] | None = None) -> list[Listed]:
     found = json.loads(LIST.read_text(encoding="utf-8"))
     kernels = [Listed(kernel=k, arguments=a, weight=w) for name in groups or found for k, a, w in found[name]]
     return sorted(kernels, key=lambda one: -one.weight)
-
-
-def uncompiled(groups: Iterable[str] | None = None) -> list[Listed]:
-    """Those of the `listed` kernels of which this machine has no file; imports their modules, and not numba."""
-    from pipeline.compiler.signatures import kernel_named
-
-    return [one for one in listed(groups) if not kernel_named(one.kernel).is_compiled]
 
 
 def about_s(kernels: Iterable[Listed], processes: int) -> float:
@@ -104,7 +97,7 @@ def compile_kernels(
 
 def _compile(one: Listed) -> int:
     """Compile or load a kernel in this process; returns its weight."""
-    from pipeline.compiler.signatures import from_json, kernel_named
+    from pipeline.compiler.signatures import from_json
 
     kernel = kernel_named(one.kernel)
     if not is_off():
@@ -117,7 +110,6 @@ def ship(folder: Path) -> int:
 
     Raises RunError if no kernel is compiled: numba is unknown or switched off; or if the folder cannot be written.
     """
-    from pipeline.compiler.signatures import kernel_named
 
     def is_current(name: str, fingerprint: bytes) -> bool:
         try:

@@ -7,7 +7,8 @@ import os
 from collections.abc import Callable, Collection
 
 from pipeline.compiler import store
-from pipeline.compiler.warm_up import Listed, about_s, compile_kernels, listed, uncompiled
+from pipeline.compiler.kernel import kernel_named
+from pipeline.compiler.warm_up import Listed, about_s, compile_kernels, listed
 from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled
 from pipeline.runtime.isolation.child_main import end_with_parent
 from pipeline.runtime.monitoring.events import Event, Listener, never
@@ -30,13 +31,18 @@ def kernel_groups(*, method: str | None = None, points: bool = False, terrain: s
 def missing_kernels(groups: Collection[str] = RECONSTRUCT) -> list[Listed]:
     """Kernels of some groups that are to be compiled here.
 
-    A few kernels show at once whether those of most runs are compiled. If not, all of these count: loading what is
-    there takes no time.
+    A few kernels stand for each group, since looking at all would import most of the science. If one of them is not
+    compiled all of its group count: loading what is there takes no time.
     """
-    most = set(groups).intersection(RECONSTRUCT)
-    others = [name for name in groups if name not in RECONSTRUCT]
-    found = listed(most) if most and not kernels_are_compiled() else []
-    return found + (uncompiled(others) if others else [])
+    return [one for name in groups if not _is_compiled(name) for one in listed([name])]
+
+
+def _is_compiled(group: str) -> bool:
+    """Whether the kernels of a group are compiled: of most runs by their own, else the first and the last to be."""
+    if group in RECONSTRUCT:
+        return kernels_are_compiled()
+    kernels = listed([group])
+    return all(kernel_named(one.kernel).is_compiled for one in (kernels[0], kernels[-1]))
 
 
 def compiling_s(groups: Collection[str] = RECONSTRUCT) -> float:

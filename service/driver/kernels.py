@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from pipeline.compiler.warm_up import groups
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.compiling import RECONSTRUCT, STAGE, compile_first
 from pipeline.runtime.monitoring.events import Event, Listener
@@ -15,6 +14,8 @@ from service.jobs import JobRequest
 
 _LOOK_S = 0.25
 """Seconds between two looks of a waiting job."""
+_OTHERS = ("classify", "terrain", "compare", "solar")
+"""Groups of kernels that other jobs call."""
 _DEFAULT = {"method": "arrangement", "terrain": "none"}
 """General settings with which a reconstruction needs the first kernels alone."""
 
@@ -40,7 +41,7 @@ class Kernels:
     ----------
     compiles : bool
         Whether jobs run on this machine; a cluster elsewhere compiles for itself.
-    compile : callable
+    compile_groups : callable
         Compiles groups of kernels; replaced in tests.
     """
 
@@ -95,8 +96,7 @@ class Kernels:
             held.record(warning)
 
     def _work(self) -> None:
-        steps = ((RECONSTRUCT, self._first), ([name for name in groups() if name not in RECONSTRUCT], self._rest))
-        for names, done in steps:
+        for names, done in ((RECONSTRUCT, self._first), (_OTHERS, self._rest)):
             if self._stopped.is_set():
                 return
             try:

@@ -4,6 +4,7 @@ import stat
 from collections.abc import Callable, Iterable
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -63,8 +64,19 @@ def test_nothing_is_said_or_done_where_all_is_compiled(cold: Path, monkeypatch: 
     monkeypatch.setattr(compiling, "kernels_are_compiled", lambda: True)
     assert said(monkeypatch) == []
     assert compiling_s() == 0.0
-    # those of other groups are looked at one by one
+    # those of other groups are looked at by themselves
     assert missing_kernels(("terrain",)) == missing_kernels(("reconstruct", "terrain")) == warm_up.listed(["terrain"])
+
+
+def test_one_kernel_that_is_missing_makes_a_group_incomplete(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled = {one.kernel: True for one in warm_up.listed()}
+    monkeypatch.setattr(compiling, "kernel_named", lambda name: SimpleNamespace(is_compiled=compiled[name]))
+    kernels = warm_up.listed(["terrain"])
+    assert missing_kernels(("terrain", "compare")) == []
+    for end in (kernels[0], kernels[-1]):
+        compiled[end.kernel] = False
+        assert missing_kernels(("terrain", "compare")) == kernels
+        compiled[end.kernel] = True
 
 
 def test_the_forecast_grows_with_the_code_and_falls_with_the_cores(cold: Path, monkeypatch: pytest.MonkeyPatch) -> None:
