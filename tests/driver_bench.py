@@ -140,6 +140,8 @@ class Bench:
         self.tools: dict[str, Any] = {}
         self.work: Callable[[Order], tuple[str, dict[str, Any]]] | None = None
         """What processes of attempts do in place of the script, which runs in threads of this process."""
+        self.performs: Callable[[DriverParts, str], Perform] | None = None
+        """What does the work of attempts, in place of both."""
         self.settings = ServiceSettings(
             state=folder, poll_s=0.02, lease_s=30.0, driver_jobs=1, drain_s=40.0, max_attempts=3
         )
@@ -155,6 +157,8 @@ class Bench:
         cluster = SharedCluster(settings, Engine)
 
         def perform(shop: DriverParts, name: str) -> Perform:
+            if self.performs is not None:
+                return self.performs(shop, name)
             if self.work is not None:
                 return InOwnProcess(shop, name, self.work)
             return InThisProcess(shop, name, tools)

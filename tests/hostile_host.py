@@ -65,6 +65,10 @@ class HostileHost:
                 return
             target = first.split(b" ", 2)[1].decode()
             self.requests.append(target)
+            if first.startswith(b"HEAD ") and target.startswith("/body/"):
+                # a body after it would be read as the next answer, or not, as it happens to come
+                self.send(link, _HEAD + b"Content-Length: %d\r\nConnection: close\r\n\r\n" % len(BODY))
+                return
             TEMPERS[target.split("/")[1]](self, link)
 
     def send(self, link: socket.socket, content: bytes) -> None:

@@ -66,9 +66,12 @@ def classify(
         from pipeline.runtime.classify import ClassifyRequest
         from pipeline.runtime.classify import classify as classify_files
         from pipeline.runtime.cluster.tls import given_tls
+        from pipeline.runtime.compiling import RECONSTRUCT, compile_first
         from pipeline.runtime.resources import Resources
         from pipeline.settings import RunSettings
 
+        if scheduler is None:
+            compile_first(console.on_event, (*RECONSTRUCT, "classify"))
         if not is_surely_small(tiles):
             start_early(
                 "classify", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None

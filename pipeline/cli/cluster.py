@@ -42,6 +42,7 @@ def worker(
     with Console(log_json=log_json) as console:
         from pipeline.runtime.cluster.tls import given_tls
         from pipeline.runtime.cluster.worker import WorkerOptions, serve_worker
+        from pipeline.runtime.compiling import compile_first
         from pipeline.runtime.monitoring.logs import wants_json
 
         options = WorkerOptions(
@@ -58,4 +59,5 @@ def worker(
             metrics_port=metrics_port,
             metrics_host=metrics_host,
         )
+        compile_first(console.on_event)
         serve_worker(options, console.status)

@@ -191,20 +191,20 @@ def show_statistics(console: Console, statistics: Mapping[str, Any]) -> None:
     from pipeline.report.table import statistics_tables
 
     for table in statistics_tables(statistics):
-        console.show(table)
+        console.table(table.title, table.header, table.rows)
 
 
 def show_evaluation(console: Console, evaluation: Evaluation) -> dict[str, Any]:
     """An evaluation as tables; returns it as plain JSON values."""
     from pipeline.ruler.evaluation.chapters import chapters
+    from pipeline.ruler.evaluation.model_figures import model_figures
     from pipeline.ruler.evaluation.writing import all_notes, measures_table
 
     document: dict[str, Any] = {"models": evaluation.models.path, "notes": list(all_notes(evaluation))}
-    if evaluation.models.kind == "run":
-        from pipeline.report.statistics import run_statistics
-
-        document["statistics"] = run_statistics(evaluation.models.path)
-        show_statistics(console, document["statistics"])
+    if evaluation.statistics is not None:
+        document["statistics"] = evaluation.statistics
+    for figures in model_figures(evaluation):
+        console.table(figures.title, figures.header, figures.rows)
     for chapter in chapters(evaluation):
         rows = [
             (line.label, line.value, line.interval, line.n) for line in chapter.lines if line.measure.subset == "all"

@@ -103,10 +103,13 @@ def reconstruct(
     """Reconstruct buildings from tiles into a run directory."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.runtime.cluster.tls import given_tls
+        from pipeline.runtime.compiling import compile_first, kernel_groups
         from pipeline.runtime.request import RunRequest
         from pipeline.runtime.resources import Resources
         from pipeline.runtime.run import run
 
+        if scheduler is None:
+            compile_first(console.on_event, kernel_groups(method=method, points=points, terrain=terrain))
         start_early(
             "reconstruct", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=method
         )
@@ -174,10 +177,13 @@ def rerun(
     """Model single buildings of a run again, after other overrides; all others stay untouched."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.runtime.cluster.tls import given_tls
+        from pipeline.runtime.compiling import compile_first
         from pipeline.runtime.rerun import RerunRequest
         from pipeline.runtime.rerun import rerun as rerun_buildings
         from pipeline.runtime.resources import Resources
 
+        if scheduler is None:
+            compile_first(console.on_event)
         start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=False, method=None)
 
         request = RerunRequest(
@@ -248,10 +254,13 @@ def compare(
         from pipeline.ruler.report.evaluation_page import headline
         from pipeline.runtime.cluster.tls import given_tls
         from pipeline.runtime.compare import CompareRequest, own_tables, parse_variants
+        from pipeline.runtime.compiling import RECONSTRUCT, compile_first
         from pipeline.runtime.request import RunRequest
         from pipeline.runtime.resources import Resources
         from pipeline.settings import RunSettings, read_table
 
+        if scheduler is None:
+            compile_first(console.on_event, (*RECONSTRUCT, "compare"))
         start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None)
 
         table = read_table(settings)

@@ -95,8 +95,10 @@ def demo(
         from pipeline.ruler.evaluation.chapters import chapters
         from pipeline.ruler.evaluation.writing import measures_table
         from pipeline.ruler.report.evaluation_page import headline
+        from pipeline.runtime.compiling import RECONSTRUCT, compile_first
         from pipeline.runtime.isolation.preloading import start_early
 
+        compile_first(console.on_event, (*RECONSTRUCT, "simulate", "evaluate"))
         start_early("reconstruct", workers=workers, scheduler=None, footprints=False, method=None)
         made = demonstrate(out, console.on_event, workers=workers, overwrite=overwrite, size_m=size, seed=seed)
         show_summary(console, made.summary)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib
 import importlib.util
 import operator
 import os
@@ -74,6 +75,13 @@ class Kernel:
     def __reduce__(self) -> str:
         """Pickle a kernel by name."""
         return self.py_func.__qualname__
+
+
+def kernel_named(name: str) -> Kernel:
+    """A kernel by its name, `module:function`; raises AttributeError or ModuleNotFoundError if there is none."""
+    module, function = name.split(":")
+    found: Kernel = getattr(importlib.import_module(module), function)
+    return found
 
 
 def is_off() -> bool:

@@ -19,8 +19,6 @@ import numba
 import numpy as np
 from numba.np.numpy_support import as_dtype
 
-from pipeline.compiler.kernel import Kernel
-
 types: Any = numba.types
 
 
@@ -63,10 +61,3 @@ def from_json(document: Any) -> Any:
     return types.BaseTuple.from_types(
         [from_json(one) for one in document["fields"]], getattr(importlib.import_module(module), name)
     )
-
-
-def kernel_named(name: str) -> Kernel:
-    """A kernel by its name, `module:function`; raises AttributeError or ModuleNotFoundError if there is none."""
-    module, function = name.split(":")
-    found: Kernel = getattr(importlib.import_module(module), function)
-    return found

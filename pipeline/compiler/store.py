@@ -116,6 +116,13 @@ def save(name: str, fingerprint: bytes, stored: Stored) -> None:
         _warn(fault, once="cannot be stored")
 
 
+def can_save() -> bool:
+    """Whether compiled kernels can be stored; makes their folder."""
+    with contextlib.suppress(OSError):
+        folder_of_kernels().mkdir(parents=True, exist_ok=True)
+    return os.access(folder_of_kernels(), os.W_OK)
+
+
 def is_stored(prefix: str, fingerprint: bytes) -> bool:
     """Whether a file of a kernel exists, for any signature and processor; reads its first bytes."""
     for folder in (shipped_folder(), folder_of_kernels()):

@@ -11,17 +11,20 @@ import dataclasses
 import json
 import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from pipeline.compiler import store
-from pipeline.compiler.kernel import Kernel, is_off
+from pipeline.compiler.kernel import Kernel, is_off, kernel_named
 from pipeline.errors import RunError
 
 LIST = Path(__file__).with_name("kernels.json")
 """Written by `make kernels`."""
+_START_S, _KILOBYTE_S = 2.0, 0.006
+"""Seconds until the processes work, and processor seconds per kilobyte of code: docs/results/start_up.md."""
+_KNOWN_SHARE = 0.3
+"""Share of the work from which on it shows its own pace: before, the heaviest kernels are under way."""
+_TICK_S, _SAY_S = 0.2, 2.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,32 +51,53 @@ def listed(groups: Iterable[str] | None = None) -> list[Listed]:
     return sorted(kernels, key=lambda one: -one.weight)
 
 
+def about_s(kernels: Iterable[Listed], processes: int) -> float:
+    """About how many seconds of the clock so many processes need to compile kernels; 0 without any."""
+    weight = sum(one.weight for one in kernels)
+    return _START_S + _KILOBYTE_S * weight / max(1, processes) if weight else 0.0
+
+
 def compile_kernels(
     kernels: Iterable[Listed],
     processes: int,
     on_progress: Callable[[int, int, float], None] | None = None,
+    *,
+    cancelled: Callable[[], bool] = lambda: False,
+    start: Callable[[], None] | None = None,
 ) -> int:
     """Compile those `listed` kernels that are not compiled yet; returns how many were compiled or loaded.
 
-    `on_progress` gets the numbers of finished and of all kernels, and an estimate of the seconds left.
+    `on_progress` gets the numbers of finished and of all kernels, and an estimate of the seconds left: whenever one is
+    finished, and every two seconds, since the heaviest take long and come first. `start` is called first in each
+    process. Once `cancelled` returns True nothing more is begun, and what runs is not waited for.
     """
+    from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait  # most commands compile nothing
+    from multiprocessing import get_context
+
     waiting = list(kernels)
     whole = sum(one.weight for one in waiting) or 1
-    began = time.perf_counter()
+    about, began = about_s(waiting, processes), time.perf_counter()
     done = weight = 0
-    with ProcessPoolExecutor(min(processes, len(waiting)) or 1, mp_context=get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(_compile, one) for one in waiting]):
-            weight += future.result()
-            done += 1
-            if on_progress is not None:
-                took = time.perf_counter() - began
-                on_progress(done, len(waiting), took * (whole - weight) / max(weight, 1))
+    said = began
+    pool = ProcessPoolExecutor(min(processes, len(waiting)) or 1, mp_context=get_context("spawn"), initializer=start)
+    pending = {pool.submit(_compile, one) for one in waiting}
+    try:
+        while pending and not cancelled():
+            ended, pending = wait(pending, _TICK_S, FIRST_COMPLETED)
+            done, weight = done + len(ended), weight + sum(future.result() for future in ended)
+            now = time.perf_counter()
+            if on_progress is not None and (ended or now - said >= _SAY_S):
+                share, said = weight / whole, now
+                left_s = (1.0 - share) * max(about, (now - began) / max(share, _KNOWN_SHARE))
+                on_progress(done, len(waiting), left_s)
+    finally:
+        pool.shutdown(wait=not pending, cancel_futures=True)
     return done
 
 
 def _compile(one: Listed) -> int:
     """Compile or load a kernel in this process; returns its weight."""
-    from pipeline.compiler.signatures import from_json, kernel_named
+    from pipeline.compiler.signatures import from_json
 
     kernel = kernel_named(one.kernel)
     if not is_off():
@@ -86,7 +110,6 @@ def ship(folder: Path) -> int:
 
     Raises RunError if no kernel is compiled: numba is unknown or switched off; or if the folder cannot be written.
     """
-    from pipeline.compiler.signatures import kernel_named
 
     def is_current(name: str, fingerprint: bytes) -> bool:
         try:

@@ -182,13 +182,10 @@ class _Window:
         self._check()
         self._room.acquire()
         self._tell()
-        self._going.add(self._threads.submit(self._one, key, content))
-
-    def _one(self, key: str, content: bytes) -> None:
-        try:
-            self._storage._put(key, content, self._checked)  # noqa: SLF001 - a part of it
-        finally:
-            self._room.release()
+        going = self._threads.submit(self._storage._put, key, content, self._checked)  # noqa: SLF001 - a part of it
+        self._going.add(going)
+        # only when it is over: the next put takes this room, looks for faults first, and must see this one
+        going.add_done_callback(lambda _: self._room.release())
 
     def _checked(self) -> None:
         self._check()

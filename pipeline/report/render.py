@@ -81,7 +81,7 @@ def render_run(
     FigureCanvasAgg(figure)
     plan, view = figure.subplots(1, 2, gridspec_kw={"width_ratios": [0.85, 1.0], "wspace": 0.02})
     figure.subplots_adjust(left=0.01, right=0.99, top=0.94, bottom=0.06)
-    window, is_part = _window(planes, units[0])
+    window, is_part = view_window(_geometries(planes), units[0])
     _draw_map(plan, buildings, planes, rejected, outlines)
     _draw_scale_bar(plan, units[0])
     if is_part:
@@ -112,13 +112,12 @@ def _units(run_dir: str, filesystem: pafs.FileSystem) -> tuple[float, float]:
     return float(crs.get("horizontal_unit_m", 1.0)), float(crs.get("vertical_unit_m", 1.0))
 
 
-def _window(planes: pa.Table, unit_m: float) -> tuple[Window, bool]:
-    """The window of the bird's-eye view in CRS units, and whether it is smaller than the whole run.
+def view_window(faces: Any, unit_m: float) -> tuple[Window, bool]:
+    """The window of a bird's-eye view in the units of an array of roof faces, and whether it is smaller than the whole.
 
     The square with the most roof faces is found on a lattice of half its side; the first of equal ones wins.
     """
-    found = _geometries(planes)
-    present = found[~shapely.is_missing(found)]
+    present = faces[~shapely.is_missing(faces)]
     if len(present) == 0:
         return NO_WINDOW, False
     west, south, east, north = (float(v) for v in shapely.total_bounds(present))

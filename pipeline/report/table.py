@@ -2,58 +2,54 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from rich.table import Table
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CountTable:
+    """A table of texts."""
+
+    title: str
+    """What is counted."""
+    header: tuple[str, ...]
+    """One text per column."""
+    rows: tuple[tuple[str, ...], ...]
+    """The first column names the row."""
 
 
-def statistics_tables(statistics: Mapping[str, Any]) -> list[Table]:
-    """The figures of `run_statistics` as rich tables for a terminal."""
-    tables = [_outcome_table(statistics), _count_table("Roof types", "type", statistics["roof_types"])]
+def statistics_tables(statistics: Mapping[str, Any]) -> list[CountTable]:
+    """The figures of `run_statistics` as tables."""
+    tables = [_outcome_table(statistics), count_table("Roof types", "type", statistics["roof_types"])]
     if statistics["rejected_reasons"]:
-        tables.append(_count_table("Rejected objects", "reason", statistics["rejected_reasons"]))
-    tables.append(_quantile_table(statistics))
-    return tables
+        tables.append(count_table("Rejected objects", "reason", statistics["rejected_reasons"]))
+    return [*tables, quantile_table("Over the buildings", statistics["quantiles"])]
 
 
-def _outcome_table(statistics: Mapping[str, Any]) -> Table:
+def _outcome_table(statistics: Mapping[str, Any]) -> CountTable:
     """Statuses with their shares, and their reasons beneath."""
-    table = Table(title="Candidates", title_justify="left")
-    table.add_column("status")
-    table.add_column("reason")
-    table.add_column("count", justify="right")
-    table.add_column("share", justify="right")
+    rows: list[tuple[str, ...]] = []
     for status, count in statistics["statuses"].items():
         share = statistics["shares"][status]
-        table.add_row(status, "", str(count), "" if share is None else f"{share:.1%}")
+        rows.append((status, "", f"{count:,}", "" if share is None else f"{100.0 * share:.1f} %"))
         for reason, number in statistics["reasons"].get(status, {}).items():
-            table.add_row("", reason, str(number), f"{number / statistics['candidates']:.1%}")
-    table.add_section()
-    table.add_row("all", "", str(statistics["candidates"]), "")
-    return table
+            rows.append(("", reason, f"{number:,}", f"{100.0 * number / statistics['candidates']:.1f} %"))
+    rows.append(("all", "", f"{statistics['candidates']:,}", ""))
+    return CountTable(title="Candidates", header=("status", "reason", "count", "share"), rows=tuple(rows))
 
 
-def _count_table(title: str, header: str, counts: Mapping[str, int]) -> Table:
-    table = Table(title=title, title_justify="left")
-    table.add_column(header)
-    table.add_column("count", justify="right")
-    for name, count in counts.items():
-        table.add_row(name, str(count))
-    return table
+def count_table(title: str, header: str, counts: Mapping[str, int]) -> CountTable:
+    """Counts by name."""
+    rows = tuple((name, f"{count:,}") for name, count in counts.items())
+    return CountTable(title=title, header=(header, "count"), rows=rows)
 
 
-def _quantile_table(statistics: Mapping[str, Any]) -> Table:
-    """Quantiles of the figures over the buildings."""
-    table = Table(title="Over the buildings", title_justify="left")
-    table.add_column("figure")
-    names = list(
-        dict.fromkeys(name for quantiles in statistics["quantiles"].values() for name in quantiles if name != "n")
+def quantile_table(title: str, quantiles: Mapping[str, Mapping[str, float | int | None]]) -> CountTable:
+    """Quantiles of figures with their number `n`; nothing for an unknown one."""
+    names = list(dict.fromkeys(name for figures in quantiles.values() for name in figures if name != "n"))
+    rows = tuple(
+        (figure, *("" if known[name] is None else f"{known[name]:,.3f}" for name in names), f"{known['n']:,}")
+        for figure, known in quantiles.items()
     )
-    for name in names:
-        table.add_column(name, justify="right")
-    table.add_column("n", justify="right")
-    for figure, quantiles in statistics["quantiles"].items():
-        values = ["" if quantiles[name] is None else f"{quantiles[name]:.3f}" for name in names]
-        table.add_row(figure, *values, str(quantiles["n"]))
-    return table
+    return CountTable(title=title, header=("figure", *names, "n"), rows=rows)

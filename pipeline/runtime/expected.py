@@ -60,8 +60,6 @@ class Rates:
     """Buildings where no better estimate exists."""
     points_per_building: float = 100.0
     """The least points per building on average, where no better estimate exists."""
-    compiling_s: float = 45.0
-    """Additional wall seconds of the first run, which compiles its kernels."""
     other_methods: float = 2.0
     """Cost of modelling by other methods than the default one, as a multiple of its own."""
     process_gib: float = 0.3

@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from pipeline.compiler.signatures import kernel_named
-from pipeline.compiler.warm_up import listed
-from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled
+from pipeline.runtime.compiling import compiling_s, kernel_groups
 from pipeline.runtime.engine import Engine
 from pipeline.runtime.expected import RATES, Expected, expected
 from pipeline.runtime.monitoring.machine import cores
@@ -51,9 +49,10 @@ class Forecast:
 
     @property
     def range_s(self) -> tuple[float, float]:
-        """Least and most seconds in total."""
+        """Least and most seconds in total, with those to compile kernels."""
         factor = _BY_SAMPLE if self.sampled else _BY_RATES
-        return self.total_s / factor, self.total_s * factor + self.cold_s
+        least_s, most_s = self.cold_s / _BY_RATES, self.cold_s * _BY_RATES
+        return self.total_s / factor + least_s, self.total_s * factor + most_s
 
 
 def forecast(
@@ -83,7 +82,9 @@ def forecast(
     here = request.resources.scheduler is None
     hands = min(workers, cores()) if here else workers
     total_s, stage_s = _total_s(work, engine, hands)
-    cold_s = 0.0 if not here or _is_compiled(request) else RATES.compiling_s
+    general = request.settings.general
+    groups = kernel_groups(method=general.method, points=request.points, terrain=general.terrain)
+    cold_s = compiling_s(groups) if here else 0.0
     found = None
     if total_s >= worth_s and here and not cold_s:
         from pipeline.runtime.sample import sampled  # loads what runs
@@ -101,14 +102,6 @@ def forecast(
         process_bytes=max(largest, round(driver)),
         memory_bytes=round(workers * largest + driver),
     )
-
-
-def _is_compiled(request: RunRequest) -> bool:
-    """Whether this machine has compiled the kernels of a run: each method has its own, and so has `--points`."""
-    groups = ["compare"] if request.settings.general.method != _METHOD else []
-    groups += ["classify"] if request.points else []
-    others = listed(groups) if groups else []
-    return kernels_are_compiled() and all(kernel_named(one.kernel).is_compiled for one in others)
 
 
 def _total_s(work: Expected, engine: Engine, hands: int) -> tuple[float, dict[str, float]]:

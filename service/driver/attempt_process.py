@@ -37,6 +37,7 @@ from service.driver.attempt_child import (
     attend,
 )
 from service.driver.failures import has_no_space
+from service.driver.kernels import Kernels
 from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.driver.shared_cluster import SharedCluster
 from service.errors import AttemptEndedError, NoProcessError, NoSuchUploadError
@@ -80,6 +81,9 @@ class Perform(Protocol):
     def preload(self) -> None:
         """Get ready for the first attempt."""
 
+    def wait_until_ready(self) -> None:
+        """Wait until most attempts find all that they need."""
+
     def close(self) -> None:
         """End all processes."""
 
@@ -93,6 +97,9 @@ class InThisProcess:
         self._tools = tools
 
     def preload(self) -> None:
+        """Everything is there."""
+
+    def wait_until_ready(self) -> None:
         """Everything is there."""
 
     def __call__(self, held: LeasedJob, place: Path) -> tuple[str, dict[str, Any]]:
@@ -124,22 +131,35 @@ class InOwnProcess:
         Name of the driver.
     work : callable
         Called in the process with its order; `attend`, except in tests of processes that go wrong.
+    kernels : Kernels, optional
+        Compiles what attempts call; by default on this machine, unless the workers are elsewhere.
     """
 
     def __init__(
-        self, shop: DriverParts, name: str, work: Callable[[Order], tuple[str, dict[str, Any]]] = attend
+        self,
+        shop: DriverParts,
+        name: str,
+        work: Callable[[Order], tuple[str, dict[str, Any]]] = attend,
+        kernels: Kernels | None = None,
     ) -> None:
         self._shop = shop
         self._name = name
         self._work = work
         self._pool = ChildPool(stderr=sys.stderr.fileno())
+        self._kernels = kernels or Kernels(compiles=shop.settings.scheduler is None)
 
     def preload(self) -> None:
-        """Start the process from which attempts are forked."""
+        """Start the process from which attempts are forked, and the compilation of kernels."""
+        self._kernels.start()
         self._pool.preload(LOADS)
+
+    def wait_until_ready(self) -> None:
+        """Wait for the kernels of most attempts."""
+        self._kernels.wait_for_first()
 
     def close(self) -> None:
         """End all processes."""
+        self._kernels.stop()
         self._pool.close()
 
     def __call__(self, held: LeasedJob, place: Path) -> tuple[str, dict[str, Any]]:
@@ -152,6 +172,7 @@ class InOwnProcess:
         NoProcessError
             It cannot be started now.
         """
+        self._kernels.wait_for(held)
         order = Order(
             job=held.job,
             settings=self._shop.settings,

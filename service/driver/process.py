@@ -146,11 +146,16 @@ class Driver:
     # --- start and end
 
     def _start(self, threads: list[threading.Thread]) -> None:
-        """Wait for the database, start the workers, then let the slots claim."""
+        """Wait for the database, let the slots claim, then start the workers."""
         try:
             self._shop.folder.make()
             self._perform.preload()
             if not self._until_done(self._store.migrate, "the database cannot be migrated"):
+                return
+            # jobs that wait for kernels say so, and workers start when they find them compiled
+            self._start_all(threads)
+            self._perform.wait_until_ready()
+            if self._stopping.is_set():
                 return
             try:
                 self._cluster.engine()
@@ -161,6 +166,8 @@ class Driver:
             self._broken = True
             return
         quieten()
+
+    def _start_all(self, threads: list[threading.Thread]) -> None:
         for thread in threads:
             if not self._stopping.is_set():
                 thread.start()

@@ -48,6 +48,7 @@ CLASSIFY_WEIGHTS = MappingProxyType(
 
 WORDS = MappingProxyType(
     {
+        "compile": "kernels are translated for this machine",
         "inputs": "inputs are prepared",
         "plan": "the run is planned",
         "ingest": "points are read",
@@ -74,6 +75,9 @@ WORDS = MappingProxyType(
 )
 """Descriptions of stages. Those without a weight belong to a comparison and are short."""
 
+COMPILING = 10
+"""Percent that kernels take which are compiled before the first job of an installation; its stages then begin at less,
+and it stays there until they have more."""
 _LAST = 99
 _READING = frozenset({"inputs", "plan", "ingest"})
 _START_S = 60.0
@@ -86,7 +90,7 @@ def percent(stage: str, done: int, total: int, weights: Mapping[str, int] = WEIG
     Parameters
     ----------
     stage : str
-        One of `weights`; any other counts as not begun.
+        One of `weights`, or compile; any other counts as not begun.
     done, total : int
         Units of this stage; a `total` of 0 is unknown and counts as nothing done.
     weights : mapping
@@ -99,14 +103,18 @@ def percent(stage: str, done: int, total: int, weights: Mapping[str, int] = WEIG
 
     Examples
     --------
-    >>> percent("inputs", 0, 1), percent("reconstruct", 0, 80), percent("reconstruct", 40, 80), percent("outputs", 3, 3)
-    (0, 45, 62, 99)
+    >>> percent("compile", 53, 106), percent("inputs", 0, 1)
+    (5, 0)
+    >>> percent("reconstruct", 0, 80), percent("reconstruct", 40, 80), percent("outputs", 3, 3)
+    (45, 62, 99)
     """
+    share = min(max(done / total, 0.0), 1.0) if total > 0 else 0.0
+    if stage == "compile":
+        return int(COMPILING * share)
     if stage not in weights:
         return 0
     names = list(weights)
     before = sum(weights[name] for name in names[: names.index(stage)])
-    share = min(max(done / total, 0.0), 1.0) if total > 0 else 0.0
     return min(_LAST, int(before + weights[stage] * share))
 
 

@@ -1,6 +1,8 @@
 """The list of kernels to compile ahead, its signatures, and compiling them only once."""
 
+import functools
 import json
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +11,8 @@ import numpy as np
 import pytest
 
 from pipeline.compiler import Kernel, store, warm_up
-from pipeline.compiler.signatures import from_json, kernel_named, to_json
+from pipeline.compiler.kernel import kernel_named
+from pipeline.compiler.signatures import from_json, to_json
 from pipeline.errors import RunError
 
 
@@ -73,8 +76,9 @@ def test_kernels_are_compiled_in_other_processes_with_progress_and_never_again(
     lightest = warm_up.listed()[-3:]
     progress: list[tuple[int, int, float]] = []
     warm_up.compile_kernels(lightest, processes=2, on_progress=lambda *figures: progress.append(figures))
-    assert [figures[:2] for figures in progress] == [(1, 3), (2, 3), (3, 3)]
-    assert progress[-1][2] == 0.0
+    assert [total for _, total, _ in progress] == [3] * len(progress)
+    assert [done for done, _, _ in progress] == sorted(done for done, _, _ in progress)
+    assert progress[-1] == (3, 3, 0.0)
     names = {path.name.split(".cpython")[0] for path in tmp_path.glob(f"*{store.ENDING}")}
     assert names >= {one.kernel.replace(":", ".") for one in lightest}
 
@@ -84,6 +88,26 @@ def test_kernels_are_compiled_in_other_processes_with_progress_and_never_again(
     before = times()
     assert warm_up.compile_kernels(lightest, processes=2) == 3
     assert times() == before
+
+
+@pytest.mark.slow
+def test_compiling_ends_when_it_is_cancelled_and_each_process_begins_as_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    kernels = warm_up.listed()[-6:]
+    progress: list[tuple[int, int, float]] = []
+    done = warm_up.compile_kernels(
+        kernels,
+        processes=1,
+        on_progress=lambda *figures: progress.append(figures),
+        cancelled=lambda: any(finished for finished, _, _ in progress),
+        start=functools.partial(os.mkdir, "begun"),
+    )
+    assert 1 <= done < len(kernels)
+    assert (tmp_path / "begun").is_dir()
+    assert all(left_s > 0.0 for _, _, left_s in progress)
 
 
 def test_a_folder_of_kernels_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

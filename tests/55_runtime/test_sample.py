@@ -267,40 +267,35 @@ def foreseen(town: Path, engine: Engine, resources: Resources, worth_s: float, w
 
 def test_a_sample_is_run_only_where_it_is_worth_it(town: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sample, "sampled", _Fails())
-    monkeypatch.setattr(forecasts, "kernels_are_compiled", lambda: True)
+    monkeypatch.setattr(forecasts, "compiling_s", lambda _groups: 0.0)
     short = foreseen(town, "local", Resources(), WORTH_S)
     assert not short.sampled
     assert short.range_s == pytest.approx((short.total_s / 2.0, short.total_s * 2.0))
     # workers elsewhere are other machines
     assert not foreseen(town, "cluster", Resources(scheduler="tcp://far:8786"), 0.0).sampled
     # a sample would compile what is not compiled
-    monkeypatch.setattr(forecasts, "kernels_are_compiled", lambda: False)
+    monkeypatch.setattr(forecasts, "compiling_s", lambda _groups: 30.0)
     cold = foreseen(town, "local", Resources(), 0.0)
     assert not cold.sampled
-    assert cold.range_s[1] == short.range_s[1] + RATES.compiling_s
+    assert cold.range_s == pytest.approx((short.range_s[0] + 15.0, short.range_s[1] + 60.0))
+    assert foreseen(town, "cluster", Resources(scheduler="tcp://far:8786"), 0.0).cold_s == 0.0
 
 
 def test_other_methods_and_points_over_models_need_kernels_of_their_own(
     town: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(forecasts, "kernels_are_compiled", lambda: True)
-    asked: list[str] = []
-
-    class Cold:
-        is_compiled = False
-
-    monkeypatch.setattr(forecasts, "kernel_named", lambda name: asked.append(name) or Cold())
-    request, _, _ = planned([town])
-    general = dataclasses.replace(request.settings.general, method="kmeans")
+    asked: list[tuple[str, ...]] = []
+    monkeypatch.setattr(forecasts, "compiling_s", lambda groups: asked.append(groups) or 0.0)
+    request, plan, paths = planned([town])
+    general = dataclasses.replace(request.settings.general, method="kmeans", terrain="tin")
     settings = dataclasses.replace(request.settings, general=general)
-    assert forecasts._is_compiled(request)
-    assert not forecasts._is_compiled(dataclasses.replace(request, points=True))
-    assert not forecasts._is_compiled(dataclasses.replace(request, settings=settings))
-    assert len(set(asked)) == 2
+    for one in (request, dataclasses.replace(request, points=True), dataclasses.replace(request, settings=settings)):
+        forecast(one, plan, paths, engine="local", workers=2, worth_s=1e9)
+    assert asked == [("reconstruct",), ("reconstruct", "classify"), ("reconstruct", "compare", "terrain")]
 
 
 def test_what_was_measured_makes_the_range_narrower(town: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forecasts, "kernels_are_compiled", lambda: True)
+    monkeypatch.setattr(forecasts, "compiling_s", lambda _groups: 0.0)
     by_rates = foreseen(town, "local", Resources(), 1e9)
     pace = dict.fromkeys(by_rates.work.cpu_s(), 3.0)
     monkeypatch.setattr(sample, "sampled", lambda work, *_, **__: dataclasses.replace(work, pace=pace))

@@ -4,6 +4,7 @@ import base64
 import dataclasses
 import html
 import io
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -27,17 +28,21 @@ from matplotlib.colors import to_rgb
 from page_reader import Reader, assert_loads_nothing, assert_pictures_have_words_and_ids_are_unique, count, pixels
 from PIL import Image
 from processes import program
+from roofs_by_hand import flat, reference
 
 from pipeline.report.maps import BAD, GOOD, MISSING, Map
 from pipeline.ruler.evaluation.chapters import printed
 from pipeline.ruler.evaluation.counts import visible_share
 from pipeline.ruler.evaluation.definitions import DEFINITIONS as ALL
-from pipeline.ruler.evaluation.evaluate import Evaluation
-from pipeline.ruler.evaluation.models import RoofSurface
+from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
+from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
+from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
 from pipeline.ruler.evaluation.reference import ReferencePoints
+from pipeline.ruler.evaluation.writing import markdown
 from pipeline.ruler.report.evaluation_maps import maps
 from pipeline.ruler.report.evaluation_page import HEADLINE, page, write_page
 from pipeline.ruler.report.histograms import charts
+from pipeline.ruler.report.models_view import models_view
 from pipeline.ruler.report.section import RESIDUAL_CLASSES, UNCOVERED, profile_line, residual_class, section_svg
 from pipeline.ruler.report.svg_chart import rebinned
 from pipeline.ruler.report.worst_cases import MAX_NOT_FOUND, chosen_rows, worst_cases
@@ -184,6 +189,64 @@ def test_without_points_or_a_reference_there_are_still_maps_but_no_invented_figu
     assert worst_cases(alone) == []
     assert charts(alone.tables) == []
     assert "Vertical distance" not in page(damaged_evaluation(points=False), DEFINITIONS)
+
+
+def row_of_flats(walls: Sequence[float], name: str) -> list[RoofModel]:
+    """Roofs of one row between walls, each of another elevation."""
+    return [
+        flat(f"{name}{k}", low, width=high - low, z=6.0 + k % 3, source_id="row")
+        for k, (low, high) in enumerate(itertools.pairwise(walls))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("walls", "outcome", "hatched"),
+    [((0, 6, 12, 18, 24), "correct", 0), ((0, 6, 9, 12, 18, 24), "passable", 1), ((0, 3, 6, 24), "false", 0)],
+)
+def test_a_row_has_the_colour_of_what_was_found(walls: tuple[float, ...], outcome: str, hatched: int) -> None:
+    """A right division is as good as one model; a wrong one is hatched, and not shown as if no roof were there."""
+    truth = reference(row_of_flats((0, 6, 12, 18, 24), "house"))
+    found = evaluate(model_set(row_of_flats(walls, "m")), truth)
+    counts = {entry.label: entry.count for entry in map_called(found, "Buildings by outcome").legend}
+    torn = {"wrongly divided or joined: no model stands for it": 1} if hatched else {}
+    assert counts == {outcome: 1} | torn
+    gone = evaluate(model_set([flat("far", 80.0)]), truth)
+    counts = {entry.label: entry.count for entry in map_called(gone, "Buildings by outcome").legend}
+    assert counts == {"not found": 1, "model without a building": 1}
+
+
+def test_the_page_without_a_truth_has_figures_and_a_picture() -> None:
+    text = page(damaged_evaluation(reference=False), DEFINITIONS)
+    read = Reader(text)
+    texts = [part.strip() for part in read.texts]
+    for wanted in ("The models", "Roof types", "Over the models", "footprint, m2", "roof faces"):
+        assert wanted in texts, wanted
+    views = [image for image in read.all("img") if (image["alt"] or "").startswith("Bird's-eye view")]
+    assert len(views) == 1
+    assert "14 of 14 models" in (views[0]["alt"] or "")
+    drawn = pixels(base64.b64decode((views[0]["src"] or "").partition(",")[2]))
+    assert (drawn[:, :, 3] > 0).mean() > 0.05
+    with_truth = Reader(page(damaged_evaluation(), DEFINITIONS))
+    assert not [image for image in with_truth.all("img") if (image["alt"] or "").startswith("Bird's-eye view. ")]
+    assert "Over the models" in [part.strip() for part in with_truth.texts]
+
+
+def test_the_figures_of_a_run_are_on_the_page_and_in_the_report(street_run: Path) -> None:
+    found = evaluate_files(EvaluationRequest(models=str(street_run)))
+    shown = [part.strip() for part in Reader(page(found)).texts]
+    report = markdown(found)
+    for wanted in ("Candidates", "invalid_solid", "Rejected objects", "vegetation", "rmse_m"):
+        assert wanted in shown, wanted
+        assert wanted.replace("_", r"\_") in report or wanted in report, wanted
+
+
+def test_models_far_apart_are_drawn_where_most_roofs_are() -> None:
+    near = [flat(f"m{k}", 20.0 * k) for k in range(4)]
+    view = models_view([*near, flat("far", 3000.0)])
+    assert view is not None
+    assert "the square of 180 m with the most roof faces: 4 of 5 models" in view.caption
+    assert models_view([]) is None
+    assert models_view([dataclasses.replace(near[0], surfaces=(), solids=())]) is None
 
 
 def case_rows(specification: Sequence[tuple[str, str | None, str | None, float]]) -> pa.Table:

@@ -20,7 +20,6 @@ from pipeline.errors import RunError
 from pipeline.io import storage_at
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.expected import RATES
 from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, locked_file, locked_work, make_work
 
 
@@ -270,11 +269,12 @@ def test_kernels_that_are_yet_to_be_compiled_are_reported_with_their_time(
 ) -> None:
     ends = []
     for compiled in (True, False):
-        monkeypatch.setattr("pipeline.runtime.forecast.kernels_are_compiled", lambda compiled=compiled: compiled)
+        seconds = 0.0 if compiled else 30.0
+        monkeypatch.setattr("pipeline.runtime.forecast.compiling_s", lambda _groups, seconds=seconds: seconds)
         reported = json.loads(call("plan", folder / "city.toml", "--json")[1])
         assert any("gablework warm-up" in text for text in reported["warnings"]) is not compiled
         ends.append(reported["seconds"][1])
-    assert ends[1] > ends[0] + 0.5 * RATES.compiling_s
+    assert ends[1] == pytest.approx(ends[0] + 60.0)
 
 
 def test_a_window_is_planned_by_its_share(folder: Path, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from pipeline.errors import (
 from pipeline.runtime.monitoring.logs import formatter
 from service.driver.failures import failure_of, is_tried_again, pause_s
 from service.driver.messages import Scrubber, digest_of, outcome
-from service.driver.progress import CLASSIFY_WEIGHTS, WEIGHTS, WORDS, percent
+from service.driver.progress import CLASSIFY_WEIGHTS, COMPILING, WEIGHTS, WORDS, percent
 from service.errors import (
     InputRefusedError,
     NoSpaceError,
@@ -137,8 +137,10 @@ def test_progress_grows_with_the_stages_and_within_them(steps: list[tuple[str, i
 
 
 def test_the_stages_make_up_the_whole_job() -> None:
-    # what a comparison does besides is short: progress stands still meanwhile
-    assert set(WORDS) - set(WEIGHTS) - set(CLASSIFY_WEIGHTS) == {"records", "points", "pictures", "page"}
+    # what a comparison does besides is short: progress stands still meanwhile; kernels are compiled once
+    others = {"compile", "records", "points", "pictures", "page"}
+    assert set(WORDS) - set(WEIGHTS) - set(CLASSIFY_WEIGHTS) == others
+    assert [percent("compile", done, 100) for done in (0, 50, 100)] == [0, COMPILING // 2, COMPILING]
     for weights in (WEIGHTS, CLASSIFY_WEIGHTS):
         assert sum(weights.values()) == 100
         assert set(weights) <= set(WORDS)

@@ -266,7 +266,7 @@ def test_a_supervised_process_is_asked_to_end_once_however_often_that_is_wanted(
 def test_a_driver_without_a_sign_of_life_is_killed_and_one_with_signs_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervisor_module, "SILENT_S", 1.0)
+    monkeypatch.setattr(supervisor_module, "SILENT_S", 2.0)
     dead: list[str] = []
     frozen, beats = tmp_path / "frozen", tmp_path / "beats"
     # it gives signs until the test wants it to stand still
@@ -283,7 +283,7 @@ def test_a_driver_without_a_sign_of_life_is_killed_and_one_with_signs_is_not(
     supervisor.start()
     first = supervisor.pid
     # far longer than the silence that is allowed
-    wait_for(lambda: beats.exists() and len(beats.read_text()) > 30, "signs of life")
+    wait_for(lambda: beats.exists() and len(beats.read_text()) > 60, "signs of life")
     assert (dead, supervisor.pid) == ([], first)
     frozen.touch()
     wait_for(lambda: dead, "the end of the silent process")

@@ -85,25 +85,58 @@ def held_of(bench: Bench, **values: Any) -> LeasedJob:
     return LeasedJob(bench.store, claimed, **(known | values))
 
 
-def test_an_attempt_without_progress_is_stopped_and_one_with_progress_is_not(bench: Bench) -> None:
-    held = held_of(bench, step_s=lambda stage: 1e6 if stage == "reconstruct" else 0.2)
+class Clock:
+    """Stands for `time` in the module of the lease: only the test lets time pass, however long a thread waits."""
+
+    time = staticmethod(time.time)
+
+    def __init__(self) -> None:
+        self.now_s = time.monotonic()
+        self.looks = 0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def step_s(self, stage: str) -> float:
+        """Seconds of a step; asked for by each look at the progress."""
+        self.looks += 1
+        return 1e6 if stage == "reconstruct" else 0.2
+
+    def passes(self, seconds: float) -> None:
+        """Let time pass, and the lease look at the progress twice: the first look may have begun before."""
+        self.now_s += seconds
+        seen = self.looks
+        wait_for(lambda: self.looks >= seen + 2, "a look at the progress")
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    found = Clock()
+    monkeypatch.setattr(leased_job, "time", found)
+    return found
+
+
+def test_an_attempt_without_progress_is_stopped_and_one_with_progress_is_not(bench: Bench, clock: Clock) -> None:
+    held = held_of(bench, step_s=clock.step_s, claimed_s=clock.now_s)
     with held:
         held.record(Event(kind="stage", stage="reconstruct"))
-        began_s = time.monotonic()
-        assert not held.wait(0.5)
+        clock.passes(0.5)
         held.record(Event(kind="stage", stage="split"))
-        while time.monotonic() - began_s < 1.0:
+        for _ in range(10):
+            clock.passes(0.15)
+            assert not held.cancelled()
             held.move()
-            assert not held.wait(0.02)
+        clock.now_s += 0.25
         wait_for(held.cancelled, "the stop")
         assert held.stopped_for is Stop.STALLED
 
 
-def test_an_attempt_that_is_over_needs_no_progress(bench: Bench) -> None:
-    held = held_of(bench, step_s=lambda _stage: 0.1)
+def test_an_attempt_that_is_over_needs_no_progress(bench: Bench, clock: Clock) -> None:
+    held = held_of(bench, step_s=clock.step_s, claimed_s=clock.now_s)
     with held:
         held.rest()
-        assert not held.wait(0.5)
+        clock.passes(0.5)
+        assert not held.cancelled()
         assert bench.store.stalled() == []
 
 

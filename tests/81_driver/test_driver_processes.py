@@ -1,5 +1,6 @@
 """Real drivers with real clusters over real jobs: killed, drained, several at once."""
 
+import contextlib
 import json
 import os
 import signal
@@ -125,6 +126,30 @@ def test_a_driver_that_is_ended_gives_its_job_back_and_another_takes_it_at_once(
     second = site.driver("second", lease_s="600")
     done = site.over(job, second)
     assert (done.status, done.attempt, done.lost_attempts) == (JobStatus.SUCCESSFUL, 2, 0)
+
+
+@pytest.mark.parametrize("site", ["sqlite"], indirect=True)
+def test_a_first_job_says_that_kernels_are_compiled_and_nothing_of_that_outlives_the_driver(
+    site: Site, tmp_path: Path
+) -> None:
+    job = site.submit()
+    site.environment["NUMBA_CACHE_DIR"] = str(tmp_path / "no kernels yet")
+    driver = site.driver("first")
+    driver.wait_for(lambda: site.store.get(job.job_id).stage == "compile", "the stage of the job")
+    assert "compiling, once, about " in site.store.get(job.job_id).message
+    assert "compiling, once, about " in driver.text
+
+    def compilers() -> list[psutil.Process]:
+        found = []
+        for child in driver.children():
+            with contextlib.suppress(psutil.NoSuchProcess):
+                found += [child] if any("spawn_main" in word for word in child.cmdline()) else []
+        return found
+
+    driver.wait_for(compilers, "the processes that compile")
+    children = driver.children()
+    driver.kill(group=False)
+    wait_for(lambda: not [child for child in children if lives(child)], "the end of all that compile")
 
 
 @pytest.mark.parametrize("site", ["sqlite"], indirect=True)

@@ -41,6 +41,34 @@ def models(store: JobStore, job: Job) -> None:
     store.record(job, [event])
 
 
+def test_a_first_job_shows_what_is_compiled_before_its_other_stages(
+    driverless: tuple[str, Path], visit: Callable[..., Visit]
+) -> None:
+    url, state = driverless
+    with JobStore(ServiceSettings(state=state).database) as store:
+        request = JobRequest(tiles=(InputReference(kind="path", value="/srv/tile.laz"),), title="the first")
+        store.create(request, owner=None, max_queued=9, max_queued_per_key=9)
+        job = claimed(store)
+        page = visit(url).page
+        page.goto(f"{url}#/jobs/{job.job_id}")
+        expect(page.get_by_role("progressbar", name="Progress of the job")).to_be_visible()
+        stages = page.locator(".stages .stage")
+        expect(stages.first).to_have_text("Prepare the inputs")
+
+        def reported(stage: str, done: int, total: int, message: str) -> None:
+            known = {"stage": stage, "done": done, "total": total, "message": message}
+            store.record(job, [JobEvent(sequence=0, at=store.now(), kind="stage", **known)])  # type: ignore[arg-type]
+
+        reported("compile", 3, 106, "compiling, once, about 27 s")
+        expect(page.locator(".progress-words")).to_contain_text("compiling, once, about 27 s")
+        expect(stages.first).to_have_text("Compile, once on this machine3 of 106 kernels")
+        expect(stages.first).to_have_attribute("aria-current", "step")
+        expect(page.locator(".stage-done")).to_have_count(0)
+        reported("inputs", 0, 1, "inputs are prepared")
+        expect(stages.nth(1)).to_have_attribute("aria-current", "step")
+        expect(page.locator(".stage-done")).to_have_text(["Compile, once on this machine3 of 106 kernels"])
+
+
 def test_outlines_come_as_buildings_are_modelled_and_begin_anew_with_an_attempt(
     driverless: tuple[str, Path], visit: Callable[..., Visit]
 ) -> None:

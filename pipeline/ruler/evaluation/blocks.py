@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 
 from pipeline.kernels.union_find import united
-from pipeline.model import LabelArray, RoofType
+from pipeline.model import IntArray, LabelArray, RoofType
 from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
 from pipeline.ruler.evaluation.reference import Conditions, Reference, ReferencePoints
 
@@ -33,9 +33,10 @@ def joined_reference(reference: Reference) -> Reference:
     their planes and groups under new numbers. Touching faces of one plane become one group, since the points do not
     separate them.
     """
-    groups: dict[str, list[int]] = {}
-    for number, building in enumerate(reference.buildings):
-        groups.setdefault(building.source_id or f"alone {number}", []).append(number)
+    numbers = block_numbers(reference.buildings)
+    groups: dict[int, list[int]] = {}
+    for number, block in enumerate(numbers.tolist()):
+        groups.setdefault(block, []).append(number)
     if len(groups) == len(reference.buildings):
         return reference
     block_of = np.full(len(reference.buildings) + 1, -1, np.int32)  # the last one is for index -1: no building
@@ -56,7 +57,7 @@ def joined_reference(reference: Reference) -> Reference:
                 if count is not None:
                     face_points[name, surface.plane_id + shift] = count
             shift += 1 + max((max(s.plane_id, s.group) for s in part.surfaces), default=-1)
-        buildings.append(parts[0] if len(parts) == 1 else _block(parts, _with_common_groups(surfaces)))
+        buildings.append(parts[0] if len(parts) == 1 else joined_building(parts, _with_common_groups(surfaces)))
         known = [reference.conditions[p.building_id] for p in parts if p.building_id in reference.conditions]
         if known:
             conditions[name] = known[0] if len(parts) == 1 else _together(known)
@@ -72,6 +73,13 @@ def joined_reference(reference: Reference) -> Reference:
         face_points=face_points,
         notes=(*reference.notes, joined),
     )
+
+
+def block_numbers(buildings: Sequence[RoofModel]) -> IntArray:
+    """The number of the block of each building, (r,), from 0 in the order of first members: one block per source_id."""
+    seen: dict[str, int] = {}
+    names = [building.source_id or f"alone {number}" for number, building in enumerate(buildings)]
+    return np.array([seen.setdefault(name, len(seen)) for name in names], np.int64)
 
 
 def _shifted(surface: RoofSurface, shift: int) -> RoofSurface:
@@ -111,7 +119,11 @@ def _touch(one: shapely.Polygon, other: shapely.Polygon) -> bool:
     return bool(shapely.length(shapely.intersection(one.buffer(_TOUCH_M), other.exterior)) > _MIN_BORDER_M)
 
 
-def _block(parts: Sequence[RoofModel], surfaces: Sequence[RoofSurface]) -> RoofModel:
+def joined_building(parts: Sequence[RoofModel], surfaces: Sequence[RoofSurface]) -> RoofModel:
+    """Several buildings as one under the name of the first, with all their surfaces and without solids.
+
+    Its roof type is that of the parts if they agree, else combination.
+    """
     types = {part.roof_type for part in parts}
     return dataclasses.replace(
         parts[0],

@@ -9,7 +9,8 @@ import dataclasses
 import math
 from collections.abc import Mapping
 
-from pipeline.ruler.evaluation.counts import CountTable, count_tables
+from pipeline.report.table import CountTable
+from pipeline.ruler.evaluation.counts import count_tables
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.ruler.evaluation.evaluate import Evaluation
 from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -12,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.model import BoolArray, FloatArray, RoofType
+from pipeline.report.table import CountTable
 from pipeline.ruler.evaluation.measure import Group
 
 OUTCOMES = ("correct", "passable", "false")
@@ -20,18 +20,6 @@ MAX_WIREFRAMES = 20
 """Buildings in the table of the worst wireframes."""
 AREA_CLASSES_M2 = (0.0, 50.0, 100.0, 200.0, 500.0, math.inf)
 """Borders of the classes of footprints in breakdowns."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CountTable:
-    """A table of texts."""
-
-    title: str
-    """What is counted."""
-    header: tuple[str, ...]
-    """One text per column."""
-    rows: tuple[tuple[str, ...], ...]
-    """The first column names the row."""
 
 
 Tables = Mapping[str, pa.Table]

@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from pipeline.model import FloatArray, Status
+from pipeline.model import FloatArray, IntArray, Status
 from pipeline.ruler.evaluation.bootstrap import share
 from pipeline.ruler.evaluation.matching import MIN_SHARE, Matching, excused_models
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
@@ -76,7 +76,7 @@ class DeliveredModel:
     building: int
     """Index of the reference building that it stands for, else of the one with the largest common area; -1 for none."""
     share_on_reference: float
-    """Share of its footprint on reference buildings."""
+    """Share of its footprint on reference buildings; for a part of a division that of all parts together."""
     covers: int
     """Number of reference buildings that it covers by at least half."""
     stands: Stands
@@ -145,6 +145,15 @@ def score_delivery(models: Sequence[RoofModel], reference: Reference, matching: 
         for k, building in enumerate(reference.buildings)
     )
     return Delivery(buildings=buildings, models=tuple(rows))
+
+
+def of_delivered_models(delivery: Delivery, models: Sequence[RoofModel], whole_of: IntArray) -> Delivery:
+    """The same with a row per delivered model: parts of a division stand where their whole does (`WholeModels`)."""
+    rows = [
+        dataclasses.replace(delivery.models[whole], model=k, model_id=model.building_id, status=model.status)
+        for k, (model, whole) in enumerate(zip(models, whole_of.tolist(), strict=True))
+    ]
+    return dataclasses.replace(delivery, models=tuple(rows))
 
 
 def _delivered(model: RoofModel) -> Delivered:
@@ -216,7 +225,10 @@ def record_measures(models: ModelSet) -> list[Measure]:
 
 
 _OF_ALL = "share of all reference buildings "
-_FOR = "(footprint IoU >= 0.5, one to one)"
+_FOR = (
+    "(footprint IoU >= 0.5, one to one; models that divide a block into its houses, each with an IoU >= 0.8 to one or "
+    "several of them, stand as one)"
+)
 
 DEFINITIONS = (
     defined(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import pyarrow as pa
 import shapely
@@ -12,6 +13,7 @@ from pipeline.model import RoofType
 from pipeline.ruler.evaluation import delivery, faces, footprints, roof_types, surface, tables, validity
 from pipeline.ruler.evaluation.blocks import joined_reference
 from pipeline.ruler.evaluation.detection import detect, detection_measures
+from pipeline.ruler.evaluation.divisions import WholeModels, undivided, whole_models
 from pipeline.ruler.evaluation.ground import FoundGround, ground_blocks, ground_measures
 from pipeline.ruler.evaluation.matching import match_footprints
 from pipeline.ruler.evaluation.measure import Measure
@@ -39,6 +41,8 @@ class Evaluation:
     """Assumptions and omissions of the measures."""
     wireframes: WireframeSet | None = None
     """The true wireframes; None without any."""
+    statistics: Mapping[str, Any] | None = None
+    """The figures of the run's records, from `run_statistics`; None for models of other programs."""
 
     def measure(self, name: str, subset: str = "all") -> Measure:
         """One figure; KeyError if it was not possible here."""
@@ -81,12 +85,14 @@ def evaluate(
     found: dict[str, pa.Table] = {"validity_codes": tables.validity_table(solids)}
     measures: list[Measure] = []
     notes: list[str] = []
+    wholes = undivided(models.models)
     if reference is not None:
         if needs_blocks(models, reference) if blocks is None else blocks:
+            wholes = whole_models(models.models, reference)
             reference = joined_reference(reference)
-        notes += _notes(models, reference)
+        notes += [*_notes(models, reference), *_division_notes(wholes)]
     if reference is not None and (reference.buildings or reference.extent is not None):
-        measures += _buildings(models, reference, solids, found, on_step)
+        measures += _buildings(models, wholes, reference, solids, found, on_step)
     else:
         measures += delivery.record_measures(models)
         found["models"] = tables.model_table(models, solids, None)
@@ -113,6 +119,7 @@ def evaluate(
 
 def _buildings(
     models: ModelSet,
+    wholes: WholeModels,
     reference: Reference,
     solids: tuple[validity.ModelValidity, ...],
     found: dict[str, pa.Table],
@@ -121,13 +128,15 @@ def _buildings(
     """All measures of buildings; adds the tables to `found`."""
     groups = [group for group in subsets(reference) if group.elsewhere or group.size]
     on_step("footprints")
-    matching = match_footprints(models.models, reference)
-    delivered = delivery.score_delivery(models.models, reference, matching)
-    outlines = footprints.score_footprints(models.models, reference, matching)
+    matching = match_footprints(wholes.models, reference)
+    delivered = delivery.of_delivered_models(
+        delivery.score_delivery(wholes.models, reference, matching), models.models, wholes.whole_of
+    )
+    outlines = footprints.score_footprints(wholes.models, reference, matching)
     on_step("roof faces")
     face_score = faces.score_faces(models.models, reference)
     types = (
-        roof_types.score_roof_types(models.models, reference, matching, face_score) if has_roof_types(models) else ()
+        roof_types.score_roof_types(wholes.models, reference, matching, face_score) if has_roof_types(models) else ()
     )
     on_step("roof surfaces")
     surfaces = surface.score_surface(models.models, reference)
@@ -136,7 +145,7 @@ def _buildings(
     on_step("detection")
     detected = detect(models.models, reference)
     on_step("intervals")
-    found["buildings"] = tables.building_table(reference, models.models, outlines, types, residuals, surfaces)
+    found["buildings"] = tables.building_table(reference, wholes, outlines, types, residuals, surfaces)
     found["models"] = tables.model_table(models, solids, delivered)
     if residuals:
         found["residual_histogram"] = tables.residual_histogram(residuals)
@@ -187,6 +196,13 @@ def _notes(models: ModelSet, reference: Reference) -> tuple[str, ...]:
                 f"{away:,} of the {len(models.models):,} models stand beyond the reference and are not judged."
             )
     return tuple(found)
+
+
+def _division_notes(wholes: WholeModels) -> list[str]:
+    if not wholes.divided:
+        return []
+    blocks = "1 block is" if wholes.divided == 1 else f"{wholes.divided:,} blocks are"
+    return [f"{blocks} divided rightly into single houses: the models of such a block count as one."]
 
 
 def _wireframe_notes(models: ModelSet, score: WireframeScore) -> list[str]:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from pipeline.errors import SettingsError
 from pipeline.io import storage_at
 from pipeline.io.source import ReadOptions
+from pipeline.report.statistics import run_statistics
 from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
 from pipeline.ruler.evaluation.ground import FoundGround, GroundOfFiles, GroundOfRun
 from pipeline.ruler.evaluation.models import ModelSet
@@ -94,7 +95,8 @@ def evaluate_files(
         reference = read_reference(request)
     options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit)
     ground = None if reference is None else _ground(request.ground, models, reference, options)
-    return evaluate(models, reference, blocks=request.blocks, ground=ground, wireframes=drawn, on_step=on_step)
+    found = evaluate(models, reference, blocks=request.blocks, ground=ground, wireframes=drawn, on_step=on_step)
+    return dataclasses.replace(found, statistics=run_statistics(models.path)) if models.kind == "run" else found
 
 
 def _ground(files: Sequence[str], models: ModelSet, reference: Reference, options: ReadOptions) -> FoundGround | None:

@@ -11,6 +11,7 @@ import pyarrow as pa
 import shapely
 
 from pipeline.ruler.evaluation.delivery import Delivery, Stands
+from pipeline.ruler.evaluation.divisions import WholeModels
 from pipeline.ruler.evaluation.faces import FaceScore, FaceVerdict
 from pipeline.ruler.evaluation.footprints import FootprintRow
 from pipeline.ruler.evaluation.ground import GroundBlock, tile_figures
@@ -42,14 +43,17 @@ def _known(value: float) -> float | None:
 
 def building_table(
     reference: Reference,
-    models: Sequence[RoofModel],
+    wholes: WholeModels,
     footprints: Sequence[FootprintRow],
     roof_types: Sequence[RoofTypeRow],
     residuals: Sequence[BuildingResiduals],
     surface: Sequence[SurfaceRow],
 ) -> pa.Table:
-    """One row per reference building; columns of measures that were not possible are absent."""
-    buildings = reference.buildings
+    """One row per reference building; columns of measures that were not possible are absent.
+
+    `model_id` is the first of `model_ids`, which has several where models divide a block into its houses.
+    """
+    buildings, models = reference.buildings, wholes.models
     middles = [building.footprint.centroid for building in buildings]
     columns: Columns = {
         "building_id": [building.building_id for building in buildings],
@@ -58,6 +62,9 @@ def building_table(
         "x": [_known(middle.x if not middle.is_empty else math.nan) for middle in middles],
         "y": [_known(middle.y if not middle.is_empty else math.nan) for middle in middles],
         "model_id": [row.model_id for row in footprints],
+        "model_ids": pa.array(
+            [list(wholes.names[row.model]) if row.model >= 0 else [] for row in footprints], pa.list_(pa.string())
+        ),
         "model_type": [models[row.model].roof_type.value if row.model >= 0 else None for row in footprints],
         "model_status": [models[row.model].status.value if row.model >= 0 else None for row in footprints],
         "iou": [row.iou for row in footprints],

@@ -18,12 +18,14 @@ import shapely
 
 from pipeline.export.geoparquet import geo_metadata, parquet_bytes
 from pipeline.io.storage import LocalStorage
+from pipeline.report.table import CountTable
 from pipeline.ruler.evaluation.chapters import Chapter, chapters, definition_of
-from pipeline.ruler.evaluation.counts import CountTable, breakdowns
+from pipeline.ruler.evaluation.counts import breakdowns
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.ruler.evaluation.evaluate import Evaluation
 from pipeline.ruler.evaluation.markdown import markdown_cell, markdown_table
 from pipeline.ruler.evaluation.measure import Definition
+from pipeline.ruler.evaluation.model_figures import TITLE, model_figures
 from pipeline.ruler.evaluation.reading.wireframes import WireframeSet
 
 MEASURES = "measures.parquet"
@@ -152,6 +154,7 @@ def markdown(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEF
     notes = all_notes(evaluation)
     if notes:
         parts.append("## Notes\n\n" + "\n".join(f"- {markdown_cell(note)}" for note in notes))
+    parts.append("\n\n".join([f"## {TITLE}", *(_count_table(table) for table in model_figures(evaluation))]))
     found = chapters(evaluation, definitions)
     parts += [_chapter(chapter) for chapter in found]
     lost = breakdowns(evaluation.tables)

@@ -52,8 +52,19 @@ def _layer(
 
 
 def _missing(buildings: pa.Table) -> list[bool]:
-    """Whether no model stands for each building."""
-    return [value is None for value in buildings["model_id"].to_pylist()]
+    """Whether no model stands for each building, and none lies over it."""
+    over = buildings["models_over"].to_pylist() if "models_over" in buildings.column_names else [0] * len(buildings)
+    return [name is None and count == 0 for name, count in zip(buildings["model_id"].to_pylist(), over, strict=True)]
+
+
+def _torn(buildings: pa.Table, geometries: Sequence[Any]) -> Layer:
+    """Buildings under models of which none stands for them, hatched over the colour of what these models found."""
+    names = buildings["model_id"].to_pylist()
+    chosen = [
+        name is None and not gone and not cut
+        for name, gone, cut in zip(names, _missing(buildings), _cut(buildings), strict=True)
+    ]
+    return _layer("wrongly divided or joined: no model stands for it", MISSING, geometries, chosen, filled=False)
 
 
 def _cut(buildings: pa.Table) -> list[bool]:
@@ -77,7 +88,8 @@ def _outcome_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Laye
         ("false", "false", BAD),
         ("missing", "not found", MISSING),
     )
-    return [_layer(label, colour, geometries, [kind == name for kind in kinds]) for name, label, colour in named]
+    layers = [_layer(label, colour, geometries, [kind == name for kind in kinds]) for name, label, colour in named]
+    return [*layers, _torn(buildings, geometries)]
 
 
 def _share_layers(buildings: pa.Table, shares: FloatArray, geometries: Sequence[Any]) -> list[Layer]:
@@ -91,12 +103,14 @@ def _share_layers(buildings: pa.Table, shares: FloatArray, geometries: Sequence[
         label = f"at least {100.0 * least:.0f} %" if least > 0.0 else f"less than {100.0 * upper:.0f} %"
         layers.append(_layer(label, colour, geometries, judged & (shares >= least) & (shares < upper)))
         upper = least
-    return [*layers, _layer("not found", MISSING, geometries, ~unjudged & missing)]
+    return [*layers, _layer("not found", MISSING, geometries, ~unjudged & missing), _torn(buildings, geometries)]
 
 
 def _found_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]:
     missing = np.array(_missing(buildings), bool)
-    return [_layer("found", GOOD, geometries, ~missing), _layer("not found", MISSING, geometries, missing)]
+    found = np.array([name is not None for name in buildings["model_id"].to_pylist()], bool)
+    layers = [_layer("found", GOOD, geometries, found), _layer("not found", MISSING, geometries, missing)]
+    return [*layers, _torn(buildings, geometries)]
 
 
 def _false_models(evaluation: Evaluation) -> Layer:

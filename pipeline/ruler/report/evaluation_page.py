@@ -14,9 +14,11 @@ from pipeline.ruler.evaluation.counts import breakdowns
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.ruler.evaluation.evaluate import Evaluation
 from pipeline.ruler.evaluation.measure import Definition
+from pipeline.ruler.evaluation.model_figures import TITLE, model_figures
 from pipeline.ruler.evaluation.writing import INTERVALS, all_notes, subject_sentences
 from pipeline.ruler.report.evaluation_maps import maps
 from pipeline.ruler.report.histograms import charts
+from pipeline.ruler.report.models_view import models_view
 from pipeline.ruler.report.section import RESIDUAL_CLASSES
 from pipeline.ruler.report.worst_cases import MAX_NOT_FOUND, MODEL_COLOUR, SECTION_COLOUR, TRUTH_COLOUR, worst_cases
 
@@ -60,11 +62,15 @@ def page(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINIT
     measured, against = subject_sentences(evaluation)
     name = evaluation.models.name
     truth = evaluation.reference or evaluation.wireframes
+    view = models_view(evaluation.models.models) if evaluation.reference is None else None
     return page_template("evaluation.html", "pipeline.ruler.report").render(
         title=name if truth is None else f"{name} against {truth.name}",
         measured=measured,
         against=against,
         headline=headline(found),
+        models_title=TITLE,
+        figures=model_figures(evaluation),
+        view=None if view is None else _with_uris(view, png="uri"),
         chapters=found,
         lost=breakdowns(evaluation.tables),
         maps=[_with_uris(one, png="uri") for one in maps(evaluation)],

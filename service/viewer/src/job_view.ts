@@ -43,6 +43,9 @@ const STAGES: [string, string, string][] = [
   ["outputs", "Assemble the downloads", ""],
 ];
 
+/** The stage before all others, of the first jobs of a new installation. */
+const COMPILE: (typeof STAGES)[number] = ["compile", "Compile, once on this machine", "kernels"];
+
 /** Number of stages up to the buildings that are to be modelled. */
 const FOUND = 1 + STAGES.findIndex(([name]) => name === "outline");
 
@@ -273,14 +276,17 @@ class ProgressView {
 
   private enter(stage: string, event?: JobEvent): void {
     if (HAS_MODELS.has(stage)) this.soFar?.begin();
-    if (!this.rows.has(stage)) this.addStage(stage, stage);
+    if (!this.rows.has(stage)) {
+      if (stage === COMPILE[0]) this.addStage(stage, COMPILE[1], true);
+      else this.addStage(stage, stage);
+    }
     let before = true;
     for (const [name, { row, figure }] of this.rows) {
       if (name === stage) {
         before = false;
         row.className = "stage stage-now";
         row.setAttribute("aria-current", "step");
-        const noun = STAGES.find(([known]) => known === name)?.[2] ?? "";
+        const noun = [COMPILE, ...STAGES].find(([known]) => known === name)?.[2] ?? "";
         if (event !== undefined && event.total > 1) figure.textContent = `${count(event.done)} of ${count(event.total)} ${noun}`;
       } else {
         row.className = before ? "stage stage-done" : "stage";
@@ -289,9 +295,18 @@ class ProgressView {
     }
   }
 
-  private addStage(name: string, words: string): void {
+  private addStage(name: string, words: string, isFirst = false): void {
     const figure = el("span", { class: "stage-figure" });
     const row = el("li", { class: "stage" }, el("span", { class: "stage-name" }, words), figure);
+    if (isFirst) {
+      // rows are in the order of the stages
+      const others = [...this.rows];
+      this.rows.clear();
+      this.rows.set(name, { row, figure });
+      for (const [known, place] of others) this.rows.set(known, place);
+      this.stages.prepend(row);
+      return;
+    }
     this.rows.set(name, { row, figure });
     this.stages.append(row);
   }

@@ -1,0 +1,86 @@
+"""Kernels compiled before a job that needs them, in words: a first job that compiled silently would seem to hang."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Collection
+
+from pipeline.compiler import store
+from pipeline.compiler.kernel import kernel_named
+from pipeline.compiler.warm_up import Listed, about_s, compile_kernels, listed
+from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled
+from pipeline.runtime.isolation.child_main import end_with_parent
+from pipeline.runtime.monitoring.events import Event, Listener, never
+from pipeline.runtime.monitoring.machine import cores
+
+STAGE = "compile"
+"""The stage of these events."""
+RECONSTRUCT = ("reconstruct",)
+"""Group of kernels of a run by the default method."""
+_METHOD = "arrangement"
+"""The default method."""
+
+
+def kernel_groups(*, method: str | None = None, points: bool = False, terrain: str | None = None) -> tuple[str, ...]:
+    """Groups of kernels that a run calls: other methods have their own, and so have points and terrain."""
+    others = {"compare": method not in {None, _METHOD}, "classify": points, "terrain": terrain not in {None, "none"}}
+    return (*RECONSTRUCT, *(name for name, needed in others.items() if needed))
+
+
+def missing_kernels(groups: Collection[str] = RECONSTRUCT) -> list[Listed]:
+    """Kernels of some groups that are to be compiled here.
+
+    A few kernels stand for each group, since looking at all would import most of the science. If one of them is not
+    compiled all of its group count: loading what is there takes no time.
+    """
+    return [one for name in groups if not _is_compiled(name) for one in listed([name])]
+
+
+def _is_compiled(group: str) -> bool:
+    """Whether the kernels of a group are compiled: of most runs by their own, else the first and the last to be."""
+    if group in RECONSTRUCT:
+        return kernels_are_compiled()
+    kernels = listed([group])
+    return all(kernel_named(one.kernel).is_compiled for one in (kernels[0], kernels[-1]))
+
+
+def compiling_s(groups: Collection[str] = RECONSTRUCT) -> float:
+    """About how many seconds a job of some groups of kernels first compiles; 0 if all are compiled."""
+    return about_s(missing_kernels(groups), cores())
+
+
+def compile_first(
+    on_event: Listener, groups: Collection[str] = RECONSTRUCT, *, cancelled: Callable[[], bool] = never
+) -> None:
+    """Compile what some groups of kernels lack, on all cores, and send what is compiled and how long it takes.
+
+    Nothing is sent if all is compiled. Where kernels cannot be stored or a process dies, a warning is sent: each
+    process then compiles what it calls.
+    """
+    kernels = missing_kernels(groups)
+    if not kernels:
+        return
+    seconds = about_s(kernels, cores())
+    if not store.can_save():
+        message = (
+            f"compiled kernels cannot be stored in {store.folder_of_kernels()}: each process compiles its own, "
+            f"about {seconds:.0f} s. Set NUMBA_CACHE_DIR to a folder"
+        )
+        on_event(Event(kind="warning", stage=STAGE, message=message))
+        return
+
+    def on_progress(done: int, total: int, left_s: float) -> None:
+        left = f"compiling, once, about {left_s:.0f} s left" if done < total else ""
+        on_event(Event(kind="progress", stage=STAGE, done=done, total=total, message=left))
+
+    message = f"compiling, once, about {seconds:.0f} s"
+    on_event(Event(kind="stage", stage=STAGE, total=len(kernels), message=message))
+    start = functools.partial(end_with_parent, os.getpid())
+    from concurrent.futures.process import BrokenProcessPool
+
+    try:
+        compile_kernels(kernels, cores(), on_progress, cancelled=cancelled, start=start)
+    except (BrokenProcessPool, OSError) as error:
+        message = f"kernels were not compiled ahead ({error}): they are compiled as they are called, which takes longer"
+        on_event(Event(kind="warning", stage=STAGE, message=message))
