@@ -38,6 +38,8 @@ class Reason(StrEnum):
     TOO_COMPLEX = "too_complex"
     NO_FOOTPRINT = "no_footprint"
     HEIGHT_GIVEN = "height_given"
+    ABOVE_POINTS = "above_points"
+    LEVEL_THROUGH_SLOPE = "level_through_slope"
     INTERNAL_ERROR = "internal_error"
     CRASHED = "crashed"
     TIMED_OUT = "timed_out"
@@ -64,6 +66,9 @@ REASONS: Mapping[Reason, str] = {
     Reason.NO_FOOTPRINT: "no outline could be made from the points",
     Reason.HEIGHT_GIVEN: "no model could be made of the points; the block has the height that an attribute of its "
     "footprint gives",
+    Reason.ABOVE_POINTS: "a roof face rises above all its points by more than their noise and its rise over two point "
+    "spacings",
+    Reason.LEVEL_THROUGH_SLOPE: "most points within a level roof face lie on a slope that is not modelled",
     Reason.INTERNAL_ERROR: "a fault of gablework in this one building; the detail names the exception; kept as a "
     "bundle",
     Reason.CRASHED: "its process died at it, twice, the second time alone; the detail names the signal or the exit "
@@ -183,7 +188,7 @@ class Plane:
     c: float
     """Elevation over the local origin, metres."""
     n_points: int
-    """Points that support the plane."""
+    """Points that support the plane; 0 if it was drawn where no point is."""
     rmse_m: float
     """Root mean square of the vertical residuals of those points, metres."""
 
@@ -286,6 +291,9 @@ class Candidate:
     Empty unless outlines are drawn at the walls."""
     beside_later: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """(i, 3) float64, the same of pulses with several returns, the last of each."""
+    elsewhere: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """(e, 3) float64, local metres: centres, on the terrain, of the cells of 1 m wholly in the given footprint that
+    hold points, but none of its own. Empty without a footprint."""
     touches_data_edge: bool = False
     """True where the data end at the candidate: it may be cut."""
     strip_offset_m: float = math.nan
@@ -415,6 +423,8 @@ class ModelQuality:
     """Share of all points that have a roof within 0.2 m above or below them."""
     unexplained_m2: float = math.nan
     """Plan area of roof without a point within 0.2 m of it nearby, square metres."""
+    extrapolated_share: float = math.nan
+    """Share of the roof's plan area that is farther than two point spacings from every point over or under it."""
     largest_hole_m: float = math.nan
     """Diameter of the largest circle on the roof that holds no point, in plan, metres."""
     ridge_z_sigma_m: float = math.nan

@@ -58,7 +58,6 @@ from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import (
     RoofPlan,
     RoofPoints,
-    level_unsupported_faces,
     partition_roof,
     roof_points,
     wall_outline,
@@ -69,15 +68,15 @@ from pipeline.roof.roof_type import roof_type
 from pipeline.roof.shaded_points import with_shaded_points
 from pipeline.roof.solid import SolidPart, solid_parts
 from pipeline.roof.templates.fitting import RankedFaces
+from pipeline.roof.unlike_points import Contradiction, contradiction_of, stays_near
+from pipeline.roof.unseen_slopes import with_support_of_seen, with_unseen_slopes
+from pipeline.roof.unsupported_faces import goes_far, level_unsupported_faces, levelled_share_of
 from pipeline.roof.wider_eaves import wider_parts
 
 __all__ = ["ReconstructSettings", "failed_building", "reconstruct_building"]
 
 _MUCH_LEVELLED = 0.05
 """Share of the plan. Where faces of more than this had to be made level, other forms are drawn and compared with it."""
-_AROUND_M, _FAR_M = 1.0, 1.0
-"""Points this near to a face in plan bound its height, within this tolerance: a few point spacings, less than a
-storey."""
 _LEAST_BEYOND_M2 = 0.05
 """Less is what rounding adds to a footprint."""
 _FEW_EXPLAINED = 0.75
@@ -109,11 +108,13 @@ class _Model(LodParts):
     bic_margin: float = math.nan
     """By how much its faces were better than those that they competed with; nan where they did not."""
     is_levelled: bool = False
-    """True where a large part of its faces had to be made level."""
+    """True where a large part of its faces had to be made level, or where some went far or contradict the points."""
     levelled_share: float = 0.0
     """Share of the plan whose faces had to be made level."""
     cleaned: str = ""
     """What was changed on the drawn faces."""
+    contradiction: Contradiction | None = None
+    """Why its faces are not those of its points; None if they are."""
 
 
 def reconstruct_building(candidate: Candidate, method: str, settings: ReconstructSettings) -> BuildingResult:
@@ -192,6 +193,8 @@ def _reconstruct(
             forms = iter([NamedForm(PRIMITIVE, partial(primitive_partition, segmentation.faces))])
         elif is_arranged:
             roof = with_shaded_points(roof, cloud, segmentation.planes)
+            roof, planes = with_unseen_slopes(roof, segmentation.planes, building.candidate.elsewhere, settings.roof)
+            segmentation = dataclasses.replace(segmentation, planes=planes)
             forms = arranged_forms(roof, segmentation.planes, settings.roof, settings.plan, building.decisions)
         else:
             plan = partition_roof(roof, segmentation.planes, settings.roof)
@@ -207,11 +210,10 @@ def _reconstruct(
             if too_few := _too_few_points(building, model, lack):
                 _withdraw(building)
                 return failed_building(building.candidate, building.method, Reason.TOO_FEW_POINTS, too_few)
-            if record := _delivered(building, model):
+            if model.contradiction is None and (record := _delivered(building, model)):
                 return record
             _withdraw(building)
-        codes_met = ", ".join(map(str, codes)) or "none"
-        fallback = BuildingError(Reason.INVALID_SOLID, f"validity codes {codes_met}: no form of the solid passes")
+        fallback = _why_a_block(model, codes)
     except BuildingError as error:
         fallback = error
     except shapely.errors.GEOSException as error:
@@ -222,6 +224,14 @@ def _reconstruct(
     if settings.record_lods == ("1.2",):  # the settings ask for a block
         return _record(building, block)
     return _record(building, block, fallback, codes)
+
+
+def _why_a_block(model: _Model | None, codes: tuple[int, ...]) -> BuildingError:
+    """Why the chosen model is not delivered: it contradicts its points, or no form passes."""
+    if model is not None and model.contradiction is not None:
+        return BuildingError(model.contradiction.reason, model.contradiction.words)
+    codes_met = ", ".join(map(str, codes)) or "none"
+    return BuildingError(Reason.INVALID_SOLID, f"validity codes {codes_met}: no form of the solid passes")
 
 
 def _segmented(
@@ -297,7 +307,7 @@ def _first_valid(models: Iterable[NamedForm[_Model]], building: _Building) -> tu
         decisions.append(_tried(form, model, Outcome.OUTDONE, explained=explained))
         if waiting is None or explained > share:
             waiting, share, at = model, explained, len(decisions) - 1
-            if not model.is_levelled and _stays_near(model.parts, building.roof):
+            if not model.is_levelled and stays_near(model.parts, building.roof):
                 decisions[at] = dataclasses.replace(decisions[at], outcome=Outcome.CHOSEN)
                 return model, ()
 
@@ -330,6 +340,7 @@ def _own_model(building: _Building, segmentation: Segmentation, roof: RoofPoints
     """Solids over the roof faces that a form draws."""
     settings, ground_z_m = building.settings.roof, building.candidate.ground_z_m
     drawn, planes, margin = form(), segmentation.planes, math.nan
+    slopes = roof
     if isinstance(drawn, RankedFaces):
         planes, margin = drawn.planes, drawn.bic_margin
         drawn, roof = drawn.partition, dataclasses.replace(roof, labels=drawn.labels)
@@ -344,35 +355,44 @@ def _own_model(building: _Building, segmentation: Segmentation, roof: RoofPoints
             roof_type=segmentation.roof_type,
             bic_margin=margin,
         )
-    level, extended = level_unsupported_faces(drawn, roof, planes, ground_z_m, settings)
-    cut, cut_planes = cut_at_floor(level, extended, ground_z_m + settings.min_clearance_m)
-    all_parts = solid_parts(cut, cut_planes, ground_z_m)
-    parts = large_parts(all_parts, settings.min_part_area_m2)
-    levelled_share = _levelled_share(drawn, level)
-    return _Model(
-        lod="2.2",
-        parts=parts,
-        planes=cut_planes,
-        roof_type=segmentation.roof_type,
-        bic_margin=margin,
-        is_levelled=levelled_share > _MUCH_LEVELLED,
-        levelled_share=levelled_share,
-        cleaned=_cleaned(drawn, level, cut, len(all_parts) - len(parts)),
-    )
+
+    is_far = goes_far(drawn, roof, planes, ground_z_m, settings)
+
+    def over(level: RoofPartition, extended: list[Plane]) -> _Model:
+        cut, cut_planes = cut_at_floor(level, extended, ground_z_m + settings.min_clearance_m)
+        cut_planes = with_support_of_seen(cut, cut_planes, roof)
+        contradiction = contradiction_of(cut, cut_planes, roof, slopes, segmentation.planes)
+        all_parts = solid_parts(cut, cut_planes, ground_z_m)
+        parts = large_parts(all_parts, settings.min_part_area_m2)
+        levelled_share = levelled_share_of(level, len(planes))
+        return _Model(
+            lod="2.2",
+            parts=parts,
+            planes=cut_planes,
+            roof_type=segmentation.roof_type,
+            bic_margin=margin,
+            is_levelled=is_far or levelled_share > _MUCH_LEVELLED or contradiction is not None,
+            levelled_share=levelled_share,
+            cleaned=_cleaned(level, len(planes), cut, len(all_parts) - len(parts)),
+            contradiction=contradiction,
+        )
+
+    model = over(*level_unsupported_faces(drawn, roof, planes, ground_z_m, settings))
+    if sum(len(part.faces) for part in model.parts) > len(drawn.polygons) and not _is_sound(model):
+        # the ends of slopes are small faces beside long ones: without them the roof may be sound
+        whole = over(*level_unsupported_faces(drawn, roof, planes, ground_z_m, settings, ends=False))
+        model = whole if _is_sound(whole) else model
+    return model
 
 
-def _levelled_share(drawn: RoofPartition, level: RoofPartition) -> float:
-    """Share of the area whose faces got another plane when they were made level; 0 without faces."""
-    if level is drawn:
-        return 0.0
-    areas = shapely.area(np.array(drawn.polygons, object))
-    changed_m2, whole_m2 = float(areas[drawn.labels != level.labels].sum()), float(areas.sum())
-    return changed_m2 / whole_m2 if whole_m2 > 0.0 else 0.0
+def _is_sound(model: _Model) -> bool:
+    """Whether a model has solids, and all of them are valid."""
+    return bool(model.parts) and not any(check_solid(part.solid) for part in model.parts)
 
 
-def _cleaned(drawn: RoofPartition, level: RoofPartition, cut: RoofPartition, left_out: int) -> str:
-    """What was changed on the drawn faces, in words."""
-    made_level = 0 if level is drawn else int(np.count_nonzero(drawn.labels != level.labels))
+def _cleaned(level: RoofPartition, n_planes: int, cut: RoofPartition, left_out: int) -> str:
+    """What was changed on the drawn faces, in words; faces on planes beyond the first `n_planes` were made level."""
+    made_level = int(np.count_nonzero(level.labels >= n_planes))
     return "; ".join(
         filter(
             None,
@@ -383,18 +403,6 @@ def _cleaned(drawn: RoofPartition, level: RoofPartition, cut: RoofPartition, lef
             ),
         )
     )
-
-
-def _stays_near(parts: Sequence[SolidPart], roof: RoofPoints) -> bool:
-    """Whether no corner of a roof face lies far above or below all points in the face and around it."""
-    faces = [face.polygon for part in parts for face in part.faces]
-    x, y, z = roof.points.T
-    for face in faces:
-        around = z[shapely.intersects_xy(face.buffer(_AROUND_M), x, y)]
-        corners = shapely.get_coordinates(face, include_z=True)[:, 2]
-        if len(around) and (corners.max() > around.max() + _FAR_M or corners.min() < around.min() - _FAR_M):
-            return False
-    return True
 
 
 def large_parts(parts: list[SolidPart], min_area_m2: float) -> list[SolidPart]:

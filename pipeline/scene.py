@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.model import BoolArray, ByteArray, IntArray, LabelArray
 from pipeline.terrain.facets import SceneVertices, VertexKind
+from pipeline.terrain.glass import under_glass
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
 from pipeline.terrain.needed_ground import needed_vertices
@@ -75,8 +76,10 @@ def lattice_of(window: Window) -> tuple[int, int, int, int]:
 
 
 def usable_as_ground(points: WindowPoints, kept: BoolArray, classes: ClassesInUse) -> BoolArray:
-    """(n,) which points may be ground: those of class 2 where it is believed, else last returns; no outliers."""
+    """(n,) which points may be ground: of class 2 where it is believed, else last returns, no roofs; no outliers."""
     usable: BoolArray = kept & (points.classification == GROUND_CLASS if classes.ground else _is_last(points))
+    if classes.roofs:
+        usable &= points.classification != BUILDING_CLASS
     return usable
 
 
@@ -143,7 +146,11 @@ def _vertices(
     floor = lowest_below(points.x_mm, points.y_mm, points.z_mm, stands, chosen, cell, settings.vegetation.level_m)
     planar[_has_floor(points, height_mm, floor, planar == 0, settings)] = 1
     kind[crowns(x, y, z, planar, several[chosen], settings.vegetation)] = VertexKind.CROWN
-    near = np.flatnonzero(core.grown(round(1000 * facets_m)).contains(x, y))
+    vertices = SceneVertices(x_mm=x, y_mm=y, z_mm=z, height_mm=height_mm[chosen], kind=kind, planar=planar)
+    inner = core.grown(round(1000 * facets_m)).contains(x, y)
+    least_mm = round(1000 * settings.candidates.min_height_m)
+    inner &= ~under_glass(vertices, points.x_mm, points.y_mm, used, ~stands, least_mm)
+    near = np.flatnonzero(inner)
     surfaces = settings.surfaces
     far_mm = max(surfaces.far_mm, round(1000 * surfaces.thin_m))
     near = near[needed_vertices(x[near], y[near], kind[near], 1000.0 * surfaces.max_circumradius_m, far_mm)]
@@ -151,7 +158,7 @@ def _vertices(
         x_mm=x[near],
         y_mm=y[near],
         z_mm=z[near],
-        height_mm=height_mm[chosen[near]],
+        height_mm=vertices.height_mm[near],
         kind=kind[near],
         planar=planar[near],
     )
