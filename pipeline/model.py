@@ -49,6 +49,8 @@ class Reason(StrEnum):
     NOT_SEEN = "not_seen"
     TOO_MANY_FACES = "too_many_faces"
     UNCERTAIN = "uncertain"
+    ABOVE_POINTS = "above_points"
+    LEVEL_THROUGH_SLOPE = "level_through_slope"
     INTERNAL_ERROR = "internal_error"
     CRASHED = "crashed"
     TIMED_OUT = "timed_out"
@@ -81,6 +83,9 @@ REASONS: Mapping[Reason, str] = {
     Reason.NOT_SEEN: "`doubtful`: too much of the roof is drawn where no point is",
     Reason.TOO_MANY_FACES: "`doubtful`: too few roof returns for so many roof faces",
     Reason.UNCERTAIN: "`doubtful`: it may not be a building; the detail is the confidence",
+    Reason.ABOVE_POINTS: "`doubtful`: a roof face rises above all its points by more than their noise and its rise "
+    "over two point spacings",
+    Reason.LEVEL_THROUGH_SLOPE: "`doubtful`: most points within a level roof face lie on a slope that is not modelled",
     Reason.INTERNAL_ERROR: "a fault of gablework in this one building; the detail names the exception; kept as a "
     "bundle",
     Reason.CRASHED: "its process died at it, twice, the second time alone; the detail names the signal or the exit "
@@ -202,7 +207,7 @@ class Plane:
     c: float
     """Elevation over the local origin, metres."""
     n_points: int
-    """Points that support the plane."""
+    """Points that support the plane; 0 if it was drawn where no point is."""
     rmse_m: float
     """Root mean square of the vertical residuals of those points, metres."""
 
@@ -305,6 +310,9 @@ class Candidate:
     Empty unless outlines are drawn at the walls."""
     beside_later: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """(i, 3) float64, the same of pulses with several returns, the last of each."""
+    elsewhere: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """(e, 3) float64, local metres: centres, on the terrain, of the cells of 1 m wholly in the given footprint that
+    hold points, but none of its own. Empty without a footprint."""
     touches_data_edge: bool = False
     """True where the data end at the candidate: it may be cut."""
     is_known: bool = False
@@ -438,6 +446,8 @@ class ModelQuality:
     """Share of all points that are not roof returns: on facades, below the roof."""
     unexplained_m2: float = math.nan
     """Plan area of roof without a point within 0.2 m of it nearby, square metres."""
+    extrapolated_share: float = math.nan
+    """Share of the roof's plan area that is farther than two point spacings from every point over or under it."""
     largest_hole_m: float = math.nan
     """Diameter of the largest circle on the roof that holds no point, in plan, metres."""
     ridge_z_sigma_m: float = math.nan
@@ -563,6 +573,24 @@ class Decision:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Doubt:
+    """A threshold that a model misses: why its own points do not support it."""
+
+    reason: Reason
+    """Of the closed list."""
+    words: str
+    """Figure and threshold, as in the record's `reason_detail`."""
+    check: Decision
+    """The same as an entry of the decisions."""
+
+    @classmethod
+    def of(cls, reason: Reason, words: str, name: str, value: float, limit: float) -> Doubt:
+        """A figure by its name in the decisions, and the limit that it misses."""
+        check = Decision(kind=DecisionKind.CHECK, name=name, outcome=Outcome.MISSED, value=value, limit=limit)
+        return cls(reason=reason, words=words, check=check)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class BuildingResult:
     """Outcome of a candidate. Every candidate has one, also one that failed: the defaults are those without a model."""
 
@@ -630,3 +658,13 @@ class BuildingResult:
     """Models at the coarser requested levels of detail, the finest first; none beside a fallback block."""
     overhangs: Overhangs | None = None
     """The model in LoD2.3 beside that of the record; None unless the settings request it, and without a model."""
+
+    def doubted(self, doubt: Doubt) -> BuildingResult:
+        """The same model as a doubtful one."""
+        return dataclasses.replace(
+            self,
+            status=Status.DOUBTFUL,
+            reason=doubt.reason,
+            reason_detail=doubt.words,
+            decisions=(*self.decisions, doubt.check),
+        )

@@ -24,6 +24,7 @@ from pipeline.model import (
     Candidate,
     Decision,
     DecisionKind,
+    Doubt,
     HeightSource,
     LodModel,
     NoOverhang,
@@ -59,7 +60,6 @@ from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import (
     RoofPlan,
     RoofPoints,
-    level_unsupported_faces,
     partition_roof,
     roof_points,
     wall_outline,
@@ -70,15 +70,15 @@ from pipeline.roof.roof_type import roof_type
 from pipeline.roof.shaded_points import with_shaded_points
 from pipeline.roof.solid import SolidPart, renumbered, solid_parts, united
 from pipeline.roof.templates.fitting import RankedFaces
+from pipeline.roof.unlike_points import contradiction_of, stays_near
+from pipeline.roof.unseen_slopes import with_support_of_seen, with_unseen_slopes
+from pipeline.roof.unsupported_faces import goes_far, level_unsupported_faces, levelled_share_of
 from pipeline.roof.wider_eaves import wider_parts
 
 __all__ = ["ReconstructSettings", "failed_building", "reconstruct_building"]
 
 _MUCH_LEVELLED = 0.05
 """Share of the plan. Where faces of more than this had to be made level, other forms are drawn and compared with it."""
-_AROUND_M, _FAR_M = 1.0, 1.0
-"""Points this near to a face in plan bound its height, within this tolerance: a few point spacings, less than a
-storey."""
 _LEAST_BEYOND_M2 = 0.05
 """Less is what rounding adds to a footprint."""
 _FEW_EXPLAINED = 0.75
@@ -110,11 +110,13 @@ class _Model(LodParts):
     bic_margin: float = math.nan
     """By how much its faces were better than those that they competed with; nan where they did not."""
     is_levelled: bool = False
-    """True where a large part of its faces had to be made level."""
+    """True where a large part of its faces had to be made level, or where some went far or contradict the points."""
     levelled_share: float = 0.0
     """Share of the plan whose faces had to be made level."""
     cleaned: str = ""
     """What was changed on the drawn faces."""
+    contradiction: Doubt | None = None
+    """Why its faces are not those of its points; None if they are."""
 
 
 def reconstruct_building(candidate: Candidate, method: str, settings: ReconstructSettings) -> BuildingResult:
@@ -193,6 +195,8 @@ def _reconstruct(
             forms = iter([NamedForm(PRIMITIVE, partial(primitive_partition, segmentation.faces))])
         elif is_arranged:
             roof = with_shaded_points(roof, cloud, segmentation.planes)
+            roof, planes = with_unseen_slopes(roof, segmentation.planes, building.candidate.elsewhere, settings.roof)
+            segmentation = dataclasses.replace(segmentation, planes=planes)
             forms = arranged_forms(roof, segmentation.planes, settings.roof, settings.plan, building.decisions)
         else:
             plan = partition_roof(roof, segmentation.planes, settings.roof)
@@ -209,7 +213,7 @@ def _reconstruct(
                 _withdraw(building)
                 return failed_building(building.candidate, building.method, Reason.TOO_FEW_POINTS, too_few)
             if record := _delivered(building, model):
-                return _judged(building, record, plan)
+                return _judged(building, record, plan, model.contradiction)
             _withdraw(building)
         codes_met = ", ".join(map(str, codes)) or "none"
         fallback = BuildingError(Reason.INVALID_SOLID, f"validity codes {codes_met}: no form of the solid passes")
@@ -298,7 +302,7 @@ def _first_valid(models: Iterable[NamedForm[_Model]], building: _Building) -> tu
         decisions.append(_tried(form, model, Outcome.OUTDONE, explained=explained))
         if waiting is None or explained > share:
             waiting, share, at = model, explained, len(decisions) - 1
-            if not model.is_levelled and _stays_near(model.parts, building.roof):
+            if not model.is_levelled and stays_near(model.parts, building.roof):
                 decisions[at] = dataclasses.replace(decisions[at], outcome=Outcome.CHOSEN)
                 return model, ()
 
@@ -331,6 +335,7 @@ def _own_model(building: _Building, segmentation: Segmentation, roof: RoofPoints
     """Solids over the roof faces that a form draws."""
     settings, ground_z_m = building.settings.roof, building.candidate.ground_z_m
     drawn, planes, margin = form(), segmentation.planes, math.nan
+    slopes = roof
     if isinstance(drawn, RankedFaces):
         planes, margin = drawn.planes, drawn.bic_margin
         drawn, roof = drawn.partition, dataclasses.replace(roof, labels=drawn.labels)
@@ -345,35 +350,44 @@ def _own_model(building: _Building, segmentation: Segmentation, roof: RoofPoints
             roof_type=segmentation.roof_type,
             bic_margin=margin,
         )
-    level, extended = level_unsupported_faces(drawn, roof, planes, ground_z_m, settings)
-    cut, cut_planes = cut_at_floor(level, extended, ground_z_m + settings.min_clearance_m)
-    all_parts = solid_parts(cut, cut_planes, ground_z_m)
-    parts = large_parts(all_parts, settings.min_part_area_m2)
-    levelled_share = _levelled_share(drawn, level)
-    return _Model(
-        lod="2.2",
-        parts=parts,
-        planes=cut_planes,
-        roof_type=segmentation.roof_type,
-        bic_margin=margin,
-        is_levelled=levelled_share > _MUCH_LEVELLED,
-        levelled_share=levelled_share,
-        cleaned=_cleaned(drawn, level, cut, len(all_parts) - len(parts)),
-    )
+
+    is_far = goes_far(drawn, roof, planes, ground_z_m, settings)
+
+    def over(level: RoofPartition, extended: list[Plane]) -> _Model:
+        cut, cut_planes = cut_at_floor(level, extended, ground_z_m + settings.min_clearance_m)
+        cut_planes = with_support_of_seen(cut, cut_planes, roof)
+        contradiction = contradiction_of(cut, cut_planes, roof, slopes, segmentation.planes)
+        all_parts = solid_parts(cut, cut_planes, ground_z_m)
+        parts = large_parts(all_parts, settings.min_part_area_m2)
+        levelled_share = levelled_share_of(level, len(planes))
+        return _Model(
+            lod="2.2",
+            parts=parts,
+            planes=cut_planes,
+            roof_type=segmentation.roof_type,
+            bic_margin=margin,
+            is_levelled=is_far or levelled_share > _MUCH_LEVELLED or contradiction is not None,
+            levelled_share=levelled_share,
+            cleaned=_cleaned(level, len(planes), cut, len(all_parts) - len(parts)),
+            contradiction=contradiction,
+        )
+
+    model = over(*level_unsupported_faces(drawn, roof, planes, ground_z_m, settings))
+    if sum(len(part.faces) for part in model.parts) > len(drawn.polygons) and not _is_sound(model):
+        # the ends of slopes are small faces beside long ones: without them the roof may be sound
+        whole = over(*level_unsupported_faces(drawn, roof, planes, ground_z_m, settings, ends=False))
+        model = whole if _is_sound(whole) else model
+    return model
 
 
-def _levelled_share(drawn: RoofPartition, level: RoofPartition) -> float:
-    """Share of the area whose faces got another plane when they were made level; 0 without faces."""
-    if level is drawn:
-        return 0.0
-    areas = shapely.area(np.array(drawn.polygons, object))
-    changed_m2, whole_m2 = float(areas[drawn.labels != level.labels].sum()), float(areas.sum())
-    return changed_m2 / whole_m2 if whole_m2 > 0.0 else 0.0
+def _is_sound(model: _Model) -> bool:
+    """Whether a model has solids, and all of them are valid."""
+    return bool(model.parts) and not any(check_solid(part.solid) for part in model.parts)
 
 
-def _cleaned(drawn: RoofPartition, level: RoofPartition, cut: RoofPartition, left_out: int) -> str:
-    """What was changed on the drawn faces, in words."""
-    made_level = 0 if level is drawn else int(np.count_nonzero(drawn.labels != level.labels))
+def _cleaned(level: RoofPartition, n_planes: int, cut: RoofPartition, left_out: int) -> str:
+    """What was changed on the drawn faces, in words; faces on planes beyond the first `n_planes` were made level."""
+    made_level = int(np.count_nonzero(level.labels >= n_planes))
     return "; ".join(
         filter(
             None,
@@ -384,18 +398,6 @@ def _cleaned(drawn: RoofPartition, level: RoofPartition, cut: RoofPartition, lef
             ),
         )
     )
-
-
-def _stays_near(parts: Sequence[SolidPart], roof: RoofPoints) -> bool:
-    """Whether no corner of a roof face lies far above or below all points in the face and around it."""
-    faces = [face.polygon for part in parts for face in part.faces]
-    x, y, z = roof.points.T
-    for face in faces:
-        around = z[shapely.intersects_xy(face.buffer(_AROUND_M), x, y)]
-        corners = shapely.get_coordinates(face, include_z=True)[:, 2]
-        if len(around) and (corners.max() > around.max() + _FAR_M or corners.min() < around.min() - _FAR_M):
-            return False
-    return True
 
 
 def large_parts(parts: list[SolidPart], min_area_m2: float) -> list[SolidPart]:
@@ -427,12 +429,14 @@ def _explained_share(building: _Building, model: _Model) -> float:
     return float(np.mean(np.abs(residuals) <= building.settings.plan.residual_cap_m))
 
 
-def _judged(building: _Building, record: BuildingResult, plan: RoofPlan | None) -> BuildingResult:
+def _judged(
+    building: _Building, record: BuildingResult, plan: RoofPlan | None, contradiction: Doubt | None
+) -> BuildingResult:
     """A model with a roof as `ok` or `doubtful`, or the block that explains the points as well as a doubtful one."""
     if record.lod != LODS[-1]:
         return record
     settings = building.settings.support
-    doubt = doubt_of(support_of(record, is_known=building.candidate.is_known), settings)
+    doubt = contradiction or doubt_of(support_of(record, is_known=building.candidate.is_known), settings)
     if doubt is None:
         return record
     _withdraw(building)
@@ -441,13 +445,7 @@ def _judged(building: _Building, record: BuildingResult, plan: RoofPlan | None) 
         fallback = _record(building, block, BuildingError(doubt.reason, doubt.words))
         if fallback.quality.share_within >= record.quality.share_within - settings.block_loss:
             return fallback
-    return dataclasses.replace(
-        record,
-        status=Status.DOUBTFUL,
-        reason=doubt.reason,
-        reason_detail=doubt.words,
-        decisions=(*record.decisions, doubt.check),
-    )
+    return record.doubted(doubt)
 
 
 def _delivered(building: _Building, model: _Model) -> BuildingResult | None:

@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.model import BoolArray, ByteArray, IntArray, KindArray, LabelArray
 from pipeline.terrain.class_codes import ClassCodeSettings
 from pipeline.terrain.facets import SceneVertices, VertexKind
+from pipeline.terrain.glass import under_glass
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
 from pipeline.terrain.incomplete_classes import OnRoof, undecided_on_roofs
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
@@ -77,8 +78,10 @@ def lattice_of(window: Window) -> tuple[int, int, int, int]:
 
 
 def usable_as_ground(points: WindowPoints, kept: BoolArray, classes: ClassesInUse) -> BoolArray:
-    """(n,) which points may be ground: those of class 2 where it is believed, else last returns; no outliers."""
+    """(n,) which points may be ground: of class 2 where it is believed, else last returns, no roofs; no outliers."""
     usable: BoolArray = kept & (points.classification == GROUND_CLASS if classes.ground else _is_last(points))
+    if classes.roofs:
+        usable &= points.classification != BUILDING_CLASS
     return usable
 
 
@@ -148,6 +151,9 @@ def _vertices(
     on_roof = _on_roofs((x, y, z), kind, inner, settings)
     kind[crowns(x, y, z, planar, several[chosen], settings.vegetation)] = VertexKind.CROWN
     kind[(on_roof == OnRoof.YES) & (kind == VertexKind.OBJECT)] = VertexKind.JOINED
+    vertices = SceneVertices(x_mm=x, y_mm=y, z_mm=z, height_mm=height_mm[chosen], kind=kind, planar=planar)
+    least_mm = round(1000 * settings.candidates.min_height_m)
+    inner &= ~under_glass(vertices, points.x_mm, points.y_mm, used, ~stands, least_mm)
     near = np.flatnonzero(inner & ((on_roof != OnRoof.BESIDE) | (kind != VertexKind.OBJECT)))
     surfaces = settings.surfaces
     far_mm = max(surfaces.far_mm, round(1000 * surfaces.thin_m))
@@ -156,7 +162,7 @@ def _vertices(
         x_mm=x[near],
         y_mm=y[near],
         z_mm=z[near],
-        height_mm=height_mm[chosen[near]],
+        height_mm=vertices.height_mm[near],
         kind=kind[near],
         planar=planar[near],
     )

@@ -240,6 +240,14 @@ BUILDINGS = (
         "plan area of roof that is farther than 1.5 point spacings from every point within 0.2 m of the roof",
     ),
     Column(
+        "extrapolated_share",
+        FLOAT64,
+        SHARE,
+        "share of the roof's plan area that is farther than two point spacings from every point over or under it: it "
+        "continues what lies beside it",
+        page="../methods/solids.md#sides-that-were-not-seen",
+    ),
+    Column(
         "largest_hole_m",
         FLOAT64,
         "m",
@@ -385,6 +393,14 @@ PLANES = (
     Column("area_m2", FLOAT64, "m2", "true (slanted) area", required=True),
     Column("n_points", INT64, COUNT, "points that support the plane", required=True),
     Column("rmse_m", FLOAT64, "m", "root mean square of the vertical residuals of these points"),
+    Column(
+        "extrapolated",
+        BOOL,
+        NONE,
+        "no point lies on the plane: it continues what lies beside it, ends a slope beyond its points, or has a height "
+        "by an attribute; null in runs of versions without this column",
+        page="../methods/solids.md#sides-that-were-not-seen",
+    ),
 )
 """One row per roof plane."""
 

@@ -131,6 +131,7 @@ def _quality(quality: ModelQuality) -> dict[str, float | bool | None]:
         "share_within_0_2m": _or_none(quality.share_within, 4),
         "share_below_roof": _or_none(quality.share_below_roof, 4),
         "unexplained_m2": _or_none(quality.unexplained_m2),
+        "extrapolated_share": _or_none(quality.extrapolated_share, 4),
         "largest_hole_m": _or_none(quality.largest_hole_m),
         "ridge_z_sigma_m": _or_none(quality.ridge_z_sigma_m),
         "bic_margin": _or_none(quality.bic_margin),
@@ -188,6 +189,7 @@ def plane_rows(result: BuildingResult, context: RecordContext) -> list[dict[str,
                 "area_m2": round(plan_area / math.cos(math.radians(plane.slope_deg)), 3),
                 "n_points": plane.n_points,
                 "rmse_m": _or_none(plane.rmse_m),
+                "extrapolated": plane.n_points == 0,
             }
         )
     return rows

@@ -19,6 +19,8 @@ from pipeline.quality.unseen_roof import Raster
 
 GAP_SPACINGS = 1.5
 """A place farther than this from all points is seen by none: of points strewn at random one place in a thousand is."""
+EXTRAPOLATED_SPACINGS = 2.0
+"""A part of the roof farther than this from all points was drawn by what lies beside it, and by the footprint."""
 DRAWN_OUTLINE_SPACINGS = 0.2
 """Standard deviation in plan of a drawn outline: pent roofs of the simulated suites, whose ridge is their outline."""
 _MIN_CELL_M = 0.25
@@ -50,10 +52,10 @@ def model_quality(
     surface = surface_of(faces, planes)
     residuals, face_of_point = surface.residuals(points)
     summary = summarise(residuals[roof_returns(points, residuals, spacing_m)], TOLERANCE_M)
-    unexplained = hole = math.nan
+    unexplained = extrapolated = hole = math.nan
     if summary.coverage > 0.0 and spacing_m > 0.0:
         area_m2 = math.fsum(face.polygon.area for face in faces)
-        unexplained, hole = _seen(points, surface, residuals, area_m2, spacing_m)
+        unexplained, extrapolated, hole = _seen(points, surface, residuals, area_m2, spacing_m)
     noise = sigma = math.nan
     if is_planar:
         noise = MAD_TO_SIGMA * summary.median_m
@@ -67,6 +69,7 @@ def model_quality(
         share_within=summary.share_within if summary.n_points else math.nan,
         share_below_roof=1.0 - summary.n_points / len(points) if len(points) else math.nan,
         unexplained_m2=unexplained,
+        extrapolated_share=extrapolated,
         largest_hole_m=hole,
         ridge_z_sigma_m=sigma,
         bic_margin=bic_margin,
@@ -76,13 +79,14 @@ def model_quality(
 
 def _seen(
     points: FloatArray, surface: TopSurface, residuals: FloatArray, area_m2: float, spacing_m: float
-) -> tuple[float, float]:
-    """Area of roof without points near it, m2, and the diameter of the largest circle on it without any point, m."""
+) -> tuple[float, float, float]:
+    """Area of roof without points near it, m2, its share far from all, and the largest circle without any, m across."""
     low_x, low_y, high_x, high_y = surface.bounds
     cell = max(_MIN_CELL_M, spacing_m, math.sqrt((high_x - low_x) * (high_y - low_y) / _MAX_CELLS))
     columns, rows = math.floor((high_x - low_x) / cell) + 1, math.floor((high_y - low_y) / cell) + 1
     raster = Raster(low_x, low_y, cell, columns, rows)
-    places, unseen, square = surface.seen(points, residuals, raster, TOLERANCE_M, GAP_SPACINGS * spacing_m)
+    gaps_m = (GAP_SPACINGS * spacing_m, EXTRAPOLATED_SPACINGS * spacing_m)
+    places, unseen, far, square = surface.seen(points, residuals, raster, TOLERANCE_M, gaps_m)
     if places == 0:
-        return math.nan, math.nan
-    return unseen / places * area_m2, 2.0 * math.sqrt(square)
+        return math.nan, math.nan, math.nan
+    return unseen / places * area_m2, far / places, 2.0 * math.sqrt(square)

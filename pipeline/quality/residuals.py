@@ -231,13 +231,13 @@ def _seen(
     residuals: FloatArray,
     raster: Raster,
     tolerance_m: float,
-    gap_m: float,
+    gaps_m: tuple[float, float],
     faces: _Faces,
-) -> tuple[int, int, float]:
+) -> tuple[int, int, int, float]:
     """The kernel of `TopSurface.seen`."""
     x, y = middles_of_cells(raster)
     _, number = _top_surface(x, y, faces)
-    return unseen_cells(points, residuals, number >= 0, raster, tolerance_m, gap_m)
+    return unseen_cells(points, residuals, number >= 0, raster, tolerance_m, gaps_m[0], gaps_m[1])
 
 
 class TopSurface:
@@ -310,20 +310,22 @@ class TopSurface:
         residuals: FloatArray,
         raster: Raster,
         tolerance_m: float,
-        gap_m: float,
-    ) -> tuple[int, int, float]:
+        gaps_m: tuple[float, float],
+    ) -> tuple[int, int, int, float]:
         """How much of the faces points are near to, by the cells of a raster.
 
         Points (n, 3) are in metres; residuals (n,) are points minus this surface, nan outside all faces. A point
-        is on the surface up to `tolerance_m` vertically, and a cell is far from points from `gap_m` in plan on.
+        is on the surface up to `tolerance_m` vertically. `gaps_m` are the distances in plan from which a cell is far
+        from points on the surface, and from all over or under it.
 
-        Returns the cells with a face at their middle, those of them far from all points on the surface, and the largest
-        squared distance in plan of one of them to any point over or under a face, m2; infinite without points.
+        Returns the cells with a face at their middle, those of them far from all points on the surface, those far from
+        all points over or under it, and the largest squared distance in plan of one of them to such a point, m2;
+        infinite without points.
         """
         if self._empty:
-            return 0, 0, 0.0
+            return 0, 0, 0, 0.0
         points = np.ascontiguousarray(points, dtype=np.float64)
-        return _seen(points, residuals, raster, tolerance_m, gap_m, self._faces)
+        return _seen(points, residuals, raster, tolerance_m, gaps_m, self._faces)
 
     def elevation(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Elevation of the highest face at places, (n,) float64; nan where there is none."""

@@ -42,12 +42,16 @@ def ridge_height_sigma_m(
     Points (n, 3) are in local metres; residuals (n,) are points minus roof, nan where there is none; `plane_of_point`
     (n,) is the plane that each point was held against, -1 for none. Points farther than `reach_m` from their plane do
     not support it. `outline_sigma_m` is the standard deviation of edges in plan that no other plane determines. The
-    result is nan without a roof, and where a plane at the top has fewer than four points of its own.
+    result is nan without a roof, and where a plane at the top has one to three points of its own, or none of them any.
     """
     top = _top(solids)
     if top is None:
         return math.nan
-    x, y, numbers = top
+    x, y, ending = top
+    # a plane without points was drawn after those that it meets
+    numbers = [number for number in ending if planes[number].n_points > 0]
+    if not numbers:
+        return math.nan
     variances = _variances_at(
         points, residuals, plane_of_point, reach_m, len(planes), np.array(numbers, np.int64), x, y
     ).tolist()

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import TYPE_CHECKING
 
-from pipeline.model import BuildingResult, Decision, DecisionKind, Outcome, Reason
+from pipeline.model import BuildingResult, Doubt, Reason
 from pipeline.quality.detection import confidence_of
 
 if TYPE_CHECKING:
@@ -27,18 +27,6 @@ class Support:
     """Roof returns over roof faces."""
     confidence: float = math.nan
     """Probability that it is a building; nan where it is known to be one."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Doubt:
-    """A threshold that a model misses."""
-
-    reason: Reason
-    """Of the closed list."""
-    words: str
-    """Figure and threshold, as in the record's `reason_detail`."""
-    check: Decision
-    """The same as an entry of the decisions."""
 
 
 def support_of(record: BuildingResult, *, is_known: bool) -> Support:
@@ -62,26 +50,21 @@ def doubt_of(support: Support, settings: SupportSettings) -> Doubt | None:
     scatter, most = support.scatter_m, settings.max_scatter_m
     if scatter > most:
         words = f"its roof returns scatter by {scatter:.2f} m, more than {most:g} m"
-        return _doubt(Reason.SCATTERED, words, "scatter_m", scatter, most)
+        return Doubt.of(Reason.SCATTERED, words, "scatter_m", scatter, most)
     share, least = support.share_on_roof, settings.min_share_on_roof
     if share < least:
         words = f"{share:.0%} of its roof returns lie within 0.2 m of the roof, less than {least:.0%}"
-        return _doubt(Reason.POOR_FIT, words, "share_on_roof", share, least)
+        return Doubt.of(Reason.POOR_FIT, words, "share_on_roof", share, least)
     unseen, most = support.unseen_share, settings.max_unseen_share
     if unseen > most:
         words = f"{unseen:.0%} of its roof has no point on the roof nearby, more than {most:.0%}"
-        return _doubt(Reason.NOT_SEEN, words, "unseen_share", unseen, most)
+        return Doubt.of(Reason.NOT_SEEN, words, "unseen_share", unseen, most)
     returns, least = support.returns_per_face, settings.min_returns_per_face
     if returns < least:
         words = f"{returns:.1f} roof returns per roof face, less than {least:g}"
-        return _doubt(Reason.TOO_MANY_FACES, words, "returns_per_face", returns, least)
+        return Doubt.of(Reason.TOO_MANY_FACES, words, "returns_per_face", returns, least)
     confidence, least = support.confidence, settings.min_confidence
     if confidence < least:
         words = f"the confidence that it is a building is {confidence:.2f}, less than {least:g}"
-        return _doubt(Reason.UNCERTAIN, words, "detection_confidence", confidence, least)
+        return Doubt.of(Reason.UNCERTAIN, words, "detection_confidence", confidence, least)
     return None
-
-
-def _doubt(reason: Reason, words: str, name: str, value: float, limit: float) -> Doubt:
-    check = Decision(kind=DecisionKind.CHECK, name=name, outcome=Outcome.MISSED, value=value, limit=limit)
-    return Doubt(reason=reason, words=words, check=check)

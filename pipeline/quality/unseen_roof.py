@@ -44,21 +44,24 @@ def unseen_cells(
     raster: Raster,
     tolerance_m: float,
     gap_m: float,
-) -> tuple[int, int, float]:
-    """Cells on the roof, those of them far from all points on it, and the largest squared distance to any point, m2.
+    far_m: float,
+) -> tuple[int, int, int, float]:
+    """Cells on the roof, those of them far from points on it and from all, and the largest square to any point, m2.
 
     As `TopSurface.seen`; `on_roof` (rows * columns,) are the cells, line by line, whose middle has a roof.
     """
     squares = _nearest_squares(points, residuals, tolerance_m, raster)
     places = 0
     unseen = 0
+    far = 0
     largest = 0.0
     for k in range(len(on_roof)):
         if on_roof[k]:
             places += 1
             unseen += squares[k, 1] > gap_m * gap_m
+            far += squares[k, 0] > far_m * far_m
             largest = max(largest, squares[k, 0])
-    return places, unseen, largest
+    return places, unseen, far, largest
 
 
 @kernel

@@ -1,12 +1,13 @@
-"""Roof faces that come down to the floor end there: each is cut along a level line, and the rest is level.
+"""Roof faces that leave the heights in which a roof may lie end there: each is cut along a level line.
 
-The sloping part keeps its plane, and the neighbours get the ends of the cut, so the faces still share their borders.
+The sloping part keeps its plane, what is beyond the line is level, and the neighbours get the ends of the cut, so the
+faces still share their borders.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -33,15 +34,25 @@ def cut_at_floor(
     into polygons becomes level as a whole. Without such faces the same partition comes back.
     """
     lowest = _lowest_m(partition, planes)
-    if not (lowest < floor_z_m - _SMALL_DIP_M).any():
+    dips = np.flatnonzero(lowest < floor_z_m - _SMALL_DIP_M).tolist()
+    return cut_at_levels(partition, planes, dict.fromkeys(dips, floor_z_m), above=False, undivided=True)
+
+
+def cut_at_levels(
+    partition: RoofPartition, planes: Sequence[Plane], levels_m: Mapping[int, float], *, above: bool, undivided: bool
+) -> tuple[RoofPartition, list[Plane]]:
+    """Cut faces, by number, at an elevation, and make what lies above it, or else below it, level there.
+
+    Returns the partition and the planes; the level ones come last, one for each elevation. A face whose cut does not
+    divide it into polygons becomes level as a whole if `undivided`, else it stays. Without faces to cut the same
+    partition comes back.
+    """
+    if not levels_m:
         return partition, list(planes)
     faces = [_rings(polygon) for polygon in partition.polygons]
-    cut = {
-        k: _ends_of_cut(rings, planes[label], floor_z_m)
-        for k, (rings, label) in enumerate(zip(faces, partition.labels.tolist(), strict=True))
-        if lowest[k] < floor_z_m - _SMALL_DIP_M
-    }
-    level = Plane(a=0.0, b=0.0, c=round(floor_z_m, 3), n_points=0, rmse_m=0.0)
+    cut = {k: _ends_of_cut(faces[k], planes[int(partition.labels[k])], z) for k, z in levels_m.items()}
+    heights = sorted({round(z, 3) for z in levels_m.values()})
+    number = {z: len(planes) + k for k, z in enumerate(heights)}
     inserted: dict[tuple[Corner, Corner], set[Corner]] = {}
     for ends in cut.values():
         for (a, b), corner in ends.items():
@@ -55,10 +66,13 @@ def cut_at_floor(
         if k in cut:
             pieces = _pieces(pieces[0], longer, _along_cut(cut[k].values(), planes[label]))
         for piece in pieces:
-            is_level = k in cut and (len(pieces) == 1 or _height_m(planes[label], _inner(piece)) < floor_z_m)
+            is_level = k in cut and undivided
+            if len(pieces) > 1:
+                is_level = bool(_height_m(planes[label], _inner(piece)) > levels_m[k]) == above
             polygons.append(piece)
-            labels.append(len(planes) if is_level else label)
-    return RoofPartition(polygons=tuple(polygons), labels=np.array(labels, np.int32)), [*planes, level]
+            labels.append(number[round(levels_m[k], 3)] if is_level else label)
+    level = [Plane(a=0.0, b=0.0, c=z, n_points=0, rmse_m=0.0) for z in heights]
+    return RoofPartition(polygons=tuple(polygons), labels=np.array(labels, np.int32)), [*planes, *level]
 
 
 def _lowest_m(partition: RoofPartition, planes: Sequence[Plane]) -> FloatArray:

@@ -173,7 +173,8 @@ class RoofSettings(Parameters):
     )
     max_overshoot_m: float = parameter(
         2.0,
-        "A roof face that goes farther than this above or below the points of its plane becomes horizontal.",
+        "A slope that goes farther than this below its points is level from there on. Other forms are tried first if a "
+        "face goes farther than this above or below the points of its plane.",
         unit="m",
         minimum=0.1,
         maximum=100.0,

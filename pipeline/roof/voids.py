@@ -56,7 +56,7 @@ def _distances(points: FloatArray, raster: Raster, gap_m: float, far_m: float) -
 
 
 @kernel
-def _empty_cells(
+def empty_cells(
     points: FloatArray, edges: FloatArray, pitch_m: float, gap_m: float, far_m: float
 ) -> tuple[FloatArray, LabelArray]:
     """Centres of the cells in voids, (v, 2) metres, and the void of each, (v,), among points (n, 2) in edges (e, 4).
@@ -113,20 +113,13 @@ def without_voids(
     far_m = max(settings.void_distance_m, 2.0 * settings.gap_spacings * spacing_m)
     gap_m = settings.gap_spacings * spacing_m
     # a building narrower than that has no room for a void
-    xy, ring = shapely.get_coordinates(shapely.get_rings(shapely.get_parts(outline_mm)), return_index=True)
-    if min(np.ptp(xy, axis=0)) * 1e-3 < far_m:
+    if min(np.ptp(shapely.get_coordinates(outline_mm), axis=0)) * 1e-3 < far_m:
         return outline_mm
-    # along the longest edge: walls around courtyards are parallel to the others
-    edges = np.hstack((xy[:-1], xy[1:]))[ring[:-1] == ring[1:]] * 1e-3
-    steps = edges[:, 2:] - edges[:, :2]
-    along = steps[np.argmax(np.hypot(steps[:, 0], steps[:, 1]))]
-    length = math.hypot(along[0], along[1])
-    cos, sin = float(along[0]) / length, float(along[1]) / length
-    turned = _turned(points[:, :2], cos, -sin)
+    edges, cos, sin = framed_edges(outline_mm)
+    turned = turned_about_origin(points[:, :2], cos, -sin)
     pitch_m = max(_PITCH_M, 0.5 * gap_m)
     reach_m = max(gap_m, pitch_m)
-    framed = _turned(edges.reshape(-1, 2), cos, -sin).reshape(-1, 4)
-    centres, numbers = _empty_cells(turned, framed, pitch_m, reach_m, far_m)
+    centres, numbers = empty_cells(turned, edges, pitch_m, reach_m, far_m)
     if len(centres) == 0:
         return outline_mm
     half = 0.5 * pitch_m
@@ -138,7 +131,7 @@ def without_voids(
         void = _widened(_widened(void, -2.0 * pitch_m), pitch_m)
         voids.append(shapely.simplify(void, _JOG * max(pitch_m, spacing_m)))
     drawn = [
-        shapely.transform(piece, lambda xy: np.rint(_turned(xy, cos, sin) * 1e3))
+        shapely.transform(piece, lambda xy: np.rint(turned_about_origin(xy, cos, sin) * 1e3))
         for piece in polygons_of(shapely.union_all(voids))
         if piece.area >= settings.min_void_m2
     ]
@@ -149,7 +142,21 @@ def without_voids(
     return MultiPolygon(large) if large else outline_mm
 
 
-def _turned(xy: FloatArray, cos: float, sin: float) -> FloatArray:
+def framed_edges(outline_mm: MultiPolygon) -> tuple[FloatArray, float, float]:
+    """The edges of an outline, (e, 4) metres, turned such that the longest one runs along x; its cosine and sine.
+
+    Walls around courtyards, and ridges, are parallel to the others.
+    """
+    xy, ring = shapely.get_coordinates(shapely.get_rings(shapely.get_parts(outline_mm)), return_index=True)
+    edges = np.hstack((xy[:-1], xy[1:]))[ring[:-1] == ring[1:]] * 1e-3
+    steps = edges[:, 2:] - edges[:, :2]
+    along = steps[np.argmax(np.hypot(steps[:, 0], steps[:, 1]))]
+    length = math.hypot(along[0], along[1])
+    cos, sin = float(along[0]) / length, float(along[1]) / length
+    return turned_about_origin(edges.reshape(-1, 2), cos, -sin).reshape(-1, 4), cos, sin
+
+
+def turned_about_origin(xy: FloatArray, cos: float, sin: float) -> FloatArray:
     """Places turned left about the origin; written out, since a matrix product differs between machines."""
     return np.column_stack((xy[:, 0] * cos - xy[:, 1] * sin, xy[:, 0] * sin + xy[:, 1] * cos))
 

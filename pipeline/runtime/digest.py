@@ -30,7 +30,10 @@ from pipeline.export.solid_geometry import OVERHANG_COLUMNS
 from pipeline.io import arrow_at
 
 NOT_CONTENT = frozenset(
-    {"tile", "mesh_path", "input_hash", "settings_hash", "engine_version", "height_source", "ground_source"}
+    {
+        *("tile", "mesh_path", "input_hash", "settings_hash", "engine_version"),
+        *("height_source", "ground_source", "extrapolated", "extrapolated_share"),
+    }
 )
 """Columns that may differ between runs with equal results (by tiling, names of settings, or the version), and those
 that say where figures come from: the figures themselves and the reasons count."""

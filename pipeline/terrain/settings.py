@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.filter_settings import HierarchicalFilterSettings, MorphologicalFilterSettings
-from pipeline.terrain.support import NEAR_CELLS, PLANARITY_SCALES
+from pipeline.terrain.support import GLASS_M, NEAR_CELLS, PLANARITY_SCALES
 
 _MAX_SUPPORT_M = 500
 """A filter that looks farther makes a block nearly all halo."""
@@ -179,8 +179,8 @@ class VegetationSettings(Parameters):
 
     @property
     def crowns_support_m(self) -> float:
-        """How far the search for crowns looks at judged vertices: the widest sphere."""
-        return self.company_m * 2.0 ** (PLANARITY_SCALES - 1)
+        """How far the searches for crowns and for glass look at judged vertices: the widest sphere, some squares."""
+        return max(self.company_m * 2.0 ** (PLANARITY_SCALES - 1), GLASS_M)
 
 
 class SurfaceSettings(Parameters):

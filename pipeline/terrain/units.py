@@ -10,6 +10,8 @@ built:
   walls run up the slope;
 - a valley between two parallel ridges is the gutter between two houses.
 
+Patches of one curved surface (`terrain.curved_surfaces`) are one unit, whatever the folds between them.
+
 Houses of one height under one ridge show none of this and stay one unit.
 """
 
@@ -23,6 +25,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.union_find import root_of, unite, united
 from pipeline.model import FloatArray, IntArray, LabelArray
+from pipeline.terrain.curved_surfaces import curved_surfaces
 from pipeline.terrain.ridge_steps import Rows, cut_at_ridge_steps
 from pipeline.terrain.roof_patches import (
     MIN_COSINE,
@@ -113,23 +116,26 @@ def _joins(seen: _Facing | None, meets: bool, extent_m: float) -> bool:
 
 
 def units_of_patches(
-    patches: Patches, borders: Borders, roof: IntArray, house: IntArray, settings: UnitSettings
+    patches: Patches, borders: Borders, roof: IntArray, house: IntArray, curve: LabelArray, settings: UnitSettings
 ) -> LabelArray:
     """The unit of every patch of a candidate's roof, (k,) int32, numbered by one of its patches.
 
-    `roof` and `house` (k,) are those of `cut_at_ridge_steps`: two houses of one roof are two units.
+    `roof` and `house` (k,) are those of `cut_at_ridge_steps`: two houses of one roof are two units. `curve` (k,) is
+    that of `curved_surfaces`: its patches are of one unit.
     """
     count = len(patches.areas_m2)
-    unit = np.arange(count)
+    unit = np.where(curve >= 0, curve, np.arange(count))
     facing = _clear_borders(patches, borders)
     has_ridge = set()
     for row, seen in facing.items():
         if seen is not None and seen.ridge and seen.opposite:
             has_ridge |= {int(borders.first[row]), int(borders.second[row])}
-    apart: dict[int, set[int]] = {k: set() for k in range(count)}
+    apart: dict[int, set[int]] = {k: set() for k in set(unit.tolist())}
     joining = []
     for row, seen in facing.items():
         p, q = int(borders.first[row]), int(borders.second[row])
+        if unit[p] == unit[q]:
+            continue
         is_gutter = (
             settings.split == "ridges"
             and seen is not None
@@ -140,8 +146,8 @@ def units_of_patches(
             and borders.extent_m[row] >= _SHORTEST_VALLEY_M
         )
         if is_gutter or (roof[p] == roof[q] and house[p] != house[q]):
-            apart[p].add(q)
-            apart[q].add(p)
+            apart[int(unit[p])].add(int(unit[q]))
+            apart[int(unit[q])].add(int(unit[p]))
         elif _joins(seen, _meets(borders, row), float(borders.extent_m[row])):
             joining.append(row)
     # the longest first, so that what runs along several houses does not unite them across their gutters
@@ -338,7 +344,8 @@ def units_of(
     grown, roof, house = cut_at_ridge_steps(grown, borders, rows, strip, settings.min_ridge_step_m)
     if len(roof) > len(patches.areas_m2):
         patches, borders = measured_patches(grown, settings.min_step_m)
-    unit_of_patch = units_of_patches(patches, borders, roof, house, settings)
+    curve = curved_surfaces(grown, patches, borders)
+    unit_of_patch = units_of_patches(patches, borders, roof, house, curve, settings)
     if (unit_of_patch == unit_of_patch[0]).all():
         return one
     planes = np.column_stack((patches.slopes, patches.levels_mm))

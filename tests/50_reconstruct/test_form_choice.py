@@ -9,8 +9,7 @@ from candidates_by_hand import candidate
 
 from pipeline import reconstruct
 from pipeline.methods import ReconstructSettings
-from pipeline.model import Candidate, Plane, Status
-from pipeline.quality.settings import SupportSettings
+from pipeline.model import Candidate, Plane, Reason, Status
 from pipeline.reconstruct import reconstruct_building
 from pipeline.roof import block
 from pipeline.roof.partition import RoofPartition
@@ -51,13 +50,12 @@ def test_a_form_that_was_made_level_gives_way_to_one_that_explains_the_points(mo
     assert result.rmse_m < 0.05
 
 
-def test_a_form_that_was_made_level_is_delivered_where_no_other_is_better(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_level_face_through_slopes_is_not_delivered_as_a_roof(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn_forms = levelled_at_first(monkeypatch, 1_000)
-    trusting = SupportSettings(max_scatter_m=10.0, min_share_on_roof=0.0, max_unseen_share=1.0)
-    result = reconstruct_building(gable(), "arrangement", ReconstructSettings(support=trusting))
-    assert (result.status, result.lod) == (Status.OK, "2.2")
+    result = reconstruct_building(gable(), "arrangement", ReconstructSettings())
+    assert (result.status, result.reason, result.lod) == (Status.FALLBACK, Reason.LEVEL_THROUGH_SLOPE, "1.2")
     assert len(drawn_forms) > 2
-    assert [plane.c for plane in result.planes] == [6.4]
+    assert "more than 50%" in result.reason_detail
 
 
 def test_a_block_that_cannot_be_drawn_gives_way_to_the_next(monkeypatch: pytest.MonkeyPatch) -> None:

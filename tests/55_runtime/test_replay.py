@@ -45,6 +45,7 @@ def bundle() -> Bundle:
         split_returns=np.array([[0.25, 0.25, 6.15], [9.75, 0.25, 6.15]]),
         beside=np.array([[5.0, -0.1, 3.0], [6.0, -1.0, 0.0]]),
         beside_later=np.array([[7.0, 0.1, 2.0]]),
+        elsewhere=np.array([[0.5, 9.5, -0.1]]),
         footprint=shapely.box(0.0, 0.0, 10.0, 10.0),
         source_id="house 7",
         outline=shapely.MultiPolygon([shapely.box(0.0, 0.0, 10.0, 9.9)]),
@@ -93,7 +94,9 @@ def document_of(path: Path) -> dict[str, Any]:
 
 def test_a_bundle_comes_back_as_it_was(bundle: Bundle, path: Path) -> None:
     found = read_bundle(str(path))
-    bare = {name: np.empty((0, 3)) for name in ("points", "ground", "split_returns", "beside", "beside_later")}
+    bare = {
+        name: np.empty((0, 3)) for name in ("points", "ground", "split_returns", "beside", "beside_later", "elsewhere")
+    }
     for name in bare:
         assert np.array_equal(getattr(found.candidate, name), getattr(bundle.candidate, name))
     given, back = (str(dataclasses.replace(one.candidate, **bare)) for one in (bundle, found))

@@ -83,6 +83,7 @@ QUALITY = ModelQuality(
     share_within=0.981,
     share_below_roof=0.0625,
     unexplained_m2=1.25,
+    extrapolated_share=0.0625,
     largest_hole_m=1.4,
     ridge_z_sigma_m=0.017,
     bic_margin=12.5,
@@ -196,7 +197,8 @@ def levelled(building_id: str = "levelled") -> BuildingResult:
     corners = [(20.0, 0.0, 3.0), (24.0, 0.0, 3.0), (24.0, 8.0, 3.0), (20.0, 8.0, 3.0)]
     detailed = gable_solid(), roofed_solid(corners, [[[0, 1, 2, 3]]], 0.0, 2)
     quality = ModelQuality(
-        point_spacing_m=0.5, noise_m=0.03, share_within=0.98, unexplained_m2=1.5, largest_hole_m=1.2,
+        point_spacing_m=0.5, noise_m=0.03, share_within=0.98, unexplained_m2=1.5, extrapolated_share=0.01,
+        largest_hole_m=1.2,
         ridge_z_sigma_m=0.02, bic_margin=14.0,
     )  # fmt: skip
     coarser = levels("1.3", 4.75, 3.0), levels("1.2", 4.5, 4.5)

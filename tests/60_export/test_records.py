@@ -29,7 +29,7 @@ solid_lod13, solid_lod13_parts, solid_lod13_surfaces, solid_lod23, solid_lod23_p
 solid_lod23_planes, ground_z, ground_source, eave_z, ridge_z, h_min, h_50p, h_70p, h_max, height_m, height_source,
 footprint_area_m2, footprint_share, roof_area_m2, volume_m3, n_points, density_per_m2, through_share,
 detection_confidence, n_planes, rmse_m, p95_m, coverage, point_spacing_m, noise_m, share_within_0_2m, share_below_roof,
-unexplained_m2, largest_hole_m, ridge_z_sigma_m, bic_margin,
+unexplained_m2, extrapolated_share, largest_hole_m, ridge_z_sigma_m, bic_margin,
 is_curved, valid, validity_codes, touches_data_edge, strip_offset_m, wall_outline, overhang_m, overhang_sigma_m,
 overhang_source, lod23_reason, guides_followed, guides_not_followed, acquired_from, acquired_to, mesh_path, input_hash,
 settings_hash, engine_version"""
@@ -68,8 +68,9 @@ def test_the_quality_of_a_model_is_reported_as_it_was_measured(contexts: Context
     row = building_row(small.gable(), contexts["US feet"])
     figures = ("point_spacing_m", "noise_m", "share_within_0_2m", "share_below_roof", "unexplained_m2")
     assert [row[name] for name in figures] == [0.48, 0.029, 0.981, 0.0625, 1.25]
-    known = [row[name] for name in ("largest_hole_m", "ridge_z_sigma_m", "bic_margin", "is_curved")]
-    assert known == [1.4, 0.017, 12.5, False]
+    known = [row[name] for name in ("extrapolated_share", "largest_hole_m", "ridge_z_sigma_m", "bic_margin")]
+    assert known == [0.0625, 1.4, 0.017, 12.5]
+    assert row["is_curved"] is False
     curved = dataclasses.replace(small.gable(), quality=dataclasses.replace(small.QUALITY, is_curved=True))
     assert building_row(curved, contexts["US feet"])["is_curved"] is True
 
@@ -98,7 +99,7 @@ def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts: Contexts) 
         *("source_id", "geometry", "lod", "eave_z", "ridge_z", "h_min", "h_50p", "h_70p", "h_max", "height_m"),
         *("footprint_area_m2", "footprint_share", "roof_area_m2", "volume_m3", "density_per_m2", "rmse_m", "p95_m"),
         *("point_spacing_m", "noise_m", "share_within_0_2m", "unexplained_m2", "largest_hole_m", "ridge_z_sigma_m"),
-        *("share_below_roof",),
+        *("share_below_roof", "extrapolated_share"),
         *("strip_offset_m", "wall_outline", "overhang_m", "overhang_sigma_m"),
         *("overhang_source", "lod23_reason"),
         *("through_share", "detection_confidence", "ground_source", "height_source"),

@@ -1,8 +1,8 @@
 """Quarantine bundles: one building with everything needed to model it, in one small file.
 
 A zip of `bundle.json` (names, settings, incident), `points.npy`, `ground.npy`, `split_returns.npy`, `beside.npy` and
-`beside_later.npy` (for outlines at the walls) and `stderr.txt`. Reading a bundle executes nothing from it: there are no
-pickles, and sizes are checked before anything is unpacked.
+`beside_later.npy` (for outlines at the walls), `elsewhere.npy` (in given footprints) and `stderr.txt`. Reading a bundle
+executes nothing from it: there are no pickles, and sizes are checked before anything is unpacked.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from pipeline.settings import RunSettings
 SUFFIX = ".bundle"
 
 _FORMAT = "gablework bundle 2"
-_OPTIONAL = ("beside", "beside_later")
+_OPTIONAL = ("beside", "beside_later", "elsewhere")
 """Points of a candidate that a bundle holds only if there are any."""
 _LARGEST_BYTES = 2 * 2**30
 _LARGEST_TEXT_BYTES = 64 * 2**20
@@ -158,14 +158,14 @@ def read_bundle(path: str) -> Bundle:
             points = _array(_member(archive, path, "points.npy", _LARGEST_BYTES))
             ground = _array(_member(archive, path, "ground.npy", _LARGEST_BYTES))
             split_returns = _array(_member(archive, path, "split_returns.npy", _LARGEST_BYTES))
-            beside, beside_later = (
+            beside, beside_later, elsewhere = (
                 _array(_member(archive, path, f"{name}.npy", _LARGEST_BYTES))
                 if f"{name}.npy" in archive.namelist()
                 else np.zeros((0, 3))
                 for name in _OPTIONAL
             )
         bundle = _bundle(document, points, ground, split_returns, stderr)
-        candidate = dataclasses.replace(bundle.candidate, beside=beside, beside_later=beside_later)
+        candidate = dataclasses.replace(bundle.candidate, beside=beside, beside_later=beside_later, elsewhere=elsewhere)
         return dataclasses.replace(bundle, candidate=candidate)
     except OSError as error:
         raise UnreadableInputError(path, f"it cannot be read: {error.strerror or error}", _FIX) from error

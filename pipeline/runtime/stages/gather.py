@@ -254,6 +254,8 @@ def gather(
         beside_mm, later_mm = _beside(scratch, grid, xyz_mm, _grown(cells, _BESIDE_CELLS), around)
         digest.update(beside_mm.tobytes())
         digest.update(later_mm.tobytes())
+    elsewhere_mm = _elsewhere(footprint, cells, around)
+    digest.update(elsewhere_mm.tobytes())
     if site.outline is not None:
         digest.update(np.rint(shapely.get_coordinates(site.outline) * MM).astype(np.int64).tobytes())
     strip_offset_m = math.nan
@@ -274,6 +276,7 @@ def gather(
         outline=None if site.outline is None else _moved(site.outline, origin_mm),
         beside=_in_metres(beside_mm, origin_mm),
         beside_later=_in_metres(later_mm, origin_mm),
+        elsewhere=_in_metres(elsewhere_mm, origin_mm),
         touches_data_edge=touches_data_edge,
         is_known=is_given or (site.override is not None and site.override.says_building),
         strip_offset_m=strip_offset_m,
@@ -304,6 +307,23 @@ def _ground_mm(
     if len(points_mm):
         return int(points_mm.min()) - _HEIGHT_WITHOUT_TERRAIN_MM, GroundSource.ASSUMED
     return None, None
+
+
+def _elsewhere(footprint: Polygon | MultiPolygon | None, own: BoolArray, around: Surroundings) -> IntArray:
+    """Centres (e, 3), mm, of the cells wholly in a footprint that hold points, but none of the building's `own`.
+
+    They lie on the terrain, at 0 where it is unknown.
+    """
+    if footprint is None:
+        return np.empty((0, 3), np.int64)
+    rows, columns = np.nonzero(around.occupied & ~own)
+    z = around.elevation_mm[rows, columns].astype(np.int64)
+    places = np.column_stack((columns + around.column0, rows + around.row0)) * CELL_MM + CELL_MM // 2
+    within = shapely.buffer(footprint, -_HALF_DIAGONAL_M)  # ground at a wall lies in cells that the wall cuts
+    shapely.prepare(within)
+    inside = shapely.contains_xy(within, places / MM)
+    elsewhere_mm: IntArray = np.column_stack((places, np.where(z == NO_DATA, 0, z)))[inside]
+    return elsewhere_mm
 
 
 def _local(

@@ -21,7 +21,8 @@ from pipeline.terrain.scene_settings import ClassesInUse
 from pipeline.tiling import MM, Tile
 
 _CLASSIFIED_SHARE = 0.05
-"""Smallest share of ground points (class 2) in a classified file. Not a setting: any share between that of stray codes
+"""Smallest share of ground points (class 2) in a classified file, and of building points (class 6) in one that knows
+roofs from ground. Not a setting: any share between that of stray codes
 and that of real ground will do, and the setting `classes` overrules it."""
 
 _NO_POINTS = np.zeros(3, np.uint64)
@@ -121,21 +122,20 @@ def classes_in_use(ingested: Sequence[Ingested], *, trust: bool) -> tuple[Classe
     """Which classes are believed, and a sentence on why; empty where there is nothing to explain.
 
     Ground, buildings and vegetation are believed only where every input is classified: at least 5 % of its points are
-    ground. A file with stray codes, or one that was never classified, is not taken at its word.
+    ground. A file with stray codes, or one that was never classified, is not taken at its word. Where an input has many
+    points of class 6, these are not ground in any case.
     """
     if not trust:
         return ClassesInUse(), ""
-    bare = [
-        found.path
-        for found in ingested
-        if found.classes and found.classes.get(GROUND_CLASS, 0) < _CLASSIFIED_SHARE * sum(found.classes.values())
-    ]
+    bare = [found.path for found in ingested if found.classes and _share_of(found, GROUND_CLASS) < _CLASSIFIED_SHARE]
     if bare:
         some = len(bare) < len(ingested) or any(
             found.classes.get(code, 0) for found in ingested for code in (GROUND_CLASS, BUILDING_CLASS)
         )
         why = "the inputs have no classes" if not some else f"{len(bare)} of {len(ingested)} inputs are not classified"
-        return ClassesInUse(), f"{why}: ground and buildings are found in the points alone"
+        roofs = any(_share_of(found, BUILDING_CLASS) >= _CLASSIFIED_SHARE for found in ingested)
+        but = ", and class 6 is not taken for ground" if roofs else ""
+        return ClassesInUse(roofs=roofs), f"{why}: ground and buildings are found in the points alone{but}"
     buildings = any(found.classes.get(BUILDING_CLASS, 0) for found in ingested)
     return ClassesInUse(ground=True, building=buildings, vegetation=True), ""
 
@@ -158,6 +158,11 @@ def without_roofs(points_by_class: Mapping[int, int], *, trust: bool) -> str:
         f"all {points} points are of {named}, so none can be a roof: "
         "give --classes ignore if they are not what they say"
     )
+
+
+def _share_of(found: Ingested, code: int) -> float:
+    """Share of an input's points with a class; 0 without points."""
+    return found.classes.get(code, 0) / max(sum(found.classes.values()), 1)
 
 
 def spread_m(results: Sequence[Ingested]) -> float:

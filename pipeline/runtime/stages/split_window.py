@@ -218,6 +218,8 @@ def _above_ground(
     above = ~ground_points(points.x_mm[index], points.y_mm[index], points.z_mm[index], terrain, settings)
     if classes.ground:
         above &= points.classification[index] != GROUND_CLASS
+    if classes.roofs:
+        above |= points.classification[index] == BUILDING_CLASS
     if classes.vegetation:
         above &= ~np.isin(points.classification[index], VEGETATION_CLASSES)
     return above

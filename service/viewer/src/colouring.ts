@@ -58,6 +58,8 @@ const REASON_COLOURS: Record<string, string> = {
   too_complex: "#0072b2",
   no_footprint: "#f0e442",
   height_given: "#882255",
+  above_points: "#aa4499",
+  level_through_slope: "#117733",
 };
 const REASONS = new Map(Object.entries(REASON_COLOURS).map(([name, colour]) => [name, { label: reasonWords(name), colour }]));
 const NO_REASON: ColourClass = { label: "none: modelled in full", colour: GREY };

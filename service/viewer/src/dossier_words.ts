@@ -166,6 +166,8 @@ const CHECKS: Record<string, Check> = {
   unseen_share: { label: "Roof without points", show: percent, met: "little", missed: "too much: the model is doubtful" },
   returns_per_face: { label: "Points per roof face", show: (v) => measure(v, 1), met: "enough", missed: "too few: the model is doubtful" },
   detection_confidence: { label: "Confidence that it is a building", show: percent, met: "enough", missed: "too low: the model is doubtful" },
+  above_points_m: { label: "Height of a face above its points", show: (v) => measure(v, 2, "m"), met: "near them", missed: "too high: the model is doubtful" },
+  level_on_slope_share: { label: "Points of a level face that lie on a slope", show: percent, met: "few", missed: "too many: the model is doubtful" },
   explained_share: { label: "Roof points that the model explains", show: percent, met: "enough for so few points", missed: "too few: the model is not delivered" },
 };
 

@@ -7,6 +7,8 @@ const REASONS: Record<string, string> = {
   invalid_solid: "the solid is not valid",
   too_complex: "it exceeded the work limit of one building",
   no_footprint: "no outline could be made from its points",
+  above_points: "a roof face rises above all its points",
+  level_through_slope: "a level roof face runs through a slope",
   height_given: "too few points; a block of the height that its footprint states",
   poor_fit: "too few of its points lie on the model",
   scattered: "its points scatter about the model more than those of a roof",

@@ -57,6 +57,7 @@ function groups(elevationUnitM: number): [string, Row[]][] {
         { label: "Noise of the points", column: "noise_m", show: metres(3) },
         { label: "Ridge uncertainty (one sigma)", column: "ridge_z_sigma_m", show: metres(3) },
         { label: "Roof unexplained by points", column: "unexplained_m2", show: (v) => measure(v, 1, "m²") },
+        { label: "Roof that was not seen", column: "extrapolated_share", show: percent },
         { label: "Largest hole in the points", column: "largest_hole_m", show: metres(1) },
         { label: "Confidence that it is a building", column: "detection_confidence", show: percent },
         { label: "Points", column: "n_points", show: whole },
