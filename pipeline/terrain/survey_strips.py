@@ -229,6 +229,11 @@ def _squares(x_mm: IntArray, y_mm: IntArray) -> tuple[IntArray, int]:
     return number, int(np.count_nonzero(is_first))
 
 
+def rows_of(stored: bytes) -> Rows:
+    """Rows from their bytes, as they travel."""
+    return np.frombuffer(stored, np.int64).reshape(-1, 4)
+
+
 def counted(rows: Rows) -> Rows:
     """Rows with the counts of equal ones added up, in their order."""
     if len(rows) == 0:
