@@ -390,7 +390,7 @@ def whole_join(
     rejected, small = [], 0
     for k, verdict in enumerate(verdicts):
         kind = int(surfaces.kind[k])
-        if verdict is None or int(leader[k]) >= 0 or kind in {FacetKind.STEP, FacetKind.GROUND}:
+        if verdict is None or int(leader[k]) >= 0 or kind in {FacetKind.STEP, FacetKind.SEAM, FacetKind.GROUND}:
             continue
         point = tuple(int(v) for v in surfaces.lowest_point_mm[k])
         if not listed[k] or point[0] == NOWHERE:

@@ -47,10 +47,11 @@ class ClassCodeSettings(Parameters):
         return next((name for name, codes in lists.items() if code in codes), "undecided")
 
     def cross_faults(self) -> list[str]:
-        """A code means one thing."""
+        """A code means one thing; the default of `other` gives way to other lists."""
         groups: dict[int, list[str]] = {}
         for name, codes in dataclasses.asdict(self).items():
-            for code in dict.fromkeys(codes) if isinstance(codes, tuple) else ():
+            is_default = name == "other" and codes == type(self).__dataclass_fields__["other"].default
+            for code in dict.fromkeys(codes) if isinstance(codes, tuple) and not is_default else ():
                 groups.setdefault(code, []).append(name)
         return [
             f"code {code} is {' and '.join(names)}: give it in one list"
@@ -73,7 +74,8 @@ class ClassCodeSettings(Parameters):
         for codes in asprs.values():
             for code in codes:
                 table[code] = OTHER
-        for name, codes in asprs.items():
+        # `other` first, whose default gives way to other lists
+        for name, codes in reversed(asprs.items()):
             for code in getattr(self, name):
                 table[code] = code if code in codes else OTHER if name == "other" else codes[0]
         return None if table == list(range(256)) else tuple(table)

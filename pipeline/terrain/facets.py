@@ -42,7 +42,7 @@ class FacetKind(IntEnum):
     CROWN = 6
     """Some vertex has rough surroundings, as crowns of trees have; no vertex is ground."""
     SEAM = 7
-    """Building goes on without a wall in what nothing is known of."""
+    """Building goes on, by a vertex that was joined to it, in what nothing is known of."""
 
 
 class VertexKind(IntEnum):
@@ -147,14 +147,15 @@ def _bridges_gap(x: IntArray, y: IntArray, corners: tuple[int, int, int], radius
 @kernel(inline="always")
 def _kind_above(a: int, b: int, c: int) -> int:
     """FacetKind of a facet that no wall cuts, by the kinds of its vertices, none of which is ground or excluded."""
-    buildings, crowns = 0, 0
+    buildings, joined, crowns = 0, 0, 0
     for kind in (a, b, c):
-        buildings += kind == VertexKind.BUILDING or kind == VertexKind.JOINED  # noqa: PLR1714 - compiled
+        buildings += kind == VertexKind.BUILDING
+        joined += kind == VertexKind.JOINED
         crowns += kind == VertexKind.CROWN
-    if buildings == 3:
+    if buildings + joined == 3:
         return FacetKind.BUILDING
-    if buildings > 0:
-        return FacetKind.BORDER if crowns > 0 else FacetKind.SEAM
+    if buildings + joined > 0:
+        return FacetKind.SEAM if joined > 0 and crowns == 0 else FacetKind.BORDER
     return FacetKind.CROWN if crowns > 0 else FacetKind.OBJECT
 
 

@@ -200,9 +200,12 @@ def compared_strips(
     if len(strip) == 0 or (strip == strip[0]).all():
         return NO_ROWS
     x, y, _ = places_mm
-    names, number = np.unique(strip, return_inverse=True)
+    # not by np.unique, which loads np.ma
+    names = np.flatnonzero(np.bincount(strip))
+    number = np.zeros(int(names[-1]) + 1, np.int32)
+    number[names] = np.arange(len(names))
     square, squares = _squares(x, y)
-    last, of_strip = returns[0] >= returns[1], number.reshape(-1).astype(np.int32)
+    last, of_strip = returns[0] >= returns[1], number[strip]
     of, sums, smallest = _square_sums(places_mm, last, square, of_strip, (squares, len(names)))
     owned = np.ones(squares, np.bool_) if core is None else core.contains(smallest[:, 0], smallest[:, 1])
     order = np.lexsort((of[:, 0], of[:, 1])).astype(np.int64)
@@ -219,18 +222,25 @@ def _squares(x_mm: IntArray, y_mm: IntArray) -> tuple[IntArray, int]:
     key, count = column * rows + row, (int(column.max()) + 1) * rows
     if count <= 4 * len(key):
         return key, count
-    kinds, number = np.unique(key, return_inverse=True)
-    return number.reshape(-1).astype(np.int64), len(kinds)
+    order = np.argsort(key, kind="stable")
+    is_first = np.diff(key[order], prepend=-1) > 0
+    number = np.empty(len(key), np.int64)
+    number[order] = np.cumsum(is_first) - 1
+    return number, int(np.count_nonzero(is_first))
+
+
+def rows_of(stored: bytes) -> Rows:
+    """Rows from their bytes, as they travel."""
+    return np.frombuffer(stored, np.int64).reshape(-1, 4)
 
 
 def counted(rows: Rows) -> Rows:
     """Rows with the counts of equal ones added up, in their order."""
     if len(rows) == 0:
         return NO_ROWS
-    kinds, number = np.unique(rows[:, :3], axis=0, return_inverse=True)
-    squares = np.zeros(len(kinds), np.int64)
-    np.add.at(squares, number.reshape(-1), rows[:, 3])
-    return np.column_stack((kinds, squares))
+    rows = rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))]
+    first = np.flatnonzero(np.append(True, (rows[1:, :3] != rows[:-1, :3]).any(axis=1)))
+    return np.column_stack((rows[first, :3], np.add.reduceat(rows[:, 3], first)))
 
 
 def _all_pairs(parts: Iterable[Rows]) -> list[StripOffset]:

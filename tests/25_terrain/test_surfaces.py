@@ -167,10 +167,11 @@ def slow_kind(scene: Scene, facet: npt.NDArray[np.int32]) -> FacetKind:
     if (kinds == VertexKind.OBJECT).all():
         return FacetKind.OBJECT
     building = np.isin(kinds, (VertexKind.BUILDING, VertexKind.JOINED))
-    if building.any() and (kinds == VertexKind.CROWN).any():
-        return FacetKind.BORDER
+    if building.all():
+        return FacetKind.BUILDING
     if building.any():
-        return FacetKind.BUILDING if building.all() else FacetKind.SEAM
+        goes_on = (kinds == VertexKind.JOINED).any() and not (kinds == VertexKind.CROWN).any()
+        return FacetKind.SEAM if goes_on else FacetKind.BORDER
     return FacetKind.CROWN
 
 

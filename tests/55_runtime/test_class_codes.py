@@ -117,6 +117,16 @@ def test_a_code_that_was_taken_from_its_group_means_nothing_special() -> None:
     assert ClassCodeSettings(vegetation=(5, 4, 3)).table is None
 
 
+def test_other_things_give_way_to_lists_that_name_their_codes_and_the_rest_is_undecided() -> None:
+    codes = RunSettings.from_mapping({"class-codes": {"ground": [2, 8], "building": [6, 21, 67], "undecided": [26]}})
+    table = codes.class_codes.table
+    assert table is not None
+    assert (table[8], table[21], table[67], table[26], table[17], table[28]) == (2, 6, 6, 0, 17, 28)
+    with pytest.raises(SettingsError, match="code 21 is building and other: give it in one list"):
+        RunSettings.from_mapping({"class-codes": {"building": [6, 21], "other": [9, 21]}})
+    assert ClassCodeSettings.role(28) == ClassCodeSettings.role(70) == "undecided"
+
+
 def test_settings_of_codes_are_checked_and_hashed() -> None:
     with pytest.raises(SettingsError, match=r"\[class-codes\] building is .*list of whole numbers from 0 to 255"):
         RunSettings.from_mapping({"class-codes": {"building": [6, 300]}})

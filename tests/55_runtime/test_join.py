@@ -26,7 +26,7 @@ from pipeline.runtime.stages.open_fragments import open_fragments
 from pipeline.runtime.stages.sites import FoundSites
 from pipeline.runtime.stages.split_window import Split, SplitFigures
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints
-from pipeline.terrain.candidates import NOWHERE
+from pipeline.terrain.candidates import CONNECTING, NOWHERE, SOLID
 from pipeline.terrain.facets import FacetKind, SceneVertices, VertexKind
 from pipeline.terrain.fragment_sums import N_SUMS, Sum
 from pipeline.terrain.point_assignment import ScenePoints
@@ -211,7 +211,7 @@ def test_the_patches_have_what_the_join_is_for() -> None:
         tiles_of = [{part.tile for part in site.ranges} for site in found.candidates]
         surfaces, surface, offsets = whole_surfaces(wholes)
         tile_of = np.repeat(np.arange(len(wholes)), np.diff(offsets))
-        steps = np.flatnonzero(surfaces.kind == FacetKind.STEP)
+        steps = np.flatnonzero(np.isin(surfaces.kind, CONNECTING))
         seen["candidates of one tile"] += sum(len(tiles) == 1 for tiles in tiles_of)
         seen["candidates of several tiles"] += sum(len(tiles) > 1 for tiles in tiles_of)
         seen["candidates of several surfaces of a tile"] += sum(
@@ -223,9 +223,7 @@ def test_the_patches_have_what_the_join_is_for() -> None:
         seen["finished in their tile"] += sum(len(s.surfaces.done.kind) for s in handed if s.surfaces)
         named = sum(len(s.surfaces.open.facets.names) for s in handed if s.surfaces)
         kinds = [w.fragments.kind[w.fragments.crossing_fragment] for w in wholes]
-        seen["facets that need not be named"] += (
-            sum(int(((kind != FacetKind.GROUND) & (kind != FacetKind.STEP)).sum()) for kind in kinds) - named
-        )
+        seen["facets that need not be named"] += sum(int(np.isin(kind, SOLID).sum()) for kind in kinds) - named
     assert min(seen.values()) >= 6, seen
 
 
@@ -234,14 +232,22 @@ def test_the_patches_have_what_the_join_is_for() -> None:
 CORNER = TileGrid(size_mm=20_000, halo_mm=8_000)
 """Facets around the origin lie where four tiles see them."""
 TILES = (Tile(-1, -1), Tile(-1, 0), Tile(0, -1), Tile(0, 0))
-KINDS = (FacetKind.OBJECT, FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.CROWN, FacetKind.STEP, FacetKind.GROUND)
+KINDS = (
+    FacetKind.OBJECT,
+    FacetKind.OBJECT,
+    FacetKind.BUILDING,
+    FacetKind.CROWN,
+    FacetKind.STEP,
+    FacetKind.SEAM,
+    FacetKind.GROUND,
+)
 SHARES = (0, 1000, 6000, 12_000)
 
 
 def any_fragments(seed: int, most: int, facets: int) -> list[WholeSplit]:
     """Four tiles with up to `most` fragments each, any of which may hold any of the facets of its kind, or none."""
     random = np.random.default_rng(seed)
-    facet_kinds = random.choice(KINDS[:5], facets)
+    facet_kinds = random.choice(KINDS[:6], facets)
     corners = random.integers(-800, 800, (facets, 2))
     keys = np.column_stack([corners + shift for shift in ([0, 0], [150, 10], [20, 140])])
     places = iter(random.permutation(4 * most + 1).tolist())
@@ -259,7 +265,7 @@ def any_fragments(seed: int, most: int, facets: int) -> list[WholeSplit]:
         sums[:, Sum.POINTS] = random.choice([1, 20, 200], count)
         sums[:, Sum.SEVERAL] = sums[:, Sum.POINTS] * random.choice([0, 0.1, 0.5], count)
         sums[:, Sum.THROUGH] = sums[:, Sum.SEVERAL] // 2
-        for column in (Sum.WALL, Sum.WALL_TOP, Sum.STEP):
+        for column in (Sum.WALL, Sum.WALL_TOP, Sum.STEP, Sum.SEAM):
             sums[:, column] = random.choice(SHARES, count)
         low = random.integers(-9000, 9000, (count, 2))
         boxes = np.column_stack((low, low + random.integers(0, 6000, (count, 2))))
@@ -268,7 +274,7 @@ def any_fragments(seed: int, most: int, facets: int) -> list[WholeSplit]:
         points = np.column_stack((low, [next(places) for _ in range(count)])).reshape(count, 3).astype(np.int64)
         held = np.flatnonzero(random.random(count) < 0.8)
         points[np.setdiff1d(np.arange(count), held)] = NOWHERE
-        solid, steps = np.flatnonzero((kind != FacetKind.STEP) & (kind != FacetKind.GROUND)), np.flatnonzero(kind == 5)
+        solid, steps = np.flatnonzero(np.isin(kind, SOLID)), np.flatnonzero(np.isin(kind, CONNECTING))
         links = int(random.integers(0, 2 * most)) if len(solid) and len(steps) else 0
         ends = [random.choice(which, links) if links else np.empty(0) for which in (solid, steps)]
         along = np.column_stack((*ends, random.integers(1, 900, links)))

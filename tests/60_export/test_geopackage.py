@@ -237,7 +237,7 @@ def values_of(layer: str, name: str) -> list[str | None]:
 
 def test_every_status_and_every_reason_of_rejection_has_a_class() -> None:
     assert sorted(values_of("buildings", "status")) == sorted(Status)
-    reasons = {*REASON_OF_FAULT.values(), Reason.TOO_FEW_POINTS, Reason.OVERRIDDEN}
+    reasons = {*REASON_OF_FAULT.values(), Reason.TOO_FEW_POINTS, Reason.OVERRIDDEN, Reason.STRIPS_DISAGREE}
     *known, others = values_of("rejected", "reason")
     assert sorted(known) == sorted(reasons)
     assert others == ""

@@ -34,7 +34,7 @@ from pipeline.terrain.lattice import NO_DATA, lowest_per_cell
 from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.scene_settings import ClassesInUse
 from pipeline.terrain.settings import OutlierSettings
-from pipeline.terrain.survey_strips import SQUARE_MM, Rows, compared_strips
+from pipeline.terrain.survey_strips import SQUARE_MM, compared_strips
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 
@@ -68,8 +68,8 @@ class TileCells:
     """Digest of the cells."""
     states: int
     """CRC-32 of the states of its points."""
-    strips: Rows
-    """How its flight strips differ."""
+    strips: bytes
+    """How its flight strips differ: the bytes of the rows of `compared_strips`."""
 
 
 def find_all_cells(
@@ -154,7 +154,7 @@ def find_cells(task: CellsTask, settings: OutlierSettings) -> TileCells:
         outliers=int(n - np.count_nonzero(kept)),
         outcome=_digest_of(*rasters.values()),
         states=zlib.crc32(states.data),
-        strips=strips,
+        strips=strips.tobytes(),
     )
 
 

@@ -10,7 +10,7 @@ from pipeline.runtime.stages.ground import BlockCells, cells_of_blocks
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.settings import RunSettings
-from pipeline.terrain.survey_strips import moves_of, offsets_of, strips_warning
+from pipeline.terrain.survey_strips import moves_of, offsets_of, rows_of, strips_warning
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ def read_inputs(context: RunContext, settings: RunSettings, paths: Sequence[str]
     """
     ingested = ingest(context, paths)
     cells = cells_of_blocks(context, settings, ingested, footprints=footprints)
-    rows = [found.strips for found in cells.cells.values()]
+    rows = [rows_of(found.strips) for found in cells.cells.values()]
     moves_mm = moves_of(rows, settings.scene.strips)
     apart = offsets_of(rows, settings.scene.strips)
     if apart:

@@ -1,4 +1,4 @@
-"""Rejected objects that two flight strips saw apart: they may be buildings, and say so."""
+"""Rejected objects that look rough because two flight strips saw them apart: they may be buildings, and say so."""
 
 from __future__ import annotations
 
@@ -16,19 +16,16 @@ from pipeline.strip_alignment import disagreement_m
 from pipeline.terrain.candidates import Verdict
 from pipeline.tiling import MM
 
-_SURE = frozenset({Reason.BRIDGE, Reason.VEHICLE, Reason.OVERRIDDEN})
-"""Reasons that say what an object is, and not only that it does not look like a roof."""
-
 
 def with_strips_that_disagree(
     rejected: Iterable[RejectedSite], scratch: Scratch, min_offset_m: float
 ) -> tuple[RejectedSite, ...]:
-    """Rejected objects; those whose strips lie farther than `min_offset_m` above one another have that reason."""
+    """Rejected objects; rough ones whose strips lie farther than `min_offset_m` above one another have that reason."""
     return tuple(_judged(site, scratch, min_offset_m) for site in rejected)
 
 
 def _judged(site: RejectedSite, scratch: Scratch, min_offset_m: float) -> RejectedSite:
-    if site.verdict.reason in _SURE or not site.ranges:
+    if site.verdict.reason is not Reason.VEGETATION or not site.ranges:
         return site
     pieces = []
     for part in site.ranges:
