@@ -7,6 +7,7 @@ that the list lacks is compiled at its first call.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import time
@@ -97,11 +98,15 @@ def compile_kernels(
 
 def _compile(one: Listed) -> int:
     """Compile or load a kernel in this process; returns its weight."""
+    from numba.core.errors import NumbaError
+
     from pipeline.compiler.signatures import from_json
 
     kernel = kernel_named(one.kernel)
     if not is_off():
-        kernel.dispatcher.compile(tuple(from_json(kind) for kind in one.arguments))
+        # types of an old list may not fit: such a kernel is compiled when it is called, which takes longer
+        with contextlib.suppress(NumbaError, TypeError):
+            kernel.dispatcher.compile(tuple(from_json(kind) for kind in one.arguments))
     return one.weight
 
 

@@ -61,6 +61,10 @@ def compile_first(
     kernels = missing_kernels(groups)
     if not kernels:
         return
+    from pipeline.compiler.backend import is_known  # loads numba
+
+    if not is_known():  # plain numba stores what it compiles by itself, as it is called
+        return
     seconds = about_s(kernels, cores())
     if not store.can_save():
         message = (
