@@ -31,8 +31,7 @@ MIN_SHARE = 0.5
 """Least share of class 6 of a right building."""
 BINS = (0.0, 0.2, 0.4, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0)
 COLUMNS = (
-    "building_id", "geometry", "ground_z", "n_points", "density_per_m2", "through_share", "share_within_0_2m",
-    "share_below_roof",
+    "building_id", "geometry", "ground_z", "n_points", "density_per_m2", "noise_m", "share_within_0_2m", "n_planes",
     "footprint_area_m2", "height_m", "coverage", "detection_confidence",
 )  # fmt: skip
 

@@ -8,13 +8,13 @@ from pipeline.model import BuildingResult
 
 # Not settings: fitted by logistic regression to the surveys that docs/reference/records.md names;
 # benchmarks/detection_confidence.py and benchmarks/trust.py measure how reliable the result is.
-PER_LOG_NOISE = -4.0
+PER_LOG_NOISE = -2.06
 """Log-odds per e-fold of the scatter about the roof: crowns are rough."""
-PER_SHARE_WITHIN = 14.0
+PER_SHARE_WITHIN = 4.82
 """Log-odds of a roof whose returns all lie within 0.2 m of planes: crowns are not planar."""
-PER_LOG_PLANE_AREA = 3.5
+PER_LOG_PLANE_AREA = 2.77
 """Log-odds per e-fold of the plan area per roof plane: a crown takes many small planes."""
-AT_ONE = -30.0
+AT_ONE = -15.65
 """Log-odds of no share, 1 m of scatter and planes of 1 m2."""
 LEAST_NOISE_M = 0.005
 """Less scatter shows nothing more."""

@@ -7,22 +7,28 @@ import pytest
 from pipeline.quality.detection import detection_confidence
 
 
-def test_more_points_a_smoother_roof_and_fewer_pulses_that_go_on_raise_the_confidence() -> None:
-    base = detection_confidence(20, 0.8, 0.1)
-    assert detection_confidence(40, 0.8, 0.1) > base
-    assert detection_confidence(20, 0.9, 0.1) > base
-    assert detection_confidence(20, 0.8, 0.05) > base
+def test_a_smoother_roof_on_its_points_with_larger_planes_raises_the_confidence() -> None:
+    base = detection_confidence(0.1, 0.8, 10.0)
+    assert detection_confidence(0.05, 0.8, 10.0) > base
+    assert detection_confidence(0.1, 0.9, 10.0) > base
+    assert detection_confidence(0.1, 0.8, 20.0) > base
 
 
-def test_a_plain_house_is_nearly_sure_and_a_pierced_crown_is_not() -> None:
-    assert detection_confidence(500, 0.95, 0.01) > 0.99
-    assert detection_confidence(20, 0.3, 0.35) < 0.1
+def test_a_plain_house_is_nearly_sure_and_a_crown_is_not() -> None:
+    assert detection_confidence(0.03, 0.95, 40.0) > 0.99
+    assert detection_confidence(0.25, 0.5, 6.0) < 0.1
 
 
-def test_few_points_without_a_pulse_that_goes_on_are_not_sure() -> None:
-    assert detection_confidence(10, 0.8, 0.0) == pytest.approx(0.964, abs=1e-3)  # the example of docs/reference
+def test_the_example_of_the_docs_is_right() -> None:
+    assert detection_confidence(0.05, 0.9, 20.0) == pytest.approx(0.959, abs=1e-3)
 
 
-@pytest.mark.parametrize("figures", [(0, 0.9, 0.1), (10, math.nan, 0.1), (10, 0.9, math.nan)])
-def test_without_a_figure_the_confidence_is_not_known(figures: tuple[int, float, float]) -> None:
+def test_scatter_below_what_a_scanner_measures_shows_nothing_more() -> None:
+    assert detection_confidence(0.0, 0.9, 20.0) == detection_confidence(0.005, 0.9, 20.0) < 1.0
+
+
+@pytest.mark.parametrize(
+    "figures", [(math.nan, 0.9, 20.0), (0.1, math.nan, 20.0), (0.1, 0.9, math.nan), (0.1, 0.9, 0.0)]
+)
+def test_without_a_figure_the_confidence_is_not_known(figures: tuple[float, float, float]) -> None:
     assert math.isnan(detection_confidence(*figures))

@@ -130,8 +130,10 @@ def test_only_a_building_found_in_the_points_alone_has_a_confidence(contexts: Co
         found: float | None = row["detection_confidence"]
         return found
 
-    share_of_all = small.QUALITY.share_within * (1.0 - small.QUALITY.share_below_roof)
-    expected = detection_confidence(small.gable().n_points, share_of_all, 0.1)
+    gable = small.gable()
+    assert gable.footprint is not None
+    plane_area_m2 = gable.footprint.area / len(gable.planes)
+    expected = detection_confidence(small.QUALITY.noise_m, small.QUALITY.share_within, plane_area_m2)
     assert confidence() == confidence("method") == pytest.approx(expected, abs=5e-4)
     assert confidence("accept, method") is confidence("footprint") is None
     assert confidence(source_id="parcel 7") is None
