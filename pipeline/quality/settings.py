@@ -22,7 +22,7 @@ class SupportSettings(Parameters):
         maximum=10.0,
     )
     max_unseen_share: float = parameter(
-        0.4,
+        0.5,
         "Share of the roof's plan area without a point on the roof nearby; above it the reason is `not_seen`.",
         minimum=0.0,
         maximum=1.0,
