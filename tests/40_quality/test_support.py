@@ -86,7 +86,9 @@ def test_a_block_that_the_settings_ask_for_is_not_judged_as_a_roof() -> None:
 
 
 def test_thresholds_are_settings() -> None:
-    settings = RunSettings.from_mapping({"support": {"min_share_on_roof": 0.2, "max_scatter_m": 5.0}})
+    settings = RunSettings.from_mapping(
+        {"support": {"min_share_on_roof": 0.2, "max_scatter_m": 5.0, "min_confidence": 0.0}}
+    )
     assert reconstruct_building(candidate(crown(1)), "arrangement", settings.building).status is Status.OK
     assert settings.settings_hash != RunSettings().settings_hash
     with pytest.raises(SettingsError, match="min_share_on_roof"):
