@@ -58,11 +58,11 @@ def apart(work: Callable[[], Result], path: str) -> Result:
             os.kill(pid, signal.SIGKILL)
             os.waitpid(pid, 0)
     if code:
-        how = f"signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"exit code {code}"
+        how = f"signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"exit code {code}"
         raise UnreadableInputError(
             path,
-            f"the point data are damaged: the process that decoded some of them was ended by {how}",
-            "Get the file again, or rewrite it with another tool",
+            f"it cannot be read: the process that decoded some of its points was ended by {how}",
+            "Get the file again, or write it again",
         )
     is_error, found = pickle.loads(sent.lstrip(_MOVED))  # noqa: S301 - from a copy of this process
     if is_error:

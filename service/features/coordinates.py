@@ -54,7 +54,7 @@ class NamedCrs:
 def _without_place(run: str, crs: str) -> NoSuchCollectionError:
     return NoSuchCollectionError(
         f"the coordinate reference system of run {run} is {crs}, so its features have no place on the globe "
-        "and are no collection: model it again with --crs"
+        "and cannot be a collection: model it again with --crs"
     )
 
 
