@@ -80,9 +80,10 @@ REASONS: Mapping[Reason, str] = {
     "footprint gives",
     Reason.POOR_FIT: "`doubtful`: too few of its roof returns lie on the model",
     Reason.SCATTERED: "`doubtful`: its roof returns scatter about the model more than a roof does: a tree, a heap",
-    Reason.NOT_SEEN: "`doubtful`: too much of the roof is drawn where no point is",
+    Reason.NOT_SEEN: "`doubtful`: too much of the roof is drawn where no point is, or may lie where none is",
     Reason.TOO_MANY_FACES: "`doubtful`: too few roof returns for so many roof faces",
-    Reason.UNCERTAIN: "`doubtful`: it may not be a building; the detail is the confidence",
+    Reason.UNCERTAIN: "`doubtful`: it may not be a building; the detail is the confidence, or how much of a level roof "
+    "the ground reaches",
     Reason.ABOVE_POINTS: "`doubtful`: a roof face rises above all its points by more than their noise and its rise "
     "over two point spacings",
     Reason.LEVEL_THROUGH_SLOPE: "`doubtful`: most points within a level roof face lie on a slope that is not modelled",
@@ -99,7 +100,8 @@ REASONS: Mapping[Reason, str] = {
     Reason.NO_WALLS: "too little of its outline is wall: a mound, a bank",
     Reason.VEGETATION: "rough, many returns, ground seen beneath",
     Reason.TOO_NARROW: "narrower than a building: a wall, a hedge, a wire",
-    Reason.BRIDGE: "level with the ground along two opposite ends and free along its sides: the deck of a bridge",
+    Reason.BRIDGE: "level with the ground along two opposite ends, or one end of a long surface, and free along its "
+    "sides: the deck of a bridge",
     Reason.VEHICLE: "narrow, low and free all around: a van, a truck, a row of them, a container",
     Reason.STRIPS_DISAGREE: "the flight strips that saw it lie above one another by more than "
     "`min_strip_offset_m`, so it may be a building; the detail names the offset, and what it looks like",
@@ -313,6 +315,9 @@ class Candidate:
     elsewhere: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """(e, 3) float64, local metres: centres, on the terrain, of the cells of 1 m wholly in the given footprint that
     hold points, but none of its own. Empty without a footprint."""
+    voids: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """(v, 3) float64, local metres, at elevation 0: centres of the cells of 1 m nearby that belong to squares without
+    any point. Empty with a footprint and at the edge of the data."""
     touches_data_edge: bool = False
     """True where the data end at the candidate: it may be cut."""
     is_known: bool = False

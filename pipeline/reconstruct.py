@@ -43,7 +43,7 @@ from pipeline.model import (
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, model_quality
 from pipeline.quality.residuals import vertical_residuals
-from pipeline.quality.support import doubt_of, support_of
+from pipeline.quality.support import NOT_OF_FORM, doubt_of, support_of
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_forms, block_plane
 from pipeline.roof.facades import Walls
@@ -436,9 +436,11 @@ def _judged(
     if record.lod != LODS[-1]:
         return record
     settings = building.settings.support
-    doubt = contradiction or doubt_of(support_of(record, is_known=building.candidate.is_known), settings)
+    doubt = contradiction or doubt_of(support_of(record, building.candidate), settings)
     if doubt is None:
         return record
+    if doubt.reason in NOT_OF_FORM:
+        return record.doubted(doubt)
     _withdraw(building)
     block, _ = _first_valid(_blocks(building, plan), building)
     if block is not None:

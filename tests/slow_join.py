@@ -85,11 +85,16 @@ def _shape(sums: IntArray, facets_m2: float, spacing_m: float) -> dict[str, floa
     found = {
         "end_share": 0.0,
         "apart_m": 0.0,
+        "ends": 0.0,
         "across_m": math.sqrt(12.0 * max(0.0, middle - half)) + spacing_m,
         "along_m": math.sqrt(12.0 * max(0.0, middle + half)) + spacing_m,
         "spacing_m": spacing_m,
     }
-    for outlines, ends in (((Sum.LEVEL_W, Sum.GAP_W), 1.0), ((Sum.LEVEL_W,), 2.0)):
+    is_open = int(sums[Sum.OPEN]) >= 0.85 * max(1, int(sums[Sum.BOUNDARY]))
+    cut, whole = (Sum.LEVEL_W, Sum.GAP_W), (Sum.LEVEL_W,)
+    for outlines, ends, long in ((whole, 1.0, 8.0), (cut, 1.0, 1.0), (whole, 2.0, 0.0)):
+        if long > 1.0 and not is_open:
+            continue
         mx, my, lxx, lxy, lyy = _moments(sums, outlines, x, y)
         inverse = max(1e-12, a * d - b * b)
         m = ((d * lxx - b * lxy) / inverse, (d * lxy - b * lyy) / inverse)
@@ -98,15 +103,15 @@ def _shape(sums: IntArray, facets_m2: float, spacing_m: float) -> dict[str, floa
         root = math.sqrt(max(0.0, mean * mean - (m[0] * n[1] - m[1] * n[0])))
         if mean + root < 2.45 or mean - root > 1.5:
             continue
-        if (d * mx * mx - 2.0 * b * mx * my + a * my * my) / inverse > 1.0:
+        if long <= 1.0 and (d * mx * mx - 2.0 * b * mx * my + a * my * my) / inverse > 1.0:
             continue
         forms = ((mean + root - n[1], n[0]), (m[1], mean + root - m[0]))
         p, q = max(forms, key=lambda form: form[0] * form[0] + form[1] * form[1])
         u, v = a * p + b * q, b * p + d * q
         apart = math.sqrt(12.0 * max(0.0, (u * u + v * v) / max(1e-12, p * u + q * v)))
-        if ends == 1.0 and apart * apart < facets_m2:
+        if apart * apart < long * facets_m2:
             continue
-        found["apart_m"] = apart
+        found["apart_m"], found["ends"] = apart, ends
         found["end_share"] = int(sums[Sum.LEVEL_W]) / 100.0 / max(1e-6, ends * facets_m2 / max(1e-6, apart))
     return found
 
@@ -164,8 +169,9 @@ def _fault(kind: int, sums: IntArray, settings: CandidateSettings) -> tuple[Reas
         detail = f"at the top of {f['top_share']:.2f} of its walls, at least {settings.min_top_share:g}"
         return Reason.BELOW_Z_AVG, f"{detail} (own {own:.2f} m, Z_avg {z_avg:.2f} m)"
     if f["end_share"] >= settings.min_deck_end_share:
-        ends = f"level with the ground along {f['end_share']:.2f} of two opposite ends, {f['apart_m']:.1f} m apart"
-        return Reason.BRIDGE, f"{ends}, at least {settings.min_deck_end_share:g}"
+        share, apart = f"level with the ground along {f['end_share']:.2f}", f"{f['apart_m']:.1f} m"
+        ends = f"of two opposite ends, {apart} apart" if f["ends"] == 2.0 else f"of one end, {apart} from the other"
+        return Reason.BRIDGE, f"{share} {ends}, at least {settings.min_deck_end_share:g}"
     if (
         f["across_m"] <= settings.max_vehicle_width_m
         and f["spacing_m"] <= 0.25 * settings.max_vehicle_width_m

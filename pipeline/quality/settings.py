@@ -22,8 +22,15 @@ class SupportSettings(Parameters):
         maximum=10.0,
     )
     max_unseen_share: float = parameter(
-        0.5,
+        0.6,
         "Share of the roof's plan area without a point on the roof nearby; above it the reason is `not_seen`.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    max_beside_share: float = parameter(
+        0.2,
+        "Area without any point beside an outline that was drawn by the points, over the same and the roof's plan "
+        "area; above it the reason is `not_seen`.",
         minimum=0.0,
         maximum=1.0,
     )
@@ -33,6 +40,13 @@ class SupportSettings(Parameters):
     min_confidence: float = parameter(
         0.5,
         "Confidence that an object found in the points alone is a building; below it the reason is `uncertain`.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    max_level_side_share: float = parameter(
+        0.1,
+        "Share of the outline of an object found in the points alone where a level roof ends at ground as high; above "
+        "it the reason is `uncertain`: a deck or a terrace.",
         minimum=0.0,
         maximum=1.0,
     )

@@ -42,6 +42,8 @@ _CELL_M = 1.0
 """Side of the cells in which other points were looked for."""
 _MOST_CELLS = 20_000
 """Larger places are filled more coarsely."""
+_LARGEST_CELLS = 2_000_000
+"""Cells of the box around a footprint up to which unseen places are looked for: its parts may lie kilometres apart."""
 _SECTIONS = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Where the footprint is cut across, as shares of a place's width; the median counts."""
 
@@ -80,6 +82,8 @@ def with_unseen_slopes(
     turned = turned_about_origin(roof.points[:, :2], cos, -sin)
     pitch_m = max(roof.spacing_m, math.sqrt(area_m2 / _MOST_CELLS))
     gap_m = max(REACH_SPACINGS * roof.spacing_m, pitch_m)
+    if float(np.prod(np.ptp(edges.reshape(-1, 2), axis=0))) > _LARGEST_CELLS * pitch_m**2:
+        return roof, planes
     centres, numbers = empty_cells(turned, edges, pitch_m, gap_m, far_m)
     if len(centres) == 0:
         return roof, planes

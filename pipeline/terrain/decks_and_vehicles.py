@@ -1,10 +1,11 @@
 """Surfaces that look like roofs and are not: decks of bridges, and vehicles.
 
 A deck is level with the ground along two opposite ends, over nearly their whole width, and free along its sides. A
-house on a slope is level at one side only, the lid of an underground garage at three. The moments of the outline where
-a surface is level with the ground show this, compared with those of its area. For an area with second moments A about
-its centre, and level outline with second moments L about the same place, both per weight, A^-1 L has eigenvalues that
-no stretching, turning or shearing of the scene changes:
+house on a slope is level at one side only, the lid of an underground garage at three. Trees may hide one end of a
+bridge: then its length tells it from such a house. The moments of the outline where a surface is level with the ground
+show this, compared with those of its area. For an area with second moments A about its centre, and level outline with
+second moments L about the same place, both per weight, A^-1 L has eigenvalues that no stretching, turning or shearing
+of the scene changes:
 
 - two opposite ends: 3 across them and 1 along them, with the mean of the level outline at the centre;
 - three sides of a square: 2.3 and 1.7; all four sides: 2 and 2;
@@ -32,6 +33,10 @@ _MAX_OFFSET = 1.0
 It is 3 for one side and 0 for two. A car or a tree may hide half of one end: then it is a third. Where only a
 quarter of one end is left, it is 1.
 """
+_LONG = 8.0
+"""Length over width from which one level end shows a deck."""
+_LONG_OPEN_SHARE = 0.85
+"""Share of the outline of such a deck that stands free."""
 _MAX_SPACING = 0.25
 """Spacing of the points over the width of a vehicle up to which this width is known: an edge is known to half of it."""
 
@@ -57,8 +62,8 @@ def _columns(sums: IntArray, first: Sum) -> IntArray:
     return sums[:, first : first + MOMENTS]
 
 
-def _two_ends(level: tuple[FloatArray, ...], area: tuple[FloatArray, ...]) -> tuple[BoolArray, FloatArray]:
-    """Whether level outlines (k,) lie at two opposite ends of areas, and the length from end to end in m.
+def _ends(level: tuple[FloatArray, ...], area: tuple[FloatArray, ...]) -> tuple[BoolArray, BoolArray, FloatArray]:
+    """Whether level outlines (k,) lie at ends of areas, if at two opposite ones, and the length from end to end in m.
 
     `level` and `area` are moments about one place, those of the area about its centre.
     """
@@ -77,16 +82,16 @@ def _two_ends(level: tuple[FloatArray, ...], area: tuple[FloatArray, ...]) -> tu
     # A p points from end to end; for a parallelogram of sides 2 s and 2 e, A = (s s^T + e e^T) / 3 and e is normal to p
     u, v = axx * p + axy * q, axy * p + ayy * q
     spread = (u * u + v * v) / np.maximum(1e-12, p * u + q * v)
-    found = (across >= _MIN_ACROSS) & (along <= _MAX_ALONG) & (offset <= _MAX_OFFSET)
-    return found, np.sqrt(12.0 * np.maximum(0.0, spread))
+    at_ends = (across >= _MIN_ACROSS) & (along <= _MAX_ALONG)
+    return at_ends, at_ends & (offset <= _MAX_OFFSET), np.sqrt(12.0 * np.maximum(0.0, spread))
 
 
 def shape_figures(sums: IntArray) -> dict[str, FloatArray]:
     """Measures of surfaces (k, N_SUMS) that show decks and vehicles, in metres and shares, each (k,).
 
     `end_share` is the share of a deck's two ends that is level with the ground; 0 where a surface does not look like a
-    deck. The edge of the data may cut a deck that is longer than wide: the cut then replaces one end, and the share is
-    that of the other.
+    deck. Where the edge of the data cuts a deck that is longer than wide, or one end of a long deck is hidden, `ends`
+    is 1, and the share is that of the other end.
     """
     area, level, gap = (_columns(sums, m) for m in (Sum.AREA_W, Sum.LEVEL_W, Sum.GAP_W))
     weight = np.maximum(1, area[:, 0])
@@ -99,21 +104,26 @@ def shape_figures(sums: IntArray) -> dict[str, FloatArray]:
     facets_m2 = sums[:, Sum.AREA2] / 2e6
     spacing = np.sqrt(2.0 * facets_m2 / np.maximum(1, sums[:, Sum.FACETS]))
     level_m, share = level[:, 0] / 100.0, np.zeros(len(sums))
-    distance = np.zeros(len(sums))
-    for outline, ends in ((level + gap, 1.0), (level, 2.0)):
-        found, apart = _two_ends(_centred(outline, cx, cy), about)
-        # a cut deck is longer than wide: any cut hall with one level side would look like a shorter one
-        found &= (ends == 2.0) | (apart * apart >= facets_m2)
+    distance, n_ends = np.zeros(len(sums)), np.zeros(len(sums))
+    open_share = sums[:, Sum.OPEN] / np.maximum(1, sums[:, Sum.BOUNDARY])
+    at_one, at_two, apart_m = _ends(_centred(level, cx, cy), about)
+    at_one &= (apart_m * apart_m >= _LONG * facets_m2) & (open_share >= _LONG_OPEN_SHARE)
+    at_cut, cut_m = _ends(_centred(level + gap, cx, cy), about)[1:]
+    # a cut deck is longer than wide: any cut hall with one level side would look like a shorter one
+    at_cut &= cut_m * cut_m >= facets_m2
+    for found, ends, apart in ((at_one, 1.0, apart_m), (at_cut, 1.0, cut_m), (at_two, 2.0, apart_m)):
         ends_m = np.maximum(1e-6, ends * facets_m2 / np.maximum(1e-6, apart))
         share = np.where(found, level_m / ends_m, share)
         distance = np.where(found, apart, distance)
+        n_ends = np.where(found, ends, n_ends)
     return {
         "end_share": share,
         "apart_m": distance,
+        "ends": n_ends,
         "across_m": np.sqrt(12.0 * np.maximum(0.0, middle - half)) + spacing,
         "along_m": np.sqrt(12.0 * np.maximum(0.0, middle + half)) + spacing,
         "spacing_m": spacing,
-        "open_share": sums[:, Sum.OPEN] / np.maximum(1, sums[:, Sum.BOUNDARY]),
+        "open_share": open_share,
     }
 
 
@@ -137,8 +147,9 @@ def are_vehicles(f: dict[str, FloatArray], settings: CandidateSettings) -> BoolA
 
 def deck_detail(f: Mapping[str, float], settings: CandidateSettings) -> str:
     """What shows that a surface is a deck, with the threshold."""
-    ends = f"along {f['end_share']:.2f} of two opposite ends, {f['apart_m']:.1f} m apart"
-    return f"level with the ground {ends}, at least {settings.min_deck_end_share:g}"
+    share, apart = f"level with the ground along {f['end_share']:.2f}", f"{f['apart_m']:.1f} m"
+    ends = f"of two opposite ends, {apart} apart" if f["ends"] == 2.0 else f"of one end, {apart} from the other"
+    return f"{share} {ends}, at least {settings.min_deck_end_share:g}"
 
 
 def vehicle_detail(f: Mapping[str, float], settings: CandidateSettings) -> str:

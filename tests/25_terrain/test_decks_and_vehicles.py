@@ -114,6 +114,23 @@ def test_a_deck_that_the_edge_of_the_data_cuts_is_a_bridge() -> None:
     assert verdict.reason == Reason.BRIDGE
 
 
+def footbridge(x: FloatArray, y: FloatArray) -> FloatArray:
+    """A deck of 2.4 m over a wide cutting, whose eastern end something hides from 3 m on."""
+    return np.where((np.abs(y) <= 1.2) & (x < 12.0), 0.0, cutting(x / 2.0, y))
+
+
+def test_a_long_deck_with_a_hidden_end_is_a_bridge_and_a_long_house_in_a_slope_is_not() -> None:
+    verdict = verdict_on(largest(footbridge, lambda x, y: cutting(x / 2.0, y)))
+    assert verdict is not None
+    assert verdict.reason == Reason.BRIDGE
+    assert "of one end" in verdict.detail
+    house = largest(
+        lambda x, y: np.where((np.abs(y) <= 3.0) & (x < 12.0), 0.0, cutting(x / 2.0, y)),
+        lambda x, y: cutting(x / 2.0, y),
+    )
+    assert verdict_on(house) is None
+
+
 def thing(width_m: float, length_m: float, height_m: float, fence_m: float = 0.0) -> Elevation:
     """An object on flat ground; a fence of some height, 0.6 m thick, stands along one long side of it."""
 

@@ -28,7 +28,17 @@ GOOD = Support(share_on_roof=0.95, scatter_m=0.04, unseen_share=0.02, returns_pe
             "69% of its roof returns lie within 0.2 m of the roof, less than 70%",
         ),
         ({"scatter_m": 0.16}, Reason.SCATTERED, "its roof returns scatter by 0.16 m, more than 0.15 m"),
-        ({"unseen_share": 0.51}, Reason.NOT_SEEN, "51% of its roof has no point on the roof nearby, more than 50%"),
+        ({"unseen_share": 0.61}, Reason.NOT_SEEN, "61% of its roof has no point on the roof nearby, more than 60%"),
+        (
+            {"beside_share": 0.21},
+            Reason.NOT_SEEN,
+            "21% of what may be its roof lies beside the model, without any point, more than 20%",
+        ),
+        (
+            {"level_side_share": 0.25},
+            Reason.UNCERTAIN,
+            "the ground is as high as a level roof along 25% of its outline, more than 10%: it may be a deck",
+        ),
         ({"returns_per_face": 1.9}, Reason.TOO_MANY_FACES, "1.9 roof returns per roof face, less than 2"),
         ({"share_on_roof": 0.3, "scatter_m": 0.5}, Reason.SCATTERED, "its roof returns scatter by 0.50 m"),
     ],
@@ -43,7 +53,7 @@ def test_the_gravest_threshold_that_is_missed_is_named(figures: dict[str, float]
 
 def test_a_model_on_its_points_and_one_without_figures_raise_no_doubt() -> None:
     unknown = Support(share_on_roof=math.nan, scatter_m=math.nan, unseen_share=math.nan, returns_per_face=math.nan)
-    exact = Support(share_on_roof=0.7, scatter_m=0.15, unseen_share=0.5, returns_per_face=2.0)
+    exact = Support(share_on_roof=0.7, scatter_m=0.15, unseen_share=0.6, returns_per_face=2.0)
     assert [doubt_of(one, SupportSettings()) for one in (GOOD, unknown, exact)] == [None, None, None]
 
 

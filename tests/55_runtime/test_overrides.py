@@ -296,7 +296,7 @@ def test_given_footprints_are_overridden_by_their_own_id(plain: Any, overridden:
         ("[[building]]\nbuilding_id = 'a'\nsettings.ground.filter = 'none'", r"\[ground\] cannot differ by building"),
         (
             "[[building]]\nbuilding_id = 'a'\nsettings.kmeans.k = 2",
-            r"\[kmeans\] cannot .* use roof, plan, roof-type, guides, arrangement",
+            r"\[kmeans\] cannot .* use roof, plan, roof-type, guides, support, arrangement",
         ),
         ("[[building]]\nbuilding_id = 'a'\nsettings.roof.colour = 1", r"\[roof\] colour is not a setting"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POLYGO ((0 0))'", "is not WKT"),

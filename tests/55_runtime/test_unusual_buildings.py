@@ -151,3 +151,50 @@ def test_a_slope_in_a_footprint_goes_on_where_nothing_was_seen_and_ends_at_a_yar
     assert ended["roof_type"] == "pent"
     assert ended["height_m"] <= 8.3
     assert ended["footprint_share"] < 0.75
+
+
+def house(density: float, wet: Any, seed: int) -> FloatArray:
+    """The ground with a gable in it; where it is wet, no pulse comes back."""
+    floor, roof = ground(density, seed), gable(density, seed + 1)
+    floor = floor[(np.abs(floor[:, 0]) > 6.0) | (np.abs(floor[:, 1]) > 4.0)]
+    return np.concatenate((floor, roof[~wet(roof[:, 0], roof[:, 1])]))
+
+
+@pytest.mark.parametrize("density", [2.5, 8.0, 20.0])
+@pytest.mark.parametrize(
+    ("wet", "place"),
+    [(lambda x, y: y - 0.0 * x > 0.3, "beyond the ridge"), (lambda x, y: x - 0.3 * y > 1.0, "across the ridge")],
+)
+def test_half_a_house_beside_a_place_without_points_is_doubtful(
+    wet: Any, place: str, density: float, tmp_path: Path, reconstruct: Any
+) -> None:
+    file = written(tmp_path / "wet.las", house(density, wet, 11))
+    (row,) = modelled(reconstruct, file, tmp_path / "run")
+    assert (row["status"], row["reason"]) == ("doubtful", "not_seen"), place
+    assert "lies beside the model, without any point" in row["reason_detail"]
+
+
+def test_a_puddle_and_the_shadow_of_a_wall_raise_no_doubt(tmp_path: Path, reconstruct: Any) -> None:
+    xyz = house(8.0, lambda x, y: (np.abs(x - 3.0) < 1.0) & (np.abs(y - 2.0) < 1.0), 13)
+    xyz = xyz[(xyz[:, 1] < 4.0) | (xyz[:, 1] > 7.0) | (np.abs(xyz[:, 0]) > 6.0)]
+    (row,) = modelled(reconstruct, written(tmp_path / "dry.las", xyz), tmp_path / "run")
+    assert (row["status"], row["roof_type"]) == ("ok", "gable")
+
+
+def on_slope(lift_m: float) -> FloatArray:
+    """A level surface of 10 m by 8 m in a slope of 1 in 2.5, so far above the ground at its upper side."""
+    xyz = ground(8.0, 17)
+    terrain = 0.4 * xyz[:, 0]
+    inside = (np.abs(xyz[:, 0]) < 5.0) & (np.abs(xyz[:, 1]) < 4.0)
+    return np.column_stack((xyz[:, :2], xyz[:, 2] + np.where(inside, 2.0 + lift_m, terrain)))
+
+
+@pytest.mark.parametrize(("lift_m", "found"), [(0.0, ("doubtful", "uncertain")), (2.5, ("ok", None))])
+def test_a_terrace_that_is_level_with_the_slope_is_doubtful_and_a_house_there_is_not(
+    lift_m: float, found: tuple[str, str | None], tmp_path: Path, reconstruct: Any
+) -> None:
+    file = written(tmp_path / "slope.las", on_slope(lift_m))
+    (row,) = modelled(reconstruct, file, tmp_path / "run")
+    assert (row["status"], row["reason"]) == found
+    if lift_m == 0.0:
+        assert "it may be a deck or a terrace" in row["reason_detail"]

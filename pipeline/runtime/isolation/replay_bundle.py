@@ -33,7 +33,7 @@ from pipeline.settings import RunSettings
 SUFFIX = ".bundle"
 
 _FORMAT = "gablework bundle 2"
-_OPTIONAL = ("beside", "beside_later", "elsewhere")
+_OPTIONAL = ("beside", "beside_later", "elsewhere", "voids")
 """Points of a candidate that a bundle holds only if there are any."""
 _LARGEST_BYTES = 2 * 2**30
 _LARGEST_TEXT_BYTES = 64 * 2**20
@@ -108,6 +108,7 @@ def write_bundle(folder: str, bundle: Bundle) -> str:
         "outline": None if candidate.outline is None else shapely.to_wkb(candidate.outline, hex=True),
         "guides": [[guide.kind.value, shapely.to_wkb(guide.line, hex=True)] for guide in candidate.guides],
         "touches_data_edge": candidate.touches_data_edge,
+        "is_known": candidate.is_known,
         "strip_offset_m": None if math.isnan(candidate.strip_offset_m) else candidate.strip_offset_m,
         "method": bundle.method,
         "settings": {
@@ -158,15 +159,13 @@ def read_bundle(path: str) -> Bundle:
             points = _array(_member(archive, path, "points.npy", _LARGEST_BYTES))
             ground = _array(_member(archive, path, "ground.npy", _LARGEST_BYTES))
             split_returns = _array(_member(archive, path, "split_returns.npy", _LARGEST_BYTES))
-            beside, beside_later, elsewhere = (
-                _array(_member(archive, path, f"{name}.npy", _LARGEST_BYTES))
-                if f"{name}.npy" in archive.namelist()
-                else np.zeros((0, 3))
+            optional: dict[str, Any] = {
+                name: _array(_member(archive, path, f"{name}.npy", _LARGEST_BYTES))
                 for name in _OPTIONAL
-            )
+                if f"{name}.npy" in archive.namelist()
+            }
         bundle = _bundle(document, points, ground, split_returns, stderr)
-        candidate = dataclasses.replace(bundle.candidate, beside=beside, beside_later=beside_later, elsewhere=elsewhere)
-        return dataclasses.replace(bundle, candidate=candidate)
+        return dataclasses.replace(bundle, candidate=dataclasses.replace(bundle.candidate, **optional))
     except OSError as error:
         raise UnreadableInputError(path, f"it cannot be read: {error.strerror or error}", _FIX) from error
     except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:

@@ -1,0 +1,99 @@
+"""Places without any point beside a model: a part of its roof may lie there, wet or hidden, and be left out.
+
+Where a roof returns no pulse, neither does the ground below it, and an outline that follows the points ends too early.
+At an eave the roof ends anyway, and the shadow of a wall is often there. A slope that rises up to such a place, or that
+it cuts across, may go on, and so may one that has hardly begun to fall. Where a level roof ends, nothing shows.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
+
+from pipeline.model import BoolArray, FloatArray, Plane, RoofFace
+
+# Not settings: they say how an outline is followed.
+_STEP_M = 0.5
+"""Places are looked at so far apart, half the side of a cell."""
+_REACH_M = 8.0
+"""Half the width of a large house; the cells without points are known as far."""
+_START_M, _START_SPACINGS = 1.5, 1.5
+"""A place without points begins this near to an outline; cells next to it may hold a point of the roof."""
+INSIDE_M = 0.05
+"""So far inside an outline lies the face that ends there."""
+SLOPED = math.tan(math.radians(7.0))
+"""Rise over run from which a face is a slope, as in `flat_below_deg`."""
+_DOWNHILL = -0.7
+"""An outline is an eave where it lies within 45 degrees of straight down the slope, as a cosine."""
+
+
+def unseen_beside_m2(
+    footprint: Polygon | MultiPolygon,
+    faces: Sequence[RoofFace],
+    planes: Sequence[Plane],
+    voids: FloatArray,
+    spacing_m: float,
+) -> float:
+    """Area beside slopes, except beside low eaves, of cells of 1 m without points nearby; m2, in plan.
+
+    `voids` (v, 2 or 3) are the centres of such cells, all in local metres.
+    """
+    if len(voids) == 0:
+        return 0.0
+    places, outward = along(footprint)
+    is_end = _ends_of_slopes(places - INSIDE_M * outward, outward, faces, planes)
+    places, outward = places[is_end], outward[is_end]
+    corner = np.floor(voids[:, :2].min(axis=0)) - 1.0
+    shape = tuple((np.floor(voids[:, :2].max(axis=0)) - corner + 2.0).astype(int).tolist())
+    is_void = np.zeros(shape, np.bool_)
+    is_void[tuple(np.floor(voids[:, :2] - corner).astype(int).T)] = True
+    distance = np.arange(0.5 * _STEP_M, _REACH_M, _STEP_M)
+    at = np.floor(places[:, None] + outward[:, None] * distance[None, :, None] - corner).astype(int)
+    at = np.clip(at, 0, np.array(shape) - 1)  # the margin is no void
+    hit = is_void[at[..., 0], at[..., 1]]
+    first = np.argmax(hit, axis=1)
+    starts = hit.any(axis=1) & (distance[first] <= max(_START_M, _START_SPACINGS * spacing_m))
+    goes_on = np.logical_and.accumulate(hit | (np.arange(len(distance)) < first[:, None]), axis=1) & hit
+    return float(goes_on[starts].sum()) * _STEP_M * _STEP_M
+
+
+def along(footprint: Polygon | MultiPolygon) -> tuple[FloatArray, FloatArray]:
+    """Places (n, 2) half a metre apart along the outer rings of an area, and the direction out of it at each."""
+    places, outward = [], []
+    for polygon in shapely.get_parts(footprint).tolist():
+        ring = shapely.get_coordinates(polygon.exterior)
+        left = -1.0 if polygon.exterior.is_ccw else 1.0
+        for start, end in itertools.pairwise(ring):
+            length = float(np.hypot(*(end - start)))
+            n = round(length / _STEP_M)
+            if n == 0:
+                continue
+            share = (np.arange(n) + 0.5) / n
+            along = (end - start) / length
+            places.append(start + share[:, None] * (end - start))
+            outward.append(np.tile(left * np.array((-along[1], along[0])), (n, 1)))
+    if not places:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    return np.concatenate(places), np.concatenate(outward)
+
+
+def _ends_of_slopes(
+    inside: FloatArray, outward: FloatArray, faces: Sequence[RoofFace], planes: Sequence[Plane]
+) -> BoolArray:
+    """Which places (n, 2) just inside an outline lie on a slope, except at its eave in the lower half of the roof."""
+    ends = np.zeros(len(inside), np.bool_)
+    heights = shapely.get_coordinates([face.polygon for face in faces], include_z=True)[:, 2]
+    middle = 0.5 * float(heights.min() + heights.max())
+    for face in faces:
+        plane = planes[face.plane]
+        up = np.array((plane.a, plane.b))
+        rise = float(np.hypot(*up))
+        if rise >= SLOPED:
+            goes_on = (outward @ up / rise > _DOWNHILL) | (inside @ up + plane.c > middle)
+            ends |= shapely.intersects_xy(face.polygon, inside) & goes_on
+    return ends
