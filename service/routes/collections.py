@@ -16,8 +16,6 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import AfterValidator
 
-from pipeline.export.columns import ELEVATIONS
-from pipeline.io.crs_units import unit_name
 from service.auth import Principal
 from service.errors import (
     NoSuchCollectionError,
@@ -276,6 +274,9 @@ def _described(run: OpenRun, layer: Layer, base: str) -> Collection:
 
 def _elevations(run: OpenRun, layer: Layer) -> str:
     """Half a sentence about the unit of the properties that are elevations, where it is not the metre."""
+    from pipeline.export.columns import ELEVATIONS
+    from pipeline.io.crs_units import unit_name
+
     unit_m = run.crs.vertical_unit_m
     if unit_m == 1.0 or not ELEVATIONS[layer.table]:
         return ""
