@@ -1,6 +1,6 @@
 """Sides of a level roof where the ground stands as high: so a deck or a terrace on a slope looks, seldom a house.
 
-From above nothing else tells a terrace with retaining walls from a garage in a slope.
+From above, only this differs between a house and a terrace with retaining walls. A garage in a slope looks the same.
 """
 
 from __future__ import annotations

@@ -92,9 +92,7 @@ def test_a_noisy_gable_becomes_the_model_of_ten_vertices(settings: KMeansSetting
         result = modelled(roof(gable_planes(pitch_deg), seed=seed), settings)
         # unrefined, a plane may be so far off that the points do not support it, and the model says so
         is_off = settings is FAITHFUL and result.rmse_m > 0.1
-        assert (result.status, result.reason) == (
-            (Status.DOUBTFUL, Reason.SCATTERED) if is_off else (Status.OK, None)
-        )
+        assert (result.status, result.reason) == ((Status.DOUBTFUL, Reason.SCATTERED) if is_off else (Status.OK, None))
         assert result.roof_type is RoofType.GABLE
         assert [len(solid.vertices) for solid in result.solids] == [10]
         assert check_solid(result.solids[0]) == ()
