@@ -9,18 +9,15 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import shapely
-from scipy.spatial import cKDTree
 from shapely import MultiPolygon, Polygon
 
 from pipeline.model import FloatArray, Plane, RoofFace
+from pipeline.quality.residuals import surface_of
 from pipeline.quality.unseen_sides import INSIDE_M, SLOPED, along
 
 # Not settings: they say what level with the ground means.
 _OUTSIDE_M = 1.5
 """The ground is looked up so far from an outline: the sample is free of the roof."""
-_NEAR_M = 1.0
-"""No sample of the terrain is farther from its place than the side of a cell."""
 _LEVEL_M = 0.3
 """A step that one takes; as in `terrain.fragment_sums`."""
 
@@ -32,16 +29,27 @@ def level_side_share(
 
     `ground` (m, 3) are samples of the terrain, on a lattice of 1 m; all in local metres.
     """
-    places, outward = along(footprint)
-    if len(places) == 0 or len(ground) == 0:
+    is_level = np.array([math.hypot(plane.a, plane.b) < SLOPED for plane in planes])
+    if len(ground) == 0 or not is_level.any():
         return 0.0
-    inside = places - INSIDE_M * outward
-    roof = np.full(len(places), np.inf)
-    for face in faces:
-        plane = planes[face.plane]
-        if math.hypot(plane.a, plane.b) < SLOPED:
-            own = shapely.intersects_xy(face.polygon, inside)
-            roof[own] = plane.a * inside[own, 0] + plane.b * inside[own, 1] + plane.c
-    distance, nearest = cKDTree(ground[:, :2]).query(places + _OUTSIDE_M * outward)
-    is_level = (distance <= _NEAR_M) & (ground[nearest, 2] >= roof - _LEVEL_M)
-    return float(is_level.mean())
+    places, outward = along(footprint)
+    if len(places) == 0:
+        return 0.0
+    inside = np.column_stack((places - INSIDE_M * outward, np.zeros(len(places))))
+    below, face = surface_of(faces, planes).residuals(inside)
+    ends = face >= 0
+    ends[ends] = is_level[np.array([one.plane for one in faces])[face[ends]]]
+    terrain = _terrain_at(ground, places[ends] + _OUTSIDE_M * outward[ends])
+    return float(np.count_nonzero(terrain >= -below[ends] - _LEVEL_M)) / len(places)
+
+
+def _terrain_at(ground: FloatArray, places: FloatArray) -> FloatArray:
+    """Elevation (n,) of the samples (m, 3) in whose cells of 1 m some places (n, 2) lie; nan where there is none."""
+    corner = np.floor(ground[:, :2].min(axis=0)) - 1.0
+    columns, rows = (np.floor(ground[:, :2].max(axis=0)) - corner + 2.0).astype(int).tolist()
+    elevation = np.full((columns, rows), np.nan)
+    column, row = np.floor(ground[:, :2] - corner).astype(int).T
+    elevation[column, row] = ground[:, 2]
+    column, row = np.floor(places - corner).astype(int).T
+    found: FloatArray = elevation[np.clip(column, 0, columns - 1), np.clip(row, 0, rows - 1)]
+    return found

@@ -7,7 +7,6 @@ it cuts across, may go on, and so may one that has hardly begun to fall. Where a
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 
@@ -15,7 +14,8 @@ import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
 
-from pipeline.model import BoolArray, FloatArray, Plane, RoofFace
+from pipeline.compiler import kernel
+from pipeline.model import BoolArray, FloatArray, IntArray, Plane, RoofFace
 
 # Not settings: they say how an outline is followed.
 _STEP_M = 0.5
@@ -64,22 +64,35 @@ def unseen_beside_m2(
 
 def along(footprint: Polygon | MultiPolygon) -> tuple[FloatArray, FloatArray]:
     """Places (n, 2) half a metre apart along the outer rings of an area, and the direction out of it at each."""
-    places, outward = [], []
-    for polygon in shapely.get_parts(footprint).tolist():
-        ring = shapely.get_coordinates(polygon.exterior)
-        left = -1.0 if polygon.exterior.is_ccw else 1.0
-        for start, end in itertools.pairwise(ring):
-            length = float(np.hypot(*(end - start)))
-            n = round(length / _STEP_M)
-            if n == 0:
-                continue
-            share = (np.arange(n) + 0.5) / n
-            along = (end - start) / length
-            places.append(start + share[:, None] * (end - start))
-            outward.append(np.tile(left * np.array((-along[1], along[0])), (n, 1)))
-    if not places:
-        return np.zeros((0, 2)), np.zeros((0, 2))
-    return np.concatenate(places), np.concatenate(outward)
+    rings = shapely.get_exterior_ring(shapely.get_parts(footprint))
+    xy, ring_of = shapely.get_coordinates(rings, return_index=True)
+    return _along(xy, ring_of)
+
+
+@kernel
+def _along(xy: FloatArray, ring_of: IntArray) -> tuple[FloatArray, FloatArray]:
+    """The kernel of `along`: vertices (v, 2) of closed rings, with the ring of each."""
+    area2, count = np.zeros(len(xy)), 0
+    for v in range(len(xy) - 1):
+        if ring_of[v] == ring_of[v + 1]:
+            area2[ring_of[v]] += (xy[v, 0] - xy[0, 0]) * (xy[v + 1, 1] - xy[0, 1])
+            area2[ring_of[v]] -= (xy[v + 1, 0] - xy[0, 0]) * (xy[v, 1] - xy[0, 1])
+            count += round(math.hypot(xy[v + 1, 0] - xy[v, 0], xy[v + 1, 1] - xy[v, 1]) / _STEP_M)
+    places, outward = np.empty((count, 2)), np.empty((count, 2))
+    count = 0
+    for v in range(len(xy) - 1):
+        if ring_of[v] != ring_of[v + 1]:
+            continue
+        dx, dy = xy[v + 1, 0] - xy[v, 0], xy[v + 1, 1] - xy[v, 1]
+        length = math.hypot(dx, dy)
+        n = round(length / _STEP_M)
+        side = 1.0 if area2[ring_of[v]] > 0.0 else -1.0
+        for k in range(n):
+            share = (k + 0.5) / n
+            places[count, 0], places[count, 1] = xy[v, 0] + share * dx, xy[v, 1] + share * dy
+            outward[count, 0], outward[count, 1] = side * dy / length, -side * dx / length
+            count += 1
+    return places, outward
 
 
 def _ends_of_slopes(
