@@ -1,9 +1,11 @@
-"""Fit of `detection_confidence`, and its reliability on surveys that it was not fitted to.
+r"""Fit of `detection_confidence`, and its reliability on surveys that it was not fitted to.
 
     .venv/bin/python -m benchmarks.trust --out TRUST --split dev
     .venv/bin/python -m benchmarks.trust --out TRUST --split test
+    .venv/bin/python -m benchmarks.trust --out TRUST --split test --feet
     .venv/bin/gablework reconstruct WEST.laz EAST.laz --classes ignore --out DELFT
-    .venv/bin/python -m benchmarks.detection_confidence --dev TRUST/dev --test TRUST/test delft=DELFT:WEST.laz,EAST.laz
+    .venv/bin/python -m benchmarks.detection_confidence delft=DELFT:WEST.laz,EAST.laz --dev TRUST/dev \
+        --test TRUST/test TRUST/test_feet
 
 Prints the weights, fitted to the dev scenes of the suite `trust` and to all real surveys that are given (as much weight
 for all real candidates as for all simulated ones), and the expected calibration error: candidates by rising confidence
@@ -31,7 +33,7 @@ BINS = 10
 EDGES = (0.0, 0.05, 0.1, 0.2, 0.5, 0.8, 0.9, 0.95, 1.0)
 """Of the table of reliability."""
 PRIOR = 0.01
-"""Penalty of squared weights, as if they were seen in a hundred candidates more: it keeps few data from being sure."""
+"""Penalty of the squared slope, per candidate: it keeps the slope finite where no candidate contradicts it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -130,15 +132,17 @@ def reliability(found: Mapping[str, tuple[Candidates, FloatArray]]) -> str:
 def kinds_of(candidates: Candidates) -> dict[str, BoolArray]:
     """The kinds of simulated surveys, by the names in `survey`."""
     density = np.array([float(name[1:].split("_")[0]) for name in candidates.survey])
+    in_feet = np.char.endswith(candidates.survey, "_feet")
     returns = np.array([name.split("_", 1)[1].split("_z")[0] for name in candidates.survey])
-    return {
+    kinds = {
         "simulated, many returns": returns == "five",
         "simulated, one return": (returns == "first") | (returns == "last"),
         "simulated, first and last": returns == "first_and_last",
         "simulated, under 2 per m2": density < 2.0,
         "simulated, 10 per m2 and more": density >= 10.0,
-        "simulated": np.ones(len(density), bool),
+        "simulated": ~in_feet,
     }
+    return {**{name: chosen & ~in_feet for name, chosen in kinds.items()}, "simulated, in feet": in_feet}
 
 
 def main() -> None:
@@ -146,7 +150,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("surveys", nargs="*", help="NAME=DIR:FILE[,FILE...]: a run and its classified files")
     parser.add_argument("--dev", type=Path, required=True, help="tables of benchmarks.trust, without the ending")
-    parser.add_argument("--test", type=Path, help="the same of test scenes")
+    parser.add_argument("--test", type=Path, nargs="*", default=[], help="the same of test scenes")
     parser.add_argument("--only-measured", nargs="*", default=[], help="names of surveys that the weights never see")
     given = parser.parse_args()
     surveys = {}
@@ -163,9 +167,9 @@ def main() -> None:
     for name, some in surveys.items():
         others = fitted(together([dev, *(other for key, other in fit_to.items() if key != name)]))
         apart[name] = (some, others.confidence(some))
-    test = dev if given.test is None else simulated(given.test)
+    test = together([simulated(tables) for tables in given.test]) if given.test else dev
     p = weights.confidence(test)
-    found = {**apart, **{name: (test[chosen], p[chosen]) for name, chosen in kinds_of(test).items()}}
+    found = {**apart, **{name: (test[chosen], p[chosen]) for name, chosen in kinds_of(test).items() if chosen.any()}}
     print("\n" + measured(found))
     everything = together([some for some, _ in apart.values()]) if apart else None
     groups = {} if everything is None else {"real": (everything, np.concatenate([q for _, q in apart.values()]))}

@@ -49,19 +49,21 @@ def test_confidence_that_is_right_as_often_as_it_says_has_nearly_no_error_and_an
 
 
 def test_simulated_surveys_are_grouped_by_returns_and_density() -> None:
-    names = ["d0.3_five", "d0.8_last", "d1.5_first_z0.45", "d30_first_and_last"]
+    names = ["d0.3_five", "d0.8_last", "d1.5_first_z0.45", "d30_first_and_last", "d4_five_feet"]
     some = Candidates(
         survey=np.array(names),
-        is_real=np.zeros(4, bool),
-        is_model=np.ones(4, bool),
-        figure=np.zeros(4),
-        right=np.ones(4, bool),
+        is_real=np.zeros(5, bool),
+        is_model=np.ones(5, bool),
+        figure=np.zeros(5),
+        right=np.ones(5, bool),
     )
     kinds = {name.removeprefix("simulated, "): chosen.tolist() for name, chosen in kinds_of(some).items()}
-    assert kinds["many returns"] == [True, False, False, False]
-    assert kinds["one return"] == [False, True, True, False]
-    assert kinds["first and last"] == [False, False, False, True]
-    assert kinds["under 2 per m2"] == [True, True, True, False]
+    assert kinds["many returns"] == [True, False, False, False, False]
+    assert kinds["one return"] == [False, True, True, False, False]
+    assert kinds["first and last"] == [False, False, False, True, False]
+    assert kinds["under 2 per m2"] == [True, True, True, False, False]
+    assert kinds["in feet"] == [False, False, False, False, True]
+    assert kinds["simulated"] == [True, True, True, True, False]
 
 
 def points(classes: list[int], went_on: float) -> FloatArray:
