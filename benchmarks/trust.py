@@ -1,6 +1,6 @@
 """Which models of a run are wrong, and whether their status says so: the suite `trust`, held against its truth.
 
-    python -m benchmarks.trust --out DIR [--split dev|test] [--draws 3] [--kinds houses glass] [--jobs 2]
+    python -m benchmarks.trust --out DIR [--split dev|test] [--draws 3] [--kinds houses glass] [--jobs 2] [--feet]
 
 Makes the scenes of the suite below DIR/SPLITn, models each with default settings, its classes ignored and, where they
 were written, trusted, and judges every model. A model is wrong if it is not of a building: true buildings lie under
@@ -8,6 +8,9 @@ less than half of it. It is wrong as well if less than 70 % of the true roofs un
 vertically (0.4 m under 2 pulses per m2), or less than 70 % of the roof of the true building that it stands for; of a
 building that is divided into several models they count together. Areas are in plan. In strips that disagree the truth
 may be at any elevation between the two.
+
+With `--feet`, the scenes of 4 and 6 pulses per m2 are modelled from copies in feet instead, into DIR/SPLIT_feet.*, and
+judged in metres.
 
 DIR/SPLIT.parquet has a row per model: scene, survey, classes, the judgement, and the columns of the record.
 DIR/SPLIT_rejected.parquet has the rejected objects, DIR/SPLIT.json and DIR/SPLIT.md the tables.
@@ -31,6 +34,7 @@ import pyarrow.parquet as pq
 import shapely
 
 from benchmarks.entries import markdown_table
+from benchmarks.trust_feet import FOOT_M, write_in_feet
 from benchmarks.trust_judge import Truth, top_of
 from pipeline.export.geoparquet import read_table
 from pipeline.ruler.evaluation.reading import read_models
@@ -44,6 +48,7 @@ from pipeline.settings import RunSettings
 
 TOLERANCE_M, SPARSE_TOLERANCE_M, SPARSE_PER_M2 = 0.2, 0.4, 2.0
 OK = "ok"
+SURVEYS_IN_FEET = ("d4_five", "d6_last")
 
 
 def tolerance_of(cell: TrustCell) -> float:
@@ -72,7 +77,9 @@ class Judged:
     """Those of which models cover less than half."""
 
 
-def judge_run(models_dir: Path, truth_dir: Path, cell: TrustCell, classes: str, draw: int) -> Judged:
+def judge_run(
+    models_dir: Path, truth_dir: Path, cell: TrustCell, classes: str, draw: int, *, in_feet: bool = False
+) -> Judged:
     """Hold a run directory against the truth of its scene."""
     truth = Truth(read_models(truth_dir).models)
     found = read_models(models_dir).models
@@ -80,15 +87,18 @@ def judge_run(models_dir: Path, truth_dir: Path, cell: TrustCell, classes: str, 
     judgements = {
         model.building_id: dataclasses.asdict(truth.judge(model, tolerance, cell.strip_step_m, top)) for model in found
     }
-    scene = {"scene": cell.kind, "survey": cell.survey, "classes": classes, "draw": draw}
+    survey = f"{cell.survey}_feet" if in_feet else cell.survey
+    scene = {"scene": cell.kind, "survey": survey, "classes": classes, "draw": draw}
     records = read_table(str(models_dir), "buildings")
     records = records.select([name for name in records.column_names if not name.startswith("solid")])
     rows = [judgements.get(name, {}) for name in records.column("building_id").to_pylist()]
     rejected = read_table(str(models_dir), "rejected")
     boxes = [None if box is None else shapely.from_wkb(box) for box in rejected.column("geometry").to_pylist()]
+    if in_feet:
+        boxes = [None if box is None else shapely.transform(box, lambda xy: xy * FOOT_M) for box in boxes]
     return Judged(
         kind=cell.kind,
-        survey=cell.survey,
+        survey=survey,
         classes=classes,
         draw=draw,
         models=_with_columns(records, scene, rows, JUDGED),
@@ -123,31 +133,38 @@ def _with_columns(
     return pa.table([*columns, *records.columns], names=[*(field.name for field in fields), *records.column_names])
 
 
-def run_cell(task: tuple[TrustCell, Path, int]) -> list[Judged]:
-    """Model a scene with its classes ignored, and trusted if it has any, and judge both."""
-    cell, place, draw = task
+def run_cell(task: tuple[TrustCell, Path, int, bool]) -> list[Judged]:
+    """Model a scene with its classes ignored, and trusted if it has any, and judge both; the last says: in feet."""
+    cell, place, draw, in_feet = task
     found = []
+    laz = place / "trust.laz"
+    if in_feet:
+        laz = place / "trust_feet.laz"
+        write_in_feet(place / "trust.laz", laz)
     for classes in ("ignore", "trust") if cell.with_classes else ("ignore",):
-        out = place / f"models-{classes}"
+        out = place / f"models-{classes}{'-feet' if in_feet else ''}"
         settings = RunSettings.from_mapping({"classes": classes})
         run(
             RunRequest(
-                inputs=(str(place / "trust.laz"),), out=str(out), settings=settings, resources=Resources(workers=0),
+                inputs=(str(laz),), out=str(out), settings=settings, resources=Resources(workers=0),
                 meshes="none", overwrite=True,
             )
         )  # fmt: skip
-        found.append(judge_run(out, place / "truth", cell, classes, draw))
+        found.append(judge_run(out, place / "truth", cell, classes, draw, in_feet=in_feet))
     return found
 
 
-def run_split(split: str, draws: int, kinds: Sequence[str], out: Path, jobs: int) -> list[Judged]:
+def run_split(
+    split: str, draws: int, kinds: Sequence[str], out: Path, jobs: int, *, in_feet: bool = False
+) -> list[Judged]:
     """Make, model and judge all scenes of some draws."""
     tasks = []
     for draw in range(draws):
         place = out / f"{split}{draw}"
         if not (place / "sweep.json").exists():
             simulate("trust", place, seed_of(split, draw))
-        tasks += [(cell, place / cell.key, draw) for cell in CELLS if cell.kind in kinds]
+        cells = [cell for cell in CELLS if cell.kind in kinds and (not in_feet or cell.survey in SURVEYS_IN_FEET)]
+        tasks += [(cell, place / cell.key, draw, in_feet) for cell in cells]
     if jobs < 2:
         return [one for task in tasks for one in run_cell(task)]
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
@@ -266,10 +283,11 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--kinds", nargs="*", choices=tuple(KINDS), default=tuple(KINDS))
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--feet", action="store_true", help="model copies of some surveys that are in feet")
     given = parser.parse_args(words)
     given.out.mkdir(parents=True, exist_ok=True)
-    runs = run_split(given.split, given.draws, given.kinds, given.out, given.jobs)
-    print(write(runs, given.out, given.split))
+    runs = run_split(given.split, given.draws, given.kinds, given.out, given.jobs, in_feet=given.feet)
+    print(write(runs, given.out, f"{given.split}_feet" if given.feet else given.split))
     return 0
 
 

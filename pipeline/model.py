@@ -649,6 +649,8 @@ class BuildingResult:
     """Share of the roof returns that have a roof above or below them; 0 without a model, nan for one by attributes."""
     quality: ModelQuality = ModelQuality()
     """How well the points support the model."""
+    replaced_confidence: float = math.nan
+    """Of a block in place of a doubtful model: the confidence in that model; nan otherwise."""
     touches_data_edge: bool
     """As the candidate's."""
     strip_offset_m: float = math.nan

@@ -41,6 +41,7 @@ from pipeline.model import (
     Status,
 )
 from pipeline.prepared_cloud import prepare_cloud
+from pipeline.quality.detection import confidence_of
 from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, model_quality
 from pipeline.quality.residuals import vertical_residuals
 from pipeline.quality.support import NOT_OF_FORM, doubt_of, support_of
@@ -446,7 +447,7 @@ def _judged(
     if block is not None:
         fallback = _record(building, block, BuildingError(doubt.reason, doubt.words))
         if fallback.quality.share_within >= record.quality.share_within - settings.block_loss:
-            return fallback
+            return dataclasses.replace(fallback, replaced_confidence=confidence_of(record))
     return record.doubted(doubt)
 
 

@@ -413,6 +413,8 @@ def whole_join(
                 height_m=float(sums[Sum.HEIGHT]) / max(1, int(sums[Sum.VERTICES])) / 1000.0,
                 points=int(sums[Sum.POINTS]),
                 ranges=tuple(ranges.get(k, ())),
+                planar=int(sums[Sum.PLANAR]),
+                rough=int(sums[Sum.ROUGH]),
             )
         )
     found = FoundSites(

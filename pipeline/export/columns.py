@@ -190,7 +190,8 @@ BUILDINGS = (
         "detection_confidence",
         FLOAT64,
         SHARE,
-        "probability, from 0 to 1, that this object is a building; null without a model, and if a given "
+        "probability, from 0 to 1, that this object is a building; of a block that of the doubtful "
+        "model that it replaced; null for other blocks, without a model, and if a given "
         "footprint or an override (`accept`, `footprint`) says that it is one",
         page="records.md#confidence-of-a-detection",
     ),
@@ -414,6 +415,13 @@ REJECTED = (
     Column("area_m2", FLOAT64, "m2", "plan area; null if not measured"),
     Column("height_m", FLOAT64, "m", "height above ground; null if not measured"),
     Column("n_points", INT64, COUNT, "points of the object", required=True),
+    Column(
+        "detection_confidence",
+        FLOAT64,
+        SHARE,
+        "probability, from 0 to 1, that this object is a building after all; null where this cannot be judged",
+        page="records.md#confidence-of-a-detection",
+    ),
     Column("settings_hash", TEXT, NONE, "sha256 of the settings that can change geometry", required=True),
     Column("engine_version", TEXT, NONE, "version of gablework", required=True),
 )

@@ -73,3 +73,5 @@ class RejectedObject:
     """Height above ground in metres; nan where it was not measured."""
     n_points: int
     """Points of the object."""
+    confidence: float = math.nan
+    """Probability that it is a building after all; nan where it could not be judged."""

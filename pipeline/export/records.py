@@ -220,6 +220,7 @@ def rejected_row(rejected: RejectedObject, context: RecordContext) -> dict[str, 
         "area_m2": _or_none(rejected.area_m2),
         "height_m": _or_none(rejected.height_m),
         "n_points": rejected.n_points,
+        "detection_confidence": _or_none(rejected.confidence, 4),
         "settings_hash": context.settings_hash,
         "engine_version": context.engine_version,
     }

@@ -4,38 +4,56 @@ from __future__ import annotations
 
 import math
 
-from pipeline.model import BuildingResult
+from pipeline.model import BuildingResult, Reason
 
-# Not settings: fitted by logistic regression to the surveys that docs/reference/records.md names;
-# benchmarks/detection_confidence.py and benchmarks/trust.py measure how reliable the result is.
-PER_LOG_NOISE = -2.06
-"""Log-odds per e-fold of the scatter about the roof: crowns are rough."""
-PER_SHARE_WITHIN = 4.82
-"""Log-odds of a roof whose returns all lie within 0.2 m of planes: crowns are not planar."""
-PER_LOG_PLANE_AREA = 2.77
-"""Log-odds per e-fold of the plan area per roof plane: a crown takes many small planes."""
-AT_ONE = -15.65
-"""Log-odds of no share, 1 m of scatter and planes of 1 m2."""
-LEAST_NOISE_M = 0.005
+# Not settings: benchmarks/detection_confidence.py fits them to the surveys that docs/reference/records.md names, and
+# measures how reliable they are on others.
+PER_LOG_FLATNESS = 5.58
+"""Log-odds per e-fold of the flatness: how wide a roof's planes are over how much their points scatter."""
+AT_FLATNESS_1 = -20.02
+"""Log-odds of planes as wide as their points scatter."""
+MOST = 0.978
+"""Confidence in the flattest object: decks, bridges and what else is flat look the same by it."""
+LEAST_NOISE_M = 0.02
 """Less scatter shows nothing more."""
 
+PER_LOG_ROUGH = -0.69
+"""Log-odds of a rejected object per e-fold of its rough places: the more there are, the surer it is not a roof."""
+AT_NO_ROUGH = -1.77
+"""Log-odds of a rejected object without a rough place."""
+_NOT_JUDGED = frozenset({Reason.STRIPS_DISAGREE, Reason.OVERRIDDEN, Reason.TOO_FEW_POINTS})
+"""Reasons that say nothing about the form of an object."""
 
-def detection_confidence(noise_m: float, share_within: float, plane_area_m2: float) -> float:
+
+def detection_confidence(noise_m: float, plane_area_m2: float) -> float:
     """Probability from 0 to 1 that an object with a model of planes is a building; nan if a figure is not known.
 
-    Logistic in the share of roof returns within 0.2 m of the roof, and in the logarithms of their scatter and of the
-    plan area per roof plane. These mean the same in every survey, however many returns a pulse has.
+    A roof has few, wide planes on which its points lie; a crown takes many small planes, and scatters about them. The
+    flatness is the width of a plane (the root of the plan area per roof plane) over the scatter. It is a ratio of two
+    lengths that every survey shows, however dense it is and however many returns a pulse has.
     """
-    if math.isnan(noise_m) or math.isnan(share_within) or not plane_area_m2 > 0.0:
+    if math.isnan(noise_m) or not plane_area_m2 > 0.0:
         return math.nan
-    odds = AT_ONE + PER_LOG_NOISE * math.log(max(LEAST_NOISE_M, noise_m))
-    odds += PER_SHARE_WITHIN * share_within + PER_LOG_PLANE_AREA * math.log(plane_area_m2)
-    return 1.0 / (1.0 + math.exp(-odds))
+    flatness = math.sqrt(plane_area_m2) / max(LEAST_NOISE_M, noise_m)
+    return MOST * _probability(AT_FLATNESS_1 + PER_LOG_FLATNESS * math.log(flatness))
 
 
 def confidence_of(record: BuildingResult) -> float:
-    """The same of a delivered model; nan for a block and without a model."""
-    if record.footprint is None or not record.planes:
+    """The same of a delivered model, and of the model that a block replaced; nan for other blocks, or without one."""
+    if record.footprint is None or not record.planes or not math.isnan(record.replaced_confidence):
+        return record.replaced_confidence
+    return detection_confidence(record.quality.noise_m, record.footprint.area / len(record.planes))
+
+
+def confidence_of_rejected(reason: Reason, planar: int, rough: int) -> float:
+    """Probability that a rejected object is a building after all, by its numbers of planar and of rough places.
+
+    nan if no place could be judged, or if the reason is not about its form.
+    """
+    if reason in _NOT_JUDGED or planar + rough == 0:
         return math.nan
-    quality = record.quality
-    return detection_confidence(quality.noise_m, quality.share_within, record.footprint.area / len(record.planes))
+    return _probability(AT_NO_ROUGH + PER_LOG_ROUGH * math.log(1 + rough))
+
+
+def _probability(log_odds: float) -> float:
+    return 1.0 / (1.0 + math.exp(-log_odds))

@@ -11,6 +11,7 @@ from candidates_by_hand import candidate
 from pipeline.errors import SettingsError
 from pipeline.methods import ReconstructSettings
 from pipeline.model import DecisionKind, Outcome, Reason, Status
+from pipeline.quality.detection import confidence_of
 from pipeline.quality.settings import SupportSettings
 from pipeline.quality.support import Support, doubt_of
 from pipeline.reconstruct import reconstruct_building
@@ -72,6 +73,7 @@ def test_a_crown_is_doubtful_and_says_why(seed: int) -> None:
     assert result.reason in {Reason.SCATTERED, Reason.POOR_FIT}
     assert result.reason_detail
     assert result.solids
+    assert confidence_of(result) < 0.5  # of a block, too: that of the model that it replaced
     if result.status is Status.DOUBTFUL:
         last = result.decisions[-1]
         assert (last.kind, last.outcome) == (DecisionKind.CHECK, Outcome.MISSED)
@@ -93,6 +95,7 @@ def test_a_gable_with_a_dormer_and_a_chimney_is_ok(noise_m: float) -> None:
 def test_a_block_that_the_settings_ask_for_is_not_judged_as_a_roof() -> None:
     result = reconstruct_building(candidate(crown(1)), "arrangement", ReconstructSettings(lods=("1.2",)))
     assert result.status is Status.OK
+    assert math.isnan(confidence_of(result))
 
 
 def test_thresholds_are_settings() -> None:

@@ -133,10 +133,19 @@ def test_only_a_building_found_in_the_points_alone_has_a_confidence(contexts: Co
     gable = small.gable()
     assert gable.footprint is not None
     plane_area_m2 = gable.footprint.area / len(gable.planes)
-    expected = detection_confidence(small.QUALITY.noise_m, small.QUALITY.share_within, plane_area_m2)
+    expected = detection_confidence(small.QUALITY.noise_m, plane_area_m2)
     assert confidence() == confidence("method") == pytest.approx(expected, abs=5e-4)
     assert confidence("accept, method") is confidence("footprint") is None
     assert confidence(source_id="parcel 7") is None
+
+
+def test_a_rejected_object_has_the_confidence_that_it_is_a_building_after_all(
+    contexts: Contexts, rejected_objects: RejectedObjects
+) -> None:
+    tree, pole = rejected_objects
+    known = dataclasses.replace(tree, confidence=0.034567)
+    rows = [rejected_row(entry, contexts["compound"]) for entry in (known, pole)]
+    assert [row["detection_confidence"] for row in rows] == [0.0346, None]
 
 
 @pytest.mark.parametrize("crs", CRSES)

@@ -158,7 +158,7 @@ def test_models_are_counted_by_any_status_and_failures_are_not_models() -> None:
 def test_a_scene_becomes_tables(tmp_path: Path) -> None:
     cell = next(one for one in CELLS if one.kind == "houses" and one.with_classes)
     simulate(dataclasses.replace(SUITES["trust"], cells=(cell,)), tmp_path, 1_000)
-    runs = run_cell((cell, tmp_path / cell.key, 0))
+    runs = run_cell((cell, tmp_path / cell.key, 0, False))
     assert [one.classes for one in runs] == ["ignore", "trust"]
     text = write(runs, tmp_path, "dev")
     assert "## trust, by scene" in text
@@ -173,3 +173,23 @@ def test_a_scene_becomes_tables(tmp_path: Path) -> None:
     both = json.loads((tmp_path / "dev.json").read_text())["all"]["all"]
     assert both["buildings"] == 2 * 8
     assert sum(both["right"].values()) + sum(both["wrong"].values()) == sum(row["right"] is not None for row in rows)
+
+
+@pytest.mark.slow
+def test_a_survey_in_feet_has_the_same_models_with_the_same_confidence(tmp_path: Path) -> None:
+    cell = next(one for one in CELLS if one.key == "houses-d6_last")
+    simulate(dataclasses.replace(SUITES["trust"], cells=(cell,)), tmp_path, 1_000)
+    place = tmp_path / cell.key
+    metres, feet = (run_cell((cell, place, 0, in_feet))[0] for in_feet in (False, True))
+    assert (metres.survey, feet.survey) == ("d6_last", "d6_last_feet")
+    found = [
+        sorted((row["footprint_area_m2"], row["right"]) for row in one.models.to_pylist() if row["lod"])
+        for one in (metres, feet)
+    ]
+    assert len(found[0]) >= 3
+    assert np.allclose(*found, atol=1.0)
+    confidence = [sorted(one.models.column("detection_confidence").to_pylist()) for one in (metres, feet)]
+    assert np.allclose(*confidence, atol=0.02)
+    assert all(
+        not is_building for one in (metres, feet) for is_building in one.rejected.column("is_building").to_pylist()
+    )

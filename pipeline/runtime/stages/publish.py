@@ -19,6 +19,7 @@ from pipeline.export.putting import Put
 from pipeline.io import LocalStorage, Storage, is_url, storage_at
 from pipeline.io.storage import Puts, sha256_of
 from pipeline.model import BuildingResult, Reason, Status
+from pipeline.quality.detection import confidence_of_rejected
 from pipeline.runtime.isolation.replay_bundle import SUFFIX
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.run_context import ProgressUnits, RunContext
@@ -92,6 +93,7 @@ def rejected_object(site: RejectedSite) -> RejectedObject:
         area_m2=site.area_m2,
         height_m=site.height_m,
         n_points=site.points,
+        confidence=confidence_of_rejected(site.verdict.reason, site.planar, site.rough),
     )
 
 

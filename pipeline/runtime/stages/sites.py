@@ -88,6 +88,10 @@ class RejectedSite:
     """Number of its points."""
     ranges: tuple[PointRange, ...] = ()
     """Its points in scratch, should an override accept it."""
+    planar: int = 0
+    """Number of its places with planar surroundings."""
+    rough: int = 0
+    """Number of its places with rough surroundings; the surroundings of the others were not judged."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

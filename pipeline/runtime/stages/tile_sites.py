@@ -138,6 +138,8 @@ def sites_of(parts: Iterable[TileSites], grid: TileGrid, settings: CandidateSett
                     height_m=float(sums[Sum.HEIGHT]) / max(1, int(sums[Sum.VERTICES])) / 1000.0,
                     points=int(sums[Sum.POINTS]),
                     ranges=ranges,
+                    planar=int(sums[Sum.PLANAR]),
+                    rough=int(sums[Sum.ROUGH]),
                 )
             )
     return FoundSites(candidates=largest_first(candidates), rejected=tuple(sorted(rejected, key=lambda r: r.object_id)))
