@@ -140,7 +140,12 @@ class ResultsView {
 
   async start(): Promise<void> {
     window.addEventListener("hashchange", () => this.followAddress(), { signal: this.calledOff.signal });
-    const [report, menu] = await Promise.all([this.loadReport(), downloadMenu(this.jobPath, this.method, this.calledOff.signal)]);
+    const { summary } = this.job;
+    const statuses = (this.method === null ? summary : summary?.runs?.[this.method])?.statuses ?? {};
+    const [report, menu] = await Promise.all([
+      this.loadReport(),
+      downloadMenu(this.jobPath, this.method, statuses, this.calledOff.signal),
+    ]);
     if (this.calledOff.signal.aborted) return;
     this.report = report;
     this.counts.set("rejected", report.counts?.["rejected"] ?? 0);
