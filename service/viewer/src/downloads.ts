@@ -118,14 +118,19 @@ function onlyOk(list: HTMLElement, count: number, jobPath: string, method: strin
   const all = [...list.children];
   const box = el("input", { type: "checkbox" });
   const entry = el("li", { class: "menu-choice" }, el("label", {}, box, ` Only the ${counted(count, "model")} that ${count === 1 ? "is" : "are"} ok`));
+  // the switch stays where it is, so it keeps the focus
+  const show = (entries: Element[]): void => {
+    for (const other of [...list.children]) if (other !== entry) other.remove();
+    list.append(...entries);
+  };
   box.addEventListener("change", () => {
-    if (!box.checked) return list.replaceChildren(entry, ...all);
-    list.replaceChildren(entry, el("li", { class: "hint", role: "status" }, "These files are being made…"));
+    if (!box.checked) return show(all);
+    show([el("li", { class: "hint menu-choice", role: "status" }, "These files are being made…")]);
     selected(`${jobPath}/results?status=ok`, method, signal)
       .then((offered) => listed(offered, OUTPUTS, jobPath, method, "ok"))
       .catch((error: unknown) => [el("li", {}, problemNotice(asProblem(error)))])
       .then((entries) => {
-        if (box.checked) list.replaceChildren(entry, ...entries);
+        if (box.checked) show(entries);
       });
   });
   return entry;
