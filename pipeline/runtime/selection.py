@@ -133,10 +133,14 @@ class _Selection:
 
     def _rows(self, name: str, tile: str, columns: Sequence[str]) -> pa.Table:
         """Some columns of a tile's file of a table; those that an older version did not write are null."""
+        schema = pa.schema([stored_schema(name).field(column) for column in columns])
         batches = list(table_batches(self._place, name, columns, self._filesystem, [tile]))
-        if batches:
-            return pa.Table.from_batches(batches).combine_chunks()
-        return pa.schema([stored_schema(name).field(column) for column in columns]).empty_table()
+        if not batches:
+            return schema.empty_table()
+        rows = pa.Table.from_batches(batches).combine_chunks()
+        return rows.cast(
+            pa.schema([field.with_nullable(field.nullable or rows[field.name].null_count > 0) for field in schema])
+        )
 
     def _ids(self, tile: str) -> pa.Array:
         """The selected buildings of a tile."""
