@@ -31,7 +31,7 @@ OFFERED = frozenset(
 WAIT_S = 20.0
 """Seconds that a request waits for a selection; then the client is asked to come again."""
 _REFUSED = 3
-"""Exit code for a run that cannot be selected from; the process says why on standard output."""
+"""Exit code for a run that cannot be selected from; the process says why in the log of the service."""
 _MOST = 2
 """Selections that one process of the service makes at a time. It is not a setting: each uses a core for seconds."""
 
@@ -105,15 +105,12 @@ class Selections:
             with subprocess.Popen(  # noqa: S603 - our own program
                 [sys.executable, "-m", "service.outputs.selected", json.dumps(asked)],
                 stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                text=True,
             ) as process:
-                assert process.stdout is not None
-                said = process.stdout.read().strip()
-            if process.returncode == _REFUSED:
-                fault = NoSuchOutputError(said)
-            elif process.returncode:
-                fault = UnexpectedError(f"a selection of buildings ended with code {process.returncode}")
+                code = process.wait()
+            if code == _REFUSED:
+                fault = NoSuchOutputError("files of this job's run are gone or damaged: submit the job again")
+            elif code:
+                fault = UnexpectedError(f"a selection of buildings, which ended with code {code}")
         except OSError as error:
             fault = error
         with self._lock:
@@ -191,7 +188,7 @@ def main() -> int:
             Path(asked["run_dir"]), Path(asked["out_dir"]), asked["names"], statuses, asked["geoid_height_m"]
         )
     except RunError as fault:
-        sys.stdout.write(f"{fault}\n")
+        sys.stderr.write(f"{fault}\n")  # it may name folders of the server
         return _REFUSED
     return 0
 
