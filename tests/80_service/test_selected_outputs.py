@@ -121,7 +121,7 @@ def test_a_client_is_asked_to_come_again_until_the_selection_is_made(
     wait_for(is_made, "the selection")
     assert answers[-1] == 200
     outputs = service.folder.outputs(job_id, 1) / "selected"
-    assert [place.name for place in outputs.iterdir()] == ["ok"]
+    wait_for(lambda: [place.name for place in outputs.iterdir()] == ["ok"], "the end of the process")
 
 
 def test_a_run_whose_files_are_gone_is_an_error_that_names_no_folder(service: runs.Service) -> None:
