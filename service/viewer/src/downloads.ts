@@ -125,7 +125,7 @@ function onlyOk(list: HTMLElement, count: number, jobPath: string, method: strin
   };
   box.addEventListener("change", () => {
     if (!box.checked) return show(all);
-    show([el("li", { class: "hint menu-choice", role: "status" }, "These files are being made…")]);
+    show([el("li", { class: "hint menu-wait", role: "status" }, "These files are being made…")]);
     selected(`${jobPath}/results?status=ok`, method, signal)
       .then((offered) => listed(offered, OUTPUTS, jobPath, method, "ok"))
       .catch((error: unknown) => [el("li", {}, problemNotice(asProblem(error)))])
