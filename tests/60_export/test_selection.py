@@ -76,7 +76,8 @@ def ids(folder: Path, table: str = "buildings") -> set[str]:
 
 @pytest.mark.parametrize("meshes", ["building", "tile", "glb", "none"])
 def test_a_selection_of_all_statuses_is_the_run_to_the_byte(tmp_path: Path, meshes: str) -> None:
-    run = write_run(tmp_path / "run", meshes)
+    run = write_run(tmp_path / "run", meshes, moved(small.levelled(), 90), lods=("1.2", "1.3"))
+    assert meshes == "none" or list(run.glob("meshes/t2/*-lod12.*"))
     select_run(str(run), tmp_path / "all", list(Status))
     before, after = content(run), content(tmp_path / "all")
     assert before.pop("run.json") != after.pop("run.json")  # the digest is gone
