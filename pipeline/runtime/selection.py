@@ -117,16 +117,17 @@ class _Selection:
         if f"buildings/tile={tile}/part-0.parquet" not in names:
             return
         ids = self._ids(tile)
+        kept = frozenset(ids.to_pylist())
         city: list[str] = []
         for name in names:  # in order: city objects come before meshes
             folder = name.partition("/")[0]
             if folder in {"buildings", "planes", DECISIONS}:
                 yield name, self._table(folder, tile, ids)
             elif folder == "cityjson":
-                city = _city(lines_of(self._storage.get(name).decode()), set(ids.to_pylist()))
+                city = _city(lines_of(self._storage.get(name).decode()), kept)
                 yield name, "".join(f"{line}\n" for line in city).encode()
             elif folder == "meshes":
-                if content := self._mesh(name, city, set(ids.to_pylist())):
+                if content := self._mesh(name, city, kept):
                     yield name, content
             elif folder == "rejected":
                 yield name, self._storage.get(name)
@@ -163,7 +164,7 @@ class _Selection:
         text = json.dumps(geo, sort_keys=True, separators=(",", ":"))
         return parquet_bytes(rows.replace_schema_metadata({"geo": text}))
 
-    def _mesh(self, name: str, city: Sequence[str], ids: set[str]) -> bytes:
+    def _mesh(self, name: str, city: Sequence[str], ids: Collection[str]) -> bytes:
         """A mesh file with the selected buildings; empty without any."""
         found = _MESH.fullmatch(name)
         if found is None:

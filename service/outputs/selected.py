@@ -89,8 +89,9 @@ class Selections:
                     raise SelectionBusyError("other selections of buildings are being made: ask again")
                 # a copy of the run, and as much as all outputs
                 disk.require(2 * sum(one.size_bytes for one in catalogue.outputs.values()), "a selection of buildings")
-                under_way = self._under_way[place] = Future()
+                under_way = Future()
                 threading.Thread(target=self._run, args=(place, asked, under_way), daemon=True).start()
+                self._under_way[place] = under_way  # before the thread ends: that needs the lock
         try:
             under_way.result(WAIT_S)
         except TimeoutError:

@@ -113,7 +113,7 @@ def file_answers(documents: Mapping[str, bool], **described: str) -> dict[int | 
         200: {"description": "The file.", "content": content, "headers": headers},
         206: {"description": "The requested range of bytes.", "content": {**content, **part}},
         304: {"description": "The client has this file already."},
-        **problems(400, 404, 406, 416, *FAILED),
+        **problems(400, 404, 406, 416, 507, *FAILED),
     }
 
 
