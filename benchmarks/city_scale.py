@@ -37,6 +37,7 @@ from benchmarks.city_tiles import SUFFIX, make_city, square_of
 from benchmarks.entries import markdown_table
 from benchmarks.process_watch import DRIVER, NANNY, SCHEDULER, Watcher
 from benchmarks.traced_run import folder_bytes
+from pipeline.model import Status
 
 REQUIRED, WANTED = 0.80, 0.90
 _SCHEDULER_WAIT_S = 300.0
@@ -216,7 +217,7 @@ def report(seen: Mapping[str, Any], trace: Mapping[str, Any] | None, run_dir: Pa
         "wall_s": wall_s,
         "buildings_a_second": buildings / wall_s,
         "digest": manifest["content_sha256"],
-        "statuses": {name: counts[name] for name in ("ok", "fallback", "failed")},
+        "statuses": {status.value: counts.get(status, 0) for status in Status},
         "seen": dict(seen),
         "result_bytes": results,
     }

@@ -116,7 +116,7 @@ def outcomes(run: Path, truth: Path) -> dict[str, Outcomes]:
         mine = [row for row in rows if row["building_id"].startswith(kind)]
         faces = [faces_of.get(row["building_id"], []) for row in mine]
         reported[kind] = Outcomes(
-            delivered=[row["model_status"] == "ok" for row in mine],
+            delivered=[row["model_status"] in {"ok", "doubtful"} for row in mine],
             all_right=[row["faces_found"] == row["faces_to_find"] and row["faces_wrong"] == 0 for row in mine],
             correct=[row["outcome"] == "correct" for row in mine],
             faces=[float(np.mean(one)) if one else math.nan for one in faces],

@@ -93,7 +93,7 @@ def scored(results: Sequence[BuildingResult], reference: Reference) -> LowScore:
             near = np.abs(vertical_residuals(xyz - model.origin, model.faces, model.planes)) <= TOLERANCE_M
             within += int(near.sum())
             share = float(near.mean()) if len(xyz) else 0.0
-            delivered += model.status is Status.OK and model.lod == "2.2"
+            delivered += model.status.has_roof and model.lod == "2.2"
             blocks += model.status is Status.FALLBACK
             invalid += any(check_solid(solid) for solid in model.solids)
         shares.append(share)

@@ -30,7 +30,7 @@ import numpy as np
 from benchmarks.candidates import candidates_of
 from benchmarks.entries import Entry, Workplace, all_variants, hofmann_entries, markdown_table, run_settings, tiles_of
 from pipeline.methods import Method, ReconstructSettings
-from pipeline.model import Candidate, FloatArray, PreparedCloud, Segmentation
+from pipeline.model import Candidate, FloatArray, PreparedCloud, Segmentation, Status
 from pipeline.reconstruct import reconstruct_building
 from pipeline.runtime.compare import Variant, settings_of
 
@@ -122,7 +122,7 @@ def times_table(found: dict[str, Times]) -> str:
     heads = [f"{part}, {figure}" for part in ("segmentation", "solids") for figure in ("median", "mean", "95 %")]
     rows = []
     for label, times in found.items():
-        counts = "/".join(str(times.statuses.count(status)) for status in ("ok", "fallback", "failed"))
+        counts = "/".join(str(times.statuses.count(status)) for status in Status)
         together = times.segmentation_s + times.solids_s
         rows.append(
             [
@@ -133,7 +133,7 @@ def times_table(found: dict[str, Times]) -> str:
                 f"{1000 * float(together.mean()):.1f}",
             ]
         )
-    return markdown_table(["ms per building", "ok/block/failed", *heads, "together, mean"], rows)
+    return markdown_table(["ms per building", "ok/doubtful/block/failed", *heads, "together, mean"], rows)
 
 
 def entries(data: Path, split: str) -> list[Entry]:

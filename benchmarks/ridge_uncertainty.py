@@ -79,7 +79,7 @@ def ridge_errors(entry: Entry, variant: Variant, place: Workplace) -> list[Ridge
     found = []
     for model, stands_for in zip(models, match_footprints(models, reference).reference_of.tolist(), strict=True):
         row = rows[model.building_id]
-        if stands_for < 0 or row["status"] != "ok" or row["touches_data_edge"]:
+        if stands_for < 0 or row["status"] not in {"ok", "doubtful"} or row["touches_data_edge"]:
             continue
         true = reference.buildings[stands_for]
         sigma, conditions = row["ridge_z_sigma_m"], reference.conditions.get(true.building_id)

@@ -30,6 +30,7 @@ from benchmarks.entries import (
     measure_all,
     sweep_entries,
 )
+from pipeline.model import Status
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.runtime.compare import Variant
 
@@ -99,7 +100,7 @@ def cell(rows: Sequence[Mapping[str, Any]], name: str) -> str:
 
 def statuses(manifest: Mapping[str, Any]) -> str:
     """Candidates by status; how long they take is the business of `method_times.py`."""
-    return "/".join(str(manifest["counts"][name]) for name in ("ok", "fallback", "failed"))
+    return "/".join(str(manifest["counts"].get(status, 0)) for status in Status)
 
 
 def _reading_order(entry: Entry) -> tuple[bool, bool, float, float]:
@@ -126,12 +127,12 @@ def methods_table(entries: Sequence[Entry], variants: Sequence[Variant], place: 
             tables = [place.table(variant, entry, "measures") for entry in measured]
             facts = [place.manifest(variant, entry) for entry in measured]
             lines.append([f"cube, {len(measured)} draws", variant.label, statuses(_summed(facts)), *_means(tables)])
-    return markdown_table(["entry", "method", "ok/block/failed", *(head for _, head in SHOWN)], lines)
+    return markdown_table(["entry", "method", "ok/doubtful/block/failed", *(head for _, head in SHOWN)], lines)
 
 
 def _summed(manifests: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """What `statuses` looks at, of several runs together."""
-    return {"counts": {name: sum(one["counts"][name] for one in manifests) for name in ("ok", "fallback", "failed")}}
+    return {"counts": {status: sum(one["counts"].get(status, 0) for one in manifests) for status in Status}}
 
 
 def _means(tables: Sequence[Sequence[Mapping[str, Any]]]) -> list[str]:

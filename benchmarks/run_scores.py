@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from pipeline.export.geoparquet import read_table
-from pipeline.model import Status
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reference import Reference
@@ -129,7 +128,7 @@ def score_run(run: Path, reference: Reference, val3dity: str | None = None) -> R
 
 
 def _is_lod2(model: RoofModel) -> bool:
-    return model.status is Status.OK and model.lod == LOD2
+    return model.status.has_roof and model.lod == LOD2
 
 
 def _building(row: BuildingResiduals) -> BuildingScore:

@@ -30,7 +30,7 @@ from benchmarks.results_page import filled
 from benchmarks.scenes import DELFT_CRS, SCENES
 from benchmarks.thinned_surveys import thinned, write_changed
 from pipeline.export.geoparquet import read_table
-from pipeline.model import BoolArray
+from pipeline.model import BoolArray, Status
 from pipeline.ruler.evaluation.evaluate import evaluate
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reading.wireframes import read_wireframes
@@ -173,8 +173,8 @@ def forest_table(data: Path, out: Path) -> str:
         )  # fmt: skip
         status = collections.Counter(read_table(str(place), "buildings").column("status").to_pylist())
         rejected = read_table(str(place), "rejected").num_rows
-        rows.append([classes, *(str(n) for n in (status["ok"], status["fallback"], status["failed"], rejected))])
-    return markdown_table(["classes", "models", "blocks", "failed", "rejected"], rows)
+        rows.append([classes, *(str(status[one]) for one in Status), str(rejected)])
+    return markdown_table(["classes", *Status, "rejected"], rows)
 
 
 def tallinn_half(data: Path, out: Path, *, kept_aside: bool) -> Path:

@@ -29,7 +29,7 @@ from pipeline.geometry import vertical_residuals_m
 from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.methods.kmeans import BuildingTop, building_top, planes_of, sides_of
 from pipeline.methods.settings import KMeansSettings
-from pipeline.model import BuildingResult, Candidate, FloatArray, LabelArray, Plane, RoofType, Status
+from pipeline.model import BuildingResult, Candidate, FloatArray, LabelArray, Plane, RoofType
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.reconstruct import reconstruct_building
 from pipeline.report.perspective import VIEW_SUN, View, ViewedFace, draw_view, projected
@@ -79,13 +79,13 @@ def picked(candidates: Iterator[Candidate], arguments: argparse.Namespace) -> tu
     best: tuple[float, str, Candidate, BuildingResult] | None = None
     for candidate in candidates:
         robust = reconstruct_building(candidate, "kmeans", ReconstructSettings())
-        if robust.roof_type is not RoofType.GABLE or robust.status is not Status.OK or robust.footprint is None:
+        if robust.roof_type is not RoofType.GABLE or not robust.status.has_roof or robust.footprint is None:
             continue
         if not arguments.min_area <= robust.footprint.area <= arguments.most_area:
             continue
         faithful = ReconstructSettings(method=METHODS["kmeans"].preset("faithful"))
         result = reconstruct_building(candidate, "kmeans", faithful)
-        if result.status is not Status.OK or result.roof_type is not RoofType.GABLE:
+        if not result.status.has_roof or result.roof_type is not RoofType.GABLE:
             continue
         if min(plane.slope_deg for plane in result.planes) < arguments.min_slope:
             continue

@@ -57,7 +57,7 @@ class ExitCode(IntEnum):
 
 
 EXIT_CODES: Mapping[ExitCode, str] = {
-    ExitCode.DONE: "Done. Single buildings may still have failed: each has a record with its reason.",
+    ExitCode.DONE: "Done. Single buildings may still be doubtful or have failed: each has a record with its reason.",
     ExitCode.TILES_FAILED: (
         "The run or job finished, but at least one tile failed or has no points; all other tiles are complete. Or: the "
         "building of a replay failed again."

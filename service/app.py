@@ -19,6 +19,7 @@ from service.guard import Guard
 from service.input_policy import check_hosts, check_roots
 from service.methods import HeadAsGet, check_query, written_out
 from service.metrics import Measured, Metrics
+from service.outputs.selected import Selections
 from service.rate_limits import RateLimiter
 from service.routes import (
     buildings,
@@ -107,6 +108,7 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     app.state.published = published_runs(settings.publish, settings.state)
     app.state.limiter = RateLimiter(settings)
     app.state.streams = streams
+    app.state.selections = Selections()
     app.state.polled_jobs = PolledJobs(kept, settings.database_wait_s)
     app.state.writing = writing(settings)
     app.state.metrics = metrics

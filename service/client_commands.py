@@ -284,13 +284,27 @@ def fetch(
     method: Annotated[
         str | None, typer.Option(metavar="LABEL", help="The results of one method of a comparison.")
     ] = None,
+    statuses: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--status",
+            metavar="STATUS",
+            help="Only buildings of this status: ok, doubtful, fallback or failed; with commas, or repeated.",
+        ),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace files that are there with another content.")
     ] = False,
 ) -> None:
     """Fetch the results of a job, with checksums. Run it again to continue after an interruption."""
     found = remote.client.fetch(
-        job, out, kinds or (), method=method, overwrite=overwrite, on_transfer=_shown(remote.console, "fetch")
+        job,
+        out,
+        kinds or (),
+        method=method,
+        status=statuses or (),
+        overwrite=overwrite,
+        on_transfer=_shown(remote.console, "fetch"),
     )
     for file in found:
         remote.console.say(f"{file.path}{'' if file.is_new else ' was here already'}")

@@ -5,6 +5,7 @@ ServiceError
 ├── NoSuchJobError, NoSuchProcessError, NoSuchUploadError, NoSuchBuildingError, NoSuchOutputError, NoSuchScheduleError
 ├── NoSuchWebhookError, NoSuchDeliveryError, NoSuchCollectionError, NoSuchFeatureError
 ├── ResultNotReadyError      the job is not over yet, or was dismissed
+├── SelectionBusyError       the outputs of some statuses are being made
 ├── RequestError             inputs that do not fit the process: lists the faults together
 ├── OutsideAreaError         tiles far outside the area of use of their CRS: lists them together
 ├── InputRefusedError        an input that is not allowed: a path outside the roots, a host that is not listed
@@ -153,6 +154,13 @@ class NotReplayableError(ServiceError):
 
 class ResultNotReadyError(ServiceError):
     """The job has no results (yet)."""
+
+
+class SelectionBusyError(ServiceError):
+    """The outputs with the buildings of some statuses are being made."""
+
+    retry_after_s = 2.0
+    """Seconds after which a client may ask again."""
 
 
 class RequestError(ServiceError):

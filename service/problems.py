@@ -100,6 +100,9 @@ KINDS: Mapping[type[Exception], Kind] = {
         status=412, type_uri=f"{OWN}changed-meanwhile", title="It was changed in the meantime"
     ),
     errors.ResultNotReadyError: Kind(status=404, type_uri=f"{OGC}result-not-ready", title="The results are not ready"),
+    errors.SelectionBusyError: Kind(
+        status=503, type_uri=f"{OWN}selection-busy", title="The selection is being made", retry=True
+    ),
     errors.RequestError: Kind(status=400, type_uri=f"{OWN}invalid-request", title="The request does not fit"),
     errors.OutsideAreaError: Kind(
         status=422, type_uri=f"{OWN}outside-area-of-use", title="A tile would lie far from where its CRS is used"

@@ -12,6 +12,9 @@ from pipeline.console import Console
 from pipeline.errors import SettingsError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.model import Status
     from pipeline.runtime.publishing import Published
 
 
@@ -29,6 +32,15 @@ def publish(
     out: Annotated[
         str, typer.Option(metavar="PATH", help="The file, which ends in .gpkg or .pmtiles, or the folder to write.")
     ],
+    statuses: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--status",
+            metavar="STATUS",
+            help="Only buildings of this status: ok, doubtful, fallback or failed; with commas, or repeated. Rejected "
+            "objects stay. Not for stac, which lists the files of the run.",
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
     geoid_height: Annotated[
         float | None,
@@ -43,7 +55,14 @@ def publish(
 ) -> None:
     """Write a finished run as files that other programs open. The run stays as it is."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.runtime.publishing import publish_cityjson, publish_geopackage, publish_pmtiles, publish_stac
+        from pipeline.runtime.publishing import (
+            path_outside,
+            publish_cityjson,
+            publish_geopackage,
+            publish_pmtiles,
+            publish_stac,
+        )
+        from pipeline.runtime.selection import run_of
 
         forms = {
             "geopackage": publish_geopackage,
@@ -51,15 +70,31 @@ def publish(
             "pmtiles": publish_pmtiles,
             "stac": publish_stac,
         }
-        if form == "3dtiles":
-            published: Published = _tiles(console, run, out, overwrite, geoid_height)
-        elif geoid_height is not None:
+        if geoid_height is not None and form != "3dtiles":
             raise SettingsError([f"--geoid-height {geoid_height:g} is for --as 3dtiles alone: leave it out"])
-        else:
-            published = forms[form](run, out, overwrite=overwrite, on_event=console.on_event)
+        wanted = _statuses(statuses or [])
+        if wanted and form == "stac":
+            raise SettingsError([f"--status {','.join(wanted)} cannot be used with --as stac: leave it out"])
+        path_outside(run, out, "what is published is")
+        with run_of(run, wanted) as source:
+            if form == "3dtiles":
+                published: Published = _tiles(console, source, out, overwrite, geoid_height)
+            else:
+                published = forms[form](source, out, overwrite=overwrite, on_event=console.on_event)
         console.table("Written", ["what", "rows"], list(published.rows.items()))
         console.say(f"{published.place}, {published.size_bytes / 1e6:.1f} MB")
-        console.document({"run": run, "as": form, **dataclasses.asdict(published)})
+        console.document({"run": run, "as": form, "status": wanted, **dataclasses.asdict(published)})
+
+
+def _statuses(given: Sequence[str]) -> list[Status]:
+    """The statuses of `--status`, in their order; raises SettingsError for other words."""
+    from pipeline.model import Status
+
+    words = {word.strip() for text in given for word in text.split(",")}
+    unknown = sorted(words - set(Status))
+    if unknown:
+        raise SettingsError([f"--status {unknown[0]!r}: use one of {', '.join(Status)}"])
+    return [status for status in Status if status in words]
 
 
 def _tiles(console: Console, run: str, out: str, overwrite: bool, geoid_height: float | None) -> Published:

@@ -222,9 +222,9 @@ class Client:
         """Remove a job that is over, with its results."""
         finished(self._operations.remove(job))
 
-    def results(self, job: JobRef, *, method: str | None = None) -> list[Output]:
-        """The outputs of a job that succeeded; of a comparison also those of one method."""
-        return finished(self._operations.results(job, method=method))
+    def results(self, job: JobRef, *, method: str | None = None, status: Sequence[str] = ()) -> list[Output]:
+        """The outputs of a job that succeeded; also those of one method, or with buildings of some statuses only."""
+        return finished(self._operations.results(job, method=method, status=status))
 
     def fetch(
         self,
@@ -233,12 +233,18 @@ class Client:
         kinds: Sequence[str] = (),
         *,
         method: str | None = None,
+        status: Sequence[str] = (),
         overwrite: bool = False,
         on_transfer: OnTransfer = ignore,
     ) -> list[FetchedFile]:
-        """Fetch outputs into a folder, all or those of some kinds. A call that was interrupted continues."""
+        """Fetch outputs into a folder, all or those of some kinds. A call that was interrupted continues.
+
+        With `status` such as `["ok"]` they hold only buildings of these statuses.
+        """
         return finished(
-            self._operations.fetch(job, out, kinds, method=method, overwrite=overwrite, on_transfer=on_transfer)
+            self._operations.fetch(
+                job, out, kinds, method=method, status=status, overwrite=overwrite, on_transfer=on_transfer
+            )
         )
 
     def request(self, method: str, path: str, *, params: Mapping[str, Any] | None = None, document: Any = None) -> Any:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import os
 import re
 from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
+from typing import Any
 from urllib.parse import unquote
 
 from pipeline.errors import RunError
@@ -22,7 +24,22 @@ _ATTEMPTS = 2
 """Attempts at a file that arrives with another checksum: the second one begins at its first byte."""
 
 
-async def outputs_of(session: Session, job_id: str, kinds: Sequence[str], method: str | None) -> list[Output]:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Choice:
+    """Which results of a job."""
+
+    method: str | None = None
+    """The run of a comparison."""
+    status: Sequence[str] = ()
+    """The statuses of the buildings in them; all if it is empty."""
+
+    @property
+    def query(self) -> dict[str, Any]:
+        """As parameters of a request."""
+        return {"method": self.method, "status": ",".join(self.status) or None}
+
+
+async def outputs_of(session: Session, job_id: str, kinds: Sequence[str], choice: Choice) -> list[Output]:
     """The outputs of a job, or those of these kinds.
 
     Raises
@@ -32,7 +49,7 @@ async def outputs_of(session: Session, job_id: str, kinds: Sequence[str], method
     NotFoundError
         The job is unknown, still runs, or lacks this output.
     """
-    path = path_of("jobs", job_id, "results", outputs=tuple(kinds), method=method)
+    path = path_of("jobs", job_id, "results", outputs=tuple(kinds), **choice.query)
     try:
         answer = await session.ask("GET", path)
     except RefusedError as error:
@@ -46,13 +63,13 @@ async def outputs_of(session: Session, job_id: str, kinds: Sequence[str], method
     if answer.status == 204:
         # of a job that was submitted with `response: raw`: a header names the outputs
         names = re.findall(r'title="([^"]+)"', answer.headers.get("link", ""))
-        return [await _described(session, job_id, name, method) for name in names if name in kinds or not kinds]
+        return [await _described(session, job_id, name, choice) for name in names if name in kinds or not kinds]
     return [Output.of(output_id, entry) for output_id, entry in session.document(answer).items()]
 
 
-async def _described(session: Session, job_id: str, output_id: str, method: str | None) -> Output:
+async def _described(session: Session, job_id: str, output_id: str, choice: Choice) -> Output:
     """An output, from the headers of its file."""
-    headers = (await session.ask("HEAD", path_of("jobs", job_id, "results", output_id, method=method))).headers
+    headers = (await session.ask("HEAD", path_of("jobs", job_id, "results", output_id, **choice.query))).headers
     return Output(
         id=output_id,
         media_type=headers["content-type"],
@@ -68,7 +85,7 @@ async def fetch_output(
     output: Output,
     folder: Path,
     *,
-    method: str | None,
+    choice: Choice,
     overwrite: bool,
     on_transfer: OnTransfer,
 ) -> FetchedFile:
@@ -83,7 +100,7 @@ async def fetch_output(
     UnreachableError, ForeignAnswerError, RefusedError
         Those of every request.
     """
-    path = path_of("jobs", job_id, "results", output.id, method=method)
+    path = path_of("jobs", job_id, "results", output.id, **choice.query)
     head = await session.ask("HEAD", path)
     target = folder / file_name(head.headers.get("content-disposition", ""), job_id, output.id)
     try:

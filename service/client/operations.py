@@ -12,7 +12,7 @@ from typing import Any
 
 from pipeline.errors import SettingsError
 from service.client.answers import OVER, Event, FetchedFile, Job, Output, Submitted
-from service.client.downloads import fetch_output, outputs_of
+from service.client.downloads import Choice, fetch_output, outputs_of
 from service.client.errors import ForeignAnswerError, JobDismissedError, JobFailedError, NotFoundError, RefusedError
 from service.client.events import follow
 from service.client.session import Session, path_of
@@ -244,9 +244,9 @@ class Operations:
 
     # --- results
 
-    async def results(self, job: JobRef, *, method: str | None = None) -> list[Output]:
-        """The outputs of a job that succeeded; of a comparison also those of one method."""
-        return await outputs_of(self._session, _id(job), (), method)
+    async def results(self, job: JobRef, *, method: str | None = None, status: Sequence[str] = ()) -> list[Output]:
+        """The outputs of a job that succeeded; also those of one method, or with buildings of some statuses only."""
+        return await outputs_of(self._session, _id(job), (), Choice(method=method, status=status))
 
     async def fetch(
         self,
@@ -255,15 +255,19 @@ class Operations:
         kinds: Sequence[str] = (),
         *,
         method: str | None = None,
+        status: Sequence[str] = (),
         overwrite: bool = False,
         on_transfer: OnTransfer = ignore,
     ) -> list[FetchedFile]:
-        """Fetch outputs into a folder, all or those of some kinds. A call that was interrupted continues."""
-        job_id, folder = _id(job), Path(out)
-        found = await outputs_of(self._session, job_id, kinds, method)
+        """Fetch outputs into a folder, all or those of some kinds. A call that was interrupted continues.
+
+        With `status` such as `["ok"]` they hold only buildings of these statuses.
+        """
+        job_id, folder, choice = _id(job), Path(out), Choice(method=method, status=status)
+        found = await outputs_of(self._session, job_id, kinds, choice)
         return [
             await fetch_output(
-                self._session, job_id, output, folder, method=method, overwrite=overwrite, on_transfer=on_transfer
+                self._session, job_id, output, folder, choice=choice, overwrite=overwrite, on_transfer=on_transfer
             )
             for output in found
         ]

@@ -1,10 +1,9 @@
-"""Zip files without times, and the lines of one building in an OBJ file."""
+"""Zip files without times."""
 
 from __future__ import annotations
 
 import shutil
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -41,37 +40,3 @@ def _entry(name: str) -> zipfile.ZipInfo:
     entry.compress_type = zipfile.ZIP_STORED if name.endswith(".laz") else zipfile.ZIP_DEFLATED
     entry.external_attr = _FILE_MODE
     return entry
-
-
-def building_lines(path: Path, building_id: str) -> Iterator[str]:
-    r"""The lines of one building in an OBJ file that may hold several, with its vertices counted from 1.
-
-    Objects are named after the building and the number of the solid; comments before the first object are kept.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = Path(folder) / "tile.obj"
-    ...     _ = path.write_text("# m\no a-0\nv 0 0 0\nf 1 1 1\no b-0\nv 1 1 1\nf 2 2 2\n")
-    ...     list(building_lines(path, "b"))
-    ['# m', 'o b-0', 'v 1 1 1', 'f 1 1 1']
-    """
-    mine, seen, before = False, 0, 0
-    with path.open(encoding="ascii") as stream:
-        for raw in stream:
-            line = raw.rstrip("\n")
-            kind, _, rest = line.partition(" ")
-            if kind == "#":
-                yield line
-                continue
-            if kind == "o":
-                if rest.rpartition("-")[0] == building_id:
-                    # solids of one building follow one another
-                    before = before if mine else seen
-                    mine = True
-                elif mine:
-                    return
-            seen += kind == "v"
-            if mine:
-                yield line if kind != "f" else "f " + " ".join(str(int(i) - before) for i in rest.split())

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.export.building_points import building_points
+from pipeline.export.obj_parts import lines_of_buildings
 from pipeline.export.point_files import FOLDER, TILESET
 from pipeline.export.solid_geometry import OVERHANGS
 from service.errors import NoSuchBuildingError, NoSuchOutputError
 from service.outputs.building_index import FEATURES_NAME
 from service.outputs.building_pages import GONE, opened_index
-from service.outputs.meshes import building_lines
 from service.outputs.single_glb import cut_glb
 
 ID_PATTERN = "^[a-z2-7]{24}$"
@@ -123,7 +123,13 @@ def building_obj(run_dir: Path, building: StoredBuilding, lod: str | None = None
     NoSuchBuildingError
         It has no model, the job was requested without OBJ files or in another level of detail, or its file is gone.
     """
-    return building_lines(_mesh_file(run_dir, building, "obj", lod), building.building_id)
+    path = _mesh_file(run_dir, building, "obj", lod)
+
+    def lines() -> Iterator[str]:
+        with path.open(encoding="ascii") as stream:
+            yield from lines_of_buildings((line.rstrip("\n") for line in stream), [building.building_id])
+
+    return lines()
 
 
 def building_glb(run_dir: Path, building: StoredBuilding, lod: str | None = None) -> bytes:

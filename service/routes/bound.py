@@ -15,6 +15,7 @@ from service.auth import Principal, authenticate, needs_table
 from service.errors import UnauthorizedError
 from service.files import StateFolder
 from service.keys import Scope
+from service.outputs.selected import Selections
 from service.rate_limits import RateLimiter
 from service.settings import ServiceSettings
 from service.store import JobStore
@@ -43,6 +44,11 @@ async def _folder(request: Request) -> StateFolder:
     return folder
 
 
+async def _selections(request: Request) -> Selections:
+    selections: Selections = request.app.state.selections
+    return selections
+
+
 async def _limiter(request: Request) -> RateLimiter:
     limiter: RateLimiter = request.app.state.limiter
     return limiter
@@ -60,6 +66,9 @@ Store = Annotated[JobStore, Depends(_store)]
 
 Folder = Annotated[StateFolder, Depends(_folder)]
 """The folder of files."""
+
+Selecting = Annotated[Selections, Depends(_selections)]
+"""Makes outputs with the buildings of some statuses."""
 
 Base = Annotated[str, Depends(_base_url)]
 """The service's own URL without a final slash, for links."""

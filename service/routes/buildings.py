@@ -48,7 +48,7 @@ from service.routes.results import FAILED
 from service.wire import patterns
 from service.wire.base import link, respond
 from service.wire.buildings import CityJson, Decision, Decisions, Feature, FeaturePage
-from service.wire.queries import entry_of, words
+from service.wire.queries import Statuses, entry_of, words
 
 router = APIRouter(tags=["results"])
 
@@ -118,7 +118,6 @@ _Coordinates = Annotated[
 _BuildingId = Annotated[
     str, Path(alias="buildingID", description="As in the lists.", examples=["3givd2mvtyerfjxv2yytjbmi"])
 ]
-_Statuses = Annotated[list[Annotated[str, entry_of(Status)]] | None, AfterValidator(words(list(Status)))]
 _RoofTypes = Annotated[list[Annotated[str, entry_of(RoofType)]] | None, AfterValidator(words(list(RoofType)))]
 _Reasons = Annotated[list[Annotated[str, entry_of(Reason)]] | None, AfterValidator(words(list(Reason)))]
 
@@ -144,7 +143,7 @@ class _Asked:
         CoordinateChoice | None, Query(alias="bbox-crs", description="Coordinates of bbox; CRS84 by default.")
     ] = None
     crs: _Coordinates = None
-    status: Annotated[_Statuses, Query(description=_any_of(Status))] = None
+    status: Annotated[Statuses, Query(description=_any_of(Status))] = None
     roof_type: Annotated[_RoofTypes, Query(description=_any_of(RoofType))] = None
     reason: Annotated[_Reasons, Query(description=_any_of(Reason))] = None
     limit: Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Maximum number of buildings of the page.")] = 100

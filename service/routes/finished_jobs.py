@@ -8,22 +8,27 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime as dt
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import urlencode
 
 from fastapi import Depends, Query
 
+from pipeline.model import Status
 from service.errors import NoSuchOutputError, RequestError, ResultNotReadyError, StoreError
 from service.files import StateFolder
 from service.jobs import Job, JobStatus
 from service.outputs import Catalogue, read_catalogue, run_outputs
 from service.outputs.catalogue import NOTHING_YET
 from service.outputs.comparison import RUNS
+from service.outputs.kinds import OUTPUTS
+from service.outputs.selected import OFFERED, Selections
 from service.problems import JobFailedError
-from service.routes.bound import Folder, Reader, Store
+from service.routes.bound import Folder, Reader, Selecting, Store
 from service.routes.jobs import JobId
 from service.store import JobStore
+from service.wire.queries import Statuses
 
 _WATCHED_AGAIN_S = 10.0
 """Seconds after which it is noted again that a client reads the buildings of a running job."""
@@ -43,6 +48,8 @@ class FinishedJob:
     """The list of the outputs."""
     label: str | None = None
     """The requested run of a comparison; None for the whole comparison, and for other jobs."""
+    statuses: tuple[Status, ...] = ()
+    """The statuses of the buildings in the outputs; empty for all."""
     is_complete: bool = True
     """Whether the job is over; if not, there are only the buildings that it has modelled so far."""
 
@@ -62,9 +69,17 @@ class FinishedJob:
             self, out_dir=out_dir, run_dir=self.run_dir / RUNS / label, catalogue=read_catalogue(out_dir), label=label
         )
 
+    def only(self, statuses: Collection[str], selections: Selections, folder: StateFolder) -> FinishedJob:
+        """The same job with outputs that hold the buildings of some statuses only; they are made if need be."""
+        wanted = tuple(status for status in Status if status in statuses)
+        geoid_height_m = self.job.request.geoid_height
+        place = selections.make(self.run_dir, self.out_dir, wanted, folder.disk, geoid_height_m)
+        return dataclasses.replace(self, out_dir=place, catalogue=read_catalogue(place), statuses=wanted)
+
     def address(self, path: str, **query: str) -> str:
         """A path below the job with the query that selects the same run."""
-        given = {**({} if self.label is None else {"method": self.label}), **query}
+        status = {"status": ",".join(self.statuses)} if self.statuses else {}
+        given = {**({} if self.label is None else {"method": self.label}), **status, **query}
         return f"{path}?{urlencode(given)}" if given else path
 
 
@@ -101,9 +116,24 @@ _Label = Annotated[
 ]
 
 
-def _results(finished: _Finished, label: _Label = None) -> FinishedJob:
-    """The job's results, or those of one run."""
-    return finished if label is None else finished.run(label)
+_Only = Annotated[
+    Statuses,
+    Query(
+        alias="status",
+        description=f"Only buildings of these statuses: {', '.join(Status)}; with commas, or the parameter again. For "
+        f"{', '.join(name for name in OUTPUTS if name in OFFERED)}. These outputs are made when they are first asked "
+        "for; until then the answer is 503 with Retry-After.",
+        examples=["ok"],
+    ),
+]
+
+
+def _results(
+    finished: _Finished, selections: Selecting, folder: Folder, label: _Label = None, statuses: _Only = None
+) -> FinishedJob:
+    """The job's results, or those of one run, or of the buildings of some statuses."""
+    found = finished if label is None else finished.run(label)
+    return found.only(statuses, selections, folder) if statuses else found
 
 
 def _so_far(job: Job, store: JobStore, folder: StateFolder) -> FinishedJob:

@@ -14,6 +14,7 @@ from starlette.exceptions import HTTPException
 from service.errors import RequestError
 from service.outputs import KINDS, OUTPUTS, output_file
 from service.outputs.kinds import HTML
+from service.outputs.selected import refuse_others
 from service.routes.answers import JOB_ID, document, header, problems
 from service.routes.bound import Base
 from service.routes.finished_jobs import Finished, FinishedJob
@@ -61,7 +62,7 @@ _EXAMPLE = {
             "description": "The outputs by reference, for a job that was submitted with `response` raw.",
             "headers": header("Link", "One link per output: `rel` item, its id as `title`."),
         },
-        **problems(400, 404, *FAILED),
+        **problems(400, 404, 507, *FAILED),
     },
 )
 def results(
@@ -76,6 +77,8 @@ def results(
     if unknown:
         raise RequestError([f"query outputs names {unknown[0][:80]!r}: use {', '.join(KINDS)}"])
     missing = [name for name in wanted if name not in stored]
+    if missing and finished.statuses:
+        refuse_others(missing[0])
     if missing:
         raise finished.catalogue.missing(missing[0])
     place = f"{base}/jobs/{finished.job.job_id}/results"
@@ -110,7 +113,7 @@ def file_answers(documents: Mapping[str, bool], **described: str) -> dict[int | 
         200: {"description": "The file.", "content": content, "headers": headers},
         206: {"description": "The requested range of bytes.", "content": {**content, **part}},
         304: {"description": "The client has this file already."},
-        **problems(400, 404, 406, 416, *FAILED),
+        **problems(400, 404, 406, 416, 507, *FAILED),
     }
 
 
@@ -132,6 +135,8 @@ def result(
     ],
 ) -> Response:
     """Send one output; ranges of bytes are served, so Parquet can be read remotely."""
+    if finished.statuses:
+        refuse_others(output_id)
     path = output_file(finished.out_dir, output_id)
     kind, stored = KINDS[output_id], finished.catalogue.outputs[output_id]
     preferred(request.headers.get("accept"), [kind.media_type])
@@ -146,7 +151,7 @@ def result(
         stored.size_bytes,
         media_type=kind.media_type,
         headers=headers,
-        filename=_saved_name(finished.job.job_id, finished.label, path),
+        filename=_saved_name(finished.job.job_id, finished.label, *finished.statuses, path.name),
         content_disposition_type="inline" if is_page else "attachment",
     )
 
@@ -169,15 +174,15 @@ def unchanging_file(request: Request, finished: FinishedJob, path: FilePath, med
     return sent_file(request, path, found.st_size, media_type=media_type, headers=headers, stat_result=found)
 
 
-def _saved_name(job_id: str, label: str | None, path: FilePath) -> str:
+def _saved_name(job_id: str, *parts: str | None) -> str:
     """The name under which a browser saves a file.
 
-    >>> _saved_name("ab" * 16, None, FilePath("buildings.parquet"))
+    >>> _saved_name("ab" * 16, None, "buildings.parquet")
     'gablework-abababab-buildings.parquet'
-    >>> _saved_name("ab" * 16, "kmeans", FilePath("report.json"))
+    >>> _saved_name("ab" * 16, "kmeans", "report.json")
     'gablework-abababab-kmeans-report.json'
     """
-    return "-".join(part for part in ("gablework", job_id[:8], label, path.name) if part is not None)
+    return "-".join(("gablework", job_id[:8], *(part for part in parts if part is not None)))
 
 
 def is_known(if_none_match: str, etag: str) -> bool:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, Field, WithJsonSchema
 
+from pipeline.model import Status
 from service.jobs import JobStatus
 from service.wire import patterns
 
@@ -44,6 +45,8 @@ def entry_of(allowed: Iterable[str]) -> WithJsonSchema:
 
 
 Words = Annotated[list[str] | None, AfterValidator(words())]
+Statuses = Annotated[list[Annotated[str, entry_of(Status)]] | None, AfterValidator(words(list(Status)))]
+"""Statuses of buildings."""
 
 
 def interval(text: str | None) -> tuple[dt.datetime | None, dt.datetime | None]:

@@ -149,6 +149,39 @@ def test_an_accepted_object_is_modelled_under_its_own_id(plain: Any, overridden:
     assert outline(after[name]).intersection(around).area > 0.8 * outline(after[name]).area
 
 
+def test_a_doubtful_building_is_ok_once_a_user_accepts_it_or_its_figures(
+    reconstruct: Any, suburb: Path, overridden: Any
+) -> None:
+    strict = {**TILES, "support": {"min_confidence": 1.0}}
+    before = rows_by_id(reconstruct(suburb, settings=strict).run_dir)
+    doubted = sorted(
+        name for name, row in before.items() if row["reason"] == "uncertain" and row["status"] == "doubtful"
+    )
+    accepted, relaxed = doubted[:2]
+    summary = overridden(
+        f"""
+        [[building]]
+        building_id = "{accepted}"
+        action = "accept"
+
+        [[building]]
+        building_id = "{relaxed}"
+        settings.support.min_confidence = 0.0
+        """,
+        settings=strict,
+    )
+    after = rows_by_id(summary.run_dir)
+    assert others(after, accepted, relaxed) == others(before, accepted, relaxed)
+    for name, effect in ((accepted, "accept"), (relaxed, "method")):
+        row = after[name]
+        assert (row["status"], row["reason"], row["overridden"]) == ("ok", None, effect)
+        assert row["geometry"] == before[name]["geometry"]
+    assert {status: summary.statuses.get(status, 0) for status in ("ok", "doubtful")} == {
+        "ok": 2,
+        "doubtful": sum(row["status"] == "doubtful" for row in before.values()) - 2,
+    }
+
+
 def test_another_footprint_is_modelled_with_the_points_inside_it(plain: Any, overridden: Any) -> None:
     before = rows_by_id(plain.run_dir)
     name = min(before)

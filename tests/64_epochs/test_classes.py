@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from epochs_by_hand import ORIGIN, failed, house, rejected
 
-from pipeline.model import BuildingResult
+from pipeline.model import BuildingResult, Reason, Status
 from pipeline.ruler.epochs.settings import DiffSettings
 from pipeline.ruler.simulation.roofs import RoofShape
 from pipeline.runtime.manifest import RunStatus
@@ -155,6 +155,31 @@ def test_a_failed_candidate_is_not_taken_for_a_gone_or_a_new_house(compare: Comp
         "b": ("not_comparable", "failed_in_old"),
     }
     assert rows["a"]["gained_m3"] is None
+
+
+def doubtful(name: str, **options: Any) -> BuildingResult:
+    """A house whose points do not support its model."""
+    reason = {"reason": Reason.SCATTERED, "reason_detail": "0.4 m"}
+    return dataclasses.replace(house(name, **options), status=Status.DOUBTFUL, **reason)
+
+
+def test_a_change_of_a_model_that_its_points_do_not_support_is_never_a_sure_one(compare: Compare) -> None:
+    old = [doubtful("a1"), house("b1", 50.0), doubtful("c1", y=50.0), house("e1", 50.0, 50.0)]
+    new = [house("a2", eave=8.0), doubtful("b2", x=50.0, eave=8.0), doubtful("d2", y=-50.0), house("e2", 50.0, 50.0)]
+    rows = compare(old, new)
+    assert {name: (row["change"], row["doubts"]) for name, row in rows.items()} == {
+        "a": ("raised", ["doubtful_in_old"]),
+        "b": ("raised", ["doubtful_in_new"]),
+        "c": ("gone", ["doubtful_in_old"]),
+        "d": ("new", ["doubtful_in_new"]),
+        "e": ("unchanged", []),
+    }
+
+
+def test_one_doubtful_part_of_a_group_is_a_doubt_of_the_row(compare: Compare) -> None:
+    parts = [house("b2", -5.0, length=10.0, **FLAT), doubtful("c2", x=5.0, length=10.0, **FLAT)]
+    row = one(compare([house("a1", length=20.0, **FLAT)], parts))
+    assert (row["change"], row["relation"], row["doubts"]) == ("unchanged", "split", ["doubtful_in_new", "other_units"])
 
 
 def test_a_house_at_the_edge_of_the_data_is_not_compared(compare: Compare) -> None:

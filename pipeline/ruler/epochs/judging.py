@@ -132,6 +132,8 @@ def judge(
         doubts=(
             (Doubt.BLOCK_IN_OLD, old.has_block),
             (Doubt.BLOCK_IN_NEW, new.has_block),
+            (Doubt.DOUBTFUL_IN_OLD, old.has_doubtful),
+            (Doubt.DOUBTFUL_IN_NEW, new.has_doubtful),
             (Doubt.ROUGH_PART, reshaped & ~hidden & (figures[:, ROUGH_M2] > half_m2)),
             (Doubt.UNEXPLAINED_PART, reshaped & ~hidden & (unexplained_m2 >= half_m2)),
             (Doubt.NEAR_LIMIT, near & ~hidden),

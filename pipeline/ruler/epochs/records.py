@@ -89,6 +89,8 @@ class Doubt(StrEnum):
 
     BLOCK_IN_OLD = "block_in_old"
     BLOCK_IN_NEW = "block_in_new"
+    DOUBTFUL_IN_OLD = "doubtful_in_old"
+    DOUBTFUL_IN_NEW = "doubtful_in_new"
     ROUGH_PART = "rough_part"
     UNEXPLAINED_PART = "unexplained_part"
     NEAR_LIMIT = "near_limit"
@@ -99,6 +101,8 @@ class Doubt(StrEnum):
 DOUBTS: Mapping[Doubt, str] = {
     Doubt.BLOCK_IN_OLD: "the model of OLD is a block in place of its roof (`fallback`)",
     Doubt.BLOCK_IN_NEW: "the model of NEW is a block in place of its roof (`fallback`)",
+    Doubt.DOUBTFUL_IN_OLD: "the points of OLD do not support its model (`doubtful`): it may not be a building",
+    Doubt.DOUBTFUL_IN_NEW: "the points of NEW do not support its model (`doubtful`): it may not be a building",
     Doubt.ROUGH_PART: "most of the changed area is roof faces with scattered points: it may be a tree",
     Doubt.UNEXPLAINED_PART: "a model has roof without points (`unexplained_m2`) over at least half of the changed area",
     Doubt.NEAR_LIMIT: "`change_ratio` is between 2/3 and 3/2: a small difference would change the verdict",

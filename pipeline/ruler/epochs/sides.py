@@ -41,6 +41,8 @@ class Side:
     """(g,) bool, some building has no model."""
     has_block: BoolArray
     """(g,) bool, some model is a block in place of a roof."""
+    has_doubtful: BoolArray
+    """(g,) bool, some model is not supported by its own points."""
     at_edge: BoolArray
     """(g,) bool, some building touches the edge of the data."""
     roof_type: npt.NDArray[np.object_]
@@ -102,6 +104,7 @@ def side_of(buildings: Buildings, group: IntArray, count: int, vertical_unit_m: 
         unexplained_m2=np.nan_to_num(total(floats(table["unexplained_m2"]))),
         has_failed=some(status == Status.FAILED.value),
         has_block=some(is_block),
+        has_doubtful=some(status == Status.DOUBTFUL.value),
         at_edge=some(table["touches_data_edge"].to_numpy(zero_copy_only=False).astype(np.bool_)),
         roof_type=_of_largest(table["roof_type"].to_numpy(zero_copy_only=False), area_m2, group, count),
         ids=_lists(table["building_id"], starts),

@@ -59,7 +59,7 @@ class Override:
     preset: str | None = None
     """Where the method's settings start; None leaves them as they are."""
     settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
-    """Tables of settings: `roof`, `plan`, `roof-type` and the method's own."""
+    """Tables of settings: `roof`, `plan`, `roof-type`, `guides`, `support` and the method's own."""
     note: str = ""
     """The user's reason."""
 

@@ -97,6 +97,19 @@ function classOf(
   }
 }
 
+/** The colour of an object's outline on the map; outlines have no planes. */
+export function outlineColour(colouring: Colouring, { category, reason, figures }: Listed): string {
+  switch (colouring) {
+    case "type":
+      return CATEGORIES[category].colour;
+    case "plane":
+    case "plain":
+      return GREY;
+    default:
+      return classOf(colouring, category, reason, figures.within ?? null).colour;
+  }
+}
+
 /** Red, green, blue, opaque for each corner of a batch; in the linear space that three works in. */
 export function coloursOf(batch: Batch, colouring: Colouring): Uint8Array {
   const colours = new Uint8Array(4 * batch.surfaces.length).fill(255);

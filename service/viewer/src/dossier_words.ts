@@ -125,7 +125,8 @@ export function trust(properties: Properties, decisions: readonly Decision[]): {
   const { status, reason, valid } = properties;
   const words = typeof reason === "string" ? reasonWords(reason) : "";
   if (status === "failed") bad.push(`There is no model: ${words}.`);
-  if (status === "doubtful") bad.push(`The model is doubtful: ${words}.`);
+  const detail = typeof properties["reason_detail"] === "string" ? properties["reason_detail"] : "";
+  if (status === "doubtful") bad.push(`The model is doubtful: ${[words, detail].filter(Boolean).join(": ")}.`);
   if (status === "fallback") bad.push(`The roof is not modelled, the building is a block: ${words}.`);
   if (valid === true) good.push("The solid is closed and valid by the rules of ISO 19107.");
   for (const figure of trustFigures(properties)) (figure.good ? good : bad).push(figure.words);
@@ -147,6 +148,8 @@ export function trust(properties: Properties, decisions: readonly Decision[]): {
 interface Check {
   label: string;
   show: (value: number) => string;
+  /** Whether the limit is the largest allowed value; else it is the least. */
+  isMost?: boolean;
   met: string;
   missed: string;
 }
@@ -161,15 +164,15 @@ const CHECKS: Record<string, Check> = {
     met: "sparse: simple shapes compete with the arrangement",
     missed: "dense: the arrangement is drawn without competition",
   },
-  scatter_m: { label: "Scatter of the points about the roof", show: (v) => measure(v, 2, "m"), met: "like that of a roof", missed: "more than that of a roof: the model is doubtful" },
+  scatter_m: { label: "Scatter of the points about the roof", show: (v) => measure(v, 2, "m"), isMost: true, met: "like that of a roof", missed: "more than that of a roof: the model is doubtful" },
   share_on_roof: { label: "Points on the roof", show: percent, met: "enough", missed: "too few: the model is doubtful" },
-  unseen_share: { label: "Roof without points", show: percent, met: "little", missed: "too much: the model is doubtful" },
-  beside_share: { label: "Area without points beside the roof", show: percent, met: "little", missed: "too much: the model is doubtful" },
+  unseen_share: { label: "Roof without points", show: percent, isMost: true, met: "little", missed: "too much: the model is doubtful" },
+  beside_share: { label: "Area without points beside the roof", show: percent, isMost: true, met: "little", missed: "too much: the model is doubtful" },
   returns_per_face: { label: "Points per roof face", show: (v) => measure(v, 1), met: "enough", missed: "too few: the model is doubtful" },
   detection_confidence: { label: "Confidence that it is a building", show: percent, met: "enough", missed: "too low: the model is doubtful" },
-  level_side_share: { label: "Outline at which the ground is as high", show: percent, met: "little", missed: "too much: the model is doubtful" },
-  above_points_m: { label: "Height of a face above its points", show: (v) => measure(v, 2, "m"), met: "near them", missed: "too high: the model is doubtful" },
-  level_on_slope_share: { label: "Points of a level face that lie on a slope", show: percent, met: "few", missed: "too many: the model is doubtful" },
+  level_side_share: { label: "Outline at which the ground is as high", show: percent, isMost: true, met: "little", missed: "too much: the model is doubtful" },
+  above_points_m: { label: "Height of a face above its points", show: (v) => measure(v, 2, "m"), isMost: true, met: "near them", missed: "too high: the model is doubtful" },
+  level_on_slope_share: { label: "Points of a level face that lie on a slope", show: percent, isMost: true, met: "few", missed: "too many: the model is doubtful" },
   explained_share: { label: "Roof points that the model explains", show: percent, met: "enough for so few points", missed: "too few: the model is not delivered" },
 };
 
@@ -183,7 +186,7 @@ export function checkRows(decisions: readonly Decision[]): { label: string; valu
       return {
         label: known?.label ?? capital(name.replaceAll("_", " ")),
         value: value === undefined ? "–" : show(value),
-        limit: limit === undefined || limit === 0 ? "–" : `from ${show(limit)}`,
+        limit: limit === undefined || limit === 0 ? "–" : `${known?.isMost ? "up to" : "from"} ${show(limit)}`,
         words: (outcome === "met" ? known?.met : known?.missed) ?? detail,
       };
     });

@@ -2,7 +2,7 @@ import { ofRun } from "./address";
 import { currentKey, getJson, request, serviceUrl, type Link } from "./api";
 import { el } from "./elements";
 import { asProblem, problemNotice } from "./notices";
-import { bytes } from "./numbers";
+import { bytes, counted } from "./numbers";
 
 /** Outputs of the process, the most wanted ones first: label, description, file name. */
 const OUTPUTS: Record<string, [string, string, string]> = {
@@ -79,9 +79,22 @@ export function pageLink(jobPath: string, name: string): HTMLAnchorElement {
 
 type Offered = Record<string, Link & { bytes?: number }>;
 
-/** A menu of all outputs of the job; for a comparison those of one run, then those of all. */
-export async function downloadMenu(jobPath: string, method: string | null, signal: AbortSignal): Promise<HTMLElement> {
+/** Milliseconds between two questions whether a selection of buildings is made. */
+const ASK_AGAIN_MS = 2000;
+
+/**
+ * A menu of all outputs of the job; for a comparison those of one run, then those of all. Where some buildings are not
+ * ok, it offers the outputs of the others alone.
+ */
+export async function downloadMenu(
+  jobPath: string,
+  method: string | null,
+  statuses: Record<string, number>,
+  signal: AbortSignal,
+): Promise<HTMLElement> {
   const list = await downloadList(jobPath, method, signal);
+  const { ok = 0, ...others } = statuses;
+  if (ok > 0 && Object.values(others).some((count) => count > 0)) list.prepend(onlyOk(list, ok, jobPath, method, signal));
   list.classList.add("menu-list");
   const menu = el(
     "details",
@@ -100,6 +113,41 @@ export async function downloadMenu(jobPath: string, method: string | null, signa
   return menu;
 }
 
+/** A switch between the outputs of all buildings and those of the ones that are ok. */
+function onlyOk(list: HTMLElement, count: number, jobPath: string, method: string | null, signal: AbortSignal): HTMLElement {
+  const all = [...list.children];
+  const box = el("input", { type: "checkbox" });
+  const entry = el("li", { class: "menu-choice" }, el("label", {}, box, ` Only the ${counted(count, "model")} that ${count === 1 ? "is" : "are"} ok`));
+  // the switch stays where it is, so it keeps the focus
+  const show = (entries: Element[]): void => {
+    for (const other of [...list.children]) if (other !== entry) other.remove();
+    list.append(...entries);
+  };
+  box.addEventListener("change", () => {
+    if (!box.checked) return show(all);
+    show([el("li", { class: "hint menu-wait", role: "status" }, "These files are being made…")]);
+    selected(`${jobPath}/results?status=ok`, method, signal)
+      .then((offered) => listed(offered, OUTPUTS, jobPath, method, "ok"))
+      .catch((error: unknown) => [el("li", {}, problemNotice(asProblem(error)))])
+      .then((entries) => {
+        if (box.checked) show(entries);
+      });
+  });
+  return entry;
+}
+
+/** The outputs of a selection, once they are made. */
+async function selected(path: string, method: string | null, signal: AbortSignal): Promise<Offered> {
+  for (;;) {
+    try {
+      return await getJson<Offered>(ofRun(path, method), { signal });
+    } catch (error) {
+      if (asProblem(error).kind !== "selection-busy") throw error;
+      await new Promise((resolve) => setTimeout(resolve, ASK_AGAIN_MS));
+    }
+  }
+}
+
 /** A list of the same outputs. */
 export async function downloadList(jobPath: string, method: string | null, signal: AbortSignal): Promise<HTMLElement> {
   const offer = (of: string | null): Promise<Offered> => getJson<Offered>(ofRun(`${jobPath}/results`, of), { signal });
@@ -112,7 +160,7 @@ export async function downloadList(jobPath: string, method: string | null, signa
 }
 
 /** Entries of the menu: known outputs in their order, then any others. */
-function listed(offered: Offered, known: typeof OUTPUTS, jobPath: string, method: string | null): HTMLElement[] {
+function listed(offered: Offered, known: typeof OUTPUTS, jobPath: string, method: string | null, status = ""): HTMLElement[] {
   const names = [...Object.keys(known), ...Object.keys(offered).filter((name) => !(name in known))];
   return names
     .filter((name) => name in offered)
@@ -121,7 +169,8 @@ function listed(offered: Offered, known: typeof OUTPUTS, jobPath: string, method
       const size = offered[name]?.bytes;
       const note = el("span", { class: "hint" }, words);
       const weight = el("span", { class: "menu-size" }, typeof size === "number" ? bytes(size) : "");
-      const saved = method === null ? filename : `${method}-${filename}`;
-      return el("li", {}, downloadLink(label, ofRun(`${jobPath}/results/${name}`, method), saved, weight, note));
+      const saved = [method, status, filename].filter(Boolean).join("-");
+      const path = `${jobPath}/results/${name}${status && `?status=${status}`}`;
+      return el("li", {}, downloadLink(label, ofRun(path, method), saved, weight, note));
     });
 }

@@ -44,9 +44,13 @@ export function resultWords({ status, summary, exception, message }: StatusInfo)
 }
 
 function buildings(summary: Summary | undefined): string {
-  if (summary?.statuses === undefined) return "";
-  const { doubtful = 0, fallback = 0, failed = 0 } = summary.statuses;
-  const parts = [counted(total(summary.statuses), "building")];
+  return summary?.statuses === undefined ? "" : buildingWords(summary.statuses);
+}
+
+/** How many buildings there are, and how many of them are not ok. */
+export function buildingWords(statuses: Record<string, number>): string {
+  const { doubtful = 0, fallback = 0, failed = 0 } = statuses;
+  const parts = [counted(total(statuses), "building")];
   if (doubtful > 0) parts.push(`${count(doubtful)} doubtful`);
   if (fallback > 0) parts.push(counted(fallback, "block"));
   if (failed > 0) parts.push(`${count(failed)} failed`);

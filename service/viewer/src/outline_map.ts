@@ -26,8 +26,12 @@ interface Shape {
   box: Box;
 }
 
+/** The colour of an object. */
+type ColourOf = (shape: { id: string; category: Category }) => string;
+
 interface Cell {
   category: Category;
+  colour: string;
   path: Path2D;
   box: Box;
 }
@@ -46,6 +50,7 @@ export class OutlineMap {
   private readonly context: CanvasRenderingContext2D;
   private readonly shapes = new Map<string, Shape>();
   private only: ReadonlySet<string> | null = null;
+  private colours: ColourOf = ({ category }) => CATEGORIES[category].colour;
   private selected: string | null = null;
   private cells: Cell[] | null = null;
   private readonly view = new MapView();
@@ -91,6 +96,13 @@ export class OutlineMap {
     });
     this.cells = null;
     if (!this.touched) this.fit(false);
+    this.request();
+  }
+
+  /** Colour the objects from now on by a function of their ids and categories. */
+  colourBy(colours: ColourOf): void {
+    this.colours = colours;
+    this.cells = null;
     this.request();
   }
 
@@ -173,8 +185,8 @@ export class OutlineMap {
     const [a, , , d, e, f] = view.matrix();
     context.setTransform(ratio * a, 0, 0, ratio * d, ratio * e, ratio * f);
     const seen = view.box();
-    this.cells ??= cellsOf(this.shown());
-    for (const { category, path, box } of this.cells) if (meet(box, seen)) this.paint(path, category);
+    this.cells ??= cellsOf(this.shown(), this.colours);
+    for (const cell of this.cells) if (meet(cell.box, seen)) this.paint(cell);
     const shape = this.selected === null ? undefined : this.shapes.get(this.selected);
     if (shape !== undefined) this.mark(shape);
     this.drawBar();
@@ -182,10 +194,9 @@ export class OutlineMap {
     if (this.flight !== null) this.request();
   }
 
-  private paint(path: Path2D, category: Category): void {
+  private paint({ path, category, colour }: Cell): void {
     const { context, view } = this;
     const pixel = 1 / view.scale;
-    const { colour } = CATEGORIES[category];
     context.fillStyle = context.strokeStyle = colour;
     context.globalAlpha = isFlat(category) ? 0.3 : 0.55;
     context.fill(path);
@@ -196,11 +207,11 @@ export class OutlineMap {
     context.stroke(path);
   }
 
-  private mark({ rings, category }: Shape): void {
+  private mark(shape: Shape): void {
     const { context, view } = this;
     const path = new Path2D();
-    trace(path, rings);
-    context.fillStyle = CATEGORIES[category].colour;
+    trace(path, shape.rings);
+    context.fillStyle = this.colours(shape);
     context.globalAlpha = 0.7;
     context.fill(path);
     context.globalAlpha = 1;
@@ -341,14 +352,16 @@ export class OutlineMap {
 const DASHES: Partial<Record<Category, number[]>> = { doubtful: [10, 2], fallback: [7, 3], failed: [4, 3], rejected: [1.5, 2.5] };
 
 /** The outlines of each category as paths of neighbours. */
-function cellsOf(shapes: readonly Shape[]): Cell[] {
+function cellsOf(shapes: readonly Shape[], colours: ColourOf): Cell[] {
   if (shapes.length === 0) return [];
   const [x0, y0, x1, y1] = united(shapes.map(({ box }) => box));
   const side = Math.max(x1 - x0, y1 - y0, 1) / CELLS;
   const found = new Map<string, Cell>();
-  for (const { category, rings, box } of shapes) {
-    const key = `${category} ${Math.floor((box[0] - x0) / side)} ${Math.floor((box[1] - y0) / side)}`;
-    const cell = found.get(key) ?? { category, path: new Path2D(), box };
+  for (const shape of shapes) {
+    const { category, rings, box } = shape;
+    const colour = colours(shape);
+    const key = `${category} ${colour} ${Math.floor((box[0] - x0) / side)} ${Math.floor((box[1] - y0) / side)}`;
+    const cell = found.get(key) ?? { category, colour, path: new Path2D(), box };
     cell.box = united([cell.box, box]);
     trace(cell.path, rings);
     found.set(key, cell);

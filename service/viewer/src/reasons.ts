@@ -11,7 +11,7 @@ const REASONS: Record<string, string> = {
   level_through_slope: "a level roof face runs through a slope",
   height_given: "too few points; a block of the height that its footprint states",
   poor_fit: "too few of its points lie on the model",
-  scattered: "its points scatter about the model more than those of a roof",
+  scattered: "its points scatter more than those of a roof",
   not_seen: "too much of the roof has no points",
   uncertain: "it may not be a building",
   too_many_faces: "too few points for so many faces",

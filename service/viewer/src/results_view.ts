@@ -11,17 +11,18 @@ import { FilterPanel } from "./filter_panel";
 import type { Hooks } from "./job_view";
 import { jobMenu } from "./job_actions";
 import { capital } from "./fields";
-import { titleOf } from "./job_words";
+import { buildingWords, titleOf } from "./job_words";
 import { Legend } from "./legend";
 import { LevelChoice } from "./level_choice";
 import { loadModels, type FromLoading } from "./model_loading";
 import { announce, asProblem, problemNotice, warningNotice } from "./notices";
 import { count, counted, duration, measure } from "./numbers";
+import { outlineColour, type Colouring } from "./colouring";
 import type { OutlineMap } from "./outline_map";
 import type { Outlines } from "./outlines";
 import { showRecord } from "./record";
 import { rejectedRecord } from "./rejected_record";
-import { CATEGORY_NAMES, type Category } from "./roof_types";
+import { CATEGORIES, CATEGORY_NAMES, type Category } from "./roof_types";
 import { ModelScene } from "./scene";
 import { USUAL, isFiltered, queryWith, selected, tallies, wantedOf, type Wanted } from "./selection";
 import { elevationUnitM, modelUnits, type Units } from "./units";
@@ -77,6 +78,7 @@ class ResultsView {
   private shown: Listed[] = [];
   private scene: ModelScene | null = null;
   private map: OutlineMap | null = null;
+  private colouring: Colouring = "type";
   private readonly stage: HTMLElement;
   private readonly top = el("button", { type: "button", title: "From above, north up (t)", onclick: () => this.scene?.top() }, "Top");
   private readonly modes = {
@@ -109,7 +111,11 @@ class ResultsView {
         else hidden.add(category);
         this.change({ ...this.wanted, hidden });
       },
-      (colouring) => this.scene?.colourBy(colouring),
+      (colouring) => {
+        this.colouring = colouring;
+        this.scene?.colourBy(colouring);
+        this.colourMap();
+      },
     );
     const mode = el("div", { class: "tool-group", role: "group", "aria-label": "3D or map" }, ...Object.values(this.modes));
     const view = el(
@@ -140,7 +146,12 @@ class ResultsView {
 
   async start(): Promise<void> {
     window.addEventListener("hashchange", () => this.followAddress(), { signal: this.calledOff.signal });
-    const [report, menu] = await Promise.all([this.loadReport(), downloadMenu(this.jobPath, this.method, this.calledOff.signal)]);
+    const { summary } = this.job;
+    const statuses = (this.method === null ? summary : summary?.runs?.[this.method])?.statuses ?? {};
+    const [report, menu] = await Promise.all([
+      this.loadReport(),
+      downloadMenu(this.jobPath, this.method, statuses, this.calledOff.signal),
+    ]);
     if (this.calledOff.signal.aborted) return;
     this.report = report;
     this.counts.set("rejected", report.counts?.["rejected"] ?? 0);
@@ -237,6 +248,7 @@ class ResultsView {
     }
     this.outlines.push(outlines);
     this.map?.add(outlines);
+    this.colourMap();
     this.apply();
   }
 
@@ -372,6 +384,7 @@ class ResultsView {
     if (this.calledOff.signal.aborted || !this.wanted.map || this.map !== null) return;
     const map = new OutlineMap((id) => this.open(id));
     this.map = map;
+    this.colourMap();
     this.stage.prepend(map.element);
     for (const outlines of this.outlines) map.add(outlines);
     if (isFiltered(this.wanted)) map.showOnly(new Set(this.shown.map(({ id }) => id)));
@@ -380,6 +393,13 @@ class ResultsView {
   }
 
   /** Lay the operator's tiles beneath the map, if there are some and the results lie on Earth. */
+  /** Give the map the colours of the legend. */
+  private colourMap(): void {
+    if (this.map === null) return;
+    const of = new Map(this.listed.map((object) => [object.id, outlineColour(this.colouring, object)]));
+    this.map.colourBy(({ id, category }) => of.get(id) ?? CATEGORIES[category].colour);
+  }
+
   private async layBackground(map: OutlineMap): Promise<void> {
     const { crs } = this.report;
     if (document.querySelector('meta[name="map-tiles"]') === null || (crs?.to_wgs84 ?? null) === null) return;
@@ -401,8 +421,11 @@ class ResultsView {
     const seconds = this.report.timings_s?.["total"];
     const warnings = this.report.warnings ?? [];
     const crsName = this.report.crs?.name ?? "unknown";
+    const of = (category: Category): number => this.counts.get(category) ?? 0;
+    const [doubtful, fallback, failed] = [of("doubtful"), of("fallback"), of("failed")];
+    const ok = this.listed.length - this.rejected.size - doubtful - fallback - failed;
     const facts = [
-      this.listed.length > this.rejected.size ? counted(this.listed.length - this.rejected.size, "building") : null,
+      this.listed.length > this.rejected.size ? buildingWords({ ok, doubtful, fallback, failed }) : null,
       rejected === undefined ? null : `${count(rejected)} other objects left out`,
       points === undefined ? null : `${count(points)} points`,
       seconds === undefined ? null : duration(seconds),

@@ -1,7 +1,7 @@
 import { expect, test } from "vitest";
 import { Batcher, SURFACE, type Batch } from "../src/batching";
 import { SequenceReader, type Building } from "../src/cityjson";
-import { classesOf, coloursOf, CYCLE, type Colouring } from "../src/colouring";
+import { classesOf, coloursOf, CYCLE, outlineColour, type Colouring } from "../src/colouring";
 import { bytesOf, CATEGORIES } from "../src/roof_types";
 import { GABLE, METADATA } from "./gable";
 
@@ -66,6 +66,15 @@ test("residual, status and reason colour a whole roof as the legend says", () =>
       expect(new Set([roofs.get(0), roofs.get(1)])).toEqual(new Set([linear(own.colour).join()]));
     }
   }
+});
+
+test("outlines on the map have the colours of the legend", () => {
+  const { listed } = batched();
+  for (const colouring of ["residual", "status", "reason"] as const) {
+    for (const one of listed) expect(outlineColour(colouring, one)).toBe(classesOf(colouring, [one])[0].colour);
+  }
+  expect(listed.map((one) => outlineColour("type", one))).toEqual(listed.map(({ category }) => CATEGORIES[category].colour));
+  expect(outlineColour("plane", listed[0])).toBe(outlineColour("plain", listed[1]));
 });
 
 test("the legend counts the buildings of each class and leaves out empty ones", () => {

@@ -179,6 +179,18 @@ test("figures are shown beside their limits, forms with their outcome", () => {
   expect([rows[0].detail, rows[0].rmse, rows[1].rmse]).toEqual(["codes 306", "–", "0.053\u202fm"]);
 });
 
+test("a doubtful model says why, with the figure and the threshold, and which side of the limit is right", () => {
+  const doubtful = { status: "doubtful", reason: "scattered", reason_detail: "its roof returns scatter by 0.32 m, more than 0.15 m" };
+  expect(trust(doubtful, []).bad[0]).toBe(
+    "The model is doubtful: its points scatter more than those of a roof: its roof returns scatter by 0.32 m, more than 0.15 m.",
+  );
+  const checks: Decision[] = [
+    { step: 0, kind: "check", name: "scatter_m", outcome: "missed", detail: "", value: 0.32, limit: 0.15 },
+    { step: 1, kind: "check", name: "share_on_roof", outcome: "missed", detail: "", value: 0.45, limit: 0.7 },
+  ];
+  expect(checkRows(checks).map(({ limit }) => limit)).toEqual(["up to 0.15\u202fm", "from 70\u202f%"]);
+});
+
 test("a dossier has an address of its own, which keeps the query", () => {
   const building = "#/jobs/j/methods/m/buildings/b";
   for (const query of ["", "?status=failed"]) {
