@@ -27,6 +27,7 @@ def candidate(points: npt.ArrayLike, **fields: Any) -> Candidate:
         "points": points,
         "ground": np.zeros((0, 3)),
         "ground_z_m": 0.0,
+        "is_known": fields.get("footprint") is not None,
     }
     return Candidate(**(values | fields))
 
