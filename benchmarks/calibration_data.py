@@ -58,6 +58,8 @@ class Candidates:
     is_real: BoolArray
     is_model: BoolArray
     """Whether it has a model; rejected otherwise."""
+    is_block: BoolArray
+    """Whether that model is a block: its figure is that of the doubtful model that it replaced."""
     figure: FloatArray
     """Logarithm of the flatness of a model, or of 1 + the rough places of a rejected object."""
     right: BoolArray
@@ -104,6 +106,7 @@ def _candidates(rows: Sequence[Mapping[str, Any]], is_real: bool) -> Candidates:
         survey=np.array([row["survey"] for row, _ in known], np.str_),
         is_real=np.full(len(known), is_real),
         is_model=np.array(["object_id" not in row for row, _ in known], bool),
+        is_block=np.array(["object_id" not in row and row["noise_m"] is None for row, _ in known], bool),
         figure=np.array([figure for _, figure in known], float),
         right=np.array([row["right"] for row, _ in known], bool),
     )

@@ -11,7 +11,9 @@ Prints the weights, fitted to the dev scenes of the suite `trust` and to all rea
 for all real candidates as for all simulated ones), and the expected calibration error: candidates by rising confidence
 in ten bins of equal count, the distance between mean confidence and share right in each, their mean. Each real survey
 is measured with weights that were fitted without it, the test scenes with weights from the dev scenes and all real
-surveys. `benchmarks/calibration_data.py` says which candidates are right. Without `--test` the dev scenes are measured.
+surveys. Blocks are measured, but no weight is fitted to them: their confidence is that of the doubtful model that they
+replaced. `benchmarks/calibration_data.py` says which candidates are right. Without `--test`, the dev scenes are
+measured.
 """
 
 from __future__ import annotations
@@ -60,8 +62,8 @@ def logistic(odds: FloatArray) -> FloatArray:
 
 
 def fitted(candidates: Candidates) -> Weights:
-    """The likeliest weights, models and rejected objects apart."""
-    slope, start, most = _likeliest(candidates[candidates.is_model], has_ceiling=True)
+    """The likeliest weights, models with a roof and rejected objects apart."""
+    slope, start, most = _likeliest(candidates[candidates.is_model & ~candidates.is_block], has_ceiling=True)
     slope_rejected, start_rejected, _ = _likeliest(candidates[~candidates.is_model], has_ceiling=False)
     return Weights(
         per_log_flatness=slope,

@@ -18,7 +18,10 @@ TURNS: list[Matrix] = [((-1, 0), (0, 1)), ((0, -1), (1, 0)), ((0, 1), (1, 0))]
 
 
 def candidate(points: npt.ArrayLike, **fields: Any) -> Candidate:
-    """A candidate over the floor 0 with these points, (n, 3) metres; `fields` are further ones of `Candidate`."""
+    """A candidate over the floor 0 with these points, (n, 3) metres; `fields` are further ones of `Candidate`.
+
+    As in a run, a given footprint says that there is a building.
+    """
     points = np.rint(np.asarray(points, np.float64).reshape(-1, 3) * 1e3) / 1e3
     points = points[np.lexsort((points[:, 2], points[:, 1], points[:, 0]))]
     values = {

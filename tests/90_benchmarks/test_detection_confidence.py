@@ -1,5 +1,6 @@
 """Fit and reliability of the confidence: candidates by hand, weights that are known, classes that say what is what."""
 
+import dataclasses
 from pathlib import Path
 
 import laspy
@@ -24,11 +25,12 @@ def candidates(count: int, seed: int) -> Candidates:
         survey=np.full(count, "d0.8_last"),
         is_real=random.random(count) < 0.3,
         is_model=is_model,
+        is_block=np.zeros(count, bool),
         figure=figure,
         right=np.zeros(count, bool),
     )
     right = random.random(count) < TRUE.confidence(some)
-    return Candidates(survey=some.survey, is_real=some.is_real, is_model=some.is_model, figure=some.figure, right=right)
+    return dataclasses.replace(some, right=right)
 
 
 def test_the_fit_finds_the_weights_by_which_candidates_are_right() -> None:
@@ -54,6 +56,7 @@ def test_simulated_surveys_are_grouped_by_returns_and_density() -> None:
         survey=np.array(names),
         is_real=np.zeros(5, bool),
         is_model=np.ones(5, bool),
+        is_block=np.zeros(5, bool),
         figure=np.zeros(5),
         right=np.ones(5, bool),
     )
