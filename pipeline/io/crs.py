@@ -18,6 +18,7 @@ from pipeline.io.crs_units import (
     with_vertical,
     with_vertical_unit,
 )
+from pipeline.io.geotiff_keys import LINEAR_UNITS, by_unit_key
 from pipeline.io.library_faults import words_of
 
 if TYPE_CHECKING:
@@ -223,10 +224,11 @@ def resolve_reference(
 ) -> tuple[SpatialReference, tuple[str, ...]]:
     """The reference of a file from its header and the user's overrides, and warnings of one sentence each.
 
-    An override replaces what it states: a horizontal `crs` keeps the vertical CRS, or the unit, of the header. The
-    vertical unit is the user's, else the CRS's, else the header's, else the horizontal one. The CRS that comes back
-    has a vertical part if its elevations are not in its horizontal unit. Raises CrsError if the CRS is geographic or
-    not understood, or the unit is not known.
+    An override replaces what it states: a horizontal `crs` keeps the vertical CRS, or the unit, of the header. A
+    horizontal unit that the header states without a CRS is that of its coordinates, and stays, too. The vertical unit
+    is the user's, else the CRS's, else the header's, else the horizontal one. The CRS that comes back has a vertical
+    part if its elevations are not in its horizontal unit. Raises CrsError if the CRS is geographic or not understood,
+    or the unit is not known.
 
     Parameters
     ----------
@@ -237,12 +239,14 @@ def resolve_reference(
     vertical_unit : str, optional
         The user's vertical unit, a word of `UNITS_M`; overrides everything else.
     """
+    warnings: list[str] = []
     given = None if crs is None else parse_crs(crs, path=path)
+    if given is not None and header_crs is None:
+        given = _in_unit_of_header(given, header_horizontal_unit_m, path, warnings)
     given_m = None if vertical_unit is None else unit_in_metres(vertical_unit, path=path)
     named = header_crs if given is None else given
     if named is None:
         return _unknown_reference(header_horizontal_unit_m, header_vertical_unit_m, given_m)
-    warnings: list[str] = []
     if given is not None and header_crs is not None and _differ(given, header_crs):
         warnings.append(f"the given CRS {given.name!r} replaces the header's {horizontal_part(header_crs).name!r}")
     horizontal_m = horizontal_unit_of(named, path=path)
@@ -302,6 +306,17 @@ def _unknown_reference(
 def _differ(one: pyproj.CRS, other: pyproj.CRS) -> bool:
     """Whether the horizontal parts of two CRS differ."""
     return not horizontal_part(one).equals(horizontal_part(other), ignore_axis_order=True)
+
+
+def _in_unit_of_header(given: pyproj.CRS, unit_m: float | None, path: str, warnings: list[str]) -> pyproj.CRS:
+    """The user's CRS in the unit that a header without a CRS states for its coordinates, with a warning."""
+    if unit_m is None or same_unit(unit_m, horizontal_unit_of(given, path=path)):
+        return given
+    plane = by_unit_key(horizontal_part(given).to_2d(), unit_m, LINEAR_UNITS, warnings, is_given=True)
+    vertical, vertical_m = vertical_part(given), vertical_unit_of(given)
+    if vertical is not None:
+        return with_vertical(plane, vertical)
+    return plane if vertical_m is None else with_vertical_unit(plane, vertical_m)
 
 
 def _with_vertical_of(given: pyproj.CRS, header_crs: pyproj.CRS | None) -> pyproj.CRS:

@@ -97,13 +97,13 @@ def crs_of_keys(header: laspy.LasHeader, keys: GeoKeys) -> tuple[pyproj.CRS | No
     if crs is None:
         return None, warnings
     if crs.is_projected and not crs.is_compound:
-        crs = _by_unit_key(crs, keys.horizontal_unit_m, LINEAR_UNITS, warnings)
+        crs = by_unit_key(crs, keys.horizontal_unit_m, LINEAR_UNITS, warnings)
     vertical = vertical_part(crs) or _vertical_crs(codes)
     code = codes.get(VERTICAL_CRS, 0)
     if vertical is None and 1024 <= code < USER_DEFINED:
         warnings.append(f"the header's vertical CRS key {code} is not known")
     if vertical is not None:
-        found = _by_unit_key(vertical, keys.vertical_unit_m, VERTICAL_UNITS, warnings)
+        found = by_unit_key(vertical, keys.vertical_unit_m, VERTICAL_UNITS, warnings)
         if found is not vertical or not crs.is_compound:
             crs = with_vertical(crs, found)
     return crs, warnings
@@ -123,17 +123,20 @@ def _vertical_crs(codes: Mapping[int, int]) -> pyproj.CRS | None:
     return found if found.is_vertical else None
 
 
-def _by_unit_key(crs: pyproj.CRS, unit_m: float | None, key: int, warnings: list[str]) -> pyproj.CRS:
-    """A projected or vertical CRS in the unit of its key; a warning names the CRS that has it."""
+def by_unit_key(
+    crs: pyproj.CRS, unit_m: float | None, key: int, warnings: list[str], *, is_given: bool = False
+) -> pyproj.CRS:
+    """A projected or vertical CRS, of the header or given, in the unit of its key; a warning names the CRS with it."""
     own_m = float(crs.axis_info[0].unit_conversion_factor)
     if unit_m is None or same_unit(unit_m, own_m):
         return crs
     found = in_unit(crs, unit_m)
     code = found.to_epsg()
     name = found.name if code is None else f"EPSG:{code} ({found.name})"
+    whose, fix = ("the given", "mend the key") if is_given else ("its", "give --crs EPSG:n")
     warnings.append(
-        f"the header's units key {key} ({unit_name(unit_m)}) overrides the unit of its CRS {crs.name!r}"
-        f" ({unit_name(own_m)}): read as {name}; give --crs EPSG:n if that is wrong"
+        f"the header's units key {key} ({unit_name(unit_m)}) overrides the unit of {whose} CRS {crs.name!r}"
+        f" ({unit_name(own_m)}): read as {name}; {fix} if that is wrong"
     )
     return found
 

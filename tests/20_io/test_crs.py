@@ -112,7 +112,7 @@ def test_a_vertical_crs_alone_is_kept_too(tmp_path):
     assert [part.to_epsg() for part in reference.crs.sub_crs_list] == [26910, 6360]
     assert any("units are mixed" in warning for warning in reported)
     # the vertical key beside a user-defined plan
-    write_keys(tmp_path / "a.las", {1024: 1, 3072: 32767, 3076: 9003, 4096: 6360})
+    write_keys(tmp_path / "a.las", {1024: 1, 3072: 32767, 4096: 6360})
     info = open_source(tmp_path / "a.las", ReadOptions(crs="EPSG:26910")).info
     assert info.reference.vertical_unit_m == pytest.approx(US_SURVEY_FOOT_M)
     assert any("units are mixed" in warning for warning in info.warnings)
@@ -177,7 +177,7 @@ def test_a_reference_is_frozen_hashable_survives_pickling_and_is_the_same_by_wkt
         reference.epsg = 1
 
 
-def write_keys(path, keys, wkt=None, doubles=()):
+def write_keys(path, keys, wkt=None, doubles=(), **options):
     """A LAS file with GeoTIFF keys, and WKT beside where given; `doubles` are pairs of a key and its number."""
     header = laspy.LasHeader(version="1.2", point_format=0)
     header.scales = np.full(3, 0.01)
@@ -200,7 +200,7 @@ def write_keys(path, keys, wkt=None, doubles=()):
     las = laspy.LasData(header)
     las.x, las.y, las.z = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]).T
     las.write(path)
-    return open_source(path).info
+    return open_source(path, ReadOptions(**options)).info
 
 
 def test_geotiff_keys_give_the_crs_and_the_vertical_unit(tmp_path):
@@ -240,6 +240,27 @@ def test_a_units_key_overrides_the_unit_of_its_pcs_code_and_names_the_crs_that_h
     ways = [(own, x, y), (reference.horizontal_crs, x * factor, y * factor)]
     places = [pyproj.Transformer.from_crs(crs, own.geodetic_crs, always_xy=True).transform(*xy) for crs, *xy in ways]
     assert np.abs(np.subtract(*places)).max() < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [("EPSG:32128", [2271]), ("EPSG:32128+5703", [2271, 5703]), ("EPSG:5070", [None])],
+)
+def test_a_given_crs_keeps_the_unit_that_a_header_without_crs_states_for_its_coordinates(tmp_path, given, found):
+    keys = {1024: 1, 3076: 9003}
+    info = write_keys(tmp_path / "a.las", keys, crs=given)
+    crs = info.reference.crs
+    assert [part.to_epsg() for part in (crs.sub_crs_list or [crs])] == found
+    assert info.reference.horizontal_unit_m == pytest.approx(US_SURVEY_FOOT_M, rel=1e-12)
+    assert info.reference.vertical_unit_m == (1.0 if "+" in given else pytest.approx(US_SURVEY_FOOT_M, rel=1e-12))
+    assert any("key 3076" in warning and "mend the key" in warning for warning in info.warnings)
+    assert not any("units are mixed" in warning for warning in info.warnings)
+    # a CRS in the header's unit is taken as it is
+    agreed = write_keys(tmp_path / "a.las", keys, crs="EPSG:2271")
+    assert agreed.reference.epsg == 2271
+    assert not any("key 3076" in warning for warning in agreed.warnings)
+    with pytest.raises(CrsError, match="geographic"):
+        write_keys(tmp_path / "a.las", keys, crs="EPSG:4326")
 
 
 def test_units_keys_that_agree_with_their_codes_change_nothing(tmp_path):
