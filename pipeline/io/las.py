@@ -80,6 +80,8 @@ class LasFile:
         self._block = read_header_block(path)
         with path.open("rb") as stream:
             self._header = self._laspy_header(stream)
+            # LAS: points with 0 are of the strip that the file has
+            self._file_id = np.uint16(self._header.file_source_id)
             self._laszip_record = b""
             self._chunks: ChunkTable | None = None
             self._copc = None
@@ -285,7 +287,7 @@ class LasFile:
             return_count=np.asarray(packed["number_of_returns"], dtype=np.uint8),
             classification=np.asarray(packed["classification"], dtype=np.uint8),
             gps_time=np.array(array["gps_time"]) if "gps_time" in array.dtype.names else None,
-            source_id=np.array(array["point_source_id"]),
+            source_id=np.where(array["point_source_id"] == 0, self._file_id, array["point_source_id"]),
             withheld=np.asarray(packed["withheld"], dtype=np.bool_),
         )
 

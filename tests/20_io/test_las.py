@@ -196,3 +196,14 @@ def test_times_that_are_no_numbers_become_zero(tmp_path, points, write_las):
     times = np.linspace(1.0, 2.0, 100)
     times[7] = np.nan
     assert read_all(write_las(tmp_path / "a.laz", points(100), gps_time=times)).gps_time[7] == 0.0
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_points_without_a_strip_are_of_the_strip_that_the_header_names(tmp_path, points, write_las, suffix):
+    path = write_las(tmp_path / f"a.{suffix}", points(6), point_source_id=np.array([0, 0, 3, 0, 9, 0], np.uint16))
+    assert read_all(path).source_id.tolist() == [0, 0, 3, 0, 9, 0]
+    raw = bytearray(path.read_bytes())
+    struct.pack_into("<H", raw, 4, 7)
+    path.write_bytes(raw)
+    found = read_all(path).source_id
+    assert (found.tolist(), found.dtype) == ([7, 7, 3, 7, 9, 7], np.uint16)
