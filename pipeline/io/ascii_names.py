@@ -12,9 +12,18 @@ from collections.abc import Sequence
 from pipeline.errors import UnreadableInputError
 
 COLUMN_NAMES = {
-    "x": ("x", "easting", "east", "eastings", "x1", "e", "rechtswert", "utm_e", "utm_x", "x_utm"),
-    "y": ("y", "northing", "north", "northings", "y1", "n", "hochwert", "utm_n", "utm_y", "y_utm"),
-    "z": ("z", "elevation", "z1", "height", "altitude", "elev", "alt", "h", "hoehe", "höhe"),
+    "x": (
+        *("x", "easting", "east", "eastings", "x1", "e", "rechtswert", "utm_e", "utm_x", "x_utm"),
+        *("rechts", "ost", "oost", "est", "este"),
+    ),
+    "y": (
+        *("y", "northing", "north", "northings", "y1", "n", "hochwert", "utm_n", "utm_y", "y_utm"),
+        *("hoch", "nord", "noord", "norte"),
+    ),
+    "z": (
+        *("z", "elevation", "z1", "height", "altitude", "elev", "alt", "h", "hoehe", "höhe"),
+        *("hoogte", "hauteur", "altura", "cota", "quota"),
+    ),
     "x2": ("x2",),
     "y2": ("y2",),
     "z2": ("z2",),
@@ -34,6 +43,8 @@ _UNIT = re.compile(r"\(.*?\)|\[.*?\]|_(?:m|ft|us_?ft)$")
 _MARKS = " \t\r\n#/%\"'"
 _WORDS = re.compile(r"[\s_-]*coord(?:inate)?s?$")
 _AXES = ("x", "y", "z")
+_PROSE = frozenset({"above", "and", "are", "by", "for", "from", "is", "of", "the", "to", "with"})
+"""Words of sentences: a comment with one of them names no columns, unless it names two coordinates."""
 
 
 def columns_of(names: Sequence[str]) -> dict[str, int]:
@@ -105,7 +116,7 @@ def _least_axes(names: Sequence[str], line: bytes, separator: str | None, width:
     if len(names) != width or not is_last:
         return 2
     if COMMENT.match(line):
-        return 1 if separator is not None else 2
+        return 2 if separator is None and not _PROSE.isdisjoint(names) else 1
     return 1 if any(map(_is_number, names)) else 0
 
 

@@ -213,6 +213,9 @@ SWAPPED = "5402000.5{0}513000.25{0}300{0}17\n5402001{0}513001.5{0}301.25{0}80\n5
         ("Y-Coordinate,X-Coordinate,Elevation (ft),red light", ","),
         ("//Y X Z Intensity", " "),
         ("# Columns: n e h i", " "),
+        ("# Nord Ost Hoehe i", " "),
+        ("% Hoch Rechts Höhe i", " "),
+        ("# Noord Oost Hoogte i", " "),
         ("northing easting height i\n# in metres\n", " "),
     ],
 )
@@ -229,6 +232,7 @@ def test_columns_are_read_by_the_names_of_their_coordinates(tmp_path, header, se
         ("lat;lon;ell;i", ";", "which of them is x or y or z is not known"),
         ("#northing;b;c;d", ";", "which of them is x or z is not known"),
         ("north east up i", " ", "which of them is z is not known"),
+        ("# breite laenge Hoehe i", " ", "which of them is x or y is not known"),
         ("y x z", " ", "its header names 3 columns ('y', 'x', 'z'), its rows have 4"),
         ("y,x,z,i,class,", ",", "its header names 5 columns"),
         ("# y x z", " ", "its header names 3 columns"),
