@@ -110,7 +110,9 @@ def _beside_its_schema(path: Path) -> Iterator[str]:
         if schema.is_file():
             name.with_suffix(".xsd").symlink_to(schema)
         with in_our_words(path, WHAT, VALID):
-            pyogrio.read_info(name, encoding=BYTES, WRITE_GFS="YES", DOWNLOAD_SCHEMA="NO")
+            driver = pyogrio.read_info(name, encoding=BYTES, WRITE_GFS="YES", DOWNLOAD_SCHEMA="NO")["driver"]
+        if driver != "GML":
+            raise UnreadableInputError(str(path), f"cannot be read as {WHAT}: it is {driver}, not GML", VALID)
         yield name.as_posix()
 
 

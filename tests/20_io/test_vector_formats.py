@@ -181,6 +181,23 @@ def test_a_file_that_could_name_other_files_is_refused(tmp_path, kind):
         read_footprints(path, reference())
 
 
+PDS4 = """<?xml version="1.0"?><!-- http://www.opengis.net/gml -->
+<Product_Observational xmlns="http://pds.nasa.gov/pds4/pds/v1"><File_Area_Observational>
+<File><file_name>{0}</file_name></File><Table_Delimited><offset unit="byte">0</offset>
+<parsing_standard_id>PDS DSV 1</parsing_standard_id><records>1</records>
+<record_delimiter>Carriage-Return Line-Feed</record_delimiter><field_delimiter>Comma</field_delimiter>
+<Record_Delimited><fields>1</fields><groups>0</groups><Field_Delimited><name>WKT</name>
+<field_number>1</field_number><data_type>ASCII_String</data_type></Field_Delimited></Record_Delimited>
+</Table_Delimited></File_Area_Observational></Product_Observational>"""
+
+
+def test_xml_that_only_mentions_gml_is_refused(tmp_path):
+    path = tmp_path / "a.gml"
+    path.write_text(PDS4.format(path.name))
+    with pytest.raises(UnreadableInputError, match="it is PDS4, not GML"):
+        read_footprints(path, reference())
+
+
 def test_xml_with_entities_is_refused(tmp_path):
     path = made(tmp_path, "gml")
     text = path.read_text().replace("<ogr:FeatureCollection", '<!DOCTYPE x [<!ENTITY a "b">]><ogr:FeatureCollection', 1)
