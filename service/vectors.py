@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pipeline.errors import EmptyInputError, UnreadableInputError
+from pipeline.errors import EmptyInputError, InputError, UnreadableInputError
 from pipeline.io.crs import parse_crs
 from pipeline.io.formats import LAS_SUFFIXES
 from pipeline.io.gdal_source import (
@@ -171,7 +171,10 @@ def _archive(path: Path, head: bytes) -> dict[str, Any]:
     found = []
     for layer in layers:
         with unpacked(path, layer if len(layers) > 1 else None, SHAPE_OF_FOOTPRINTS) as (file, _):
-            found.append(examine_vector(file))
+            try:
+                found.append(examine_vector(file))
+            except InputError as fault:
+                raise fault.of(str(path), str(file)) from fault
     if len(found) == 1:
         return found[0]
     shapes = _shapes(*(any(shape in one["shapes"] for one in found) for shape in (POLYGONS, LINES)))

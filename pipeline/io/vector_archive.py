@@ -76,8 +76,8 @@ def _chosen(
         named = ", ".join(sorted(there)[:20])
         raise UnreadableInputError(str(path), problem, f"{shape.choose}: {named}" if there else VALID)
     stem = PurePosixPath(wanted.filename).with_suffix("")
-    parts = [one for one in members if PurePosixPath(one.filename).with_suffix("") == stem]
-    parts = [one for one in parts if one.filename.lower().endswith(SHAPE_PARTS)]
+    parts = [one for one in members if one.filename.lower().endswith(SHAPE_PARTS)]
+    parts = [one for one in parts if PurePosixPath(one.filename).with_suffix("") == stem]
     chosen = [wanted, *(one for one in parts if one is not wanted)]
     size = sum(one.file_size for one in chosen)
     if size > UNPACKED_LIMIT or any(one.flag_bits & _ENCRYPTED for one in chosen):

@@ -152,6 +152,14 @@ def test_one_of_several_layers_must_be_named(tmp_path, kind):
         read_area(path, reference())
 
 
+@pytest.mark.parametrize("folder", ["./", "/", "houses/"])
+def test_folders_in_an_archive_are_passed_over(tmp_path, folder):
+    path = made(tmp_path, "zipped geopackage")
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(folder, b"")
+    assert read_footprints(path, reference()).ids == ("A", "B")
+
+
 def test_archives_that_cannot_be_used_are_refused(tmp_path):
     (tmp_path / "a.txt").write_text("no vectors")
     with pytest.raises(UnreadableInputError, match="a zip archive with 0 vector files"):

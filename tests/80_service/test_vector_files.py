@@ -84,8 +84,9 @@ def test_what_is_refused_alone_is_refused_in_an_archive(tmp_path: Path) -> None:
     with sqlite3.connect(path) as database:
         database.execute('ALTER TABLE "a" RENAME TO "b"')
         database.execute('CREATE VIEW "a" AS SELECT * FROM "b"')
-    with pytest.raises(InputError, match="is a view or is not there"):
+    with pytest.raises(InputError, match="is a view or is not there") as caught:
         examine(zipped(tmp_path / "a.zip", path), max_points=1)
+    assert caught.value.path == str(tmp_path / "a.zip")
     (tmp_path / "a.txt").write_text("x")
     with pytest.raises(InputError, match="a zip archive with 0 vector files"):
         examine(zipped(tmp_path / "b.zip", tmp_path / "a.txt"), max_points=1)
