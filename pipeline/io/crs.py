@@ -304,8 +304,8 @@ def _unknown_reference(
 
 
 def _differ(one: pyproj.CRS, other: pyproj.CRS) -> bool:
-    """Whether the horizontal parts of two CRS differ."""
-    return not horizontal_part(one).equals(horizontal_part(other), ignore_axis_order=True)
+    """Whether the horizontal parts of two CRS differ, also of 3D ones."""
+    return not horizontal_part(one).to_2d().equals(horizontal_part(other).to_2d(), ignore_axis_order=True)
 
 
 def _in_unit_of_header(given: pyproj.CRS, unit_m: float | None, path: str, warnings: list[str]) -> pyproj.CRS:

@@ -122,7 +122,8 @@ def test_a_3d_crs_of_the_header_keeps_its_vertical_unit_too():
     reference, reported = resolve(pyproj.CRS("EPSG:26910").to_3d(), crs="EPSG:2992")
     assert (reference.horizontal_unit_m, reference.vertical_unit_m) == (FOOT_M, 1.0)
     assert any("units are mixed" in warning for warning in reported)
-    assert resolve(pyproj.CRS("EPSG:26910").to_3d(), crs="EPSG:26910")[0].epsg == 26910
+    reference, reported = resolve(pyproj.CRS("EPSG:26910").to_3d(), crs="EPSG:26910")
+    assert (reference.epsg, reported) == (26910, ())
 
 
 def test_the_facts_of_an_older_run_make_a_reference():
