@@ -129,6 +129,7 @@ class Console:
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
         self._last_line_s: dict[str, float] = {}
+        self._firsts: set[str] = set()
         self._log_json = log_json
         self._logs = contextlib.ExitStack()
 
@@ -165,7 +166,9 @@ class Console:
 
     def on_event(self, event: Event) -> None:
         """Show an event of a run."""
-        if event.kind == "warning":
+        if event.kind == "warning" and event.facts and not (self._log_json or self.as_json):
+            self.say_first(event.message)
+        elif event.kind == "warning":
             self.warn(event.message, stage=event.stage)
         elif self.quiet or event.kind == "detail":
             # its own lines are in the worker's log, and its counts in the progress
@@ -246,6 +249,12 @@ class Console:
         if not self.as_json:
             self._close_bars()
             print(message, flush=True)
+
+    def say_first(self, message: str) -> None:
+        """Print a warning above the results of a run, once: its event may come before its summary."""
+        if message not in self._firsts:
+            self._firsts.add(message)
+            self.say(f"warning: {message}")
 
     def status(self, message: str) -> None:
         """Report the state of a command that runs until it is ended: a line for people, or a line of its log."""

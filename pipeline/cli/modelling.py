@@ -410,7 +410,7 @@ def show_summary(console: Console, summary: RunSummary) -> None:
     from pipeline.cli.measuring import show_statistics
 
     if summary.headline:
-        console.say(f"warning: {summary.headline}")
+        console.say_first(summary.headline)
     show_statistics(console, _statistics_of(summary.run_dir))
     console.table(
         "Time", ["stage", "wall clock"], [(k, f"{seconds:.1f} s") for k, seconds in summary.timings_s.items()]

@@ -168,9 +168,8 @@ def test_a_house_under_a_larger_footprint_fails_with_the_name_of_that_one(
     found = {row["source_id"]: row for row in rows(summary.run_dir)}
     assert (found["house"]["status"], found["house"]["reason"]) == ("failed", "too_few_points")
     assert found["house"]["reason_detail"].endswith("footprint larger covers 100% of it, and has the points there")
-    assert any(
-        warning.startswith("footprint house: footprint larger covers 100% of it") for warning in summary.warnings
-    )
+    covered = "footprint house: footprint larger covers 100% of it, and has the points there: used without them"
+    assert covered in summary.warnings
     report = json.loads((Path(summary.run_dir) / "footprints.json").read_text())
     assert [(issue["source_id"], issue["problem"]) for issue in report["issues"]] == [("house", "overlap")]
     # neighbours that overlap by a hand's breadth are nothing to speak of

@@ -206,11 +206,12 @@ def test_points_of_class_2_alone_are_named_on_the_first_line(scene: Path, tmp_pa
     las = laspy.read(scene / "gable.laz")
     las.classification[:] = 2
     las.write(tmp_path / "ground.laz")
-    code, said, _ = invoke(
+    code, said, log = invoke(
         "reconstruct", str(tmp_path / "ground.laz"), "--out", str(tmp_path / "run"), "--workers", "0"
     )
     assert code == 0
     first = said.splitlines()[0]
+    assert (said + log).count(first.removeprefix("warning: ")) == 1
     assert first.startswith(f"warning: all {len(las.points)} points are of class 2 (ground), so none can be a roof")
     arguments = ("--out", str(tmp_path / "again"), "--workers", "0", "--json")
     summary = json.loads(invoke("reconstruct", str(tmp_path / "ground.laz"), *arguments)[1])

@@ -30,7 +30,7 @@ class Event:
     failed: int = 0
     """Failed units, which are among the finished ones."""
     facts: Mapping[str, str | float] = dataclasses.field(default_factory=dict)
-    """What a detail is about: tile, building, reason, seconds."""
+    """What a detail is about: tile, building, reason, seconds. A warning that comes before all others has a place."""
 
 
 Listener = Callable[[Event], None]

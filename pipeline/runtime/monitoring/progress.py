@@ -46,7 +46,7 @@ class Progress:
         return own
 
     def tell(self, kind: EventKind, stage: str, message: str = "", **counts: Any) -> None:
-        """Send an event; `counts` are the counting fields of `Event`."""
+        """Send an event; `counts` are the counting fields of `Event`, or its facts."""
         self.listener(Event(kind=kind, stage=stage, message=message, **counts))
 
     def warn(self, stage: str, message: str) -> None:
@@ -59,7 +59,7 @@ class Progress:
         """Store and send a warning that comes before all others, and before the figures of the run."""
         self.headline = message
         self.warnings.insert(0, message)
-        self.tell("warning", stage, message)
+        self.tell("warning", stage, message, facts={"place": "first"})
 
     def detail(self, stage: str, message: str, **facts: str | float) -> None:
         """Send what only logs need: something about one building or task."""

@@ -106,7 +106,7 @@ def _given_footprints(path: str, plan: Plan, settings: FootprintSettings, layer:
             source_id=found.ids[k],
             problem="overlap",
             detail=words,
-            action="its points there count for that one",
+            action="used without them",
             bounds_m=found.polygons[k].bounds,
         )
         for k, words in zip(inside, overlaps, strict=True)
