@@ -50,7 +50,8 @@ def run_of(run_dir: str, statuses: Collection[Status]) -> Iterator[str]:
             yield str(made)
         except RunError as fault:
             chosen = ", ".join(status.value for status in Status if status in statuses)
-            raise RunError(str(fault).replace(str(made), f"{run_dir} (only {chosen})")) from fault
+            words, named = str(fault), f"{run_dir} (only {chosen})"
+            raise RunError(words.replace(str(made), named) if str(made) in words else f"{named}: {words}") from fault
 
 
 def select_run(run_dir: str, out: Path, statuses: Collection[Status]) -> None:

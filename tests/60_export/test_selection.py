@@ -171,6 +171,8 @@ def test_all_statuses_need_no_copy_and_a_fault_names_the_run(tmp_path: Path) -> 
         run_of(str(run), [Status.DOUBTFUL, Status.OK]) as place,
     ):
         raise RunError(f"no model in {place}")
+    with pytest.raises(RunError, match=f"{run} \\(only ok\\): nothing to show"), run_of(str(run), [Status.OK]):
+        raise RunError("nothing to show")
 
 
 def test_the_command_publishes_the_buildings_of_some_statuses(tmp_path: Path) -> None:
