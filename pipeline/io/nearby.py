@@ -56,6 +56,10 @@ POLYGONS = Shape(
 """The default."""
 AREAS = POLYGONS._replace(named="area", choose=Shape._field_defaults["choose"])
 """Polygons of areas of interest."""
+TILES = AREAS._replace(named="tiles")
+"""Outlines of a tile index."""
+OWN_OUTLINES = POLYGONS._replace(choose="Name one of its layers as layer")
+"""Outlines that overrides name in files."""
 
 
 class Nearby:

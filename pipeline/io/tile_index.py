@@ -22,6 +22,7 @@ import shapely
 from pipeline.errors import UnreadableInputError
 from pipeline.io.crs import SpatialReference, horizontal_part, parse_crs
 from pipeline.io.formats import POINT_SUFFIXES
+from pipeline.io.nearby import TILES
 from pipeline.io.readable import Readable
 from pipeline.io.remote_file import file_at
 from pipeline.io.urls import is_url, name_in, shown
@@ -165,7 +166,7 @@ def _of_text(location: str) -> list[str]:
 
 def _of_layer(location: str) -> tuple[list[str], npt.NDArray[np.object_], str | None]:
     """Names, outlines and CRS of a vector index."""
-    layer = read_layer(location, None)
+    layer = read_layer(location, None, shape=TILES)
     column = _column(shown(location), layer.columns)
     rows = [k for k, value in enumerate(layer.columns[column]) if isinstance(value, str) and value.strip()]
     return [str(layer.columns[column][k]).strip() for k in rows], layer.geometries[rows], layer.crs

@@ -15,6 +15,7 @@ from pipeline.io import SpatialReference, read_area, read_footprints
 from pipeline.io.crs import resolve_reference
 from pipeline.io.guides import read_guides
 from pipeline.io.placed_features import Elsewhere, off_the_data
+from pipeline.io.tile_index import read_tile_index
 
 HOUSES = [box(85_000, 447_000, 85_010, 447_008), box(85_020, 447_000, 85_030, 447_010)]
 NAMES = ["Müllerstraße 1", "Œuvre"]
@@ -150,6 +151,9 @@ def test_one_of_several_layers_must_be_named(tmp_path, kind):
         read_footprints(path, reference(), layer="barns")
     with pytest.raises(UnreadableInputError, match="Give a file with one of its layers: houses, sheds"):
         read_area(path, reference())
+    if path.suffix == ".gpkg":
+        with pytest.raises(UnreadableInputError, match=r"be the tiles\. Give a file with one of its layers: houses"):
+            read_tile_index(str(path))
 
 
 @pytest.mark.parametrize("folder", ["./", "/", "houses/"])

@@ -9,6 +9,7 @@ import weakref
 from pathlib import Path
 from typing import Any
 
+import geopandas
 import pytest
 import shapely
 from examples import examples
@@ -371,6 +372,15 @@ def test_all_faults_are_reported_at_once_and_before_anything_is_touched(
     (tmp_path / "bad.toml").write_text("[[building")
     with pytest.raises(SettingsError, match="is not TOML"):
         read_overrides(tmp_path / "bad.toml", METRES, RunSettings())
+
+
+def test_a_file_with_several_layers_needs_the_key_layer(tmp_path: Path) -> None:
+    outlines = geopandas.GeoDataFrame({"id": ["A"]}, geometry=[shapely.box(0, 0, 9, 9)], crs="EPSG:28992")
+    for layer in ("houses", "sheds"):
+        outlines.to_file(tmp_path / "a.gpkg", layer=layer, driver="GPKG")
+    entry = {"building_id": "a", "footprint": {"file": str(tmp_path / "a.gpkg"), "id": "A"}}
+    with pytest.raises(SettingsError, match="Name one of its layers as layer: houses, sheds"):
+        overrides_of({"building": [entry]}, METRES, RunSettings())
 
 
 KEYS = st.sampled_from(["point", "action", "footprint", "settings", "x"])

@@ -20,6 +20,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.errors import InputError, SettingsError
 from pipeline.io.crs import SpatialReference
 from pipeline.io.footprints import LARGEST_OUTLINE_M, Footprints, read_footprints
+from pipeline.io.nearby import OWN_OUTLINES
 from pipeline.io.reading import one_input
 from pipeline.methods import ReconstructSettings, method_named
 from pipeline.parameters import is_finite_number, quoted, read_toml
@@ -275,7 +276,9 @@ class _Reading:
         try:
             if key not in self._files:
                 with one_input(str(path)):
-                    self._files[key] = read_footprints(path, self._reference, layer=key[1], id_column=key[2])
+                    self._files[key] = read_footprints(
+                        path, self._reference, layer=key[1], id_column=key[2], shape=OWN_OUTLINES
+                    )
         except InputError as error:
             faults.append(f"footprint: {error}")
             return None
