@@ -14,7 +14,9 @@ PARQUET_SUFFIXES = (".parquet", ".geoparquet")
 """Endings of GeoParquet."""
 LINES_SUFFIXES = (".geojsonl", ".geojsons", ".ndjson")
 """Endings of GeoJSON with one feature per line."""
-FOOTPRINT_SUFFIXES = (".gpkg", *GEOJSON_SUFFIXES, *LINES_SUFFIXES, *PARQUET_SUFFIXES, ".fgb", ".gml", ".zip")
+XML_SUFFIXES = (".gml", ".kml")
+"""Endings of GML and KML."""
+FOOTPRINT_SUFFIXES = (".gpkg", *GEOJSON_SUFFIXES, *LINES_SUFFIXES, *PARQUET_SUFFIXES, ".fgb", *XML_SUFFIXES, ".zip")
 """Endings of footprints in one file; a Shapefile is several files and is accepted in a zip archive, or by path."""
 SUFFIXES = (*POINT_SUFFIXES, *FOOTPRINT_SUFFIXES)
 """Endings of the files that are accepted."""

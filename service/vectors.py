@@ -27,15 +27,15 @@ from pipeline.io.gdal_source import (
     FLATGEOBUF_MAGIC,
     RECORD,
     SHAPE_MAGIC,
-    is_gml,
     is_lines,
     refuse_links,
+    xml_ending,
 )
 from pipeline.io.library_faults import in_our_words, shortened
 from pipeline.io.nearby import POLYGONS as SHAPE_OF_FOOTPRINTS
 from pipeline.io.vector_archive import ZIP_MAGIC, unpacked, vector_members
 from service.errors import TooLargeError
-from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES, LINES_SUFFIXES, PARQUET_SUFFIXES
+from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES, LINES_SUFFIXES, PARQUET_SUFFIXES, XML_SUFFIXES
 
 VECTOR_SUFFIXES = (*FOOTPRINT_SUFFIXES, ".shp")
 """Endings of footprints and guides."""
@@ -56,7 +56,7 @@ BLOCK_BYTES = 1 << 20
 
 FIX = (
     "Give a GeoPackage (.gpkg), GeoJSON (.geojson, .json, .geojsonl), GeoParquet (.parquet), FlatGeobuf (.fgb), GML "
-    "(.gml) or a zip archive (.zip) with polygons of buildings, or with lines of roofs"
+    "(.gml), KML (.kml) or a zip archive (.zip) with polygons of buildings, or with lines of roofs"
 )
 ARCHIVED_LIMIT = 20
 """Maximum number of vector files in a zip archive: each is examined."""
@@ -90,7 +90,7 @@ def examine_vector(path: Path) -> dict[str, Any]:
         More bytes than allowed.
     """
     suffix = path.suffix.lower()
-    limit = GEOJSON_LIMIT if suffix in (*GEOJSON_SUFFIXES, *LINES_SUFFIXES, ".gml") else GEOPACKAGE_LIMIT
+    limit = GEOJSON_LIMIT if suffix in (*GEOJSON_SUFFIXES, *LINES_SUFFIXES, *XML_SUFFIXES) else GEOPACKAGE_LIMIT
     size = path.stat().st_size
     if size > limit:
         raise TooLargeError(
@@ -107,10 +107,11 @@ def examine_vector(path: Path) -> dict[str, Any]:
         if not head.startswith(FLATGEOBUF_MAGIC):
             raise UnreadableInputError(str(path), f"not a FlatGeobuf: it begins with {head[:8]!r}", FIX)
         return _facts("flatgeobuf", None, None, None, [], (POLYGONS, LINES))
-    if suffix == ".gml":
-        if not is_gml(head):
-            raise UnreadableInputError(str(path), f"not GML: it begins with {head[:16]!r}", FIX)
-        return _facts("gml", None, None, None, [], (POLYGONS, LINES))
+    if suffix in XML_SUFFIXES:
+        ending = xml_ending(head)
+        if ending is None:
+            raise UnreadableInputError(str(path), f"neither GML nor KML: it begins with {head[:16]!r}", FIX)
+        return _facts(ending[1:], None, None, None, [], (POLYGONS, LINES))
     if suffix == ".zip":
         return _archive(path, head)
     if suffix == ".gpkg":

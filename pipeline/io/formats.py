@@ -48,7 +48,8 @@ def first_bytes(path: Readable) -> bytes:
     except FileNotFoundError:
         raise UnreadableInputError(str(path), "no such file", "Check the path") from None
     except IsADirectoryError:
-        raise UnreadableInputError(str(path), "a folder, not a file", "Give the files in it") from None
+        fix = "Convert it to GeoPackage (.gpkg)" if path.suffix.lower() == ".gdb" else "Give the files in it"
+        raise UnreadableInputError(str(path), "a folder, not a file", fix) from None
     except OSError as fault:
         raise UnreadableInputError(
             str(path), f"cannot be read ({fault.strerror or fault})", "Check the file's permissions and the disk"

@@ -21,19 +21,30 @@ from pipeline.io.vector_text import BYTES
 
 VALID = (
     "Valid are GeoPackage (.gpkg), GeoJSON (.geojson, .json), lines of GeoJSON (.geojsonl), Shapefile (.shp with .shx "
-    "and .dbf), FlatGeobuf (.fgb), GML (.gml), GeoParquet (.parquet), and a zip archive of one of them (.zip)"
+    "and .dbf), FlatGeobuf (.fgb), GML (.gml), KML (.kml), GeoParquet (.parquet), and a zip archive of one of them "
+    "(.zip)"
 )
 WHAT = "vector data"
 GEOJSON, GEOJSON_LINES = "GeoJSON:", "GeoJSONSeq:"
 SHAPE_MAGIC, FLATGEOBUF_MAGIC = b"\0\0\x27\x0a", b"fgb\x03fgb"
 PREFIXES = {b"SQLi": "GPKG:", SHAPE_MAGIC: "", FLATGEOBUF_MAGIC: ""}
-"""What GDAL is given before the path, by a file's first bytes; text in braces is GeoJSON, and in angles GML."""
+"""What GDAL is given before the path, by a file's first bytes; text in braces is GeoJSON, and in angles GML or KML."""
 RECORD = b"\x1e"
 """Begins each line of GeoJSON text sequences (RFC 8142), if their writer keeps to it."""
 LINE_LIMIT = 2**24
 """Bytes of a first line that may be a feature of its own."""
-_GML = re.compile(rb"opengis\.net/gml\b")
-_ENTITIES = re.compile(rb"<!(?:DOCTYPE|ENTITY)")
+_XML = {".gml": re.compile(rb"opengis\.net/gml\b"), ".kml": re.compile(rb"<(?:\w+:)?kml\b")}
+"""What is found in the first bytes of XML, by its ending."""
+_ELSEWHERE = re.compile(rb"<!(?:DOCTYPE|ENTITY)|<(?:\w+:)?NetworkLink\b")
+"""XML whose content is in other files, or may be."""
+_OTHERS = (
+    (re.compile(rb"SQLite format 3(?s:.{53})(?!GPKG|GP1[01])(?!(?s:.*)gpkg_)"), "SQLite that is not a GeoPackage"),
+    (re.compile(rb"\s*\{(?s:.*)spec/json-fg"), "JSON-FG"),
+    (re.compile(rb"!table\s", re.IGNORECASE), "MapInfo TAB"),
+    (re.compile(rb"version\s+\d+\s", re.IGNORECASE), "MapInfo MIF"),
+)
+"""Formats that are not read, by the first bytes."""
+CONVERT = "Convert it to GeoPackage (.gpkg)"
 _POINTER = re.compile(rb"<OGR[A-Z]")
 """Begins XML that names other files or servers; GDAL looks for it anywhere in the first bytes."""
 HEAD_BYTES = 2**16
@@ -71,6 +82,8 @@ def gdal_source(path: Path) -> Iterator[GdalSource]:
     begin = first_bytes(path)
     with path.open("rb") as stream:
         head = stream.read(HEAD_BYTES)
+    if other := next((name for pattern, name in _OTHERS if pattern.match(head)), None):
+        raise UnreadableInputError(str(path), f"{other} is not read", CONVERT)
     prefix = next((prefix for magic, prefix in PREFIXES.items() if begin.startswith(magic)), None)
     text = begin.removeprefix(b"\xef\xbb\xbf").lstrip()
     if text.startswith((b"{", RECORD)):
@@ -80,39 +93,44 @@ def gdal_source(path: Path) -> Iterator[GdalSource]:
         raise UnreadableInputError(str(path), f"cannot be read as {WHAT}: it may name other files or servers", VALID)
     if prefix is not None:
         yield GdalSource(f"{prefix}{where.as_posix()}", states_encoding=begin.startswith(SHAPE_MAGIC))
-    elif is_gml(head):
-        with _beside_its_schema(where) as name:
+    elif ending := xml_ending(head):
+        with _alone(where, ending) as name:
             yield GdalSource(name)
     else:
         raise UnreadableInputError(str(path), f"cannot be read as {WHAT}: it begins with {begin[:8]!r}", VALID)
 
 
-def is_gml(head: bytes) -> bool:
-    """Whether a file is GML by its first bytes."""
-    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"<") and _GML.search(head) is not None
+def xml_ending(head: bytes) -> str | None:
+    """The ending of GML or KML, by a file's first bytes; None if it is neither."""
+    if not head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"<"):
+        return None
+    return next((ending for ending, pattern in _XML.items() if pattern.search(head)), None)
 
 
 @contextlib.contextmanager
-def _beside_its_schema(path: Path) -> Iterator[str]:
-    """GML under a name in a folder of its own, for GDAL leaves a file beside it that describes it.
+def _alone(path: Path, ending: str) -> Iterator[str]:
+    """GML or KML under a name in a folder of its own, for GDAL leaves a file beside GML that describes it.
 
     Once that is there, or a schema, no server is asked for one.
     """
     import pyogrio
 
     with path.open("rb") as stream:
-        if _ENTITIES.search(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)):
-            raise UnreadableInputError(str(path), "it is XML with entities of its own, which GML does not need", VALID)
+        if found := _ELSEWHERE.search(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)):
+            named = found[0].decode()
+            raise UnreadableInputError(str(path), f"it is XML with entities of its own or links: {named}", VALID)
     with tempfile.TemporaryDirectory(prefix="gablework-vector-") as folder:
-        name = Path(folder, f"{path.stem}.gml")
+        name = Path(folder, path.stem + ending)
         name.symlink_to(path)
         schema = path.with_suffix(".xsd")
         if schema.is_file():
             name.with_suffix(".xsd").symlink_to(schema)
+        options = {"WRITE_GFS": "YES", "DOWNLOAD_SCHEMA": "NO"} if ending == ".gml" else {}
         with in_our_words(path, WHAT, VALID):
-            driver = pyogrio.read_info(name, encoding=BYTES, WRITE_GFS="YES", DOWNLOAD_SCHEMA="NO")["driver"]
-        if driver != "GML":
-            raise UnreadableInputError(str(path), f"cannot be read as {WHAT}: it is {driver}, not GML", VALID)
+            driver = pyogrio.read_info(name, encoding=BYTES, **options)["driver"]
+        kind = ending[1:].upper()
+        if driver.removeprefix("LIB") != kind:
+            raise UnreadableInputError(str(path), f"cannot be read as {WHAT}: it is {driver}, not {kind}", VALID)
         yield name.as_posix()
 
 

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io.formats import first_bytes
-from pipeline.io.gdal_source import VALID
+from pipeline.io.gdal_source import CONVERT, VALID
 from pipeline.io.library_faults import in_our_words
 from pipeline.io.nearby import Shape
 
@@ -22,7 +22,9 @@ _ENCRYPTED = 1
 """The flag of an encrypted member."""
 SHAPE_PARTS = (".shp", ".shx", ".dbf", ".prj", ".cpg", ".cst")
 """Files that make a Shapefile."""
-VECTOR_MEMBERS = (".shp", ".gpkg", ".geojson", ".json", ".geojsonl", ".geojsons", ".ndjson", ".fgb", ".gml", ".parquet")
+VECTOR_MEMBERS = (
+    *(".shp", ".gpkg", ".geojson", ".json", ".geojsonl", ".geojsons", ".ndjson", ".fgb", ".gml", ".kml", ".parquet"),
+)
 """Endings of vector files in a zip archive; Parquet is read without GDAL, but unpacked here."""
 
 
@@ -73,6 +75,8 @@ def _chosen(
     if wanted is None:
         problem = f"it is a zip archive with {len(there)} vector files"
         problem += f", none of them {layer!r}" if layer is not None and of_several else ""
+        if any(one.filename.lower().endswith(".gdbtable") for one in members):
+            raise UnreadableInputError(str(path), "a File Geodatabase is not read", CONVERT)
         named = ", ".join(sorted(there)[:20])
         raise UnreadableInputError(str(path), problem, f"{shape.choose}: {named}" if there else VALID)
     stem = PurePosixPath(wanted.filename).with_suffix("")

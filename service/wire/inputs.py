@@ -212,8 +212,8 @@ class Inputs(JobInputs):
     footprints: Outlines | None = Field(
         None,
         title="Footprints",
-        description="Building outlines to be modelled, as GeoJSON, GeoPackage, GeoParquet, FlatGeobuf, GML or a zip "
-        f"archive with one of them or a Shapefile. {GIVEN_BY}",
+        description="Building outlines to be modelled, as GeoJSON, GeoPackage, GeoParquet, FlatGeobuf, GML, KML or a "
+        f"zip archive with one of them or a Shapefile. {GIVEN_BY}",
     )
     footprintsLayer: Text | None = Field(
         None, title="Layer of the footprints", description="The layer to use, where the file of footprints has several."

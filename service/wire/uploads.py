@@ -57,6 +57,7 @@ class Preflight(BaseModel):
         "geoparquet",
         "flatgeobuf",
         "gml",
+        "kml",
         "shapefile",
         "zip",
     ]

@@ -112,6 +112,47 @@ def test_every_format_gives_the_same_polygons_ids_and_text(tmp_path, kind, area)
     assert sorted(tmp_path.rglob("*")) == before, "reading leaves nothing beside the file"
 
 
+@pytest.mark.parametrize("driver", ["KML", "LIBKML"])
+@pytest.mark.parametrize("is_zipped", [False, True])
+def test_kml_is_read_with_its_attributes(tmp_path, driver, is_zipped):
+    path = written(tmp_path / "a.kml", driver, frame(use=["house", "barn"]).to_crs("EPSG:4326"))
+    path = zipped(tmp_path / "a.kmz", path) if is_zipped else path
+    before = sorted(tmp_path.rglob("*"))
+    found = read_footprints(path, reference())
+    assert [row["use"] for row in found.attributes] == ["house", "barn"]
+    for polygon, wanted in zip(found.polygons, HOUSES, strict=True):
+        assert polygon.hausdorff_distance(wanted) < 0.02
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_kml_that_links_to_other_files_is_refused(tmp_path):
+    path = written(tmp_path / "a.kml", "KML", frame().to_crs("EPSG:4326"))
+    link = "<NetworkLink><Link><href>http://127.0.0.1/b.kml</href></Link></NetworkLink></Folder>"
+    path.write_text(path.read_text().replace("</Folder>", link))
+    with pytest.raises(UnreadableInputError, match="links: <NetworkLink"):
+        read_footprints(path, reference())
+
+
+@pytest.mark.parametrize(
+    ("name", "driver", "words"),
+    [
+        ("a.sqlite", "SQLite", "SQLite that is not a GeoPackage is not read"),
+        ("a.json", "JSONFG", "JSON-FG is not read"),
+        ("a.tab", "MapInfo File", "MapInfo TAB is not read"),
+        ("a.mif", "MapInfo File", "MapInfo MIF is not read"),
+        ("a.gdb", "OpenFileGDB", "a folder, not a file"),
+    ],
+)
+def test_a_format_that_is_not_read_is_named(tmp_path, name, driver, words):
+    path = written(tmp_path / name, driver)
+    with pytest.raises(UnreadableInputError, match=rf"{words}. Convert it to GeoPackage"):
+        read_footprints(path, reference())
+    if path.is_dir():
+        files = zipped(tmp_path / "a.zip", *path.iterdir())
+        with pytest.raises(UnreadableInputError, match=r"a File Geodatabase is not read\. Convert"):
+            read_footprints(files, reference())
+
+
 def test_guides_and_areas_read_the_same_formats(tmp_path):
     lines = frame([LineString([(85_000, 447_004), (85_010, 447_004)])], kind=["ridge"])
     assert len(read_guides(written(tmp_path / "a.fgb", "FlatGeobuf", lines), reference(), area=AREA).guides) == 1
@@ -286,5 +327,7 @@ def test_a_column_of_ids_must_tell_most_features_apart(tmp_path, columns, ids):
 
 
 def test_the_bundled_gdal_reads_what_the_docs_promise():
-    assert {"GML", "FlatGeobuf", "GeoJSONSeq", "GPKG", "ESRI Shapefile", "GeoJSON"} <= set(pyogrio.list_drivers())
+    assert {"GML", "LIBKML", "FlatGeobuf", "GeoJSONSeq", "GPKG", "ESRI Shapefile", "GeoJSON"} <= set(
+        pyogrio.list_drivers()
+    )
     assert np.all([isinstance(name, str) for name in pyogrio.list_drivers()])

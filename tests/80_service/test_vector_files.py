@@ -30,13 +30,20 @@ from service.wire.files import outlines
 from service.wire.inputs import ReconstructInputs
 
 SQUARE = shapely.box(84_010.0, 447_010.0, 84_020.0, 447_020.0)
-DRIVERS = {".gpkg": "GPKG", ".fgb": "FlatGeobuf", ".gml": "GML", ".geojsonl": "GeoJSONSeq", ".shp": "ESRI Shapefile"}
+DRIVERS = {
+    ".gpkg": "GPKG",
+    ".fgb": "FlatGeobuf",
+    ".gml": "GML",
+    ".kml": "LIBKML",
+    ".geojsonl": "GeoJSONSeq",
+    ".shp": "ESRI Shapefile",
+}
 
 
 def write(path: Path, *geometries: Any, layer: str | None = None, crs: str = "EPSG:28992") -> Path:
-    """Write features in RD; lines of GeoJSON are in degrees."""
+    """Write features in RD; lines of GeoJSON and KML are in degrees."""
     frame = gpd.GeoDataFrame({"id": [*map(str, range(len(geometries)))]}, geometry=list(geometries), crs=crs)
-    if path.suffix == ".geojsonl":
+    if path.suffix in {".geojsonl", ".kml"}:
         frame = frame.to_crs("EPSG:4326")
     frame.to_file(path, driver=DRIVERS.get(path.suffix), **({} if layer is None else {"layer": layer}))
     return path
@@ -56,7 +63,8 @@ def shapes_of(folder: Path, name: str) -> list[Path]:
 
 
 @pytest.mark.parametrize(
-    ("suffix", "kind"), [(".fgb", "flatgeobuf"), (".gml", "gml"), (".geojsonl", "geojson"), (".ndjson", "geojson")]
+    ("suffix", "kind"),
+    [(".fgb", "flatgeobuf"), (".gml", "gml"), (".kml", "kml"), (".geojsonl", "geojson"), (".ndjson", "geojson")],
 )
 def test_an_upload_of_each_format_is_known_by_its_name_and_checked_by_its_content(
     tmp_path: Path, suffix: str, kind: str
