@@ -88,7 +88,7 @@ def unseen_left_out_m2(given: Area, modelled: Area, elsewhere: FloatArray, densi
     if cells == 0:
         return 0.0
     held = np.count_nonzero(shapely.contains_xy(inner, elsewhere[:, :2])) / (1.0 - math.exp(-density_per_m2))
-    return area_m2 * max(0.0, 1.0 - held / cells)
+    return float(area_m2 * max(0.0, 1.0 - held / cells))
 
 
 def along(footprint: Area) -> tuple[FloatArray, FloatArray]:
