@@ -44,7 +44,7 @@ from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.detection import confidence_of
 from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, model_quality
 from pipeline.quality.residuals import vertical_residuals
-from pipeline.quality.support import NOT_OF_FORM, doubt_of, support_of
+from pipeline.quality.support import NOT_OF_FORM, NOT_OF_ROOF, doubt_of, support_of
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_forms, block_plane
 from pipeline.roof.facades import Walls
@@ -214,7 +214,7 @@ def _reconstruct(
                 _withdraw(building)
                 return failed_building(building.candidate, building.method, Reason.TOO_FEW_POINTS, too_few)
             if record := _delivered(building, model):
-                return _judged(building, record, plan, model.contradiction)
+                return _judged(building, record, plan, model)
             _withdraw(building)
         codes_met = ", ".join(map(str, codes)) or "none"
         fallback = BuildingError(Reason.INVALID_SOLID, f"validity codes {codes_met}: no form of the solid passes")
@@ -430,17 +430,17 @@ def _explained_share(building: _Building, model: _Model) -> float:
     return float(np.mean(np.abs(residuals) <= building.settings.plan.residual_cap_m))
 
 
-def _judged(
-    building: _Building, record: BuildingResult, plan: RoofPlan | None, contradiction: Doubt | None
-) -> BuildingResult:
-    """A model with a roof as `ok` or `doubtful`, or the block that explains the points as well as a doubtful one."""
-    if record.lod != LODS[-1]:
+def _judged(building: _Building, record: BuildingResult, plan: RoofPlan | None, model: _Model) -> BuildingResult:
+    """A model as `ok` or `doubtful`, or a block that explains the points as well; a coarser model by its finest."""
+    settings, is_finest = building.settings.support, record.lod == LODS[-1]
+    finest = record if is_finest else _record(building, model)
+    doubt = model.contradiction if is_finest else None
+    doubt = doubt or doubt_of(support_of(finest, building.candidate), settings)
+    if not is_finest:  # a coarser model does not claim to lie on its points
+        record = dataclasses.replace(record, replaced_confidence=confidence_of(finest))
+    if doubt is None or not (is_finest or doubt.reason in NOT_OF_ROOF):
         return record
-    settings = building.settings.support
-    doubt = contradiction or doubt_of(support_of(record, building.candidate), settings)
-    if doubt is None:
-        return record
-    if doubt.reason in NOT_OF_FORM:
+    if not is_finest or doubt.reason in NOT_OF_FORM:
         return record.doubted(doubt)
     _withdraw(building)
     block, _ = _first_valid(_blocks(building, plan), building)

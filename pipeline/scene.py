@@ -69,6 +69,14 @@ class SplitTile:
     """(n,) int32, their fragments; -1 where none."""
 
 
+def never_roof(codes: ByteArray, classes: ClassesInUse) -> BoolArray:
+    """Which points (n,) are never part of a building, by their class codes, where these are believed."""
+    if not (classes.building or classes.vegetation):
+        return np.zeros(len(codes), np.bool_)
+    excluded: BoolArray = np.isin(codes, (*VEGETATION_CLASSES, *OTHER_CLASSES))
+    return excluded
+
+
 def lattice_of(window: Window) -> tuple[int, int, int, int]:
     """column0, row0, columns, rows of the terrain lattice that covers a window."""
     column0, row0 = window.x0_mm // CELL_MM, window.y0_mm // CELL_MM
@@ -225,11 +233,7 @@ def split_tile(
     points = points if len(near_index) == len(points) else points.take(near_index)
     height = height_above(points.x_mm, points.y_mm, points.z_mm, terrain.elevation_mm, terrain.column0, terrain.row0)
     building = (points.classification == BUILDING_CLASS) & classes.building
-    excluded = np.zeros(len(points), np.bool_)
-    if classes.building:
-        excluded = np.isin(points.classification, (*VEGETATION_CLASSES, *OTHER_CLASSES))
-    elif classes.vegetation:
-        excluded = np.isin(points.classification, VEGETATION_CLASSES)
+    excluded = never_roof(points.classification, classes)
     vertices = _vertices(points, core, height, terrain, building, excluded, settings, classes)
     core_index = np.flatnonzero(core.contains(points.x_mm, points.y_mm) & (height != NO_DATA))
     owned = points.take(core_index)

@@ -29,8 +29,8 @@ class SupportSettings(Parameters):
     )
     max_beside_share: float = parameter(
         0.2,
-        "Area without any point beside an outline that was drawn by the points, over the same and the roof's plan "
-        "area; above it the reason is `not_seen`.",
+        "Area without any point beside an outline that was drawn by the points, or left out of a given footprint, over "
+        "the same and the roof's plan area; above it the reason is `not_seen`.",
         minimum=0.0,
         maximum=1.0,
     )

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING
 from pipeline.model import BuildingResult, Candidate, Doubt, Reason
 from pipeline.quality.detection import confidence_of
 from pipeline.quality.level_sides import level_side_share
-from pipeline.quality.unseen_sides import unseen_beside_m2
+from pipeline.quality.unseen_sides import unseen_beside_m2, unseen_left_out_m2
 
 if TYPE_CHECKING:
     from pipeline.quality.settings import SupportSettings
 
 NOT_OF_FORM = frozenset({Reason.NOT_SEEN, Reason.UNCERTAIN})
 """Doubts that no other form of the roof would answer."""
+NOT_OF_ROOF = NOT_OF_FORM | {Reason.SCATTERED}
+"""Doubts that hold for coarser models, too."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -31,7 +33,8 @@ class Support:
     returns_per_face: float
     """Roof returns over roof faces."""
     beside_share: float = math.nan
-    """Area without any point beside the roof, over the same and the roof's plan area; nan in a given footprint."""
+    """Area without any point beside the roof, over the same and the roof's plan area. In a given footprint it is what
+    the model leaves out of it."""
     confidence: float = math.nan
     """Probability that it is a building; nan where it is known to be one."""
     level_side_share: float = math.nan
@@ -43,7 +46,11 @@ def support_of(record: BuildingResult, candidate: Candidate) -> Support:
     quality, n_faces = record.quality, len(record.faces)
     area_m2 = math.fsum(face.polygon.area for face in record.faces)
     beside_m2, level_share = 0.0, math.nan
-    if record.footprint is not None:
+    if candidate.footprint is not None and record.footprint is not None and area_m2 > 0.0:
+        beside_m2 = unseen_left_out_m2(
+            candidate.footprint, record.footprint, candidate.elsewhere, record.n_points / area_m2
+        )
+    elif record.footprint is not None:
         spacing_m = quality.point_spacing_m
         beside_m2 = unseen_beside_m2(record.footprint, record.faces, record.planes, candidate.voids, spacing_m)
         if not candidate.is_known:
@@ -66,7 +73,7 @@ def doubt_of(support: Support, settings: SupportSettings) -> Doubt | None:
     """
     scatter, most = support.scatter_m, settings.max_scatter_m
     if scatter > most:
-        words = f"its roof returns scatter by {scatter:.2f} m, more than {most:g} m"
+        words = f"its roof returns scatter by {scatter:.3f} m, more than {most:g} m"
         return Doubt.of(Reason.SCATTERED, words, "scatter_m", scatter, most)
     share, least = support.share_on_roof, settings.min_share_on_roof
     if share < least:
@@ -86,7 +93,7 @@ def doubt_of(support: Support, settings: SupportSettings) -> Doubt | None:
         return Doubt.of(Reason.TOO_MANY_FACES, words, "returns_per_face", returns, least)
     confidence, least = support.confidence, settings.min_confidence
     if confidence < least:
-        words = f"the confidence that it is a building is {confidence:.2f}, less than {least:g}"
+        words = f"the confidence that it is a building is {confidence:.3f}, less than {least:g}"
         return Doubt.of(Reason.UNCERTAIN, words, "detection_confidence", confidence, least)
     level, most = support.level_side_share, settings.max_level_side_share
     if level > most:

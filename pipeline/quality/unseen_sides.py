@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 import shapely
@@ -16,6 +17,8 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, Plane, RoofFace
+
+Area: TypeAlias = Polygon | MultiPolygon
 
 # Not settings: they say how an outline is followed.
 _STEP_M = 0.5
@@ -28,12 +31,15 @@ INSIDE_M = 0.05
 """So far inside an outline lies the face that ends there."""
 SLOPED = math.tan(math.radians(7.0))
 """Rise over run from which a face is a slope, as in `flat_below_deg`."""
+_CELL_M, _HALF_DIAGONAL_M = 1.0, 0.71
+"""Cells that hold a point of the roof are within the first of it; those within an area have their centres so far inside
+it."""
 _DOWNHILL = -0.7
 """An outline is an eave where it lies within 45 degrees of straight down the slope, as a cosine."""
 
 
 def unseen_beside_m2(
-    footprint: Polygon | MultiPolygon,
+    footprint: Area,
     faces: Sequence[RoofFace],
     planes: Sequence[Plane],
     voids: FloatArray,
@@ -62,7 +68,30 @@ def unseen_beside_m2(
     return float(goes_on[starts].sum()) * _STEP_M * _STEP_M
 
 
-def along(footprint: Polygon | MultiPolygon) -> tuple[FloatArray, FloatArray]:
+def unseen_left_out_m2(given: Area, modelled: Area, elsewhere: FloatArray, density_per_m2: float) -> float:
+    """Area of a given footprint that a model leaves out and where no point lies, m2.
+
+    `elsewhere` (e, 3) are the centres of the cells of 1 m wholly in the footprint that hold points, but none of the
+    roof; of such cells as many are empty by chance as the density lets expect. All in local metres.
+    """
+    area_m2 = given.area - modelled.area
+    if area_m2 < _CELL_M * _CELL_M:
+        return 0.0
+    left_out = shapely.difference(given, shapely.buffer(modelled, _CELL_M))
+    if left_out.is_empty:
+        return 0.0
+    west, south, east, north = np.floor(left_out.bounds)
+    x, y = np.meshgrid(np.arange(west, east + 1.0) + 0.5, np.arange(south, north + 1.0) + 0.5)
+    inner = shapely.buffer(left_out, -_HALF_DIAGONAL_M)
+    shapely.prepare(inner)
+    cells = np.count_nonzero(shapely.contains_xy(inner, x, y))
+    if cells == 0:
+        return 0.0
+    held = np.count_nonzero(shapely.contains_xy(inner, elsewhere[:, :2])) / (1.0 - math.exp(-density_per_m2))
+    return float(area_m2 * max(0.0, 1.0 - held / cells))
+
+
+def along(footprint: Area) -> tuple[FloatArray, FloatArray]:
     """Places (n, 2) half a metre apart along the outer rings of an area, and the direction out of it at each."""
     rings = shapely.get_exterior_ring(shapely.get_parts(footprint))
     xy, ring_of = shapely.get_coordinates(rings, return_index=True)

@@ -71,7 +71,8 @@ def _squares(
         if (is_building or vertices.kind[v] == VertexKind.OBJECT) and vertices.height_mm[v] >= least_mm:
             r, c = vy[v] // side_mm - row0, vx[v] // side_mm - column0
             upper[r, c] += 1
-            planar[r, c] += is_building or vertices.planar[v] > 0
+            # not what was joined to a building: whether far vertices are, another tile decides
+            planar[r, c] += vertices.kind[v] == VertexKind.BUILDING or vertices.planar[v] > 0
     for i in range(len(x_mm)):
         r, c = y_mm[i] // side_mm - row0, x_mm[i] // side_mm - column0
         if used[i] and 0 <= r < rows and 0 <= c < columns:

@@ -27,7 +27,7 @@ class ClassesInUse:
     building: bool = False
     """Class 6 is building, classes that exclude buildings are believed, the rest is judged by its own evidence."""
     vegetation: bool = False
-    """Classes 3 to 5 are vegetation, which is never part of a building."""
+    """Classes 3 to 5 are vegetation; neither it nor other things, such as water, are ever part of a building."""
     roofs: bool = False
     """Class 6 is never ground, although the ground is found in the points."""
 

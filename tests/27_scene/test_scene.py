@@ -284,6 +284,14 @@ def test_a_wholly_excluded_area_is_not_a_surface(town: Any) -> None:
     assert not np.isin(found.fragments.kind, (FacetKind.OBJECT, FacetKind.BUILDING)).any()
 
 
+@pytest.mark.parametrize("excluded", [3, 5, 9, 17])
+def test_excluded_classes_never_enter_in_a_file_without_class_6_either(town: Any, excluded: int) -> None:
+    classification = np.where(town.truth == BUILDING, excluded, town.truth).astype(np.uint8)
+    believed = ClassesInUse(ground=True, vegetation=True)
+    found = split_whole(changed(town.points, classification=classification), believed)
+    assert not np.isin(found.fragments.kind, (FacetKind.OBJECT, FacetKind.BUILDING)).any()
+
+
 @pytest.mark.parametrize("neutral", [0, 1, 12, 19])
 def test_neutral_classes_are_judged_by_their_own_evidence(town: Any, neutral: int) -> None:
     classification = np.where(town.house, neutral, town.points.classification).astype(np.uint8)

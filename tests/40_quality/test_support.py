@@ -28,7 +28,7 @@ GOOD = Support(share_on_roof=0.95, scatter_m=0.04, unseen_share=0.02, returns_pe
             Reason.POOR_FIT,
             "69% of its roof returns lie within 0.2 m of the roof, less than 70%",
         ),
-        ({"scatter_m": 0.16}, Reason.SCATTERED, "its roof returns scatter by 0.16 m, more than 0.15 m"),
+        ({"scatter_m": 0.16}, Reason.SCATTERED, "its roof returns scatter by 0.160 m, more than 0.15 m"),
         ({"unseen_share": 0.61}, Reason.NOT_SEEN, "61% of its roof has no point on the roof nearby, more than 60%"),
         (
             {"beside_share": 0.21},
@@ -41,7 +41,7 @@ GOOD = Support(share_on_roof=0.95, scatter_m=0.04, unseen_share=0.02, returns_pe
             "the ground is as high as a level roof along 25% of its outline, more than 10%: it may be a deck",
         ),
         ({"returns_per_face": 1.9}, Reason.TOO_MANY_FACES, "1.9 roof returns per roof face, less than 2"),
-        ({"share_on_roof": 0.3, "scatter_m": 0.5}, Reason.SCATTERED, "its roof returns scatter by 0.50 m"),
+        ({"share_on_roof": 0.3, "scatter_m": 0.5}, Reason.SCATTERED, "its roof returns scatter by 0.500 m"),
     ],
 )
 def test_the_gravest_threshold_that_is_missed_is_named(figures: dict[str, float], reason: Reason, words: str) -> None:
@@ -92,10 +92,38 @@ def test_a_gable_with_a_dormer_and_a_chimney_is_ok(noise_m: float) -> None:
     assert (result.status, result.reason, result.reason_detail) == (Status.OK, None, "")
 
 
-def test_a_block_that_the_settings_ask_for_is_not_judged_as_a_roof() -> None:
-    result = reconstruct_building(candidate(crown(1)), "arrangement", ReconstructSettings(lods=("1.2",)))
-    assert result.status is Status.OK
-    assert math.isnan(confidence_of(result))
+@pytest.mark.parametrize("lods", [("1.2",), ("1.3",), ("1.2", "1.3")])
+def test_a_coarser_model_is_judged_by_the_roof_that_it_comes_from(lods: tuple[str, ...]) -> None:
+    result = reconstruct_building(candidate(crown(1)), "arrangement", ReconstructSettings(lods=lods))
+    assert (result.status, result.reason, result.lod) == (Status.DOUBTFUL, Reason.SCATTERED, lods[-1])
+    assert confidence_of(result) < 0.1
+
+
+@pytest.mark.parametrize("lods", [("1.2",), ("1.3",)])
+def test_a_coarser_model_need_not_lie_on_its_points(lods: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(0, 12, 960), rng.uniform(0, 8, 960)
+    points = np.column_stack((x, y, 5.0 + 0.7 * np.minimum(y, 8.0 - y) + rng.normal(0, 0.02, 960)))
+    result = reconstruct_building(candidate(points), "arrangement", ReconstructSettings(lods=lods))
+    assert (result.status, result.lod) == (Status.OK, lods[-1])
+    assert result.quality.share_within < 0.5
+
+
+@pytest.mark.parametrize(("seen_m", "status"), [(5.0, Status.DOUBTFUL), (10.5, Status.OK)])
+def test_what_a_model_leaves_out_of_a_given_footprint_is_not_seen(seen_m: float, status: Status) -> None:
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(0, seen_m, 600), rng.uniform(0, 8, 600)
+    points = np.column_stack((x, y, 5.0 + rng.normal(0, 0.02, 600)))
+    given = candidate(points, footprint=shapely.box(0, 0, 12, 8))
+    result = reconstruct_building(given, "arrangement", ReconstructSettings())
+    assert result.status is status
+    if status is Status.DOUBTFUL:
+        assert result.reason is Reason.NOT_SEEN
+        # where other points lie, of a yard or of the ground, no roof is missing
+        x, y = np.meshgrid(np.arange(seen_m + 1.5, 11.0), np.arange(1.5, 7.0))
+        yard = np.column_stack((x.ravel(), y.ravel(), 0.0 * x.ravel()))
+        result = reconstruct_building(dataclasses.replace(given, elsewhere=yard), "arrangement", ReconstructSettings())
+        assert result.status is Status.OK
 
 
 def test_thresholds_are_settings() -> None:

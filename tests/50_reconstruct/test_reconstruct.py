@@ -230,7 +230,7 @@ def test_a_part_of_a_footprint_without_points_is_left_out_and_its_share_reported
     house, empty = shapely.box(0, 0, 12, 8), shapely.box(30, 0, 36, 8)
     whole, part = (modelled(gable(footprint=f), method) for f in (house, shapely.MultiPolygon([house, empty])))
     assert (whole.status, whole.lod, whole.footprint_share) == (Status.OK, "2.2", pytest.approx(1.0, abs=1e-3))
-    assert (part.status, part.lod) == (Status.OK, "2.2")
+    assert (part.status, part.reason, part.lod) == (Status.DOUBTFUL, Reason.NOT_SEEN, "2.2")
     assert part.footprint.equals(whole.footprint)
     assert part.footprint_share == pytest.approx(2.0 / 3.0, abs=1e-3)
 

@@ -20,9 +20,9 @@ from pipeline.runtime.stages.window_points import LoadedWindow, load_window
 from pipeline.scene import (
     BUILDING_CLASS,
     GROUND_CLASS,
-    VEGETATION_CLASSES,
     SplitTile,
     WindowPoints,
+    never_roof,
     split_tile,
 )
 from pipeline.terrain.ground import Terrain, ground_points
@@ -210,7 +210,7 @@ def _above_ground(
 ) -> BoolArray:
     """Whether each of the points at `index` counts inside a footprint.
 
-    Where class 6 is believed its points count, else all points above the ground that are not vegetation by their class.
+    Where class 6 is believed its points count, else all above the ground that are not of a class that is never roof.
     """
     if classes.building:
         is_building: BoolArray = points.classification[index] == BUILDING_CLASS
@@ -220,9 +220,7 @@ def _above_ground(
         above &= points.classification[index] != GROUND_CLASS
     if classes.roofs:
         above |= points.classification[index] == BUILDING_CLASS
-    if classes.vegetation:
-        above &= ~np.isin(points.classification[index], VEGETATION_CLASSES)
-    return above
+    return above & ~never_roof(points.classification[index], classes)
 
 
 def _inside_footprints(points: WindowPoints, index: IntArray, above: BoolArray, task: SplitTask) -> IntArray:
