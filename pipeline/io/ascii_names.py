@@ -44,7 +44,7 @@ _MARKS = " \t\r\n#/%\"'"
 _WORDS = re.compile(r"[\s_-]*coord(?:inate)?s?$")
 _AXES = ("x", "y", "z")
 _PROSE = frozenset({"above", "and", "are", "by", "for", "from", "is", "of", "the", "to", "with"})
-"""Words of sentences: a comment with one of them names no columns, unless it names two coordinates."""
+"""Words of sentences: a comment with one of them, or a number, names no columns, unless it names two coordinates."""
 
 
 def columns_of(names: Sequence[str]) -> dict[str, int]:
@@ -116,7 +116,8 @@ def _least_axes(names: Sequence[str], line: bytes, separator: str | None, width:
     if len(names) != width or not is_last:
         return 2
     if COMMENT.match(line):
-        return 2 if separator is None and not _PROSE.isdisjoint(names) else 1
+        is_prose = not _PROSE.isdisjoint(names) or any(map(_is_number, names))
+        return 2 if separator is None and is_prose else 1
     return 1 if any(map(_is_number, names)) else 0
 
 

@@ -22,9 +22,8 @@ _ENCRYPTED = 1
 """The flag of an encrypted member."""
 SHAPE_PARTS = (".shp", ".shx", ".dbf", ".prj", ".cpg", ".cst")
 """Files that make a Shapefile."""
-VECTOR_MEMBERS = (
-    *(".shp", ".gpkg", ".geojson", ".json", ".geojsonl", ".geojsons", ".ndjson", ".fgb", ".gml", ".kml", ".parquet"),
-)
+_JSON = (".geojson", ".json", ".geojsonl", ".geojsons", ".ndjson")
+VECTOR_MEMBERS = (".shp", ".gpkg", *_JSON, ".fgb", ".gml", ".kml", ".parquet")
 """Endings of vector files in a zip archive; Parquet is read without GDAL, but unpacked here."""
 
 
@@ -75,7 +74,7 @@ def _chosen(
     if wanted is None:
         problem = f"it is a zip archive with {len(there)} vector files"
         problem += f", none of them {layer!r}" if layer is not None and of_several else ""
-        if any(one.filename.lower().endswith(".gdbtable") for one in members):
+        if not there and any(one.filename.lower().endswith(".gdbtable") for one in members):
             raise UnreadableInputError(str(path), "a File Geodatabase is not read", CONVERT)
         named = ", ".join(sorted(there)[:20])
         raise UnreadableInputError(str(path), problem, f"{shape.choose}: {named}" if there else VALID)

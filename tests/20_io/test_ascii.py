@@ -251,6 +251,7 @@ def test_a_header_that_is_half_understood_is_refused_with_its_names(tmp_path, he
     [
         "# exported by some tool",
         "// height above the sea",
+        "# est accuracy 0.1 m",
         "# x y z of all returns",
         "Survey of 2023, block 7",
         "3",
