@@ -11,6 +11,7 @@ GableworkError
 ├── RunError              a run directory, in a folder or an object store, that cannot be written, read or resumed
 │   ├── RunCancelledError        the user cancelled the run
 │   │   └── RunOverError             a task finds no mark of its run: it was cancelled, or its folder is gone
+│   ├── NothingToShowError       a run without a building that an output could show
 │   ├── FolderLostError          a folder of the run was removed while it was going, or another run took it
 │   └── ClusterError             the scheduler does not answer, or was lost while the run was under way
 │       └── VersionMismatchError     client, scheduler and workers do not run the same versions
@@ -159,6 +160,10 @@ class RunOverError(RunCancelledError):
 
     Tasks end without a word. A driver that cancelled nothing raises FolderLostError in its place.
     """
+
+
+class NothingToShowError(RunError):
+    """A run has no building that an output could show."""
 
 
 class FolderLostError(RunError):

@@ -9,14 +9,25 @@ import os
 import shutil
 from pathlib import Path
 
+from pipeline.errors import causes
 from service.errors import NoSpaceError
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 """Codes of a disk that is full."""
+FULL_BYTES = 1 << 20
+"""Free bytes below which any failure is put down to the full disk."""
 BALLAST_BYTES = 16 << 20
 """Size of the ballast: four times the size at which SQLite moves its log into the database."""
 BALLAST = ".ballast"
 """Name of the ballast, beside the database."""
+
+
+def has_no_space(error: BaseException) -> bool:
+    """Whether a full disk is the error, or its cause."""
+    return any(
+        isinstance(cause, NoSpaceError) or (isinstance(cause, OSError) and cause.errno in FULL)
+        for cause in causes(error)
+    )
 
 
 @dataclasses.dataclass(frozen=True)

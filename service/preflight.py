@@ -16,6 +16,7 @@ import os
 import select
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterable, Mapping
@@ -209,6 +210,7 @@ class Examiner:
         self._memory_bytes = memory_bytes
         self._lock = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._served = 0
 
     def examine(self, path: Path, *, max_points: int) -> dict[str, Any]:
@@ -274,6 +276,9 @@ class Examiner:
             secrets = {name for name in os.environ if name.startswith("GABLEWORK_")}
             env = {name: value for name, value in os.environ.items() if name not in secrets}
             env |= {"OPENBLAS_NUM_THREADS": "1", "RAYON_NUM_THREADS": "1", "PROJ_NETWORK": "OFF"}
+            # what it unpacks goes with it, also if it is killed
+            self._folder = tempfile.TemporaryDirectory(prefix="gablework-examine-", ignore_cleanup_errors=True)
+            env["TMPDIR"] = self._folder.name
             self._child = subprocess.Popen(  # noqa: S603 - our own module, no shell
                 [sys.executable, "-m", "service.preflight", str(self._memory_bytes)],
                 stdin=subprocess.PIPE,
@@ -296,6 +301,8 @@ class Examiner:
             if pipe is not None:
                 with contextlib.suppress(BrokenPipeError):
                     pipe.close()
+        if self._folder is not None:
+            self._folder.cleanup()
 
 
 _quick_examiner, _slow_examiner = Examiner(), Examiner()

@@ -66,16 +66,9 @@ def classify(
         from pipeline.runtime.classify import ClassifyRequest
         from pipeline.runtime.classify import classify as classify_files
         from pipeline.runtime.cluster.tls import given_tls
-        from pipeline.runtime.compiling import RECONSTRUCT, compile_first
+        from pipeline.runtime.compiling import RECONSTRUCT, compile_for
         from pipeline.runtime.resources import Resources
         from pipeline.settings import RunSettings
-
-        if scheduler is None:
-            compile_first(console.on_event, (*RECONSTRUCT, "classify"))
-        if not is_surely_small(tiles):
-            start_early(
-                "classify", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None
-            )
 
         request = ClassifyRequest(
             inputs=tuple(tiles),
@@ -96,6 +89,11 @@ def classify(
             ),
             overwrite=overwrite,
         )
+        compile_for(console.on_event, (*RECONSTRUCT, "classify"), tiles, (footprints,), scheduler=scheduler)
+        if not is_surely_small(tiles):
+            start_early(
+                "classify", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None
+            )
         summary = classify_files(request, console.on_event)
         show_classes(console, summary)
         console.document(dataclasses.asdict(summary))

@@ -103,16 +103,10 @@ def reconstruct(
     """Reconstruct buildings from tiles into a run directory."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.runtime.cluster.tls import given_tls
-        from pipeline.runtime.compiling import compile_first, kernel_groups
+        from pipeline.runtime.compiling import compile_for, kernel_groups
         from pipeline.runtime.request import RunRequest
         from pipeline.runtime.resources import Resources
         from pipeline.runtime.run import run
-
-        if scheduler is None:
-            compile_first(console.on_event, kernel_groups(method=method, points=points, terrain=terrain))
-        start_early(
-            "reconstruct", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=method
-        )
 
         request = RunRequest(
             inputs=tuple(tiles),
@@ -144,6 +138,16 @@ def reconstruct(
             points=points,
             licence=licence,
             overwrite=overwrite,
+        )
+        general, files = request.settings.general, (footprints, guides, overrides, aoi)
+        groups = kernel_groups(method=general.method, points=points, terrain=general.terrain)
+        compile_for(console.on_event, groups, tiles, files, scheduler=scheduler)
+        start_early(
+            "reconstruct",
+            workers=workers,
+            scheduler=scheduler,
+            footprints=footprints is not None,
+            method=general.method,
         )
         summary = run(request, console.on_event)
         show_summary(console, summary)
@@ -177,14 +181,11 @@ def rerun(
     """Model single buildings of a run again, after other overrides; all others stay untouched."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.runtime.cluster.tls import given_tls
-        from pipeline.runtime.compiling import compile_first
+        from pipeline.runtime.compiling import compile_for, kernel_groups
+        from pipeline.runtime.earlier import earlier_run, request_of
         from pipeline.runtime.rerun import RerunRequest
         from pipeline.runtime.rerun import rerun as rerun_buildings
         from pipeline.runtime.resources import Resources
-
-        if scheduler is None:
-            compile_first(console.on_event)
-        start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=False, method=None)
 
         request = RerunRequest(
             run_dir=run_dir,
@@ -200,6 +201,11 @@ def rerun(
                 building_memory_bytes=round(building_memory * 2**30),
             ),
         )
+        earlier = request_of(earlier_run(run_dir).manifest)
+        general = earlier.settings.general
+        groups = kernel_groups(method=general.method, terrain=general.terrain)
+        compile_for(console.on_event, groups, earlier.inputs, (overrides,), scheduler=scheduler)
+        start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=False, method=general.method)
         summary = rerun_buildings(request, console.on_event)
         console.table("Made again", ["building", "status"], list(summary.buildings.items()))
         console.say(f"{len(summary.buildings)} buildings, {len(summary.tiles)} tiles written, {summary.seconds:.1f} s")
@@ -254,14 +260,10 @@ def compare(
         from pipeline.ruler.report.evaluation_page import headline
         from pipeline.runtime.cluster.tls import given_tls
         from pipeline.runtime.compare import CompareRequest, own_tables, parse_variants
-        from pipeline.runtime.compiling import RECONSTRUCT, compile_first
+        from pipeline.runtime.compiling import compile_for, kernel_groups
         from pipeline.runtime.request import RunRequest
         from pipeline.runtime.resources import Resources
         from pipeline.settings import RunSettings, read_table
-
-        if scheduler is None:
-            compile_first(console.on_event, (*RECONSTRUCT, "compare"))
-        start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None)
 
         table = read_table(settings)
         tables = own_tables(table)
@@ -308,6 +310,9 @@ def compare(
                 vertical_unit=vertical_unit,
                 as_surveyed=as_surveyed,
             )
+        groups = (*kernel_groups(terrain=request.run.settings.general.terrain), "compare")
+        compile_for(console.on_event, groups, tiles, (footprints, guides, aoi), scheduler=scheduler)
+        start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None)
         made = compare_files(request, reference, console.on_event)
         facts = comparison_facts(request, made.summary)
         names = tuple(map(str, Status))

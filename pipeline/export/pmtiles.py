@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
 
-from pipeline.errors import RunError
+from pipeline.errors import NothingToShowError
 from pipeline.export.columns import COLUMNS, ELEVATIONS, TILE_COLUMN, kind_of
 from pipeline.export.gdal_layers import write_layer
 from pipeline.export.projection import Project
@@ -117,7 +117,8 @@ def _text(value: Any) -> str:
 def write_pmtiles(path: Path, batches: Iterable[pa.RecordBatch], facts: Mapping[str, str]) -> int:
     """Write a PMTiles file; returns the number of its buildings. The same rows give the same bytes.
 
-    Raises RunError if there is no building or the file cannot be written, and whatever the `batches` raise.
+    Raises NothingToShowError if there is no building, RunError if the file cannot be written, and whatever the
+    `batches` raise.
 
     Parameters
     ----------
@@ -131,7 +132,7 @@ def write_pmtiles(path: Path, batches: Iterable[pa.RecordBatch], facts: Mapping[
     rest = iter(batches)
     first = next((batch for batch in rest if batch.num_rows), None)
     if first is None:
-        raise RunError("the run has no building with a footprint, so there is nothing for a map")
+        raise NothingToShowError("the run has no building with a footprint, so there is nothing for a map")
     options = {
         "NAME": LAYER,
         "DESCRIPTION": ", ".join(f"{name}: {value}" for name, value in facts.items()),

@@ -147,13 +147,14 @@ STATUS_CLASSES = (
 """Statuses of buildings."""
 
 DISTANCE_CLASSES = (
-    Range(lower=0.0, upper=0.5, label="up to 50 % within 0.2 m", fill=Fill(colour=(202, 54, 47, 255))),
-    Range(lower=0.5, upper=0.75, label="50 to 75 %", fill=Fill(colour=(253, 174, 97, 255))),
-    Range(lower=0.75, upper=0.9, label="75 to 90 %", fill=Fill(colour=(255, 238, 170, 255))),
+    Range(lower=0.95, upper=1.0, label="95 % or more within 0.2 m", fill=Fill(colour=(44, 123, 182, 255))),
     Range(lower=0.9, upper=0.95, label="90 to 95 %", fill=Fill(colour=(128, 191, 213, 255))),
-    Range(lower=0.95, upper=1.0, label="more than 95 % within 0.2 m", fill=Fill(colour=(44, 123, 182, 255))),
+    Range(lower=0.75, upper=0.9, label="75 to 90 %", fill=Fill(colour=(255, 238, 170, 255))),
+    Range(lower=0.5, upper=0.75, label="50 to 75 %", fill=Fill(colour=(253, 174, 97, 255))),
+    Range(lower=0.0, upper=0.5, label="under 50 %", fill=Fill(colour=(202, 54, 47, 255))),
 )
-"""Shares of the roof returns near the model, as on the page of the service: a chimney has few of them."""
+"""Shares of the roof returns near the model, as on the page of the service: a chimney has few of them. The largest come
+first, so that a value between two ranges is in the upper one, as there."""
 
 SLOPE_CLASSES = (
     Range(lower=0.0, upper=5.0, label="flat: up to 5 degrees", fill=Fill(colour=(247, 241, 221, 255))),

@@ -13,11 +13,13 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.model import FloatArray, Plane, RoofFace
 from pipeline.quality.residuals import surface_of
-from pipeline.quality.unseen_sides import INSIDE_M, SLOPED, along
+from pipeline.quality.unseen_sides import INSIDE_M, SLOPED, STEP_M, along
 
 # Not settings: they say what level with the ground means.
 _OUTSIDE_M = 1.5
 """The ground is looked up so far from an outline: the sample is free of the roof."""
+_LEAST_M = 3.0
+"""Less of an outline is level by chance: a bank or a lower annex beside a shed."""
 _LEVEL_M = 0.3
 """A step that one takes; as in `terrain.fragment_sums`."""
 
@@ -25,7 +27,7 @@ _LEVEL_M = 0.3
 def level_side_share(
     footprint: Polygon | MultiPolygon, faces: Sequence[RoofFace], planes: Sequence[Plane], ground: FloatArray
 ) -> float:
-    """Share of an outline where a level face ends at ground that is as high or higher.
+    """Share of an outline where a level face ends at ground that is as high or higher; 0 if that is short.
 
     `ground` (m, 3) are samples of the terrain, on a lattice of 1 m; all in local metres.
     """
@@ -40,7 +42,8 @@ def level_side_share(
     ends = face >= 0
     ends[ends] = is_level[np.array([one.plane for one in faces])[face[ends]]]
     terrain = _terrain_at(ground, places[ends] + _OUTSIDE_M * outward[ends])
-    return float(np.count_nonzero(terrain >= -below[ends] - _LEVEL_M)) / len(places)
+    at_ground = np.count_nonzero(terrain >= -below[ends] - _LEVEL_M)
+    return float(at_ground) / len(places) if at_ground * STEP_M >= _LEAST_M else 0.0
 
 
 def _terrain_at(ground: FloatArray, places: FloatArray) -> FloatArray:

@@ -21,7 +21,7 @@ from pipeline.model import BoolArray, FloatArray, IntArray, Plane, RoofFace
 Area: TypeAlias = Polygon | MultiPolygon
 
 # Not settings: they say how an outline is followed.
-_STEP_M = 0.5
+STEP_M = 0.5
 """Places are looked at so far apart, half the side of a cell."""
 _REACH_M = 8.0
 """Half the width of a large house; the cells without points are known as far."""
@@ -58,14 +58,14 @@ def unseen_beside_m2(
     shape = tuple((np.floor(voids[:, :2].max(axis=0)) - corner + 2.0).astype(int).tolist())
     is_void = np.zeros(shape, np.bool_)
     is_void[tuple(np.floor(voids[:, :2] - corner).astype(int).T)] = True
-    distance = np.arange(0.5 * _STEP_M, _REACH_M, _STEP_M)
+    distance = np.arange(0.5 * STEP_M, _REACH_M, STEP_M)
     at = np.floor(places[:, None] + outward[:, None] * distance[None, :, None] - corner).astype(int)
     at = np.clip(at, 0, np.array(shape) - 1)  # the margin is no void
     hit = is_void[at[..., 0], at[..., 1]]
     first = np.argmax(hit, axis=1)
     starts = hit.any(axis=1) & (distance[first] <= max(_START_M, _START_SPACINGS * spacing_m))
     goes_on = np.logical_and.accumulate(hit | (np.arange(len(distance)) < first[:, None]), axis=1) & hit
-    return float(goes_on[starts].sum()) * _STEP_M * _STEP_M
+    return float(goes_on[starts].sum()) * STEP_M * STEP_M
 
 
 def unseen_left_out_m2(given: Area, modelled: Area, elsewhere: FloatArray, density_per_m2: float) -> float:
@@ -106,7 +106,7 @@ def _along(xy: FloatArray, ring_of: IntArray) -> tuple[FloatArray, FloatArray]:
         if ring_of[v] == ring_of[v + 1]:
             area2[ring_of[v]] += (xy[v, 0] - xy[0, 0]) * (xy[v + 1, 1] - xy[0, 1])
             area2[ring_of[v]] -= (xy[v + 1, 0] - xy[0, 0]) * (xy[v, 1] - xy[0, 1])
-            count += round(math.hypot(xy[v + 1, 0] - xy[v, 0], xy[v + 1, 1] - xy[v, 1]) / _STEP_M)
+            count += round(math.hypot(xy[v + 1, 0] - xy[v, 0], xy[v + 1, 1] - xy[v, 1]) / STEP_M)
     places, outward = np.empty((count, 2)), np.empty((count, 2))
     count = 0
     for v in range(len(xy) - 1):
@@ -114,7 +114,7 @@ def _along(xy: FloatArray, ring_of: IntArray) -> tuple[FloatArray, FloatArray]:
             continue
         dx, dy = xy[v + 1, 0] - xy[v, 0], xy[v + 1, 1] - xy[v, 1]
         length = math.hypot(dx, dy)
-        n = round(length / _STEP_M)
+        n = round(length / STEP_M)
         side = 1.0 if area2[ring_of[v]] > 0.0 else -1.0
         for k in range(n):
             share = (k + 0.5) / n

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable, Sequence
+from pathlib import Path
 
 from pipeline.compiler import store
 from pipeline.compiler.kernel import kernel_named
 from pipeline.compiler.warm_up import Listed, about_s, compile_kernels, listed
+from pipeline.io import find_inputs, is_url
+from pipeline.io.formats import first_bytes
 from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled
 from pipeline.runtime.isolation.child_main import end_with_parent
 from pipeline.runtime.monitoring.events import Event, Listener, never
@@ -48,6 +51,27 @@ def _is_compiled(group: str) -> bool:
 def compiling_s(groups: Collection[str] = RECONSTRUCT) -> float:
     """About how many seconds a job of some groups of kernels first compiles; 0 if all are compiled."""
     return about_s(missing_kernels(groups), cores())
+
+
+def compile_for(
+    on_event: Listener,
+    groups: Collection[str],
+    inputs: Sequence[str],
+    files: Iterable[str | None] = (),
+    *,
+    scheduler: str | None,
+) -> None:
+    """As `compile_first`, unless workers of a scheduler compile; but first look for the files of a job.
+
+    Raises InputError for inputs or other files of this machine that are not there: this must not take minutes.
+    """
+    if scheduler is not None or not missing_kernels(groups):
+        return
+    find_inputs(inputs)
+    for file in files:
+        if file is not None and not is_url(file):
+            first_bytes(Path(file))
+    compile_first(on_event, groups)
 
 
 def compile_first(

@@ -123,6 +123,14 @@ def request_of(manifest: RunManifest) -> RunRequest:
     except SettingsError as error:
         raise RunError(f"run.json has the settings of an older gablework ({error.faults[0]}). {_AGAIN}") from error
     if settings.settings_hash != manifest.settings_hash:
+        new = [
+            f"{name}.{key}"
+            for name, values in settings.as_dict().items()
+            for key in values
+            if key not in manifest.settings.get(name, {})
+        ]
+        if new:
+            raise RunError(f"run.json has the settings of an older gablework, without {new[0]}. {_AGAIN}")
         raise RunError("the settings in run.json are not those of its settings_hash: it was changed by hand")
     asked = manifest.request
     hidden = [entry.path for entry in manifest.inputs if has_mark(entry.path)]

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import RunError
+from pipeline.errors import NothingToShowError, RunError
 from pipeline.export.cityjson import lines_of
 from pipeline.export.columns import ELEVATIONS
 from pipeline.export.geoparquet import table_batches
@@ -99,7 +99,9 @@ def publish_3dtiles(
             tree = grown(sorted(keys), lambda tile: tiles.leaf(tile, keys[tile]), tiles.skyline) if keys else None
             check_complete(run_dir, manifest, {"buildings": tiles.counts.get("buildings", 0)}, stated)
             if tree is None:
-                raise RunError(f"no building of the run in {run_dir} has a model, so there is nothing to show")
+                raise NothingToShowError(
+                    f"no building of the run in {run_dir} has a model, so there is nothing to show"
+                )
             extras = {**way.facts, "content_sha256": manifest.content_sha256, "licence": manifest.source_licence}
             terrain = tiles.terrain()
             if terrain:

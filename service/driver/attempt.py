@@ -25,7 +25,8 @@ from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.scratch.location import SCRATCH
 from pipeline.settings import RunSettings
-from service.driver.failures import failure_of, has_no_space
+from service.disk import has_no_space
+from service.driver.failures import failure_of
 from service.driver.gathered import gathered_before, note_gathered
 from service.driver.leased_job import LOG
 from service.driver.messages import (

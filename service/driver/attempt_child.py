@@ -24,8 +24,8 @@ from pipeline.runtime.isolation.progress_reports import report_progress
 from pipeline.runtime.monitoring import tracing
 from pipeline.runtime.monitoring.events import Event
 from service import traces
+from service.disk import has_no_space
 from service.driver.attempt import AttemptParts, perform
-from service.driver.failures import has_no_space
 from service.driver.leased_job import LOG
 from service.driver.logs import configure
 from service.driver.messages import Scrubber

@@ -23,6 +23,7 @@ from pipeline.runtime.isolation.supervision import SupervisedChild, system_kills
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.scratch.folder import PULSE
 from service import traces
+from service.disk import has_no_space
 from service.driver.attempt import AttemptParts, Tools, perform
 from service.driver.attempt_child import (
     LOADS,
@@ -36,7 +37,6 @@ from service.driver.attempt_child import (
     WorkersWanted,
     attend,
 )
-from service.driver.failures import has_no_space
 from service.driver.kernels import Kernels
 from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.driver.shared_cluster import SharedCluster

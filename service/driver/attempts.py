@@ -13,9 +13,10 @@ from typing import Any
 
 from pipeline.errors import ClusterError, GableworkError, RunCancelledError
 from service import traces
+from service.disk import FULL_BYTES, has_no_space
 from service.driver import workplace
 from service.driver.attempt_process import DriverParts, Perform
-from service.driver.failures import FULL_BYTES, NO_SPACE_PAUSE_S, failure_of, has_no_space, is_tried_again, pause_s
+from service.driver.failures import NO_SPACE_PAUSE_S, failure_of, is_tried_again, pause_s
 from service.driver.finished_work import leave, take_over
 from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.driver.so_far import shown_while_watched

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from pipeline.errors import ClusterError, InputError, RunError, SettingsError, VersionMismatchError, causes
-from service.disk import FULL
+from pipeline.errors import ClusterError, InputError, RunError, SettingsError, VersionMismatchError
+from service.disk import has_no_space
 from service.errors import (
     InputRefusedError,
     LimitError,
@@ -22,8 +22,6 @@ _FIRST_PAUSE_S = 2.0
 _LONGEST_PAUSE_S = 60.0
 NO_SPACE_PAUSE_S = 30.0
 """Seconds until a job that the disk had no room for is tried again: others may end by then."""
-FULL_BYTES = 1 << 20
-"""Free bytes below which any failure is put down to the full disk."""
 
 
 def pause_s(losses: int) -> float:
@@ -41,14 +39,6 @@ def is_tried_again(error: BaseException, job: Job, max_attempts: int) -> bool:
         return True
     lost = isinstance(error, ClusterError | NoSpaceError) and not isinstance(error, VersionMismatchError)
     return lost and job.lost_attempts + 1 < max_attempts
-
-
-def has_no_space(error: BaseException) -> bool:
-    """Whether a full disk is the error, or its cause."""
-    return any(
-        isinstance(cause, NoSpaceError) or (isinstance(cause, OSError) and cause.errno in FULL)
-        for cause in causes(error)
-    )
 
 
 def failure_of(error: BaseException, *, scrub: Callable[[str], str], reference: str, attempts: int) -> JobFailure:

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.model import Status
-from service.disk import Disk
-from service.errors import NoSuchOutputError, SelectionBusyError, UnexpectedError
+from service.disk import FULL_BYTES, Disk, has_no_space
+from service.errors import NoSpaceError, NoSuchOutputError, SelectionBusyError, UnexpectedError
 from service.outputs.catalogue import NAME as CATALOGUE
 from service.outputs.catalogue import read_catalogue
 from service.outputs.kinds import OUTPUTS
@@ -32,6 +32,16 @@ WAIT_S = 20.0
 """Seconds that a request waits for a selection; then the client is asked to come again."""
 _REFUSED = 3
 """Exit code for a run that cannot be selected from; the process says why in the log of the service."""
+_FULL = 4
+"""Exit code for a disk that is full."""
+_COMMAND = (sys.executable, "-m", "service.outputs.selected")
+"""The program that makes a selection; its last argument says which."""
+LIMIT_S = 1800.0
+"""Seconds after which a selection is ended: one that stands still must not keep others from being made."""
+_MEMORY_BYTES = 4 << 30
+"""Memory of its process. It is not a setting: a run is selected from and written tile by tile."""
+_MOST_WAITING = 8
+"""Requests that wait at a time, each in a thread of the server; others are asked to come again at once."""
 _MOST = 2
 """Selections that one process of the service makes at a time. It is not a setting: each uses a core for seconds."""
 
@@ -51,6 +61,7 @@ class Selections:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._under_way: dict[Path, Future[None]] = {}
+        self._waiting = threading.BoundedSemaphore(_MOST_WAITING)
 
     def make(
         self, run_dir: Path, out_dir: Path, statuses: Sequence[Status], disk: Disk, geoid_height_m: float | None
@@ -90,26 +101,38 @@ class Selections:
                 # a copy of the run, and as much as all outputs
                 disk.require(2 * sum(one.size_bytes for one in catalogue.outputs.values()), "a selection of buildings")
                 under_way = Future()
-                threading.Thread(target=self._run, args=(place, asked, under_way), daemon=True).start()
+                threading.Thread(target=self._run, args=(place, asked, disk, under_way), daemon=True).start()
                 self._under_way[place] = under_way  # before the thread ends: that needs the lock
+        waits = self._waiting.acquire(blocking=False)
         try:
-            under_way.result(WAIT_S)
+            under_way.result(WAIT_S if waits else 0.0)
         except TimeoutError:
             raise SelectionBusyError("the selection of buildings is being made: ask again") from None
+        finally:
+            if waits:
+                self._waiting.release()
         return place
 
-    def _run(self, place: Path, asked: Mapping[str, Any], outcome: Future[None]) -> None:
+    def _run(self, place: Path, asked: Mapping[str, Any], disk: Disk, outcome: Future[None]) -> None:
         """Make a selection; the outcome is set in any case."""
         fault: Exception | None = None
         try:
             # the pipe of standard input ends the process with this one
             with subprocess.Popen(  # noqa: S603 - our own program
-                [sys.executable, "-m", "service.outputs.selected", json.dumps(asked)],
+                [*_COMMAND, json.dumps(asked)],
                 stdin=subprocess.PIPE,
             ) as process:
-                code = process.wait()
+                try:
+                    code = process.wait(LIMIT_S)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    code = process.wait()
             if code == _REFUSED:
                 fault = NoSuchOutputError("files of this job's run are gone or damaged: submit the job again")
+            elif code == _FULL or (code and disk.free_bytes < FULL_BYTES):
+                fault = NoSpaceError(
+                    "there is no room on the disk for a selection of buildings: free some, or try later"
+                )
             elif code:
                 fault = UnexpectedError(f"a selection of buildings, which ended with code {code}")
         except OSError as error:
@@ -141,7 +164,7 @@ def write_selected(
     OSError
         The folder cannot be written.
     """
-    from pipeline.errors import RunError
+    from pipeline.errors import NothingToShowError
     from pipeline.runtime.selection import select_run
     from service.outputs.assemble import write_outputs
     from service.outputs.published import formats_of, publish
@@ -152,9 +175,9 @@ def write_selected(
         select_run(str(run_dir), run, statuses)
         faults = publish(run, made, formats_of(names), name=place.name, geoid_height_m=geoid_height_m)
         for fault in faults.values():
-            if not isinstance(fault, RunError):
+            # any other fault may be over next time: an output must not be missing for good
+            if not isinstance(fault, NothingToShowError):
                 raise fault
-            # such as 3D Tiles without a model: the catalogue lists what was made
             sys.stderr.write(f"{fault}\n")
         shutil.rmtree(made / "3dtiles", ignore_errors=True)  # the zip file has its files
         (made / OUTPUTS["3dtiles"].filename).unlink(missing_ok=True)
@@ -182,15 +205,21 @@ def main() -> int:
     from pipeline.errors import RunError
 
     _end_with_owner()
+    if sys.platform == "linux":
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_DATA, (_MEMORY_BYTES, _MEMORY_BYTES))
     asked = json.loads(sys.argv[1])
     statuses = [Status(word) for word in asked["statuses"]]
     try:
         write_selected(
             Path(asked["run_dir"]), Path(asked["out_dir"]), asked["names"], statuses, asked["geoid_height_m"]
         )
-    except RunError as fault:
+    except (RunError, OSError) as fault:
+        if not isinstance(fault, RunError) and not has_no_space(fault):
+            raise
         sys.stderr.write(f"{fault}\n")  # it may name folders of the server
-        return _REFUSED
+        return _FULL if has_no_space(fault) else _REFUSED
     return 0
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated
 from urllib.parse import urlencode
 
-from fastapi import Depends, Query
+from fastapi import Depends, Query, Request
 
 from pipeline.model import Status
 from service.errors import NoSuchOutputError, RequestError, ResultNotReadyError, StoreError
@@ -23,7 +23,7 @@ from service.outputs import Catalogue, read_catalogue, run_outputs
 from service.outputs.catalogue import NOTHING_YET
 from service.outputs.comparison import RUNS
 from service.outputs.kinds import OUTPUTS
-from service.outputs.selected import OFFERED, Selections
+from service.outputs.selected import OFFERED, Selections, refuse_others
 from service.problems import JobFailedError
 from service.routes.bound import Folder, Reader, Selecting, Store
 from service.routes.jobs import JobId
@@ -129,10 +129,17 @@ _Only = Annotated[
 
 
 def _results(
-    finished: _Finished, selections: Selecting, folder: Folder, label: _Label = None, statuses: _Only = None
+    request: Request,
+    finished: _Finished,
+    selections: Selecting,
+    folder: Folder,
+    label: _Label = None,
+    statuses: _Only = None,
 ) -> FinishedJob:
     """The job's results, or those of one run, or of the buildings of some statuses."""
     found = finished if label is None else finished.run(label)
+    if statuses and "outputID" in request.path_params:
+        refuse_others(request.path_params["outputID"])
     return found.only(statuses, selections, folder) if statuses else found
 
 

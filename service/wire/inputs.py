@@ -237,6 +237,13 @@ class Inputs(JobInputs):
         "classes", "Classes", "How far the file's own classes are trusted."
     )
 
+    @field_validator("footprintsLayer")
+    @classmethod
+    def _of_footprints(cls, layer: str | None, info: ValidationInfo) -> str | None:
+        if layer is not None and info.data.get("footprints", layer) is None:
+            raise ValueError("it is a layer of footprints, and none are given: give footprints, or leave it out")
+        return layer
+
     def draft(self, process_id: str, outputs: tuple[str, ...] | None) -> Draft:
         """The draft of a job; outputs are None for all."""
         tiles = tuple(

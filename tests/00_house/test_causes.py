@@ -15,7 +15,7 @@ import pytest
 
 from pipeline.errors import InputError, RunError, UnreadableInputError, causes
 from service.client.transport import _certificate_fault
-from service.driver.failures import has_no_space
+from service.disk import has_no_space
 
 ROOT = Path(__file__).resolve().parents[2]
 WALKER = "pipeline/errors.py"

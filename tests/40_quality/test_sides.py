@@ -76,5 +76,7 @@ def test_a_level_roof_is_compared_with_the_ground_at_each_side() -> None:
     assert share_of_level(level(3.0), np.where(y > 4.0, 3.0, 0.0)) == pytest.approx(12.0 / 32.0, abs=0.03)
     assert share_of_level(level(3.0), np.where(y > 4.0, 2.5, 0.0)) == 0.0
     assert share_of_level(level(3.0), np.where(y > 4.0, 9.0, 0.0)) == pytest.approx(12.0 / 32.0, abs=0.03)
+    corner = (y > 4.0) & (cells(-4, -4, 16, 8)[:, 0] < 2.0)
+    assert share_of_level(level(3.0), np.where(corner, 3.0, 0.0)) == 0.0
     assert share_of_level(PENT, np.where(y > 4.0, 5.0, 0.0)) == 0.0
     assert level_side_share(shapely.box(0, 0, 1, 1), [], [], np.zeros((0, 3))) == 0.0

@@ -8,9 +8,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from command_line import invoke
 
 from pipeline.compiler import store, warm_up
 from pipeline.compiler.warm_up import Listed, about_s
+from pipeline.errors import RunError
 from pipeline.runtime import compiling
 from pipeline.runtime.compiling import RECONSTRUCT, compile_first, compiling_s, kernel_groups, missing_kernels
 from pipeline.runtime.monitoring.events import Event
@@ -117,3 +119,52 @@ def test_options_need_kernels_of_their_own() -> None:
         "terrain",
     )
     assert set(kernel_groups(method="kmeans", points=True, terrain="tin")) <= set(warm_up.groups())
+
+
+COMMANDS = {
+    "reconstruct": ("--out", "{out}"),
+    "compare": ("--methods", "arrangement,kmeans", "--out", "{out}"),
+    "classify": ("--out", "{out}"),
+}
+
+
+@pytest.fixture
+def compiled_groups(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
+    """Gets the groups that commands compile, which is where they end."""
+    found: list[tuple[str, ...]] = []
+
+    def note(_: object, groups: tuple[str, ...]) -> None:
+        found.append(groups)
+        raise RunError("compiled")
+
+    monkeypatch.setattr(compiling, "compile_first", note)
+    monkeypatch.setattr(compiling, "missing_kernels", warm_up.listed)
+    return found
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_mistyped_name_or_option_is_an_error_before_anything_is_compiled(
+    command: str, tmp_path: Path, suburb: Path, compiled_groups: list[tuple[str, ...]]
+) -> None:
+    options = [word.format(out=tmp_path / "out") for word in COMMANDS[command]]
+    wrong = tmp_path / "settings.toml"
+    wrong.write_text("[settings]\ntile_size_meters = 100.0\n")
+    for words, named in (
+        ([str(tmp_path / "nicht.laz")], "nicht.laz"),
+        ([str(suburb), "--footprints", str(tmp_path / "nicht.gpkg")], "nicht.gpkg"),
+        ([str(suburb), "--settings", str(wrong)], "tile_size_meters"),
+    ):
+        code, _, said = invoke(command, *words, *options)
+        assert (code != 0, named in said) == (True, True), said
+    assert compiled_groups == []
+
+
+def test_groups_follow_the_settings_file_and_the_earlier_run(
+    tmp_path: Path, suburb: Path, compiled_groups: list[tuple[str, ...]], reconstruct: Any
+) -> None:
+    file = tmp_path / "settings.toml"
+    file.write_text('[settings]\nmethod = "kmeans"\nterrain = "tin"\n')
+    invoke("reconstruct", str(suburb), "--out", str(tmp_path / "out"), "--settings", str(file))
+    made = reconstruct(suburb, settings={"method": "kmeans"})
+    invoke("rerun", made.run_dir)
+    assert compiled_groups == [("reconstruct", "compare", "terrain"), ("reconstruct", "compare")]

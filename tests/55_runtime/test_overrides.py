@@ -650,7 +650,12 @@ def test_runs_that_cannot_be_continued_are_refused_with_the_reason(
     manifest = Path(first.run_dir) / "run.json"
     text = manifest.read_text()
     found = json.loads(text)
+    older = {name: values for name, values in found["settings"].items() if name != "support"}
     for change, message in (
+        (
+            {"settings": older, "settings_hash": "ab"},
+            r"of an older gablework, without support\.\w+\. Run the whole again",
+        ),
         ({"status": "running"}, "is running, not finished"),
         ({"engine_version": "0.0.0"}, r"made by gablework 0\.0\.0"),
         ({"request": {}}, "does not tell how the run was asked for"),

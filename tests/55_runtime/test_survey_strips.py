@@ -12,6 +12,7 @@ from run_tables import rows
 
 from pipeline.model import Reason
 from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import Resources
@@ -79,6 +80,31 @@ def test_the_moves_of_strips_are_a_setting(tmp_path: Path, reconstruct: Any) -> 
     assert read_manifest(summary.run_dir).strip_moves_m == {}
     assert "aligned one by one" in warning_of(summary)
     assert read_manifest(reconstruct(path).run_dir).strip_moves_m == {"11": 0.3, "12": -0.3}
+
+
+def test_moved_strips_are_read_again_in_words_and_once_in_a_work_folder(tmp_path: Path, reconstruct: Any) -> None:
+    events: list[Event] = []
+    place = {"work": str(tmp_path / "work"), "out": str(tmp_path / "run"), "on_event": events.append}
+    path = two_strips(tmp_path / "tile.laz", 0.6)
+    first = reconstruct(path, **place)
+    # each reading is a stage of its own: an attempt is judged by the stage that runs
+    assert [event.stage for event in events if event.kind == "stage"][:4] == 2 * ["ingest", "cells"]
+    events.clear()
+    again = reconstruct(path, **place)
+    assert (again.digest, warning_of(again)) == (first.digest, warning_of(first))
+    reading = [event for event in events if event.stage in {"ingest", "cells"}]
+    assert [event.stage for event in reading if event.kind == "stage"] == ["ingest", "cells"]
+    done = [(event.done, event.kept) for event in reading if event.kind == "progress"]
+    assert done
+    assert all(count == kept for count, kept in done), "something was read again"
+
+
+def test_strips_of_another_file_are_compared_again(tmp_path: Path, reconstruct: Any) -> None:
+    place = {"work": str(tmp_path / "work"), "out": str(tmp_path / "run")}
+    path = tmp_path / "tile.laz"
+    for lift_m, move_m in ((0.6, 0.3), (0.8, 0.4), (0.03, 0.0)):
+        found = read_manifest(reconstruct(two_strips(path, lift_m), **place).run_dir).strip_moves_m
+        assert found == ({"11": move_m, "12": -move_m} if move_m else {})
 
 
 @pytest.mark.slow

@@ -243,10 +243,22 @@ def test_every_status_and_every_reason_of_rejection_has_a_class() -> None:
     assert others == ""
 
 
+def bounds_of(qml: str) -> list[tuple[float, float]]:
+    """Lower and upper bound of each range, in their order."""
+    return [(float(one.get("lower", "")), float(one.get("upper", ""))) for one in ET.fromstring(qml).iter("range")]
+
+
 @pytest.mark.parametrize(("name", "most"), [("slope", 90.0), ("distance of the points", 1.0)])
 def test_ranges_touch_and_begin_at_zero(name: str, most: float) -> None:
     qml = next(style.qml for style in ALL_STYLES if style.name == name)
-    bounds = [(float(one.get("lower", "")), float(one.get("upper", ""))) for one in ET.fromstring(qml).iter("range")]
+    bounds = sorted(bounds_of(qml))
     assert bounds[0][0] == 0.0
     assert [low for low, _ in bounds[1:]] == [high for _, high in bounds[:-1]]
     assert bounds[-1][1] == most
+
+
+@pytest.mark.parametrize("share", [0.5, 0.75, 0.9, 0.95])
+def test_a_share_between_two_ranges_is_in_the_upper_one_as_on_the_page(share: float) -> None:
+    qml = next(style.qml for style in ALL_STYLES if style.name == "distance of the points")
+    # QGIS takes the first range that holds a value
+    assert next(low for low, high in bounds_of(qml) if low <= share <= high) == share

@@ -10,7 +10,9 @@ import resource
 import signal
 import sqlite3
 import struct
+import tempfile
 import tracemalloc
+import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -435,6 +437,29 @@ def test_a_file_over_which_the_child_hangs_is_refused_and_the_next_is_served(goo
     assert child.returncode == -signal.SIGKILL
     examiner._timeout_s = CHILD_S
     assert examiner.examine(good, max_points=MOST)["pointCount"] == 100
+
+
+@pytest.mark.slow
+def test_what_a_child_has_unpacked_goes_with_it(
+    tmp_path: Path, good: Path, examiner: Examiner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "temporary"
+    place.mkdir()
+    monkeypatch.setenv("TMPDIR", str(place))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    archive = tmp_path / "large.zip"
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("large.gpkg", bytes(400 << 20))  # takes a second to unpack
+    examiner.examine(good, max_points=MOST)
+    examiner._timeout_s = 5.0
+    with ThreadPoolExecutor(1) as pool:
+        refused = pool.submit(examiner.examine, archive, max_points=MOST)
+        wait_for(lambda: list(place.rglob("gablework-vector-*")), "what is unpacked")
+        assert examiner._child is not None
+        examiner._child.send_signal(signal.SIGSTOP)
+        with pytest.raises(UnreadableInputError, match="could not be read within 5 s"):
+            refused.result()
+    assert list(place.iterdir()) == []
 
 
 def test_a_file_over_which_the_child_dies_is_refused_and_the_next_is_served(good: Path, examiner: Examiner) -> None:

@@ -1,10 +1,13 @@
 """Results with the buildings of some statuses only: by REST, with the client and its command."""
 
+import errno
 import hashlib
 import io
 import json
 import shutil
+import sys
 import zipfile
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import finished_runs as runs
@@ -15,8 +18,12 @@ from processes import wait_for
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from pipeline.model import Doubt, Reason
+import pipeline.runtime.publishing
+import pipeline.runtime.selection
+from pipeline.model import Doubt, Reason, Status
+from pipeline.runtime.publishing import disk_at
 from service.cli import app
+from service.errors import SelectionBusyError
 from service.outputs import selected
 
 pytestmark = pytest.mark.slow  # each selection is made by a process
@@ -138,6 +145,69 @@ def test_a_full_disk_is_said_before_anything_is_written(service: runs.Service, m
     monkeypatch.setattr(selected.Disk, "free_bytes", property(lambda _: 1000))
     answer = service.client.get(f"/jobs/{job_id}/results", params={"status": "ok"})
     assert "a selection of buildings" in runs.problem(answer, 507, "no-space")
+    assert not (service.folder.outputs(job_id, 1) / "selected").exists()
+
+
+@pytest.mark.parametrize("fails", ["select_run", "publish_geopackage"])
+def test_a_disk_that_fills_up_meanwhile_is_said_and_no_output_stays_missing(
+    service: runs.Service, monkeypatch: pytest.MonkeyPatch, fails: str
+) -> None:
+    job_id = service.finished(write_run, publish=("geopackage",))
+    run_dir, out_dir = service.folder.run(job_id, 1), service.folder.outputs(job_id, 1)
+    place = selected.folder_of(out_dir, [Status.OK])
+    asked = {"run_dir": str(run_dir), "out_dir": str(place), "names": ["buildings", "geopackage"]}
+    monkeypatch.setattr(sys, "argv", ["", json.dumps({**asked, "statuses": ["ok"], "geoid_height_m": None})])
+    monkeypatch.setattr(selected, "_end_with_owner", lambda: None)
+
+    def full(*_: object, **__: object) -> None:
+        with disk_at(place):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline.runtime.selection if fails == "select_run" else pipeline.runtime.publishing, fails, full)
+        code = selected.main()
+    assert not place.exists()
+    assert list(place.parent.iterdir()) == []
+    with monkeypatch.context() as patch:
+        patch.setattr(selected, "_COMMAND", (sys.executable, "-c", f"import sys; sys.exit({code})"))
+        answer = service.client.get(f"/jobs/{job_id}/results", params={"status": "ok"})
+        runs.problem(answer, 507, "no-space")
+    assert "geopackage" in service.client.get(f"/jobs/{job_id}/results", params={"status": "ok"}).json()
+
+
+def test_selections_that_stand_still_are_ended_and_block_nothing(
+    service: runs.Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = service.finished(write_run)
+    path = f"/jobs/{job_id}/results"
+    with monkeypatch.context() as patch:
+        patch.setattr(selected, "_COMMAND", (sys.executable, "-c", "input()"))  # until its owner ends
+        patch.setattr(selected, "LIMIT_S", 0.3)
+        for statuses in ("ok", "failed", "fallback"):
+            runs.problem(service.client.get(path, params={"status": statuses}), 500, "internal")
+    assert service.client.get(path, params={"status": "ok"}).status_code == 200
+
+
+def test_few_requests_wait_for_a_selection(service: runs.Service, tmp_path: Path) -> None:
+    job_id = service.finished(write_run)
+    selections = selected.Selections()
+    place = selected.folder_of(service.folder.outputs(job_id, 1), [Status.OK])
+    under_way = selections._under_way[place] = Future()
+    arguments = (service.folder.run(job_id, 1), service.folder.outputs(job_id, 1), [Status.OK], selected.Disk(tmp_path))
+    with ThreadPoolExecutor(selected._MOST_WAITING) as pool:
+        waiting = [pool.submit(selections.make, *arguments, None) for _ in range(selected._MOST_WAITING)]
+        wait_for(lambda: selections._waiting._value == 0, "all waiters")
+        with pytest.raises(SelectionBusyError):
+            selections.make(*arguments, None)
+        assert not any(one.done() for one in waiting)
+        under_way.set_result(None)
+        assert {one.result() for one in waiting} == {place}
+
+
+def test_what_is_not_made_for_a_status_is_refused_before_a_selection_is_made(service: runs.Service) -> None:
+    job_id = service.finished(write_run)
+    answer = service.client.get(f"/jobs/{job_id}/results/points", params={"status": "ok"})
+    runs.problem(answer, 404, "no-such-output")
     assert not (service.folder.outputs(job_id, 1) / "selected").exists()
 
 

@@ -27,7 +27,7 @@ from service.preflight import examine
 from service.settings import ServiceSettings
 from service.status import execute_request
 from service.wire.files import outlines
-from service.wire.inputs import ReconstructInputs
+from service.wire.inputs import ClassifyInputs, CompareInputs, ReconstructInputs
 
 SQUARE = shapely.box(84_010.0, 447_010.0, 84_020.0, 447_020.0)
 DRIVERS = {
@@ -152,10 +152,14 @@ def test_requests_of_all_processes_carry_the_layer(tmp_path: Path) -> None:
 
 def test_the_input_is_checked_like_any_text() -> None:
     tiles = {"href": "/uploads/" + "1" * 32}
-    given = ReconstructInputs.model_validate({"tiles": tiles, "footprintsLayer": "sheds"})
+    both = {"tiles": tiles, "footprints": {"href": "/uploads/" + "2" * 32}}
+    given = ReconstructInputs.model_validate({**both, "footprintsLayer": "sheds"})
     assert given.draft("reconstruct", None).values["footprints_layer"] == "sheds"
     with pytest.raises(ValueError, match="use no control characters"):
-        ReconstructInputs.model_validate({"tiles": tiles, "footprintsLayer": "a\x00"})
+        ReconstructInputs.model_validate({**both, "footprintsLayer": "a\x00"})
+    for inputs in (ReconstructInputs, ClassifyInputs, CompareInputs):
+        with pytest.raises(ValueError, match="give footprints, or leave it out"):
+            inputs.model_validate({"tiles": tiles, "footprintsLayer": "sheds", "footprints": None})
 
 
 @pytest.fixture

@@ -38,7 +38,7 @@ class Record:
     """The record of a building in one run."""
 
     status: Status
-    """ok, fallback or failed."""
+    """ok, doubtful, fallback or failed."""
     reason: str | None
     """None where ok."""
     reason_detail: str

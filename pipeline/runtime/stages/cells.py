@@ -78,10 +78,8 @@ def find_all_cells(
     ingested: Sequence[Ingested],
     classes: ClassesInUse,
     tiles: Iterable[Tile],
-    *,
-    again: bool = False,
 ) -> dict[Tile, TileCells]:
-    """The cells of some tiles with points, the fullest first; in silence where they are found `again`."""
+    """The cells of some tiles with points, the fullest first."""
     grid, points, content = context.plan.grid, points_by_tile(ingested), content_by_tile(ingested)
     # the marks of points are in the order of the buckets, which equal points do not imply
     files: dict[Tile, list[tuple[tuple[str, ...], str]]] = {}
@@ -103,7 +101,7 @@ def find_all_cells(
     clear_tiles(context.scratch, FOLDER, tasks)
     function = functools.partial(find_cells, settings=settings)
     stored: Files[CellsTask, TileCells] = Files(reads=_read, leaves=_left, intact=is_intact)
-    found_cells = context.map_stored("cells", function, tasks, whole, files=stored, quiet=again)
+    found_cells = context.map_stored("cells", function, tasks, whole, files=stored)
     return {cells.tile: cells for cells in found_cells.values()}
 
 

@@ -103,12 +103,10 @@ def cells_of_blocks(
     *,
     footprints: bool,
     only: Collection[Tile] | None = None,
-    again: bool = False,
 ) -> BlockCells:
     """The cells of all tiles, or of some and of what their splits see; `footprints` says whether they are given.
 
-    `again` finds those that this run found before, in silence. Raises InputError if the points of a tile do not fit
-    into a worker, now that they are counted.
+    Raises InputError if the points of a tile do not fit into a worker, now that they are counted.
     """
     grid, scene = context.plan.grid, settings.scene
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
@@ -128,7 +126,7 @@ def cells_of_blocks(
         for name, tiles in blocks.items()
     }
     wanted = {tile for tiles in seen.values() for tile in tiles}
-    cells = find_all_cells(context, scene.outliers, ingested, classes, wanted, again=again)
+    cells = find_all_cells(context, scene.outliers, ingested, classes, wanted)
     return BlockCells(blocks=blocks, seen=seen, drawn=drawn, cells=cells, reach_mm=reach_mm, classes=classes)
 
 

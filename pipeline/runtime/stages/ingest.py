@@ -77,15 +77,11 @@ class IngestTask:
         return self.limits is not None
 
 
-def ingest(
-    context: RunContext, paths: Sequence[str], moves_mm: Mapping[int, int] | None = None, *, again: bool = False
-) -> list[Ingested]:
-    """Bucket the points of all inputs by tile; what each input held, in the order of the paths.
-
-    `moves_mm` are flight strips whose points are moved up; `again` reads inputs that this run read before, in silence.
-    Raises EmptyInputError if no usable point is left, InconsistentInputError if all points lie on one line.
-    """
-    plan, progress = context.plan, context.progress
+def tasks_of(
+    context: RunContext, paths: Sequence[str], moves_mm: Mapping[int, int] | None = None
+) -> dict[Place, IngestTask]:
+    """The tasks that read all inputs, in the order of the paths, by the places of their outcomes."""
+    plan = context.plan
     known = {info.path: info for info in plan.sources}
     tasks = {}
     for path in paths:
@@ -106,14 +102,26 @@ def ingest(
             )
             key = key_of(path, file.file_size, written, task.options, task.grid, share, task.moves_mm)
             tasks[Place("ingest", task.part, key)] = task
+    return tasks
+
+
+def ingest(context: RunContext, paths: Sequence[str], moves_mm: Mapping[int, int] | None = None) -> list[Ingested]:
+    """Bucket the points of all inputs by tile; what each input held, in the order of the paths.
+
+    `moves_mm` are flight strips whose points are moved up. Raises EmptyInputError if no usable point is left,
+    InconsistentInputError if all points lie on one line.
+    """
+    progress = context.progress
+    known = {info.path: info for info in context.plan.sources}
+    tasks = tasks_of(context, paths, moves_mm)
     clear_points(context.scratch, tasks)
     buckets: Files[IngestTask, Ingested] = Files(leaves=_buckets, intact=is_intact)
-    stored = context.map_stored("ingest", ingest_file, tasks, whole, files=buckets, quiet=again)
+    stored = context.map_stored("ingest", ingest_file, tasks, whole, files=buckets)
     shares: dict[str, list[Ingested]] = {path: [] for path in paths}
     for place, found in stored.items():
         shares[tasks[place].path].append(found)
     ingested = [of_file(known[shown(path)], found) for path, found in shares.items()]
-    for found in () if again else ingested:
+    for found in ingested:
         for warning in found.warnings:
             progress.warn("ingest", f"{shown(found.path)}: {warning}")
     points = sum(points_by_tile(ingested).values())

@@ -5,12 +5,27 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from pipeline.runtime.run_context import RunContext
+from pipeline.runtime.scratch.outcomes import (
+    DamagedError,
+    OutcomeTask,
+    Place,
+    brief_of,
+    drop_outcomes,
+    key_of,
+    run_and_store,
+    whole,
+)
 from pipeline.runtime.stages.ground import BlockCells, cells_of_blocks
-from pipeline.runtime.stages.ingest import ingest
+from pipeline.runtime.stages.ingest import ingest, tasks_of
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.settings import RunSettings
-from pipeline.terrain.survey_strips import moves_of, offsets_of, rows_of, strips_warning
+from pipeline.terrain.survey_strips import NO_ROWS, Rows, counted, moves_of, offsets_of, rows_of, strips_warning
+
+_STRIPS = "strips"
+"""The stage under which it is stored how strips that were moved differ in the files."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -28,16 +43,45 @@ class Inputs:
 def read_inputs(context: RunContext, settings: RunSettings, paths: Sequence[str], *, footprints: bool) -> Inputs:
     """Read all inputs; again, with whole strips moved, if these lie too far above one another.
 
+    A later run of the same inputs in one work folder knows the moves before it reads, so that nothing is read again.
     Raises EmptyInputError and InconsistentInputError as `ingest` does, InputError as `cells_of_blocks` does.
     """
-    ingested = ingest(context, paths)
-    cells = cells_of_blocks(context, settings, ingested, footprints=footprints)
-    rows = [rows_of(found.strips) for found in cells.cells.values()]
-    moves_mm = moves_of(rows, settings.scene.strips)
-    apart = offsets_of(rows, settings.scene.strips)
+    general, scene = settings.general, settings.scene
+    key = key_of([place.name for place in tasks_of(context, paths)], general.classes, scene.outliers)
+    place = Place(_STRIPS, "rows", key)
+    found: Inputs | None = None
+    rows = _stored(context, place)
+    if rows is None:
+        found = _read(context, settings, paths, {}, footprints=footprints)
+        rows = counted(np.concatenate([NO_ROWS, *(rows_of(cells.strips) for cells in found.cells.cells.values())]))
+    moves_mm = moves_of([rows], scene.strips)
+    apart = offsets_of([rows], scene.strips)
     if apart:
         context.progress.warn("cells", strips_warning(apart, moves_mm))
-    if moves_mm:
-        ingested = ingest(context, paths, moves_mm, again=True)
-        cells = cells_of_blocks(context, settings, ingested, footprints=footprints, again=True)
+    if found is not None and not moves_mm:
+        return found
+    if found is not None:
+        drop_outcomes(context.scratch, _STRIPS, [])
+        work = OutcomeTask(function=whole, task=rows, place=place, scratch=context.scratch, brief=whole, stage="cells")
+        run_and_store(work)
+    return _read(context, settings, paths, moves_mm, footprints=footprints)
+
+
+def _read(
+    context: RunContext, settings: RunSettings, paths: Sequence[str], moves_mm: Mapping[int, int], *, footprints: bool
+) -> Inputs:
+    """Read all inputs with some strips moved up."""
+    ingested = ingest(context, paths, moves_mm)
+    cells = cells_of_blocks(context, settings, ingested, footprints=footprints)
     return Inputs(ingested=ingested, cells=cells, moves_mm=moves_mm)
+
+
+def _stored(context: RunContext, place: Place) -> Rows | None:
+    """How the strips of these inputs differ, if an earlier run moved them; None if it is not stored, or damaged."""
+    if not context.scratch.has(place.name):
+        return None
+    try:
+        rows: Rows = brief_of(context.scratch, place)
+    except DamagedError:
+        return None
+    return rows

@@ -71,6 +71,7 @@ class ResultsView {
   private readonly counts = new Map<Category, number>();
   /** The candidates, and once they are wanted the objects that were left out. */
   private readonly listed: Listed[] = [];
+  private readonly byId = new Map<string, Listed>();
   private readonly rejected = new Map<string, Listed>();
   private loadingRejected: Promise<void> | null = null;
   private readonly outlines: Outlines[] = [];
@@ -244,11 +245,11 @@ class ResultsView {
   private take(listed: Listed[], outlines: Outlines): void {
     for (const object of listed) {
       this.listed.push(object);
+      this.byId.set(object.id, object);
       if (object.category !== "rejected") this.counts.set(object.category, (this.counts.get(object.category) ?? 0) + 1);
     }
     this.outlines.push(outlines);
     this.map?.add(outlines);
-    this.colourMap();
     this.apply();
   }
 
@@ -392,14 +393,15 @@ class ResultsView {
     await this.layBackground(map);
   }
 
-  /** Lay the operator's tiles beneath the map, if there are some and the results lie on Earth. */
-  /** Give the map the colours of the legend. */
+  /** Give the map the colours of the legend, also for the objects that are still to come. */
   private colourMap(): void {
-    if (this.map === null) return;
-    const of = new Map(this.listed.map((object) => [object.id, outlineColour(this.colouring, object)]));
-    this.map.colourBy(({ id, category }) => of.get(id) ?? CATEGORIES[category].colour);
+    this.map?.colourBy(({ id, category }) => {
+      const object = this.byId.get(id);
+      return object === undefined ? CATEGORIES[category].colour : outlineColour(this.colouring, object);
+    });
   }
 
+  /** Lay the operator's tiles beneath the map, if there are some and the results lie on Earth. */
   private async layBackground(map: OutlineMap): Promise<void> {
     const { crs } = this.report;
     if (document.querySelector('meta[name="map-tiles"]') === null || (crs?.to_wgs84 ?? null) === null) return;
