@@ -117,8 +117,8 @@ def _text(value: Any) -> str:
 def write_pmtiles(path: Path, batches: Iterable[pa.RecordBatch], facts: Mapping[str, str]) -> int:
     """Write a PMTiles file; returns the number of its buildings. The same rows give the same bytes.
 
-    Raises NothingToShowError if there is no building, RunError if the file cannot be written, and whatever the
-    `batches` raise.
+    Raises NothingToShowError without a building, and RunError if the file cannot be written. Errors of the `batches`
+    pass through.
 
     Parameters
     ----------

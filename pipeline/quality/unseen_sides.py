@@ -60,7 +60,7 @@ def unseen_beside_m2(
     is_void[tuple(np.floor(voids[:, :2] - corner).astype(int).T)] = True
     distance = np.arange(0.5 * STEP_M, _REACH_M, STEP_M)
     at = np.floor(places[:, None] + outward[:, None] * distance[None, :, None] - corner).astype(int)
-    at = np.clip(at, 0, np.array(shape) - 1)  # the margin is no void
+    at = np.clip(at, 0, np.array(shape) - 1)  # the outermost cells hold no void
     hit = is_void[at[..., 0], at[..., 1]]
     first = np.argmax(hit, axis=1)
     starts = hit.any(axis=1) & (distance[first] <= max(_START_M, _START_SPACINGS * spacing_m))

@@ -131,7 +131,7 @@ class Selections:
                 fault = NoSuchOutputError("files of this job's run are gone or damaged: submit the job again")
             elif code == _FULL or (code and disk.free_bytes < FULL_BYTES):
                 fault = NoSpaceError(
-                    "there is no room on the disk for a selection of buildings: free some, or try later"
+                    "the disk is too full for a selection of buildings: free some space, or try later"
                 )
             elif code:
                 fault = UnexpectedError(f"a selection of buildings, which ended with code {code}")

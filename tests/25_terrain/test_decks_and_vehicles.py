@@ -115,7 +115,7 @@ def test_a_deck_that_the_edge_of_the_data_cuts_is_a_bridge() -> None:
 
 
 def footbridge(x: FloatArray, y: FloatArray) -> FloatArray:
-    """A deck of 2.4 m over a wide cutting, whose eastern end something hides from 3 m on."""
+    """A deck 2.4 m wide over a wide cutting; its eastern part was not seen."""
     return np.where((np.abs(y) <= 1.2) & (x < 12.0), 0.0, cutting(x / 2.0, y))
 
 

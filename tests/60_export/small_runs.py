@@ -25,6 +25,18 @@ def moved(result: BuildingResult, east: float, north: float = 0.0) -> BuildingRe
     return dataclasses.replace(result, origin=(x + east, y + north, z))
 
 
+TREE = RejectedObject(
+    object_id="tree",
+    origin=small.ORIGIN,
+    reason=Reason.VEGETATION,
+    reason_detail="planarity 0.1, at least 0.6",
+    outline=small.Polygon([(44, 30), (50, 30), (47, 36)]),
+    area_m2=18.0,
+    height_m=6.0,
+    n_points=50,
+)
+
+
 def street() -> list[BuildingResult]:
     """A fallback, two models, and a failed candidate that has an outline."""
     failed = dataclasses.replace(
@@ -37,17 +49,7 @@ def write_run(folder: Path, results: list[BuildingResult], unit_m: float = 1.0) 
     """Write a run of the given buildings on two tiles, in metres or in feet, with one rejected tree."""
     reference = small.Reference(horizontal_unit_m=unit_m, vertical_unit_m=unit_m)
     context = RecordContext(reference=reference, settings_hash="ab", engine_version="0")
-    tree = RejectedObject(
-        object_id="tree",
-        origin=small.ORIGIN,
-        reason=Reason.VEGETATION,
-        reason_detail="planarity 0.1, at least 0.6",
-        outline=small.Polygon([(44, 30), (50, 30), (47, 36)]),
-        area_m2=18.0,
-        height_m=6.0,
-        n_points=50,
-    )
-    write_tile(folder, "t1", results[:2], [tree] if results else [], context)
+    write_tile(folder, "t1", results[:2], [TREE] if results else [], context)
     write_tile(folder, "t2", results[2:], [], context)
     manifest = RunManifest(
         status=RunStatus.FINISHED,

@@ -13,13 +13,13 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 import small_buildings as small
-from small_runs import content, moved, street
+from small_runs import TREE, content, moved, street
 from typer.testing import CliRunner
 
 from pipeline.cli.app import app
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
-from pipeline.export.records import RecordContext, RejectedObject
+from pipeline.export.records import RecordContext
 from pipeline.export.tile import write_tile
 from pipeline.io import storage_at
 from pipeline.model import BuildingResult, Doubt, Reason, Status
@@ -27,16 +27,6 @@ from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest, wri
 from pipeline.runtime.selection import run_of, select_run
 
 DOUBT = Doubt.of(Reason.SCATTERED, "its roof returns scatter by 0.32 m, more than 0.15 m", "scatter_m", 0.32, 0.15)
-TREE = RejectedObject(
-    object_id="tree",
-    origin=small.ORIGIN,
-    reason=Reason.VEGETATION,
-    reason_detail="",
-    outline=small.Polygon([(44, 30), (50, 30), (47, 36)]),
-    area_m2=18.0,
-    height_m=6.0,
-    n_points=50,
-)
 
 
 def buildings() -> list[BuildingResult]:

@@ -43,7 +43,7 @@ _EDGE_CELLS = 5
 _VOID_CELLS = 8
 """Places without points are looked for within these cells of the roof: half of a large house."""
 _CROWDED = (1.81, 1.26, 1.13)
-"""Points per cell that holds any, from which a square of 3, 5 or 7 cells without a point is no chance.
+"""An empty square of 3, 5 or 7 cells a side is a gap where the cells that hold points hold this many on average.
 
 The squares then hold 12 points on average: points spread at random leave one of 160,000 such squares empty."""
 _BESIDE_CELLS = 2
