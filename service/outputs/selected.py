@@ -130,9 +130,7 @@ class Selections:
             if code == _REFUSED:
                 fault = NoSuchOutputError("files of this job's run are gone or damaged: submit the job again")
             elif code == _FULL or (code and disk.free_bytes < FULL_BYTES):
-                fault = NoSpaceError(
-                    "the disk is too full for a selection of buildings: free some space, or try later"
-                )
+                fault = NoSpaceError("the disk is too full for a selection of buildings: free some space, or try later")
             elif code:
                 fault = UnexpectedError(f"a selection of buildings, which ended with code {code}")
         except OSError as error:
