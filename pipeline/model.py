@@ -324,6 +324,9 @@ class Candidate:
     """True where a footprint or the user says that it is a building."""
     strip_offset_m: float = math.nan
     """Largest offset between two flight strips that was taken out of the points, metres; nan where none was."""
+    ground_noise_m: float = math.nan
+    """Robust standard deviation of single points of open ground nearby about the terrain, metres; nan where there is
+    little such ground."""
     guides: tuple[Guide, ...] = ()
     """Given lines near its points, in local metres."""
 
@@ -654,6 +657,8 @@ class BuildingResult:
     touches_data_edge: bool
     """As the candidate's."""
     strip_offset_m: float = math.nan
+    """As the candidate's."""
+    ground_noise_m: float = math.nan
     """As the candidate's."""
     walls: WallOutline | None = None
     """The walls beneath the footprint; None where it was given, or where no wall is asked for or seen."""

@@ -271,8 +271,7 @@ def _first_valid(models: Iterable[NamedForm[_Model]], building: _Building) -> tu
     """
     decisions = building.decisions
     codes: set[int] = set()
-    waiting: _Model | None = None
-    share, at = 0.0, -1
+    waiting, share, at = None, 0.0, -1
     remaining = iter(models)
     while True:
         try:
@@ -501,9 +500,9 @@ def _blocks(building: _Building, plan: RoofPlan | None) -> Iterator[NamedForm[_M
     hull = hull_of_points(roof.points)
     if hull is not None:
         outlines.append(("the points' hull", MultiPolygon([shapely.transform(hull, lambda xy: np.rint(xy * 1e3))])))
-    tolerance = settings.simplification_spacings * roof.spacing_m
+    tolerance_m, least_m2 = settings.simplification_spacings * roof.spacing_m, settings.min_part_area_m2
     for words, footprint in outlines:
-        for form in block_forms(footprint, plane, ground_z_m, tolerance, settings.min_part_area_m2):
+        for form in block_forms(footprint, plane, ground_z_m, tolerance_m, least_m2):
             yield NamedForm(BLOCK, partial(_block_model, form, plane), f"on {words}")
 
 
@@ -601,6 +600,7 @@ def _record(
         quality=quality,
         touches_data_edge=candidate.touches_data_edge,
         strip_offset_m=candidate.strip_offset_m,
+        ground_noise_m=candidate.ground_noise_m,
         walls=wall_outline(walls),
         overhangs=overhangs,
         guides=guides,
@@ -619,8 +619,7 @@ def _overhangs(building: _Building, model: _Model, walls: Walls | None) -> Overh
         reason, detail = error.reason, f"{error.reason}: {error}"
     else:
         used = sorted({face.plane for part in model.parts for face in part.faces})
-        number = {plane: k for k, plane in enumerate(used)}
-        solids = tuple(renumbered(solid, number) for solid in drawn)
+        solids = tuple(renumbered(solid, {plane: k for k, plane in enumerate(used)}) for solid in drawn)
     planes = [face.plane for solid in solids for face in solid.faces if face.plane >= 0]
     building.decisions.append(
         Decision(
@@ -697,4 +696,5 @@ def failed_building(candidate: Candidate, method: str, reason: Reason, detail: s
         density_per_m2=len(candidate.points) / area if area > 0.0 else math.nan,
         touches_data_edge=candidate.touches_data_edge,
         strip_offset_m=candidate.strip_offset_m,
+        ground_noise_m=candidate.ground_noise_m,
     )

@@ -297,6 +297,14 @@ BUILDINGS = (
         page="../methods/strips.md",
     ),
     Column(
+        "ground_noise_m",
+        FLOAT64,
+        "m",
+        "robust standard deviation of single points of open ground nearby about the terrain: the noise of the survey "
+        "and of low plants; null where there is little such ground",
+        page="records.md#support",
+    ),
+    Column(
         "wall_outline",
         WKB,
         HORIZONTAL,

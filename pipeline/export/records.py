@@ -104,6 +104,7 @@ def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: s
         "validity_codes": list(result.validity_codes),
         "touches_data_edge": result.touches_data_edge,
         "strip_offset_m": _or_none(result.strip_offset_m),
+        "ground_noise_m": _or_none(result.ground_noise_m),
         **_walls(result, context.reference),
         "guides_followed": None if result.guides is None else result.guides[0],
         "guides_not_followed": None if result.guides is None else result.guides[1],

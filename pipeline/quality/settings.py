@@ -21,6 +21,14 @@ class SupportSettings(Parameters):
         minimum=0.0,
         maximum=10.0,
     )
+    max_scatter_noises: float = parameter(
+        1.5,
+        "A scatter up to this many times the noise of the ground nearby is allowed, too. Where that is more than "
+        "`max_scatter_m`, `min_share_on_roof` falls as the share of normal residuals with that scatter does.",
+        unit="times the noise",
+        minimum=0.0,
+        maximum=10.0,
+    )
     max_unseen_share: float = parameter(
         0.6,
         "Share of the roof's plan area without a point on the roof nearby; above it the reason is `not_seen`.",

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.model import BuildingResult, Candidate, Doubt, Reason
 from pipeline.quality.detection import confidence_of
 from pipeline.quality.level_sides import level_side_share
+from pipeline.quality.roof_returns import TOLERANCE_M
 from pipeline.quality.unseen_sides import unseen_beside_m2, unseen_left_out_m2
 
 if TYPE_CHECKING:
@@ -18,6 +20,8 @@ NOT_OF_FORM = frozenset({Reason.NOT_SEEN, Reason.UNCERTAIN})
 """Doubts that no other form of the roof would answer."""
 NOT_OF_ROOF = NOT_OF_FORM | {Reason.SCATTERED}
 """Doubts that hold for coarser models, too."""
+_MOST_GROUND_NOISE_M = 0.2
+"""Ground that is noisier has plants on it: no more noise of the survey is believed."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,6 +43,8 @@ class Support:
     """Probability that it is a building; nan where it is known to be one."""
     level_side_share: float = math.nan
     """Share of the outline where a level face ends at ground as high; nan where it is known to be a building."""
+    ground_noise_m: float = math.nan
+    """Noise of the survey by the ground nearby, metres."""
 
 
 def support_of(record: BuildingResult, candidate: Candidate) -> Support:
@@ -63,6 +69,7 @@ def support_of(record: BuildingResult, candidate: Candidate) -> Support:
         returns_per_face=record.n_points * (1.0 - quality.share_below_roof) / n_faces if n_faces else math.nan,
         confidence=math.nan if candidate.is_known else confidence_of(record),
         level_side_share=level_share,
+        ground_noise_m=candidate.ground_noise_m,
     )
 
 
@@ -71,32 +78,73 @@ def doubt_of(support: Support, settings: SupportSettings) -> Doubt | None:
 
     A figure that is nan raises no doubt.
     """
-    scatter, most = support.scatter_m, settings.max_scatter_m
-    if scatter > most:
-        words = f"its roof returns scatter by {scatter:.3f} m, more than {most:g} m"
-        return Doubt.of(Reason.SCATTERED, words, "scatter_m", scatter, most)
-    share, least = support.share_on_roof, settings.min_share_on_roof
-    if share < least:
-        words = f"{share:.0%} of its roof returns lie within 0.2 m of the roof, less than {least:.0%}"
-        return Doubt.of(Reason.POOR_FIT, words, "share_on_roof", share, least)
-    unseen, most = support.unseen_share, settings.max_unseen_share
-    if unseen > most:
-        words = f"{unseen:.0%} of its roof has no point on the roof nearby, more than {most:.0%}"
-        return Doubt.of(Reason.NOT_SEEN, words, "unseen_share", unseen, most)
-    beside, most = support.beside_share, settings.max_beside_share
-    if beside > most:
-        words = f"{beside:.0%} of what may be its roof lies beside the model, without any point, more than {most:.0%}"
-        return Doubt.of(Reason.NOT_SEEN, words, "beside_share", beside, most)
-    returns, least = support.returns_per_face, settings.min_returns_per_face
-    if returns < least:
-        words = f"{returns:.1f} roof returns per roof face, less than {least:g}"
-        return Doubt.of(Reason.TOO_MANY_FACES, words, "returns_per_face", returns, least)
-    confidence, least = support.confidence, settings.min_confidence
-    if confidence < least:
-        words = f"the confidence that it is a building is {confidence:.3f}, less than {least:g}"
-        return Doubt.of(Reason.UNCERTAIN, words, "detection_confidence", confidence, least)
-    level, most = support.level_side_share, settings.max_level_side_share
-    if level > most:
-        words = f"the ground is as high as a level roof along {level:.0%} of its outline, more than {most:.0%}: "
-        return Doubt.of(Reason.UNCERTAIN, words + "it may be a deck or a terrace", "level_side_share", level, most)
+    for test in _tests_of(support, settings):
+        missed = test.value > test.threshold if test.is_most else test.value < test.threshold
+        if missed:
+            words = f"{test.words}, {'more' if test.is_most else 'less'} than {test.threshold:{test.form}}{test.more}"
+            return Doubt.of(test.reason, words, test.name, test.value, test.threshold)
     return None
+
+
+class _Test(NamedTuple):
+    """One figure with its threshold."""
+
+    reason: Reason
+    name: str
+    """The figure's, in the record of decisions."""
+    value: float
+    threshold: float
+    is_most: bool
+    """The threshold is the most that is allowed, else the least."""
+    words: str
+    """The figure in words."""
+    form: str = "g"
+    """How the threshold is written."""
+    more: str = ""
+    """What is said after it."""
+
+
+def _tests_of(support: Support, settings: SupportSettings) -> Iterator[_Test]:
+    """All tests of a model, the gravest first."""
+    most_m, least = noise_limits(support.ground_noise_m, settings)
+    is_noisy = most_m > settings.max_scatter_m
+    noise = f", {settings.max_scatter_noises:g} times the noise of the ground nearby" if is_noisy else ""
+    scatter, share, level = support.scatter_m, support.share_on_roof, support.level_side_share
+    unseen, beside = support.unseen_share, support.beside_share
+    yield _Test(
+        Reason.SCATTERED, "scatter_m", scatter, most_m, True, f"its roof returns scatter by {scatter:.3f} m", ".3g",
+        f" m{noise}",
+    )  # fmt: skip
+    words = f"{share:.0%} of its roof returns lie within 0.2 m of the roof"
+    yield _Test(Reason.POOR_FIT, "share_on_roof", share, least, False, words, ".0%")
+    words = f"{unseen:.0%} of its roof has no point on the roof nearby"
+    yield _Test(Reason.NOT_SEEN, "unseen_share", unseen, settings.max_unseen_share, True, words, ".0%")
+    words = f"{beside:.0%} of what may be its roof lies beside the model, without any point"
+    yield _Test(Reason.NOT_SEEN, "beside_share", beside, settings.max_beside_share, True, words, ".0%")
+    words = f"{support.returns_per_face:.1f} roof returns per roof face"
+    yield _Test(
+        Reason.TOO_MANY_FACES, "returns_per_face", support.returns_per_face, settings.min_returns_per_face, False, words
+    )
+    words = f"the confidence that it is a building is {support.confidence:.3f}"
+    yield _Test(
+        Reason.UNCERTAIN, "detection_confidence", support.confidence, settings.min_confidence, False, words
+    )  # fmt: skip
+    words = f"the ground is as high as a level roof along {level:.0%} of its outline"
+    yield _Test(
+        Reason.UNCERTAIN, "level_side_share", level, settings.max_level_side_share, True, words, ".0%",
+        ": it may be a deck or a terrace",
+    )  # fmt: skip
+
+
+def noise_limits(ground_noise_m: float, settings: SupportSettings) -> tuple[float, float]:
+    """The largest scatter, metres, and the least share within 0.2 m, where the ground nearby has some noise.
+
+    Of normal residuals that scatter more, fewer lie within 0.2 m: the least share falls as theirs.
+    """
+    usual_m = settings.max_scatter_m
+    noise_m = 0.0 if math.isnan(ground_noise_m) else min(ground_noise_m, _MOST_GROUND_NOISE_M)
+    most_m = max(usual_m, settings.max_scatter_noises * noise_m)
+    if not most_m > usual_m:
+        return usual_m, settings.min_share_on_roof
+    within, usual = (math.erf(TOLERANCE_M / (math.sqrt(2.0) * scatter_m)) for scatter_m in (most_m, max(usual_m, 1e-9)))
+    return most_m, settings.min_share_on_roof * within / usual

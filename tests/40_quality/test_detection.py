@@ -53,3 +53,14 @@ def test_the_more_of_a_rejected_object_is_rough_the_surer_it_is_not_a_building()
 def test_a_rejected_object_whose_form_was_not_judged_has_no_confidence(reason: Reason) -> None:
     assert math.isnan(confidence_of_rejected(reason, 5, 5))
     assert math.isnan(confidence_of_rejected(Reason.TOO_SMALL, 0, 0))
+
+
+def test_noise_that_the_ground_has_beyond_the_usual_is_no_scatter_of_a_roof() -> None:
+    quiet = detection_confidence(0.15, 16.0)
+    assert detection_confidence(0.15, 16.0, 0.1) == quiet  # the fit knows such surveys
+    noisy = detection_confidence(0.15, 16.0, 0.15)
+    assert noisy == pytest.approx(detection_confidence(0.1, 16.0))
+    assert noisy > quiet
+    # crowns on rough ground: no more than 0.15 m is believed, and no more than the object itself scatters
+    assert detection_confidence(0.3, 16.0, 0.5) == detection_confidence(0.3, 16.0, 0.15)
+    assert detection_confidence(0.09, 16.0, 0.5) == detection_confidence(0.09, 16.0)

@@ -13,7 +13,7 @@ from pipeline.methods import ReconstructSettings
 from pipeline.model import DecisionKind, Outcome, Reason, Status
 from pipeline.quality.detection import confidence_of
 from pipeline.quality.settings import SupportSettings
-from pipeline.quality.support import Support, doubt_of
+from pipeline.quality.support import Support, doubt_of, noise_limits
 from pipeline.reconstruct import reconstruct_building
 from pipeline.settings import RunSettings
 
@@ -77,6 +77,44 @@ def test_a_crown_is_doubtful_and_says_why(seed: int) -> None:
     if result.status is Status.DOUBTFUL:
         last = result.decisions[-1]
         assert (last.kind, last.outcome) == (DecisionKind.CHECK, Outcome.MISSED)
+
+
+@pytest.mark.parametrize(
+    ("ground_noise_m", "scatter_m", "share"),
+    [(math.nan, 0.15, 0.7), (0.1, 0.15, 0.7), (0.16, 0.24, 0.51), (0.5, 0.3, 0.423)],
+)
+def test_the_noise_of_the_ground_nearby_moves_the_limits_up_to_a_limit_of_its_own(
+    ground_noise_m: float, scatter_m: float, share: float
+) -> None:
+    assert noise_limits(ground_noise_m, SupportSettings()) == pytest.approx((scatter_m, share), abs=1e-3)
+    assert noise_limits(ground_noise_m, SupportSettings(max_scatter_noises=0.0)) == (0.15, 0.7)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_roof_in_a_noisy_survey_is_ok_where_the_ground_is_as_noisy(known: bool) -> None:
+    rng = np.random.default_rng(8)
+    x, y = rng.uniform(0, 12, 960), rng.uniform(0, 8, 960)
+    points = np.column_stack((x, y, 5.0 + 0.5 * np.minimum(y, 8.0 - y) + rng.normal(0, 0.165, 960)))
+    smooth = candidate(points, footprint=shapely.box(0, 0, 12, 8) if known else None)
+    on_smooth = reconstruct_building(smooth, "arrangement", ReconstructSettings())
+    assert (on_smooth.status, on_smooth.reason) == (Status.DOUBTFUL, Reason.SCATTERED)
+    noisy = dataclasses.replace(smooth, ground_noise_m=0.16)
+    on_noisy = reconstruct_building(noisy, "arrangement", ReconstructSettings())
+    assert (on_noisy.status, on_noisy.reason_detail) == (Status.OK, "")
+    assert confidence_of(on_noisy) > max(0.5, confidence_of(on_smooth))
+
+
+def test_the_words_of_a_doubt_say_that_the_limit_is_that_of_a_noisy_survey() -> None:
+    doubt = doubt_of(dataclasses.replace(GOOD, scatter_m=0.4, ground_noise_m=0.16), SupportSettings())
+    assert doubt is not None
+    words = "its roof returns scatter by 0.400 m, more than 0.24 m, 1.5 times the noise of the ground nearby"
+    assert doubt.words == words
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_crown_is_doubtful_in_a_noisy_survey_too(seed: int) -> None:
+    noisy = dataclasses.replace(candidate(crown(seed)), ground_noise_m=0.2)
+    assert reconstruct_building(noisy, "arrangement", ReconstructSettings()).status is not Status.OK
 
 
 @pytest.mark.parametrize("noise_m", [0.02, 0.1])

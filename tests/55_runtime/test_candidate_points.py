@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.model import Candidate
+from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.run import RunSummary
 
 WALLS = {"outline": "walls"}
@@ -91,3 +92,21 @@ def test_outlines_at_the_walls_do_not_depend_on_tiles_and_files(
     assert tiled.digest == whole.digest
     assert reconstruct(*halves, settings={"roof": WALLS}).digest == whole.digest
     assert reconstruct(suburb).digest != whole.digest
+
+
+# --- the noise of the ground nearby
+
+
+@pytest.mark.parametrize("density_per_m2", [1.5, 10.0])
+@pytest.mark.parametrize("noise_m", [0.03, 0.15])
+def test_candidates_know_the_noise_of_the_ground_nearby(
+    density_per_m2: float,
+    noise_m: float,
+    tmp_path: Path,
+    reconstruct: Callable[..., RunSummary],
+    candidates: list[Candidate],
+) -> None:
+    made = simulate("city", tmp_path, 3, size_m=(60.0, 60.0), density_per_m2=density_per_m2, noise_m=noise_m)
+    reconstruct(made.laz)
+    assert candidates
+    assert np.median([candidate.ground_noise_m for candidate in candidates]) == pytest.approx(noise_m, rel=0.25)

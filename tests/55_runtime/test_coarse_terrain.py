@@ -8,6 +8,7 @@ import pytest
 
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.coarse_terrain import MOST_NODES, terrain_document, terrain_part, terrain_spacing
+from pipeline.runtime.stages.surroundings import NO_POINT
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
@@ -40,7 +41,7 @@ def document(folder: Path, grid: TileGrid, spacing: int) -> bytes:
         inside = (columns >= EAST) & (columns < EAST + 60) & (rows >= NORTH) & (rows < NORTH + 60)
         arrays = {
             "terrain": np.where(inside, hill(columns, rows), NO_DATA).astype(np.int32),
-            "occupied": inside,
+            "off": np.where(inside, 0, NO_POINT).astype(np.int16),
             "corner": np.array([column0, row0]),
         }
         scratch.put_arrays(f"ground/{tile.key}", arrays)

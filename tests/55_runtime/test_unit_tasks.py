@@ -23,6 +23,7 @@ from pipeline.runtime.stages.gather import gather, points_of
 from pipeline.runtime.stages.outline import outlined
 from pipeline.runtime.stages.sites import CandidateSite, PointRange, largest_first, object_id
 from pipeline.runtime.stages.stored_sites import SitesBrief
+from pipeline.runtime.stages.surroundings import NO_GROUND, NO_POINT
 from pipeline.runtime.stages.units import UnitTask, divide, is_intact, shares_of
 from pipeline.terrain.lattice import CELL_MM
 from pipeline.terrain.scene_settings import SceneSettings
@@ -59,7 +60,8 @@ def stored(points: npt.NDArray[np.void], grid: TileGrid, root: Path, fragments: 
     corner = cells.min(axis=0) - 20
     occupied = np.zeros((cells.max(axis=0) + 20 - corner)[::-1], np.bool_)
     occupied[cells[:, 1] - corner[1], cells[:, 0] - corner[0]] = True
-    level = {"corner": corner, "occupied": occupied, "terrain": np.zeros(occupied.shape, np.int32)}
+    off_mm = np.where(occupied, NO_GROUND, NO_POINT)
+    level = {"corner": corner, "off": off_mm, "terrain": np.zeros(occupied.shape, np.int32)}
     ranges = []
     for tile in tiles:
         own = points[(column == tile.column) & (line == tile.row)]

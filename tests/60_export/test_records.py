@@ -30,8 +30,8 @@ solid_lod23_planes, ground_z, ground_source, eave_z, ridge_z, h_min, h_50p, h_70
 footprint_area_m2, footprint_share, roof_area_m2, volume_m3, n_points, density_per_m2, through_share,
 detection_confidence, n_planes, rmse_m, p95_m, coverage, point_spacing_m, noise_m, share_within_0_2m, share_below_roof,
 unexplained_m2, extrapolated_share, largest_hole_m, ridge_z_sigma_m, bic_margin,
-is_curved, valid, validity_codes, touches_data_edge, strip_offset_m, wall_outline, overhang_m, overhang_sigma_m,
-overhang_source, lod23_reason, guides_followed, guides_not_followed, acquired_from, acquired_to, mesh_path, input_hash,
+is_curved, valid, validity_codes, touches_data_edge, strip_offset_m, ground_noise_m, wall_outline, overhang_m,
+overhang_sigma_m, overhang_source, lod23_reason, guides_followed, guides_not_followed, acquired_from, acquired_to, mesh_path, input_hash,
 settings_hash, engine_version"""
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
 
@@ -100,7 +100,7 @@ def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts: Contexts) 
         *("footprint_area_m2", "footprint_share", "roof_area_m2", "volume_m3", "density_per_m2", "rmse_m", "p95_m"),
         *("point_spacing_m", "noise_m", "share_within_0_2m", "unexplained_m2", "largest_hole_m", "ridge_z_sigma_m"),
         *("share_below_roof", "extrapolated_share"),
-        *("strip_offset_m", "wall_outline", "overhang_m", "overhang_sigma_m"),
+        *("strip_offset_m", "ground_noise_m", "wall_outline", "overhang_m", "overhang_sigma_m"),
         *("overhang_source", "lod23_reason"),
         *("through_share", "detection_confidence", "ground_source", "height_source"),
         *("guides_followed", "guides_not_followed"),

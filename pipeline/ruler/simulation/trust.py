@@ -78,6 +78,12 @@ STRIP_SURVEYS = tuple(
     for density, returns, steps in ((1.5, Returns.FIRST, (0.2, 0.45, 1.0)), (5.0, Returns.FIVE, (0.3, 0.6, 0.9, 1.5)))
     for step in steps
 )
+NOISY_SURVEYS = (
+    Survey(density_per_m2=1.5, noise_m=0.15, returns=Returns.FIRST),
+    Survey(density_per_m2=2.5, noise_m=0.2, returns=Returns.FIRST_AND_LAST),
+    Survey(density_per_m2=4.0, noise_m=0.15, returns=Returns.FIVE),
+    Survey(density_per_m2=10.0, noise_m=0.2, returns=Returns.LAST, with_classes=True),
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -108,6 +114,11 @@ KINDS: Mapping[str, Kind] = {
     "decks": Kind(make=terraces),
     "glass": Kind(make=glass_houses),
     **{name: Kind(make=functools.partial(stand, rule)) for name, rule in STANDS.items()},
+    "noisy_houses_and_trees": Kind(make=trees_at_houses, surveys=NOISY_SURVEYS),
+    **{
+        f"noisy_{name}": Kind(make=functools.partial(stand, STANDS[name]), surveys=NOISY_SURVEYS)
+        for name in ("broadleaf_forest", "young_forest")
+    },
 }
 """The kinds of scenes by name."""
 

@@ -110,6 +110,7 @@ def write_bundle(folder: str, bundle: Bundle) -> str:
         "touches_data_edge": candidate.touches_data_edge,
         "is_known": candidate.is_known,
         "strip_offset_m": None if math.isnan(candidate.strip_offset_m) else candidate.strip_offset_m,
+        "ground_noise_m": None if math.isnan(candidate.ground_noise_m) else candidate.ground_noise_m,
         "method": bundle.method,
         "settings": {
             "lods": ",".join(bundle.settings.lods),
@@ -227,6 +228,7 @@ def _bundle(
         touches_data_edge=bool(document["touches_data_edge"]),
         is_known=bool(document.get("is_known", False)),
         strip_offset_m=math.nan if document.get("strip_offset_m") is None else float(document["strip_offset_m"]),
+        ground_noise_m=math.nan if document.get("ground_noise_m") is None else float(document["ground_noise_m"]),
         guides=tuple(_guide(kind, line) for kind, line in document.get("guides", ())),
     )
     return Bundle(

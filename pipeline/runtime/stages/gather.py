@@ -18,10 +18,11 @@ from pipeline.export.facts import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.kernels.radix_sort import radix_order
 from pipeline.model import BoolArray, Candidate, FloatArray, GivenHeights, GroundSource, Guide, IntArray
+from pipeline.quality.roof_returns import MAD_TO_SIGMA
 from pipeline.roof.settings import GUIDE_REACH_M, RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.sites import CandidateSite, PointRange
-from pipeline.runtime.stages.surroundings import Surroundings, surroundings_of
+from pipeline.runtime.stages.surroundings import NO_GROUND, NO_POINT, Surroundings, surroundings_of
 from pipeline.runtime.stages.window_points import bucket_paths
 from pipeline.strip_alignment import aligned_mm
 from pipeline.terrain.lattice import CELL_MM, NO_DATA
@@ -52,6 +53,12 @@ _LARGEST_M = 2000
 """Longest side of a block by attributes: what is larger is a district, or a slip."""
 _HALF_DIAGONAL_M = 0.71
 """A cell that a footprint touches has its centre this near."""
+_FEWEST_GROUND_CELLS = 30
+"""The noise of the ground is known to 15 % from so many cells."""
+_OPEN_CELLS = 7
+"""Ground is open where so many of nine cells hold some."""
+_PER_POINTS, _OF_PLANE = 0.2, 0.9
+"""How the scatter of the lowest points of cells follows from that of single points; see `_ground_noise_m`."""
 _FARTHEST_MM = 2**62
 """Beyond all coordinates."""
 _HEIGHT_WITHOUT_TERRAIN_MM = 2500
@@ -289,6 +296,8 @@ def gather(
     digest.update(voids_mm.tobytes())
     if site.outline is not None:
         digest.update(np.rint(shapely.get_coordinates(site.outline) * MM).astype(np.int64).tobytes())
+    ground_noise_m = _ground_noise_m(around, len(points) / max(1, int(np.count_nonzero(cells))))
+    digest.update(np.float64(ground_noise_m).tobytes())
     strip_offset_m = math.nan
     if roof is not None:
         xyz_mm, is_split, strip_offset_m = aligned_mm(xyz_mm, own.strip, is_split, roof.min_strip_offset_m)
@@ -312,6 +321,7 @@ def gather(
         touches_data_edge=touches_data_edge,
         is_known=is_given or (site.override is not None and site.override.says_building),
         strip_offset_m=strip_offset_m,
+        ground_noise_m=ground_noise_m,
         guides=_near(guides, low, high, origin_mm) if guides and len(points) else (),
     )
     is_dated = gps_kind is GpsTimeKind.ADJUSTED and len(points) > 0
@@ -339,6 +349,41 @@ def _ground_mm(
     if len(points_mm):
         return int(points_mm.min()) - _HEIGHT_WITHOUT_TERRAIN_MM, GroundSource.ASSUMED
     return None, None
+
+
+@kernel
+def _open_ground(off_mm: npt.NDArray[np.int16]) -> IntArray:
+    """The distances (rows, columns) of cells of which most neighbours hold ground, too: (n,) int64, mm.
+
+    Beneath plants few pulses meet the ground, and a terrain through few of them misses the others.
+    """
+    rows, columns = off_mm.shape
+    found, count = np.empty(rows * columns, np.int64), 0
+    for r in range(1, rows - 1):
+        for c in range(1, columns - 1):
+            if off_mm[r, c] == NO_POINT or off_mm[r, c] == NO_GROUND:
+                continue
+            held = 0
+            for i in range(r - 1, r + 2):
+                for j in range(c - 1, c + 2):
+                    held += off_mm[i, j] != NO_POINT and off_mm[i, j] != NO_GROUND
+            if held >= _OPEN_CELLS:
+                found[count], count = off_mm[r, c], count + 1
+    return found[:count].copy()
+
+
+def _ground_noise_m(around: Surroundings, points_per_cell: float) -> float:
+    """Robust standard deviation of ground points about the terrain, metres; nan where too few cells hold ground.
+
+    Cells know their lowest point alone, and the terrain follows it. The lowest of k normal values has about
+    k^-1/5 of their standard deviation (.67 for 8, exactly .61; cells differ in k, which brings it nearer), and a plane
+    through nine cells leaves .9 of it.
+    """
+    off_mm = _open_ground(around.off_mm)
+    if len(off_mm) < _FEWEST_GROUND_CELLS:
+        return math.nan
+    lowest_mm = float(MAD_TO_SIGMA * np.median(np.abs(off_mm - np.median(off_mm))))
+    return float(lowest_mm * max(1.0, points_per_cell) ** _PER_POINTS / _OF_PLANE / MM)
 
 
 def _elsewhere(footprint: Polygon | MultiPolygon | None, own: BoolArray, around: Surroundings) -> IntArray:

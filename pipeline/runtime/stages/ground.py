@@ -13,6 +13,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.model import BoolArray
 from pipeline.runtime.plan import check_windows, ground_bytes, split_grid, tiles_per_block
@@ -23,7 +24,7 @@ from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.cells import TileCells, digests_of, find_all_cells
 from pipeline.runtime.stages.cleanup import clear_tiles
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
-from pipeline.runtime.stages.surroundings import FOLDER
+from pipeline.runtime.stages.surroundings import FOLDER, NO_POINT, distances_to_terrain
 from pipeline.runtime.stages.tile_content import ZoneSums, content_of_window, zone_sums_of
 from pipeline.runtime.stages.window_points import FOLDER as CELLS
 from pipeline.scene import lattice_of
@@ -175,10 +176,10 @@ def is_intact(task: GroundTask, found: Sequence[TileGround], folder: str) -> boo
     """Whether the terrain of a tile in a folder of scratch is as it was stored."""
     (zones,) = (one.zones for one in found if f"{FOLDER}/{one.tile.key}" == folder)
     tile = Tile.from_key(folder.rpartition("/")[2])
-    elevations, occupied, corner = (task.scratch.array(folder, name) for name in ("terrain", "occupied", "corner"))
+    elevations, off_mm, corner = (task.scratch.array(folder, name) for name in ("terrain", "off", "corner"))
     column0, row0, columns, rows = lattice_of(task.grid.core(tile).grown(APRON_M * MM))
-    is_in_place = corner.tolist() == [column0, row0] and elevations.shape == occupied.shape == (rows, columns)
-    return is_in_place and _zones(elevations, occupied, task.grid).tobytes() == zones
+    is_in_place = corner.tolist() == [column0, row0] and elevations.shape == off_mm.shape == (rows, columns)
+    return is_in_place and _zones(elevations, off_mm, task.grid).tobytes() == zones
 
 
 def terrain_window(grid: TileGrid, tile: Tile) -> Window:
@@ -200,9 +201,9 @@ def _around(grid: TileGrid, tiles: Sequence[Tile]) -> Window:
 def draw_ground(task: GroundTask, settings: GroundSettings) -> tuple[TileGround, ...]:
     """Find the ground of a block and store the terrain of its tiles.
 
-    In scratch under `ground/<tile>/` are `terrain`, `occupied` and `corner`: the elevations of the core and an apron
-    around it, which of the cells hold points, and the column and row of the first one. The apron lets a candidate at
-    the data's edge see terrain whose own tile holds no point and so is never made. Where aprons overlap they agree.
+    In scratch under `ground/<tile>/` are `terrain`, `off` and `corner`: the elevations of the core and an apron around
+    it, how far the lowest points lie above them, and the column and row of the first cell. The apron lets a candidate
+    at the data's edge see terrain whose own tile holds no point and so is never made. Where aprons overlap they agree.
     """
     task.scratch.check_cancelled()
     inside = _around(task.grid, task.tiles)
@@ -214,7 +215,7 @@ def draw_ground(task: GroundTask, settings: GroundSettings) -> tuple[TileGround,
     )
     task.scratch.check_cancelled()
     terrain, _ = ground_on(lowest, corner, settings, trusted=task.trusted, wanted=wanted)
-    return tuple(_stored(task, tile, terrain, occupied, corner) for tile in task.tiles)
+    return tuple(_stored(task, tile, terrain, lowest, occupied, corner) for tile in task.tiles)
 
 
 def _cells_in(task: GroundTask, window: Window) -> tuple[Elevations, BoolArray, tuple[int, int]]:
@@ -237,21 +238,27 @@ def _cells_in(task: GroundTask, window: Window) -> tuple[Elevations, BoolArray, 
 
 
 def _stored(
-    task: GroundTask, tile: Tile, terrain: Elevations, occupied: BoolArray, corner: tuple[int, int]
+    task: GroundTask,
+    tile: Tile,
+    terrain: Elevations,
+    lowest: Elevations,
+    occupied: BoolArray,
+    corner: tuple[int, int],
 ) -> TileGround:
     """Store the terrain of one tile."""
     column0, row0, columns, rows = lattice_of(task.grid.core(tile).grown(APRON_M * MM))
     part = (slice(row0 - corner[1], row0 - corner[1] + rows), slice(column0 - corner[0], column0 - corner[0] + columns))
-    elevations, held = np.ascontiguousarray(terrain[part]), np.ascontiguousarray(occupied[part])
-    arrays = {"terrain": elevations, "occupied": held, "corner": np.array([column0, row0], np.int64)}
-    task.scratch.put_arrays(f"{FOLDER}/{tile.key}", arrays)
+    elevations = np.ascontiguousarray(terrain[part])
+    off_mm = distances_to_terrain(lowest[part], occupied[part], elevations)
+    place = np.array([column0, row0], np.int64)
+    task.scratch.put_arrays(f"{FOLDER}/{tile.key}", {"terrain": elevations, "off": off_mm, "corner": place})
     return TileGround(
         tile=tile,
-        zones=_zones(elevations, held, task.grid).tobytes(),
+        zones=_zones(elevations, off_mm, task.grid).tobytes(),
     )
 
 
-def _zones(elevations: Elevations, occupied: BoolArray, grid: TileGrid) -> ZoneSums:
+def _zones(elevations: Elevations, off_mm: npt.NDArray[np.int16], grid: TileGrid) -> ZoneSums:
     """Cells that are known or hold points, and digest of these, by zone: (3, 3, 3) uint64, by column and row."""
     # the apron, a cell that the core's edge may cut, and what the splits of neighbours see: farther than later stages
     width = APRON_M + 1 + math.ceil((grid.halo_mm + _SLOPE_CELLS * CELL_MM) / CELL_MM)
@@ -263,9 +270,9 @@ def _zones(elevations: Elevations, occupied: BoolArray, grid: TileGrid) -> ZoneS
     for row in range(3):
         for column in range(3):
             zone = (slice(*cuts[0][row : row + 2]), slice(*cuts[1][column : column + 2]))
-            part, held = elevations[zone], occupied[zone]
-            digest = hashlib.blake2b(f"{part.shape}".encode() + part.tobytes() + held.tobytes(), digest_size=16)
-            cells = np.count_nonzero((part != NO_DATA) | held)
+            part, off = elevations[zone], off_mm[zone]
+            digest = hashlib.blake2b(f"{part.shape}".encode() + part.tobytes() + off.tobytes(), digest_size=16)
+            cells = np.count_nonzero((part != NO_DATA) | (off != NO_POINT))
             zones[column, row] = (cells, *np.frombuffer(digest.digest(), np.uint64))
     return zones
 
