@@ -22,7 +22,9 @@ from pipeline.runtime.resources import Resources
 from pipeline.runtime.stages.ingested import without_roofs
 from pipeline.settings import RunSettings
 from pipeline.terrain.settings import StripSettings
-from pipeline.terrain.survey_strips import SQUARE_MM, compared_strips, moves_of, offsets_of, strips_warning
+from pipeline.terrain.strip_moves import moves_of, offsets_of, strips_warning, surfaces_warning
+from pipeline.terrain.strip_squares import SQUARE_MM
+from pipeline.terrain.survey_strips import compared_strips
 from pipeline.tiling import MM
 
 RAISED_M = 2.5
@@ -224,17 +226,19 @@ class _Strips:
         xyz_mm = np.rint(cloud.xyz * MM).astype(np.int64)
         column, row = xyz_mm[:, 0] // SQUARE_MM, xyz_mm[:, 1] // SQUARE_MM
         kept = (column % self._every == 0) & (row % self._every == 0)
-        columns = (*xyz_mm.T, cloud.return_number, cloud.return_count, cloud.source_id)
+        columns = (*xyz_mm.T, cloud.return_number, cloud.return_count, cloud.source_id, cloud.gps_time)
         self._parts.append(tuple(np.ascontiguousarray(values[kept]) for values in columns))
 
     def warnings(self, settings: StripSettings) -> tuple[str, ...]:
-        """A warning if strips do not fit."""
+        """Warnings if strips do not fit."""
         if not self._parts:
             return ()
-        x, y, z, number, returns, source = (np.concatenate(columns) for columns in zip(*self._parts, strict=True))
-        rows = compared_strips((x, y, z), (number, returns), source, None)
+        columns = (np.concatenate(parts) for parts in zip(*self._parts, strict=True))
+        x, y, z, number, returns, source, time = columns
+        rows = compared_strips((x, y, z), (number, returns), source, time, None)
         apart = offsets_of([rows], settings)
-        return (strips_warning(apart, moves_of([rows], settings)),) if apart else ()
+        named = strips_warning(apart, moves_of([rows], settings)) if apart else ""
+        return tuple(filter(None, (named, surfaces_warning([rows]))))
 
 
 class _Raster:

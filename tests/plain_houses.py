@@ -42,9 +42,14 @@ def houses(seed: int = 5, per_m2: float = 6.0, noise_m: float = 0.02) -> Houses:
 
 
 def write_houses(
-    path: Path, found: Houses, classes: npt.ArrayLike = 0, strips: npt.ArrayLike = 1, lift_m: npt.ArrayLike = 0.0
+    path: Path,
+    found: Houses,
+    classes: npt.ArrayLike = 0,
+    strips: npt.ArrayLike = 1,
+    lift_m: npt.ArrayLike = 0.0,
+    times_s: npt.ArrayLike = 0.0,
 ) -> Path:
-    """Write the points with classes, flight strips and a lift of each, in EPSG:25832 with NHN heights."""
+    """Write the points with classes, flight strips, a lift and a GPS time of each, in EPSG:25832 with NHN heights."""
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales, header.offsets = np.full(3, 0.001), np.floor(found.xyz.min(axis=0))
     header.add_crs(pyproj.CRS("EPSG:25832+7837"))
@@ -52,7 +57,7 @@ def write_houses(
     n = len(found.house)
     las.x, las.y, las.z = found.xyz[:, 0], found.xyz[:, 1], found.xyz[:, 2] + np.asarray(lift_m)
     values: dict[str, Any] = {"return_number": 1, "number_of_returns": 1, "classification": classes}
-    for name, value in (values | {"point_source_id": strips}).items():
+    for name, value in (values | {"point_source_id": strips, "gps_time": times_s}).items():
         las[name] = np.broadcast_to(np.asarray(value), n)
     las.write(path)
     return path

@@ -21,6 +21,7 @@ import shapely
 from pipeline.errors import RunError
 from pipeline.export.putting import Put, put_local
 from pipeline.io import arrow_at
+from pipeline.terrain.flight_strip import Strip
 from pipeline.tiling import MM, Tile, TileGrid
 
 if TYPE_CHECKING:
@@ -143,7 +144,8 @@ class RunManifest:
     warnings: tuple[str, ...] = ()
     """The warnings of the run."""
     strip_moves_m: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """By how many metres each flight strip (`point_source_id`) was moved up; empty where all strips fit."""
+    """By how many metres each flight strip (`point_source_id`) was moved up; empty where all strips fit. Strips of one
+    id that do not fit are named by GPS times, too, also those that stayed."""
     headline: str = ""
     """The first warning, where it says why the result is empty; else empty."""
     content_sha256: str | None = None
@@ -157,9 +159,9 @@ class RunManifest:
                 raise RunError(f"{name} is {value.isoformat()}: give a time zone")
 
     @property
-    def strip_moves_mm(self) -> dict[int, int]:
-        """The moves in whole millimetres, by the number of the strip."""
-        return {int(strip): round(move * MM) for strip, move in self.strip_moves_m.items()}
+    def strip_moves_mm(self) -> dict[Strip, int]:
+        """The moves in whole millimetres."""
+        return {Strip.of(strip): round(move * MM) for strip, move in self.strip_moves_m.items()}
 
     def squares(self, keys: Iterable[str]) -> list[Any]:
         """The tiles of some keys as squares in metres, in their order; none where the lattice is unknown."""

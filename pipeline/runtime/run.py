@@ -63,6 +63,7 @@ from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import Splits, split
 from pipeline.runtime.stages.stored_sites import joined_of, store_sites
 from pipeline.settings import RunSettings
+from pipeline.terrain.flight_strip import Strip
 from pipeline.tiling import MM
 
 if TYPE_CHECKING:  # loads kernels, which few drivers need
@@ -283,7 +284,7 @@ class _Candidates:
     """What the stages that all variants share found."""
 
     ingested: Sequence[Ingested]
-    moves_mm: Mapping[int, int]
+    moves_mm: Mapping[Strip, int]
     ground: Ground
     splits: Splits
     joined: Joined

@@ -1,5 +1,6 @@
 """Flight strips that lie above one another: named with their offset, and the houses on them are found."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,15 @@ def two_strips(path: Path, lift_m: float, tilt_m: float = 0.0) -> Path:
     strips = np.random.default_rng(6).integers(11, 13, len(found.house))
     share = (found.xyz[:, 0] - 400_000.0) / SIDE_M - 0.5
     return write_houses(path, found, strips=strips, lift_m=(strips == 12) * (lift_m + tilt_m * share))
+
+
+def two_passes(path: Path, lift_m: float, source: int = 0, gap_s: float = 40.0) -> Path:
+    """The same in two passes of one id: the second higher, and a turn later; without a gap there are no times."""
+    found = houses(per_m2=8.0)
+    late = np.random.default_rng(6).integers(0, 2, len(found.house))
+    along_s = (found.xyz[:, 0] - 400_000.0) / 60.0
+    times_s = 230_407.0 + late * gap_s + along_s if gap_s else 0.0
+    return write_houses(path, found, strips=source, lift_m=late * lift_m, times_s=times_s)
 
 
 def warning_of(summary: Any) -> str:
@@ -124,3 +134,78 @@ def test_a_rerun_moves_the_strips_as_the_run_did(tmp_path: Path, reconstruct: An
     again = rerun(RerunRequest(run_dir=summary.run_dir, only=(one,), resources=Resources(workers=0)))
     assert again.digest == summary.digest
     assert {row["building_id"]: row["ridge_z"] for row in rows(summary.run_dir)} == before
+
+
+# --- strips that no id separates
+
+
+@pytest.mark.parametrize("lift_m", [0.3, 0.45, 0.6, 1.5])
+@pytest.mark.parametrize("source", [0, 31])
+def test_houses_in_strips_of_one_id_are_found_by_gps_times_which_name_the_strips(
+    source: int, lift_m: float, tmp_path: Path, reconstruct: Any
+) -> None:
+    summary = reconstruct(two_passes(tmp_path / "tile.laz", lift_m, source))
+    assert summary.statuses == {"ok": 3}
+    assert sorted(row["footprint_area_m2"] for row in rows(summary.run_dir)) == pytest.approx(AREAS_M2, rel=0.06)
+    first, second = (f"strip {source} at GPS time {times}" for times in ("230400 to 230416", "230440 to 230456"))
+    assert f"{first} lies {lift_m:.2f} m below {second}" in warning_of(summary)
+
+
+def test_strips_without_ids_in_files_of_their_own_are_found(tmp_path: Path, reconstruct: Any) -> None:
+    whole = houses(per_m2=8.0)
+    late = np.random.default_rng(6).random(len(whole.house)) < 0.5
+    paths = []
+    for number, own in enumerate((~late, late)):
+        one = dataclasses.replace(whole, xyz=whole.xyz[own], house=whole.house[own])
+        path = tmp_path / f"strip-{number}.laz"
+        paths.append(write_houses(path, one, strips=0, lift_m=0.6 * number, times_s=5000.0 + 100.0 * number))
+    summary = reconstruct(*paths)
+    assert summary.statuses == {"ok": 3}
+    assert "lies 0.60 m below strip 0 at GPS time" in warning_of(summary)
+
+
+def test_passes_of_one_id_that_fit_are_not_named_and_change_nothing(tmp_path: Path, reconstruct: Any) -> None:
+    summary = reconstruct(two_passes(tmp_path / "tile.laz", 0.03))
+    assert summary.statuses == {"ok": 3}
+    assert warning_of(summary) == ""
+    assert read_manifest(summary.run_dir).strip_moves_m == {}
+
+
+def test_inspect_names_strips_by_gps_times(tmp_path: Path) -> None:
+    code, out, _ = invoke("inspect", str(two_passes(tmp_path / "tile.laz", 0.6)), "--json")
+    assert code == 0
+    assert any("strip 0 at GPS time 230400 to" in warning for warning in json.loads(out)["warnings"])
+
+
+def test_an_object_that_passes_of_one_id_keep_from_being_a_building_says_so(tmp_path: Path, reconstruct: Any) -> None:
+    summary = reconstruct(two_passes(tmp_path / "tile.laz", 0.8), settings={"strips": {"align_m": 10.0}})
+    said = [row for row in rows(summary.run_dir, "rejected") if row["reason"] == Reason.STRIPS_DISAGREE]
+    assert said
+    assert all(row["reason_detail"].startswith("strips lie 0.80 m apart, at most 0.1; vegetation: ") for row in said)
+
+
+@pytest.mark.parametrize("lift_m", [0.3, 0.6])
+def test_strips_that_nothing_separates_are_named_as_two_surfaces(
+    lift_m: float, tmp_path: Path, reconstruct: Any
+) -> None:
+    path = two_passes(tmp_path / "tile.laz", lift_m, gap_s=0.0)
+    said = f"two surfaces {lift_m:.2f} m apart"
+    assert any(said in warning for warning in reconstruct(path).warnings)
+    _, out, _ = invoke("inspect", str(path), "--json")
+    assert any(said in warning for warning in json.loads(out)["warnings"])
+
+
+@pytest.mark.slow
+def test_passes_depend_on_neither_tiles_nor_workers_and_a_rerun_moves_them_alike(
+    tmp_path: Path, reconstruct: Any
+) -> None:
+    path = two_passes(tmp_path / "tile.laz", 0.6)
+    whole = reconstruct(path, out=str(tmp_path / "run"))
+    tiled = reconstruct(path, settings={"tile_size_m": 23.0, "lattice_x_m": 3.0})
+    request = RunRequest(inputs=(str(path),), out=str(tmp_path / "workers"), resources=Resources(workers=2))
+    assert {whole.digest, tiled.digest, run(request).digest} == {whole.digest}
+    named = {"0 at GPS time 230400 to 230416": 0.3, "0 at GPS time 230440 to 230456": -0.3}
+    assert read_manifest(whole.run_dir).strip_moves_m == named
+    one = min(row["building_id"] for row in rows(whole.run_dir))
+    again = rerun(RerunRequest(run_dir=whole.run_dir, only=(one,), resources=Resources(workers=0)))
+    assert again.digest == whole.digest

@@ -34,7 +34,8 @@ from pipeline.terrain.lattice import NO_DATA, lowest_per_cell
 from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.scene_settings import ClassesInUse
 from pipeline.terrain.settings import OutlierSettings
-from pipeline.terrain.survey_strips import SQUARE_MM, compared_strips
+from pipeline.terrain.strip_squares import SQUARE_MM
+from pipeline.terrain.survey_strips import compared_strips
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 
@@ -129,8 +130,8 @@ def find_cells(task: CellsTask, settings: OutlierSettings) -> TileCells:
     del parts
     around = _around(task, core.grown(max(SQUARE_MM, math.ceil(settings.support_m * MM))))
     x, y, z = (np.concatenate([columns[axis] for columns in (own, *around)]) for axis in range(3))
-    number, source, returns = (np.concatenate([columns[k] for columns in (own, *around)]) for k in (3, 5, 7))
-    strips = compared_strips((x, y, z), (number, returns), source, core)
+    number, time, source, returns = (np.concatenate([columns[k] for columns in (own, *around)]) for k in (3, 4, 5, 7))
+    strips = compared_strips((x, y, z), (number, returns), source, time, core)
     task.scratch.check_cancelled()
     n = len(own[0])
     kept = dense_enough(x, y, z, settings)[:n]

@@ -36,6 +36,7 @@ from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.cleanup import clear_points
 from pipeline.runtime.stages.ingested import Ingested, of_file, points_by_tile, spread_m
 from pipeline.runtime.stages.tile_content import ZoneSums, zone_sums
+from pipeline.terrain.flight_strip import Strip, ids_of_timed
 from pipeline.tiling import MM, Tile, TileGrid
 
 _CHUNK_POINTS = 250_000
@@ -68,8 +69,8 @@ class IngestTask:
     """The share; None for the whole file."""
     limits: IsolationLimits | None = None
     """Limits of the child process that reads it; None reads it in the process that runs the task."""
-    moves_mm: tuple[tuple[int, int], ...] = ()
-    """Flight strips that are moved, and by how much up."""
+    moves_mm: tuple[tuple[Strip, int], ...] = ()
+    """Flight strips that are moved, and by how much up; those named by GPS times get ids of their own, too."""
 
     @property
     def supervises(self) -> bool:
@@ -78,7 +79,7 @@ class IngestTask:
 
 
 def tasks_of(
-    context: RunContext, paths: Sequence[str], moves_mm: Mapping[int, int] | None = None
+    context: RunContext, paths: Sequence[str], moves_mm: Mapping[Strip, int] | None = None
 ) -> dict[Place, IngestTask]:
     """The tasks that read all inputs, in the order of the paths, by the places of their outcomes."""
     plan = context.plan
@@ -105,11 +106,11 @@ def tasks_of(
     return tasks
 
 
-def ingest(context: RunContext, paths: Sequence[str], moves_mm: Mapping[int, int] | None = None) -> list[Ingested]:
+def ingest(context: RunContext, paths: Sequence[str], moves_mm: Mapping[Strip, int] | None = None) -> list[Ingested]:
     """Bucket the points of all inputs by tile; what each input held, in the order of the paths.
 
-    `moves_mm` are flight strips whose points are moved up. Raises EmptyInputError if no usable point is left,
-    InconsistentInputError if all points lie on one line.
+    `moves_mm` are flight strips whose points are moved up, and get ids of their own if they share one. Raises
+    EmptyInputError if no usable point is left, InconsistentInputError if all points lie on one line.
     """
     progress = context.progress
     known = {info.path: info for info in context.plan.sources}
@@ -277,11 +278,14 @@ def _ingested(task: IngestTask) -> Ingested:
     moments = np.zeros(6)
     first: tuple[int, int] | None = None
     multiple = False
+    own_ids = ids_of_timed(strip for strip, _ in task.moves_mm)
     for cloud in source.chunks(_CHUNK_POINTS, task.share):
         task.scratch.check_cancelled()
         records = to_records(cloud)
         for strip, move_mm in task.moves_mm:
-            records["z"][records["source"] == strip] += move_mm
+            held = strip.holds(cloud.source_id, cloud.gps_time)
+            records["z"][held] += move_mm
+            records["source"][held] = own_ids.get(strip, strip.source)
         x, y, z = (np.ascontiguousarray(records[name]) for name in "xyz")
         for axis, values in enumerate((x, y, z)):
             low[axis] = min(low[axis], int(values.min()))

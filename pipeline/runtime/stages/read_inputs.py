@@ -22,7 +22,9 @@ from pipeline.runtime.stages.ground import BlockCells, cells_of_blocks
 from pipeline.runtime.stages.ingest import ingest, tasks_of
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.settings import RunSettings
-from pipeline.terrain.survey_strips import NO_ROWS, Rows, counted, moves_of, offsets_of, rows_of, strips_warning
+from pipeline.terrain.flight_strip import Strip
+from pipeline.terrain.strip_moves import moves_of, offsets_of, strips_warning, surfaces_warning
+from pipeline.terrain.survey_strips import NO_ROWS, Rows, counted, rows_of
 
 _STRIPS = "strips"
 """The stage under which it is stored how strips that were moved differ in the files."""
@@ -36,12 +38,12 @@ class Inputs:
     """What each input held, in the order of the paths."""
     cells: BlockCells
     """What was found of the points of each tile."""
-    moves_mm: Mapping[int, int]
-    """By how much each flight strip was moved up; empty where all fit."""
+    moves_mm: Mapping[Strip, int]
+    """By how much each flight strip was moved up, of those that share an id also 0; empty where all fit."""
 
 
 def read_inputs(context: RunContext, settings: RunSettings, paths: Sequence[str], *, footprints: bool) -> Inputs:
-    """Read all inputs; again, with whole strips moved, if these lie too far above one another.
+    """Read all inputs; again, with whole strips moved, if these lie too far above one another or share an id.
 
     A later run of the same inputs in one work folder knows the moves before it reads, so that nothing is read again.
     Raises EmptyInputError and InconsistentInputError as `ingest` does, InputError as `cells_of_blocks` does.
@@ -58,6 +60,8 @@ def read_inputs(context: RunContext, settings: RunSettings, paths: Sequence[str]
     apart = offsets_of([rows], scene.strips)
     if apart:
         context.progress.warn("cells", strips_warning(apart, moves_mm))
+    if doubled := surfaces_warning([rows]):
+        context.progress.warn("cells", doubled)
     if found is not None and not moves_mm:
         return found
     if found is not None:
@@ -68,9 +72,9 @@ def read_inputs(context: RunContext, settings: RunSettings, paths: Sequence[str]
 
 
 def _read(
-    context: RunContext, settings: RunSettings, paths: Sequence[str], moves_mm: Mapping[int, int], *, footprints: bool
+    context: RunContext, settings: RunSettings, paths: Sequence[str], moves_mm: Mapping[Strip, int], *, footprints: bool
 ) -> Inputs:
-    """Read all inputs with some strips moved up."""
+    """Read all inputs with some strips moved up and separated."""
     ingested = ingest(context, paths, moves_mm)
     cells = cells_of_blocks(context, settings, ingested, footprints=footprints)
     return Inputs(ingested=ingested, cells=cells, moves_mm=moves_mm)

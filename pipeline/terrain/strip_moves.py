@@ -1,0 +1,172 @@
+"""Flight strips that do not fit: how far they lie above one another, in words, and where whole strips are moved to.
+
+Strips that differ by more than houses bear are moved, as whole strips, to their common mean.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from pipeline.kernels.union_find import united
+from pipeline.model import FloatArray, IntArray
+from pipeline.terrain.flight_strip import Strip
+from pipeline.terrain.named_strips import FEW_SQUARES, differences, named_strips
+from pipeline.terrain.settings import StripSettings
+from pipeline.terrain.survey_strips import HAS_POINTS, NO_ROWS, Rows, counted
+
+_FEW_TO_MOVE = 30
+"""Fewest squares by which whole strips are moved: those of one roof may lie apart for a reason of its own."""
+_MOST_NAMED = 5
+"""Pairs of strips that a warning names; it counts the others."""
+_LEAST_SHARE = 0.1
+"""Least share of the squares whose points lie on two surfaces from which on these are those of strips: above that of
+trees, wires and glass."""
+_MOST_SPREAD_M = 0.2
+"""Largest distance of the quartiles of what lies between two such surfaces: it is alike where strips do not fit."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
+class StripOffset:
+    """Two strips that do not fit."""
+
+    first: Strip
+    """The strip with the smaller id, or the earlier one."""
+    second: Strip
+    """The other one."""
+    offset_m: float
+    """How far the first lies above the second, metres: the median over the squares."""
+    low_m: float
+    """The lower quartile."""
+    high_m: float
+    """The upper quartile."""
+    squares: int
+    """Squares that both saw."""
+
+    def __str__(self) -> str:
+        """In words."""
+        seen = f"({self.squares} places)"
+        if self.high_m - self.low_m > 0.1:
+            low, high = f"{self.low_m:+.2f}", f"{self.high_m:+.2f}"
+            return f"strip {self.first} lies {low} to {high} m above strip {self.second} {seen}"
+        side = "above" if self.offset_m > 0.0 else "below"
+        return f"strip {self.first} lies {abs(self.offset_m):.2f} m {side} strip {self.second} {seen}"
+
+
+def _all_pairs(parts: Iterable[Rows], settings: StripSettings) -> list[StripOffset]:
+    """All pairs of strips that some square compares."""
+    names, rows = named_strips(parts, min(settings.warn_m, settings.align_m))
+    return [
+        StripOffset(
+            first=names[found.first],
+            second=names[found.second],
+            offset_m=found.middle_m,
+            low_m=found.low_m,
+            high_m=found.high_m,
+            squares=found.squares,
+        )
+        for found in differences(rows)
+    ]
+
+
+def offsets_of(parts: Iterable[Rows], settings: StripSettings) -> list[StripOffset]:
+    """Pairs of strips that differ by more than `warn_m` at a quarter of the squares, the largest offset first.
+
+    `parts` are the rows of all tiles.
+    """
+    found = [
+        pair
+        for pair in _all_pairs(parts, settings)
+        if pair.squares >= FEW_SQUARES and max(-pair.low_m, pair.high_m) > settings.warn_m
+    ]
+    return sorted(found, key=lambda pair: (-max(-pair.low_m, pair.high_m), pair.first, pair.second))
+
+
+def strips_warning(apart: Sequence[StripOffset], moves_mm: Mapping[Strip, int]) -> str:
+    """What does not fit and what a run does about it, for people; `apart` is not empty."""
+    named = "; ".join(map(str, apart[:_MOST_NAMED]))
+    if len(apart) > _MOST_NAMED:
+        named += f"; and {len(apart) - _MOST_NAMED} pairs more"
+    moved = ", ".join(f"{strip} by {move / 1000.0:+.2f} m" for strip, move in sorted(moves_mm.items()) if move)
+    if not moved:
+        return f"flight strips do not fit: {named}. Buildings that two strips saw are aligned one by one"
+    return f"flight strips do not fit: {named}. They are moved to their common mean: strip {moved}"
+
+
+def surfaces_warning(parts: Iterable[Rows]) -> str:
+    """A sentence on points that lie on two surfaces above one another throughout an area; empty where they do not.
+
+    Neither their ids nor their GPS times say that two strips saw it.
+    """
+    rows = counted(np.concatenate([NO_ROWS, *parts]))
+    alone = rows[(rows[:, 0] == rows[:, 1]) & (rows[:, 2] != HAS_POINTS)]
+    two = alone[alone[:, 2] > 0]
+    alone[:, :2], two[:, :2] = 0, 0
+    squares = int(alone[:, 3].sum())
+    for found in differences(two):
+        share = found.squares / squares
+        if found.squares >= _FEW_TO_MOVE and share >= _LEAST_SHARE and found.high_m - found.low_m <= _MOST_SPREAD_M:
+            return (
+                f"at {100.0 * share:.0f} % of {squares} places the points lie on two surfaces {found.middle_m:.2f} m "
+                "apart, as where flight strips do not fit, and neither point_source_id nor GPS time says which point "
+                "is of which strip: houses there may be missing. Give each strip a point_source_id of its own"
+            )
+    return ""
+
+
+def moves_of(parts: Sequence[Rows], settings: StripSettings) -> dict[Strip, int]:
+    """By how many millimetres each strip is moved up; empty where all strips fit, or ids separate those that do not.
+
+    Strips that differ by no more than `align_m` keep their places to each other. The others are fitted by least squares
+    over the squares that they share, so that the mean of all places that strips were compared at stays. Strips that GPS
+    times name are listed even where they stay.
+    """
+    pairs = _all_pairs(parts, settings)
+    apart = [p for p in pairs if abs(p.offset_m) > settings.align_m and p.squares >= _FEW_TO_MOVE]
+    stay = {strip: 0 for p in pairs for strip in (p.first, p.second) if strip.is_timed}
+    if not apart:
+        return stay
+    index = {strip: k for k, strip in enumerate(sorted({strip for p in pairs for strip in (p.first, p.second)}))}
+    close = [(index[p.first], index[p.second]) for p in pairs if abs(p.offset_m) <= settings.align_m]
+    fit = np.array(close, np.int64).reshape(-1, 2)
+    group = united(len(index), fit[:, 0], fit[:, 1])
+    weight = np.zeros(len(index))
+    for p in pairs:
+        for strip in (p.first, p.second):
+            weight[group[index[strip]]] += p.squares
+    level = _levels(group, [(index[p.first], index[p.second], p.offset_m, p.squares) for p in apart], weight)
+    moves = {strip: round(-100.0 * level[int(group[k])]) * 10 for strip, k in index.items()}
+    return stay | {strip: move for strip, move in moves.items() if move}
+
+
+def _levels(group: IntArray, pairs: Sequence[tuple[int, int, float, int]], weight: FloatArray) -> Mapping[int, float]:
+    """Height of each group of strips above the mean of those it is compared with, metres.
+
+    `pairs` are two strips, how far the first lies above the second, and the squares. Gauss and Seidel's iteration: few
+    groups, added up in a fixed order.
+    """
+    roots = sorted({int(group[k]) for pair in pairs for k in pair[:2]})
+    level = dict.fromkeys(map(int, group), 0.0)
+    edges = [(int(group[a]), int(group[b]), offset, n) for a, b, offset, n in pairs if group[a] != group[b]]
+    beside: dict[int, list[tuple[int, float, int]]] = {root: [] for root in roots}
+    for a, b, offset, n in edges:
+        beside[a].append((b, offset, n))
+        beside[b].append((a, -offset, n))
+    for _ in range(_ROUNDS):
+        for root, others in beside.items():
+            if others:
+                total = sum(n for *_, n in others)
+                level[root] = sum(n * (level[other] + offset) for other, offset, n in others) / total
+    part = united(len(group), np.array([a for a, *_ in edges], np.int64), np.array([e[1] for e in edges], np.int64))
+    for piece in {int(part[root]) for root in roots}:
+        members = [root for root in roots if int(part[root]) == piece]
+        mean = sum(weight[root] * level[root] for root in members) / sum(weight[root] for root in members)
+        for root in members:
+            level[root] -= mean
+    return level
+
+
+_ROUNDS = 500
+"""Rounds of the iteration: far more than a chain of strips across a city needs to a centimetre."""
