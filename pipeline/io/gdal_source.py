@@ -9,7 +9,6 @@ import contextlib
 import json
 import mmap
 import re
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ from typing import Any, NamedTuple
 from pipeline.errors import UnreadableInputError
 from pipeline.io.formats import first_bytes
 from pipeline.io.library_faults import in_our_words
+from pipeline.io.temporary import temporary_folder
 from pipeline.io.vector_text import BYTES
 
 VALID = (
@@ -119,8 +119,8 @@ def _alone(path: Path, ending: str) -> Iterator[str]:
         if found := _ELSEWHERE.search(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)):
             named = found[0].decode()
             raise UnreadableInputError(str(path), f"it is XML with entities of its own or links: {named}", VALID)
-    with tempfile.TemporaryDirectory(prefix="gablework-vector-") as folder:
-        name = Path(folder, path.stem + ending)
+    with temporary_folder() as folder:
+        name = folder / (path.stem + ending)
         name.symlink_to(path)
         schema = path.with_suffix(".xsd")
         if schema.is_file():

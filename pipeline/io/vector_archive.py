@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
@@ -14,6 +13,7 @@ from pipeline.io.formats import first_bytes
 from pipeline.io.gdal_source import CONVERT, VALID
 from pipeline.io.library_faults import in_our_words
 from pipeline.io.nearby import Shape
+from pipeline.io.temporary import temporary_folder
 
 ZIP_MAGIC = b"PK\x03\x04"
 UNPACKED_LIMIT = 2**32
@@ -37,19 +37,21 @@ def unpacked(path: Path, layer: str | None, shape: Shape) -> Iterator[tuple[Path
     if not first_bytes(path).startswith(ZIP_MAGIC):
         yield path, layer
         return
-    with tempfile.TemporaryDirectory(prefix="gablework-vector-") as folder:
+    with temporary_folder() as folder:
         with in_our_words(path, "a zip archive", "Pack it again, or give the file in it"):
             with zipfile.ZipFile(path) as archive:
                 members, of_several = _chosen(path, archive.infolist(), layer, shape)
                 for member in members:
                     place = PurePosixPath(member.filename)
-                    with (
-                        archive.open(member) as packed,
-                        Path(folder, place.stem + place.suffix.lower()).open("wb") as to,
-                    ):
+                    with archive.open(member) as packed, (folder / _plain_name(place)).open("wb") as to:
                         shutil.copyfileobj(packed, to)
             first = PurePosixPath(members[0].filename)
-        yield Path(folder, first.stem + first.suffix.lower()), None if of_several else layer
+        yield folder / _plain_name(first), None if of_several else layer
+
+
+def _plain_name(place: PurePosixPath) -> str:
+    """The name of a member once it is unpacked: programs look for the parts of a Shapefile in small letters."""
+    return place.stem + place.suffix.lower()
 
 
 def vector_members(members: Sequence[zipfile.ZipInfo]) -> dict[str, zipfile.ZipInfo]:
