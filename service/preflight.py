@@ -25,10 +25,10 @@ from typing import IO, Any
 from pipeline.errors import CrsError, EmptyInputError, InputError, UnreadableInputError
 from pipeline.io.area_of_use import Location
 from pipeline.io.crs import LARGEST_COORDINATE
-from pipeline.io.formats import recognise_format
+from pipeline.io.formats import VECTOR_SUFFIXES, recognise_format
 from pipeline.io.temporary import temporary_folder
 from service.errors import TooLargeError
-from service.vectors import VECTOR_SUFFIXES, examine_vector
+from service.vectors import examine_vector
 from service.wording import as_inputs
 
 PASS_BYTES = 128 << 20
