@@ -350,7 +350,7 @@ class Driver:
     def _tidy(self) -> None:
         while True:
             try:
-                # those of attempts that were killed
+                # those of drivers that were killed
                 removed = remove_left_folders()
                 removed += tidy(self._store, self._shop.folder, self._settings)
                 while self._store.webhooks.forget(self._settings.webhook_log_days):
