@@ -37,7 +37,7 @@ XML_SUFFIXES = (".gml", ".kml")
 ARCHIVE_SUFFIXES = (".zip", ".kmz")
 """Endings of zip archives of vector files."""
 VECTOR_FILE_SUFFIXES = (".gpkg", ".shp", *GEOJSON_SUFFIXES, *LINES_SUFFIXES, *PARQUET_SUFFIXES, ".fgb", *XML_SUFFIXES)
-"""Endings of vector files that are no archives."""
+"""Endings of vector files that are not archives."""
 VECTOR_SUFFIXES = (*VECTOR_FILE_SUFFIXES, *ARCHIVE_SUFFIXES)
 """Endings of all vector files that are read, as footprints, guides, areas and tile indexes; none ends a point file."""
 UNREAD_VECTORS = {

@@ -88,7 +88,7 @@ def test_a_vector_index_names_files_in_its_column(folder, ending):
     assert read_tile_index(str(index)).outlines is not None
 
 
-def test_a_zip_archive_of_point_clouds_is_no_index_and_named(folder):
+def test_a_zip_archive_of_point_clouds_is_not_an_index_and_named(folder):
     with zipfile.ZipFile(folder / "tiles.zip", "w") as archive:
         archive.write(folder / "a.laz", "a.laz")
     with pytest.raises(UnreadableInputError, match=r"tiles\.zip: it is a zip archive of point clouds\. Give each"):
