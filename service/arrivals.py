@@ -23,6 +23,7 @@ from starlette.requests import ClientDisconnect
 from pipeline.errors import InputError
 from service import resumable
 from service.deliveries import Delivery
+from service.disk import MAKE_ROOM
 from service.errors import ChecksumError, NoSpaceError, NoSuchUploadError, OffsetError, RequestError, TooLargeError
 from service.filenames import clean_filename
 from service.files import StateFolder
@@ -241,7 +242,7 @@ class Arrivals:
             return state
         except OSError as fault:
             if fault.errno in {errno.ENOSPC, errno.EDQUOT}:
-                raise NoSpaceError("there is no room on the disk for the upload: free some, or try later") from fault
+                raise NoSpaceError(f"there is no room on the disk for the upload. {MAKE_ROOM}") from fault
             raise
 
     async def remove(self, upload_id: str, *, owner: str | None) -> None:

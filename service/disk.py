@@ -22,6 +22,10 @@ BALLAST = ".ballast"
 """Name of the ballast, beside the database."""
 
 
+MAKE_ROOM = "Remove finished jobs or uploads, or wait until the operator makes room"
+"""What a client can do about a disk that is full."""
+
+
 def has_no_space(error: BaseException) -> bool:
     """Whether a full disk is the error, or its cause."""
     return any(
@@ -64,7 +68,7 @@ class Disk:
         if free_bytes - more_bytes < self.reserve_bytes:
             raise NoSpaceError(
                 f"there is no room on the disk for {purpose}: {free_bytes} bytes are free, {self.reserve_bytes} are "
-                "reserved for the database. Remove finished jobs or uploads, or wait until the operator makes room"
+                f"reserved for the database. {MAKE_ROOM}"
             )
 
 

@@ -20,7 +20,7 @@ from urllib.parse import unquote
 import httpx
 
 from pipeline.errors import RunCancelledError, UnreadableInputError
-from service.disk import FULL, Disk
+from service.disk import FULL, MAKE_ROOM, Disk
 from service.errors import NoSpaceError, TooLargeError
 from service.filenames import clean_filename
 from service.input_policy import checked_url, shown
@@ -133,7 +133,7 @@ def download(
         return path, loop.run_until_complete(watch.over(_fetch(url, path, settings, watch)))
     except OSError as fault:
         if fault.errno in FULL:
-            raise NoSpaceError(f"there is no room on the disk for {path.name}") from fault
+            raise NoSpaceError(f"there is no room on the disk for {path.name}. {MAKE_ROOM}") from fault
         raise
     finally:
         # not `asyncio.run`: it waits for the thread of a name's look-up, which no one can end

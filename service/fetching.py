@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 
 from pipeline.errors import InputError
 from pipeline.io.area_of_use import location_of
-from pipeline.io.formats import POINT_SUFFIXES
+from pipeline.io.formats import POINT_SUFFIXES, VECTOR_SUFFIXES
 from service.downloads import Cancel, OnBytes, download, ignore_bytes, name_of
 from service.errors import (
     InputRefusedError,
@@ -19,12 +19,13 @@ from service.errors import (
     ServiceError,
     TooLargeError,
 )
+from service.filenames import unread
 from service.files import StateFolder
 from service.input_policy import checked_crs, checked_path, checked_url
 from service.jobs import InputReference, JobRequest, Upload
 from service.preflight import outside_area, preflight, promised_points
 from service.settings import ServiceSettings
-from service.vectors import LINES, POLYGONS, VECTOR_SUFFIXES
+from service.vectors import LINES, POLYGONS
 
 
 class UploadTable(Protocol):
@@ -189,6 +190,8 @@ def _check_suffix(source: InputReference, name: str, kind: _Kind) -> None:
     """Refuse points as footprints and vice versa, by the ending that decides how a file is read."""
     suffixes = _SUFFIXES[kind]
     if not name.lower().endswith(suffixes):
+        if kind != "point cloud" and (about := unread(name)):
+            raise RequestError([f"{source.kind} {name[:80]!r} cannot be used: {about}"])
         raise RequestError([f"{source.kind} {name[:80]!r} is not a {kind}: its name must end in {', '.join(suffixes)}"])
 
 

@@ -5,18 +5,10 @@ from __future__ import annotations
 import re
 import unicodedata
 
-from pipeline.io.formats import POINT_SUFFIXES
+from pipeline.io.formats import CONVERT, POINT_SUFFIXES, UNREAD_VECTORS, VECTOR_SUFFIXES
 from service.errors import RequestError
 
-GEOJSON_SUFFIXES = (".geojson", ".json")
-"""Endings of GeoJSON."""
-PARQUET_SUFFIXES = (".parquet", ".geoparquet")
-"""Endings of GeoParquet."""
-LINES_SUFFIXES = (".geojsonl", ".geojsons", ".ndjson")
-"""Endings of GeoJSON with one feature per line."""
-XML_SUFFIXES = (".gml", ".kml")
-"""Endings of GML and KML."""
-FOOTPRINT_SUFFIXES = (".gpkg", *GEOJSON_SUFFIXES, *LINES_SUFFIXES, *PARQUET_SUFFIXES, ".fgb", *XML_SUFFIXES, ".zip")
+FOOTPRINT_SUFFIXES = tuple(suffix for suffix in VECTOR_SUFFIXES if suffix != ".shp")
 """Endings of footprints in one file; a Shapefile is several files and is accepted in a zip archive, or by path."""
 SUFFIXES = (*POINT_SUFFIXES, *FOOTPRINT_SUFFIXES)
 """Endings of the files that are accepted."""
@@ -26,6 +18,18 @@ DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
 """Names that Windows reserves, with any ending."""
 FORBIDDEN = re.compile(r'[<>:"|?*]')
 """Characters that Windows forbids in names."""
+
+
+def unread(name: str) -> str | None:
+    """Why a vector file of this name cannot be sent, with the fix; None if its ending does not say so.
+
+    >>> unread("houses.TAB")
+    'MapInfo TAB is not read. Convert it to GeoPackage (.gpkg)'
+    """
+    if name.lower().endswith(".shp"):
+        return "a Shapefile is several files. Send them in a zip archive (.zip)"
+    ending = next((ending for ending in UNREAD_VECTORS if name.lower().endswith(ending)), None)
+    return None if ending is None else f"{UNREAD_VECTORS[ending]} is not read. {CONVERT}"
 
 
 def clean_filename(name: str) -> str:
@@ -48,6 +52,8 @@ def clean_filename(name: str) -> str:
     cleaned = FORBIDDEN.sub("_", kept).strip(" .")
     suffix = next((ending for ending in SUFFIXES if cleaned.lower().endswith(ending)), "")
     stem = cleaned[: len(cleaned) - len(suffix)].strip(" .")
+    if about := unread(cleaned):
+        raise RequestError([f"the file {last[:80]!r} cannot be used: {about}"])
     if not suffix or not stem:
         raise RequestError(
             [f"the file's name is {last[:80]!r}: give a name that ends in one of {', '.join(SUFFIXES)}, with a stem"]

@@ -16,7 +16,6 @@ import os
 import select
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterable, Mapping
@@ -26,9 +25,10 @@ from typing import IO, Any
 from pipeline.errors import CrsError, EmptyInputError, InputError, UnreadableInputError
 from pipeline.io.area_of_use import Location
 from pipeline.io.crs import LARGEST_COORDINATE
-from pipeline.io.formats import recognise_format
+from pipeline.io.formats import VECTOR_SUFFIXES, recognise_format
+from pipeline.io.temporary import temporary_folder
 from service.errors import TooLargeError
-from service.vectors import VECTOR_SUFFIXES, examine_vector
+from service.vectors import examine_vector
 from service.wording import as_inputs
 
 PASS_BYTES = 128 << 20
@@ -210,7 +210,7 @@ class Examiner:
         self._memory_bytes = memory_bytes
         self._lock = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._held = contextlib.ExitStack()
         self._served = 0
 
     def examine(self, path: Path, *, max_points: int) -> dict[str, Any]:
@@ -277,8 +277,7 @@ class Examiner:
             env = {name: value for name, value in os.environ.items() if name not in secrets}
             env |= {"OPENBLAS_NUM_THREADS": "1", "RAYON_NUM_THREADS": "1", "PROJ_NETWORK": "OFF"}
             # what it unpacks goes with it, also if it is killed
-            self._folder = tempfile.TemporaryDirectory(prefix="gablework-examine-", ignore_cleanup_errors=True)
-            env["TMPDIR"] = self._folder.name
+            env["TMPDIR"] = str(self._held.enter_context(temporary_folder()))
             self._child = subprocess.Popen(  # noqa: S603 - our own module, no shell
                 [sys.executable, "-m", "service.preflight", str(self._memory_bytes)],
                 stdin=subprocess.PIPE,
@@ -301,8 +300,7 @@ class Examiner:
             if pipe is not None:
                 with contextlib.suppress(BrokenPipeError):
                     pipe.close()
-        if self._folder is not None:
-            self._folder.cleanup()
+        self._held.close()
 
 
 _quick_examiner, _slow_examiner = Examiner(), Examiner()

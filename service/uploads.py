@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Protocol
 
 from pipeline.runtime.monitoring import tracing
-from service.disk import FULL
+from service.disk import FULL, MAKE_ROOM
 from service.errors import NoSpaceError, RequestError, TooLargeError, TooManyUploadsError
 from service.filenames import clean_filename
 from service.files import StateFolder
@@ -161,7 +161,7 @@ async def receive(
             if isinstance(fault, Exception):
                 await asyncio.wrap_future(discarded)
         if isinstance(fault, OSError) and fault.errno in FULL:
-            raise NoSpaceError(f"there is no room on the disk for {name}: free some, or try later") from fault
+            raise NoSpaceError(f"there is no room on the disk for {name}. {MAKE_ROOM}") from fault
         raise
     else:
         tracing.note(made, size_bytes=size)

@@ -22,23 +22,27 @@ import numpy as np
 
 from pipeline.errors import EmptyInputError, InputError, UnreadableInputError
 from pipeline.io.crs import parse_crs
-from pipeline.io.formats import LAS_SUFFIXES
+from pipeline.io.formats import (
+    ARCHIVE_SUFFIXES,
+    GEOJSON_SUFFIXES,
+    LINES_SUFFIXES,
+    PARQUET_SUFFIXES,
+    XML_SUFFIXES,
+)
 from pipeline.io.gdal_source import (
     FLATGEOBUF_MAGIC,
     RECORD,
     SHAPE_MAGIC,
     is_lines,
     refuse_links,
+    refuse_unread,
     xml_ending,
 )
 from pipeline.io.library_faults import in_our_words, shortened
 from pipeline.io.nearby import POLYGONS as SHAPE_OF_FOOTPRINTS
-from pipeline.io.vector_archive import ZIP_MAGIC, unpacked, vector_members
+from pipeline.io.vector_archive import ZIP_MAGIC, refuse_without_vectors, unpacked, vector_members
 from service.errors import TooLargeError
-from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES, LINES_SUFFIXES, PARQUET_SUFFIXES, XML_SUFFIXES
 
-VECTOR_SUFFIXES = (*FOOTPRINT_SUFFIXES, ".shp")
-"""Endings of footprints and guides."""
 GEOPACKAGE_LIMIT = 2**30
 """Maximum number of bytes of a GeoPackage or GeoParquet; if all of it overlaps the points, all is held in memory."""
 GEOJSON_LIMIT = 2**28
@@ -56,7 +60,7 @@ BLOCK_BYTES = 1 << 20
 
 FIX = (
     "Give a GeoPackage (.gpkg), GeoJSON (.geojson, .json, .geojsonl), GeoParquet (.parquet), FlatGeobuf (.fgb), GML "
-    "(.gml), KML (.kml) or a zip archive (.zip) with polygons of buildings, or with lines of roofs"
+    "(.gml), KML (.kml) or a zip archive (.zip, .kmz) with polygons of buildings, or with lines of roofs"
 )
 ARCHIVED_LIMIT = 20
 """Maximum number of vector files in a zip archive: each is examined."""
@@ -99,6 +103,7 @@ def examine_vector(path: Path) -> dict[str, Any]:
         )
     with path.open("rb") as stream:
         head = stream.read(HEAD_BYTES)
+    refuse_unread(path, head)
     if suffix == ".shp":
         if not head.startswith(SHAPE_MAGIC):
             raise UnreadableInputError(str(path), f"not a Shapefile: it begins with {head[:4]!r}", FIX)
@@ -112,7 +117,7 @@ def examine_vector(path: Path) -> dict[str, Any]:
         if ending is None:
             raise UnreadableInputError(str(path), f"neither GML nor KML: it begins with {head[:16]!r}", FIX)
         return _facts(ending[1:], None, None, None, [], (POLYGONS, LINES))
-    if suffix == ".zip":
+    if suffix in ARCHIVE_SUFFIXES:
         return _archive(path, head)
     if suffix == ".gpkg":
         if not head.startswith(SQLITE_MAGIC) or head[68:72] not in APPLICATION_IDS:
@@ -164,9 +169,9 @@ def _archive(path: Path, head: bytes) -> dict[str, Any]:
     if size > GEOPACKAGE_LIMIT:
         raise TooLargeError(f"{path.name} unpacks to {size} bytes, it may have {GEOPACKAGE_LIMIT}: cut out the area")
     layers = sorted(vector_members(members))
-    if not layers and any(one.filename.lower().endswith(LAS_SUFFIXES) for one in members):
-        raise UnreadableInputError(str(path), "it is a zip archive of point clouds", "Send each point cloud unpacked")
-    if not 0 < len(layers) <= ARCHIVED_LIMIT:
+    if not layers:
+        refuse_without_vectors(path, members)
+    if len(layers) > ARCHIVED_LIMIT:
         problem = f"it is a zip archive with {len(layers)} vector files: it may have 1 to {ARCHIVED_LIMIT}"
         raise UnreadableInputError(str(path), problem, FIX)
     found = []

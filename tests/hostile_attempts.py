@@ -7,6 +7,7 @@ import time
 from typing import Any
 
 from pipeline.errors import UnreadableInputError
+from pipeline.io.temporary import temporary_folder
 from pipeline.runtime.isolation import child_main
 from pipeline.runtime.monitoring.events import Event
 from service.driver.attempt_child import End, Order
@@ -68,6 +69,12 @@ def crash(_order: Order) -> Done:
     _begin()
     os.kill(os.getpid(), signal.SIGSEGV)
     return "never", {}
+
+
+def crash_with_much_unpacked(order: Order) -> Done:
+    with temporary_folder() as folder:
+        (folder / "unpacked").write_bytes(bytes(100))
+        return crash(order)
 
 
 def be_killed(_order: Order) -> Done:

@@ -15,12 +15,29 @@ from pipeline.errors import GableworkError, RunCancelledError
 from pipeline.report.run_page import write_run_page
 from pipeline.runtime.cluster.run_metrics import RunMetrics, combined, serve_metrics
 from pipeline.runtime.cluster.serial_executor import Executor
+from pipeline.runtime.compiling import compile_for, kernel_groups
 from pipeline.runtime.monitoring.events import Event, Listener, ignore, never
 from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, locked_file, make_work, refuse_locked
 
 _WORTH_S = 60.0
 """Runs that take less wall time by the rates are not sampled: they should begin soon."""
+
+
+def refuse_at_once(batch: Batch) -> None:
+    """Refuse a batch whose folders cannot be used, before anything is read; raises as `run_batch`."""
+    refuse_locked(batch.work_folder)
+    refuse(places_refused(batch))
+
+
+def compile_for_batch(batch: Batch, on_event: Listener) -> None:
+    """Compile the kernels that a batch lacks here, after a look for its folders and files; raises as `run_batch`."""
+    refuse_at_once(batch)
+    request = batch.request()
+    general, files = request.settings.general, (request.footprints, request.guides, request.overrides, request.aoi)
+    groups = kernel_groups(method=general.method, points=request.points, terrain=general.terrain)
+    with errors_with_keys():
+        compile_for(on_event, groups, request.inputs, files, scheduler=request.resources.scheduler)
 
 
 def run_batch(
@@ -40,8 +57,7 @@ def run_batch(
     InputError, SettingsError, ClusterError, RunCancelledError
         As in `pipeline.runtime.run.run`.
     """
-    refuse_locked(batch.work_folder)
-    refuse(places_refused(batch))
+    refuse_at_once(batch)
     with contextlib.ExitStack() as shown, errors_with_keys():
         # a second run must not write into the status of the first
         work = Path(batch.work_folder).resolve()

@@ -48,16 +48,12 @@ def run(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> None:
     """Run a batch; an interrupted one continues where it stopped, and unchanged parts are not computed again."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.batch.batch_file import read_batch
-        from pipeline.batch.run import run_batch
-        from pipeline.runtime.compiling import compile_first, kernel_groups
+        from pipeline.batch.run import compile_for_batch, run_batch
 
         # SIGTERM, as systemd and Kubernetes send it, leaves a run that can continue
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         batch = read_batch(file)
-        if not batch.cluster.scheduler:
-            general = batch.settings.general
-            groups = kernel_groups(method=general.method, points=batch.output.points, terrain=general.terrain)
-            compile_first(console.on_event, groups)
+        compile_for_batch(batch, console.on_event)
         summary = run_batch(batch, console.on_event)
         show_summary(console, summary)
         console.document(dataclasses.asdict(summary))

@@ -26,6 +26,31 @@ FOREIGN_MAGIC = {
 LAS_SUFFIXES = (".las", ".laz")
 ASCII_SUFFIXES = (".xyz", ".txt", ".csv", ".asc", ".pts")
 POINT_SUFFIXES = (*LAS_SUFFIXES, ".ply", *ASCII_SUFFIXES)
+GEOJSON_SUFFIXES = (".geojson", ".json")
+"""Endings of GeoJSON."""
+LINES_SUFFIXES = (".geojsonl", ".geojsons", ".ndjson")
+"""Endings of GeoJSON with one feature per line."""
+PARQUET_SUFFIXES = (".parquet", ".geoparquet")
+"""Endings of GeoParquet."""
+XML_SUFFIXES = (".gml", ".kml")
+"""Endings of GML and KML."""
+ARCHIVE_SUFFIXES = (".zip", ".kmz")
+"""Endings of zip archives of vector files."""
+VECTOR_FILE_SUFFIXES = (".gpkg", ".shp", *GEOJSON_SUFFIXES, *LINES_SUFFIXES, *PARQUET_SUFFIXES, ".fgb", *XML_SUFFIXES)
+"""Endings of vector files that are not archives."""
+VECTOR_SUFFIXES = (*VECTOR_FILE_SUFFIXES, *ARCHIVE_SUFFIXES)
+"""Endings of all vector files that are read, as footprints, guides, areas and tile indexes; none ends a point file."""
+UNREAD_VECTORS = {
+    ".sqlite": "SQLite that is not a GeoPackage",
+    ".tab": "MapInfo TAB",
+    ".mif": "MapInfo MIF",
+    ".gdb": "a File Geodatabase",
+    ".gdbtable": "a File Geodatabase",
+    ".dxf": "DXF",
+}
+"""Vector formats that are not read, by ending."""
+CONVERT = "Convert it to GeoPackage (.gpkg)"
+"""The fix for a vector format that is not read."""
 VALID = "Valid are LAS and LAZ (.las, .laz, .copc.laz), PLY (.ply) and ASCII x y z (.xyz, .txt, .csv, .asc, .pts)"
 SNIFF_BYTES = 4096
 
@@ -48,7 +73,7 @@ def first_bytes(path: Readable) -> bytes:
     except FileNotFoundError:
         raise UnreadableInputError(str(path), "no such file", "Check the path") from None
     except IsADirectoryError:
-        fix = "Convert it to GeoPackage (.gpkg)" if path.suffix.lower() == ".gdb" else "Give the files in it"
+        fix = CONVERT if path.suffix.lower() == ".gdb" else "Give the files in it"
         raise UnreadableInputError(str(path), "a folder, not a file", fix) from None
     except OSError as fault:
         raise UnreadableInputError(

@@ -9,20 +9,20 @@ import contextlib
 import json
 import mmap
 import re
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.errors import UnreadableInputError
-from pipeline.io.formats import first_bytes
+from pipeline.io.formats import CONVERT, UNREAD_VECTORS, first_bytes
 from pipeline.io.library_faults import in_our_words
+from pipeline.io.temporary import temporary_folder
 from pipeline.io.vector_text import BYTES
 
 VALID = (
     "Valid are GeoPackage (.gpkg), GeoJSON (.geojson, .json), lines of GeoJSON (.geojsonl), Shapefile (.shp with .shx "
     "and .dbf), FlatGeobuf (.fgb), GML (.gml), KML (.kml), GeoParquet (.parquet), and a zip archive of one of them "
-    "(.zip)"
+    "(.zip, .kmz)"
 )
 WHAT = "vector data"
 GEOJSON, GEOJSON_LINES = "GeoJSON:", "GeoJSONSeq:"
@@ -38,13 +38,12 @@ _XML = {".gml": re.compile(rb"opengis\.net/gml\b"), ".kml": re.compile(rb"<(?:\w
 _ELSEWHERE = re.compile(rb"<!(?:DOCTYPE|ENTITY)|<(?:\w+:)?NetworkLink\b")
 """XML whose content is in other files, or may be."""
 _OTHERS = (
-    (re.compile(rb"SQLite format 3(?s:.{53})(?!GPKG|GP1[01])(?!(?s:.*)gpkg_)"), "SQLite that is not a GeoPackage"),
+    (re.compile(rb"SQLite format 3(?s:.{53})(?!GPKG|GP1[01])(?!(?s:.*)gpkg_)"), UNREAD_VECTORS[".sqlite"]),
     (re.compile(rb"\s*\{(?s:.*)spec/json-fg"), "JSON-FG"),
-    (re.compile(rb"!table\s", re.IGNORECASE), "MapInfo TAB"),
-    (re.compile(rb"version\s+\d+\s", re.IGNORECASE), "MapInfo MIF"),
+    (re.compile(rb"!table\s", re.IGNORECASE), UNREAD_VECTORS[".tab"]),
+    (re.compile(rb"version\s+\d+\s", re.IGNORECASE), UNREAD_VECTORS[".mif"]),
 )
 """Formats that are not read, by the first bytes."""
-CONVERT = "Convert it to GeoPackage (.gpkg)"
 _POINTER = re.compile(rb"<OGR[A-Z]")
 """Begins XML that names other files or servers; GDAL looks for it anywhere in the first bytes."""
 HEAD_BYTES = 2**16
@@ -82,8 +81,7 @@ def gdal_source(path: Path) -> Iterator[GdalSource]:
     begin = first_bytes(path)
     with path.open("rb") as stream:
         head = stream.read(HEAD_BYTES)
-    if other := next((name for pattern, name in _OTHERS if pattern.match(head)), None):
-        raise UnreadableInputError(str(path), f"{other} is not read", CONVERT)
+    refuse_unread(path, head)
     prefix = next((prefix for magic, prefix in PREFIXES.items() if begin.startswith(magic)), None)
     text = begin.removeprefix(b"\xef\xbb\xbf").lstrip()
     if text.startswith((b"{", RECORD)):
@@ -98,6 +96,12 @@ def gdal_source(path: Path) -> Iterator[GdalSource]:
             yield GdalSource(name)
     else:
         raise UnreadableInputError(str(path), f"cannot be read as {WHAT}: it begins with {begin[:8]!r}", VALID)
+
+
+def refuse_unread(path: Path, head: bytes) -> None:
+    """Refuse a file that begins as a vector format that is not read; raises UnreadableInputError."""
+    if other := next((name for pattern, name in _OTHERS if pattern.match(head)), None):
+        raise UnreadableInputError(str(path), f"{other} is not read", CONVERT)
 
 
 def xml_ending(head: bytes) -> str | None:
@@ -119,8 +123,8 @@ def _alone(path: Path, ending: str) -> Iterator[str]:
         if found := _ELSEWHERE.search(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)):
             named = found[0].decode()
             raise UnreadableInputError(str(path), f"it is XML with entities of its own or links: {named}", VALID)
-    with tempfile.TemporaryDirectory(prefix="gablework-vector-") as folder:
-        name = Path(folder, path.stem + ending)
+    with temporary_folder() as folder:
+        name = folder / (path.stem + ending)
         name.symlink_to(path)
         schema = path.with_suffix(".xsd")
         if schema.is_file():

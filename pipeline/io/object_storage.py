@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
@@ -20,6 +19,7 @@ from typing import Any, TypeVar
 from pipeline.errors import RunError
 from pipeline.io.retries import GONE, POLICY, GaveUpError, RetryPolicy, persistently
 from pipeline.io.storage import Puts, parts_of_key
+from pipeline.io.temporary import temporary_folder
 from pipeline.io.urls import filesystem_of, scheme_of, shown
 
 Result = TypeVar("Result")
@@ -59,8 +59,8 @@ class ObjectStorage:
     def putting(self, key: str) -> Iterator[Path]:
         """A temporary path on this machine, uploaded when the block ends; when it raises nothing is."""
         path = self._path(key)
-        with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
-            temporary = Path(folder, "object")
+        with temporary_folder() as folder:
+            temporary = folder / "object"
             yield temporary
             if not temporary.is_file():
                 raise RunError(f"{key!r} was not written")

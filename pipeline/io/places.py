@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.io.object_storage import ObjectStorage
 from pipeline.io.storage import LocalStorage, Storage
+from pipeline.io.temporary import temporary_folder
 from pipeline.io.urls import is_url
 
 if TYPE_CHECKING:
@@ -37,9 +37,9 @@ def made_here(place: str) -> Iterator[str]:
         yield place
         return
     storage = storage_at(place)
-    with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
-        yield folder
-        for path in sorted(path for path in Path(folder).rglob("*") if path.is_file()):
+    with temporary_folder() as folder:
+        yield str(folder)
+        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
             storage.put(path.relative_to(folder).as_posix(), path.read_bytes())
 
 

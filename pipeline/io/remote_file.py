@@ -13,7 +13,7 @@ import dataclasses
 import datetime as dt
 import io
 import shutil
-import tempfile
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
@@ -24,6 +24,7 @@ from pipeline.io import urls
 from pipeline.io.readable import FileStatus, Readable
 from pipeline.io.reading import moved
 from pipeline.io.retries import POLICY, GaveUpError, RetryPolicy, ShortReadError, persistently
+from pipeline.io.temporary import temporary_folder
 from pipeline.io.urls import filesystem_of, is_url, name_in, range_options, shown
 
 BLOCK_BYTES = 1 << 18
@@ -69,7 +70,7 @@ class RemoteFile:
         self._handle: Any = None
         self._blocks: OrderedDict[int, bytes] = OrderedDict()
         self._next_block, self._ahead = -1, 1
-        self._whole: tempfile._TemporaryFileWrapper[bytes] | None = None
+        self._whole: Path | None = None
 
     def __str__(self) -> str:
         """The URL without what may be secret."""
@@ -169,7 +170,7 @@ class RemoteFile:
                     self._handle = None
                     raise ShortReadError(f"{len(content)} of {end - begin} bytes came")
                 return content
-        with Path(self._held()).open("rb") as stream:
+        with self._held().open("rb") as stream:
             stream.seek(begin)
             return stream.read(end - begin)
 
@@ -178,14 +179,15 @@ class RemoteFile:
         """Whether the server does not send parts, so that a whole copy had to be fetched."""
         return self._whole is not None
 
-    def _held(self) -> str:
+    def _held(self) -> Path:
         """A whole copy in a temporary file, removed with this object; for servers without range requests."""
         if self._whole is None:
-            # closed by its own finaliser
-            copy = tempfile.NamedTemporaryFile(prefix="gablework-")  # noqa: SIM115
-            self._download(Path(copy.name))
+            with contextlib.ExitStack() as stack:
+                copy = stack.enter_context(temporary_folder()) / "whole"
+                self._download(copy)
+                weakref.finalize(self, stack.pop_all().close)
             self._whole = copy
-        return self._whole.name
+        return self._whole
 
     def _download(self, target: Path) -> None:
         """The whole file by one request."""
@@ -298,17 +300,16 @@ def bytes_of(file: Readable, stream: io.BufferedReader, begin: int, length: int)
 
 
 @contextlib.contextmanager
-def on_this_machine(location: str | Path, folder: Path | None = None) -> Iterator[Path]:
+def on_this_machine(location: str | Path) -> Iterator[Path]:
     """A file as a path of this machine, for libraries that need one; fetched if it is behind a URL.
 
-    A fetched copy lies in the folder, by default a temporary one, while the block runs. Raises UnreadableInputError if
-    it cannot be fetched.
+    A fetched copy lies in a temporary folder while the block runs. Raises UnreadableInputError if it cannot be fetched.
     """
     if not is_url(location):
         yield Path(location)
         return
     file = RemoteFile(str(location))
-    with tempfile.TemporaryDirectory(prefix="gablework-", dir=folder) as held:
-        path = Path(held, f"file{file.suffix}")
+    with temporary_folder() as folder:
+        path = folder / f"file{file.suffix}"
         file.fetch(path)
         yield path

@@ -1,7 +1,7 @@
 """Tile indexes: files that name point files, as survey offices publish them.
 
 There are two kinds. A text file has one path or URL per line; blank lines and comments (#) are skipped. A vector file
-(GeoPackage, GeoJSON, Shapefile, GeoParquet) has one feature per tile, its outline, and a column that names the file:
+(any that footprints may be in) has one feature per tile, its outline, and a column that names the file:
 the first of `COLUMNS` that exists (in any case), else the only column in which every value names a point file or is a
 URL. Relative names begin at the index.
 """
@@ -21,7 +21,7 @@ import shapely
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io.crs import SpatialReference, horizontal_part, parse_crs
-from pipeline.io.formats import POINT_SUFFIXES
+from pipeline.io.formats import POINT_SUFFIXES, VECTOR_SUFFIXES
 from pipeline.io.nearby import TILES
 from pipeline.io.readable import Readable
 from pipeline.io.remote_file import file_at
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 COLUMNS = ("location", "path", "url", "href", "filename", "file_name", "file", "name")
 """Columns that name the file of a tile, in this order."""
-VECTOR_SUFFIXES = (".gpkg", ".geojson", ".json", ".shp", ".parquet", ".geoparquet")
-"""Endings of vector files, none of which ends a point file."""
 TEXT_SUFFIXES = (".txt", ".csv", ".lst", ".list")
 """Endings of text files that may be indexes; what they begin with decides."""
 AROUND = 100.0

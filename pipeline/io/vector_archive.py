@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
+from typing import NoReturn
 
 from pipeline.errors import UnreadableInputError
-from pipeline.io.formats import first_bytes
-from pipeline.io.gdal_source import CONVERT, VALID
+from pipeline.io.formats import CONVERT, LAS_SUFFIXES, UNREAD_VECTORS, VECTOR_FILE_SUFFIXES, first_bytes
+from pipeline.io.gdal_source import VALID
 from pipeline.io.library_faults import in_our_words
 from pipeline.io.nearby import Shape
+from pipeline.io.temporary import temporary_folder
 
 ZIP_MAGIC = b"PK\x03\x04"
 UNPACKED_LIMIT = 2**32
@@ -22,9 +23,6 @@ _ENCRYPTED = 1
 """The flag of an encrypted member."""
 SHAPE_PARTS = (".shp", ".shx", ".dbf", ".prj", ".cpg", ".cst")
 """Files that make a Shapefile."""
-_JSON = (".geojson", ".json", ".geojsonl", ".geojsons", ".ndjson")
-VECTOR_MEMBERS = (".shp", ".gpkg", *_JSON, ".fgb", ".gml", ".kml", ".parquet")
-"""Endings of vector files in a zip archive; Parquet is read without GDAL, but unpacked here."""
 
 
 @contextlib.contextmanager
@@ -37,19 +35,21 @@ def unpacked(path: Path, layer: str | None, shape: Shape) -> Iterator[tuple[Path
     if not first_bytes(path).startswith(ZIP_MAGIC):
         yield path, layer
         return
-    with tempfile.TemporaryDirectory(prefix="gablework-vector-") as folder:
+    with temporary_folder() as folder:
         with in_our_words(path, "a zip archive", "Pack it again, or give the file in it"):
             with zipfile.ZipFile(path) as archive:
                 members, of_several = _chosen(path, archive.infolist(), layer, shape)
                 for member in members:
                     place = PurePosixPath(member.filename)
-                    with (
-                        archive.open(member) as packed,
-                        Path(folder, place.stem + place.suffix.lower()).open("wb") as to,
-                    ):
+                    with archive.open(member) as packed, (folder / _plain_name(place)).open("wb") as to:
                         shutil.copyfileobj(packed, to)
             first = PurePosixPath(members[0].filename)
-        yield Path(folder, first.stem + first.suffix.lower()), None if of_several else layer
+        yield folder / _plain_name(first), None if of_several else layer
+
+
+def _plain_name(place: PurePosixPath) -> str:
+    """The name of a member once it is unpacked: programs look for the parts of a Shapefile in small letters."""
+    return place.stem + place.suffix.lower()
 
 
 def vector_members(members: Sequence[zipfile.ZipInfo]) -> dict[str, zipfile.ZipInfo]:
@@ -57,11 +57,22 @@ def vector_members(members: Sequence[zipfile.ZipInfo]) -> dict[str, zipfile.ZipI
 
     JSON counts only where nothing else is there: a Shapefile often comes with JSON about it.
     """
-    found = [one for one in members if one.filename.lower().endswith(VECTOR_MEMBERS)]
+    found = [one for one in members if one.filename.lower().endswith(VECTOR_FILE_SUFFIXES)]
     found = [one for one in found if "__MACOSX/" not in one.filename]
     found = [one for one in found if not one.filename.lower().endswith(".json")] or found
     by_stem = {PurePosixPath(one.filename).stem: one for one in found}
     return by_stem if len(by_stem) == len(found) else {one.filename: one for one in found}
+
+
+def refuse_without_vectors(path: Path, members: Sequence[zipfile.ZipInfo]) -> NoReturn:
+    """Refuse an archive without a vector file, by what else is in it; raises UnreadableInputError."""
+    names = [one.filename.lower() for one in members]
+    for ending, kind in UNREAD_VECTORS.items():
+        if any(name.endswith(ending) for name in names):
+            raise UnreadableInputError(str(path), f"{kind} is not read", CONVERT)
+    if any(name.endswith(LAS_SUFFIXES) for name in names):
+        raise UnreadableInputError(str(path), "it is a zip archive of point clouds", "Give each point cloud unpacked")
+    raise UnreadableInputError(str(path), "it is a zip archive with 0 vector files", VALID)
 
 
 def _chosen(
@@ -69,15 +80,15 @@ def _chosen(
 ) -> tuple[list[zipfile.ZipInfo], bool]:
     """The vector file of an archive and what belongs to it, and whether the layer chose it among several."""
     there = vector_members(members)
+    if not there:
+        refuse_without_vectors(path, members)
     of_several = len(there) > 1
     wanted = there.get(layer or "") if of_several else next(iter(there.values()), None)
     if wanted is None:
         problem = f"it is a zip archive with {len(there)} vector files"
         problem += f", none of them {layer!r}" if layer is not None and of_several else ""
-        if not there and any(one.filename.lower().endswith(".gdbtable") for one in members):
-            raise UnreadableInputError(str(path), "a File Geodatabase is not read", CONVERT)
         named = ", ".join(sorted(there)[:20])
-        raise UnreadableInputError(str(path), problem, f"{shape.choose}: {named}" if there else VALID)
+        raise UnreadableInputError(str(path), problem, f"{shape.choose}: {named}")
     stem = PurePosixPath(wanted.filename).with_suffix("")
     parts = [one for one in members if one.filename.lower().endswith(SHAPE_PARTS)]
     parts = [one for one in parts if PurePosixPath(one.filename).with_suffix("") == stem]

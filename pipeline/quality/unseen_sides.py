@@ -17,6 +17,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, Plane, RoofFace
+from pipeline.terrain.lattice import HALF_DIAGONAL_M
 
 Area: TypeAlias = Polygon | MultiPolygon
 
@@ -31,9 +32,8 @@ INSIDE_M = 0.05
 """So far inside an outline lies the face that ends there."""
 SLOPED = math.tan(math.radians(7.0))
 """Rise over run from which a face is a slope, as in `flat_below_deg`."""
-_CELL_M, _HALF_DIAGONAL_M = 1.0, 0.71
-"""Cells that hold a point of the roof are within the first of it; those within an area have their centres so far inside
-it."""
+_CELL_M = 1.0
+"""Cells that hold a point of the roof are within this of it."""
 _DOWNHILL = -0.7
 """An outline is an eave where it lies within 45 degrees of straight down the slope, as a cosine."""
 
@@ -82,7 +82,7 @@ def unseen_left_out_m2(given: Area, modelled: Area, elsewhere: FloatArray, densi
         return 0.0
     west, south, east, north = np.floor(left_out.bounds)
     x, y = np.meshgrid(np.arange(west, east + 1.0) + 0.5, np.arange(south, north + 1.0) + 0.5)
-    inner = shapely.buffer(left_out, -_HALF_DIAGONAL_M)
+    inner = shapely.buffer(left_out, -HALF_DIAGONAL_M)
     shapely.prepare(inner)
     cells = np.count_nonzero(shapely.contains_xy(inner, x, y))
     if cells == 0:

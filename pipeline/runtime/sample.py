@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +22,7 @@ import numpy.typing as npt
 from pipeline.errors import GableworkError, RunError
 from pipeline.io import ReadOptions, Source, SourceInfo, SpatialReference, is_url, open_source, shown
 from pipeline.io.records import Share
+from pipeline.io.temporary import temporary_folder
 from pipeline.model import PointCloud
 from pipeline.runtime.cluster.local_executor import LocalExecutor
 from pipeline.runtime.cluster.serial_executor import Executor
@@ -231,8 +231,8 @@ def sample_window(task: SampleTask, clock: Callable[[], float] | None = None) ->
     if seen is None:
         return Sampled()
     points, side_m = seen.points, seen.side_m
-    with tempfile.TemporaryDirectory(prefix="gablework-sample-") as folder:
-        path = Path(folder, "window.ply")
+    with temporary_folder() as folder:
+        path = folder / "window.ply"
         _write(path, points, source.info.reference)
         settings = task.request.settings
         x, y, _ = points.xyz.min(axis=0).tolist()
@@ -240,7 +240,7 @@ def sample_window(task: SampleTask, clock: Callable[[], float] | None = None) ->
         request = dataclasses.replace(
             task.request,
             inputs=(str(path),),
-            out=str(Path(folder, "out")),
+            out=str(folder / "out"),
             settings=dataclasses.replace(settings, general=general, class_codes=ClassCodeSettings()),
             resources=SERIAL,
             overrides=None,

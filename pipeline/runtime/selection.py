@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import json
 import re
-import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
@@ -27,6 +26,7 @@ from pipeline.export.obj_parts import lines_of_buildings
 from pipeline.export.putting import put_local
 from pipeline.io import arrow_at, storage_at
 from pipeline.io.crs import SpatialReference
+from pipeline.io.temporary import temporary_folder
 from pipeline.model import Status
 from pipeline.runtime.manifest import RunManifest, RunStatus, city_unit_m, read_manifest, write_manifest
 from pipeline.runtime.publishing import check_complete, disk_at, terrains_of
@@ -43,8 +43,8 @@ def run_of(run_dir: str, statuses: Collection[Status]) -> Iterator[str]:
     if not statuses or set(statuses) == set(Status):
         yield run_dir
         return
-    with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
-        made = Path(folder, "run")
+    with temporary_folder() as folder:
+        made = folder / "run"
         select_run(run_dir, made, statuses)
         try:
             yield str(made)

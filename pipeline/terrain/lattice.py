@@ -11,6 +11,8 @@ from pipeline.terrain.support import PIT_CELLS
 
 CELL_MM = 1000
 """Side of a cell of the terrain lattice."""
+HALF_DIAGONAL_M = 0.71
+"""Half of a cell: cells that an area touches have their centres this near to it, cells within it so far inside."""
 
 NO_DATA = np.int32(2**31 - 1)
 """Elevation of a cell without one."""

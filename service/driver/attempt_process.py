@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from pipeline.errors import RunCancelledError, RunError
+from pipeline.io.temporary import remove_left_folders
 from pipeline.runtime.isolation.child_pool import ChildPool
 from pipeline.runtime.isolation.messages import Finished, OutOfMemory, Progressed
 from pipeline.runtime.isolation.supervision import SupervisedChild, system_kills
@@ -183,6 +184,8 @@ class InOwnProcess:
         # what befell an attempt may come from those before it in its process
         is_retry = held.job.own_ends > 0
         with contextlib.ExitStack() as stack:
+            # what it unpacked stays behind if it is ended
+            stack.callback(remove_left_folders)
             try:
                 child = stack.enter_context(self._pool.borrowed(held.cancelled, fresh=is_retry, loads=LOADS))
             except RunCancelledError:

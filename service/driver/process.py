@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 from pipeline.errors import ClusterError
+from pipeline.io.temporary import remove_left_folders
 from pipeline.schedule import Outcome
 from service.driver.attempt_process import DriverParts, InOwnProcess, Perform
 from service.driver.attempts import FIRST_PAUSE_S, LONGEST_PAUSE_S, Attempts
@@ -349,7 +350,9 @@ class Driver:
     def _tidy(self) -> None:
         while True:
             try:
-                removed = tidy(self._store, self._shop.folder, self._settings)
+                # those of drivers that were killed
+                removed = remove_left_folders()
+                removed += tidy(self._store, self._shop.folder, self._settings)
                 while self._store.webhooks.forget(self._settings.webhook_log_days):
                     continue
             except (StoreError, OSError) as error:

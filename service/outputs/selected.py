@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.model import Status
-from service.disk import FULL_BYTES, Disk, has_no_space
+from service.disk import FULL_BYTES, MAKE_ROOM, Disk, has_no_space
 from service.errors import NoSpaceError, NoSuchOutputError, SelectionBusyError, UnexpectedError
 from service.outputs.catalogue import NAME as CATALOGUE
 from service.outputs.catalogue import read_catalogue
@@ -130,7 +130,7 @@ class Selections:
             if code == _REFUSED:
                 fault = NoSuchOutputError("files of this job's run are gone or damaged: submit the job again")
             elif code == _FULL or (code and disk.free_bytes < FULL_BYTES):
-                fault = NoSpaceError("the disk is too full for a selection of buildings: free some space, or try later")
+                fault = NoSpaceError(f"there is no room on the disk for a selection of buildings. {MAKE_ROOM}")
             elif code:
                 fault = UnexpectedError(f"a selection of buildings, which ended with code {code}")
         except OSError as error:

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Annotated
 from urllib.parse import urlencode
 
-from fastapi import Depends, Query, Request
+from fastapi import Depends, Query
 
 from pipeline.model import Status
+from service.disk import Disk
 from service.errors import NoSuchOutputError, RequestError, ResultNotReadyError, StoreError
 from service.files import StateFolder
 from service.jobs import Job, JobStatus
@@ -69,18 +70,42 @@ class FinishedJob:
             self, out_dir=out_dir, run_dir=self.run_dir / RUNS / label, catalogue=read_catalogue(out_dir), label=label
         )
 
-    def only(self, statuses: Collection[str], selections: Selections, folder: StateFolder) -> FinishedJob:
-        """The same job with outputs that hold the buildings of some statuses only; they are made if need be."""
-        wanted = tuple(status for status in Status if status in statuses)
-        geoid_height_m = self.job.request.geoid_height
-        place = selections.make(self.run_dir, self.out_dir, wanted, folder.disk, geoid_height_m)
-        return dataclasses.replace(self, out_dir=place, catalogue=read_catalogue(place), statuses=wanted)
-
     def address(self, path: str, **query: str) -> str:
         """A path below the job with the query that selects the same run."""
         status = {"status": ",".join(self.statuses)} if self.statuses else {}
         given = {**({} if self.label is None else {"method": self.label}), **status, **query}
         return f"{path}?{urlencode(given)}" if given else path
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AskedResults:
+    """The results that a request asks for; a selection of buildings is made only for outputs that there are."""
+
+    whole: FinishedJob
+    """The job, or one run of a comparison, with all buildings."""
+    statuses: tuple[Status, ...]
+    """The statuses of the wanted buildings; empty for all."""
+    selections: Selections
+    """Makes selections of buildings."""
+    disk: Disk
+    """Where they go."""
+
+    def having(self, names: Collection[str]) -> FinishedJob:
+        """The job with outputs that hold the wanted buildings; raises NoSuchOutputError if a named one is missing."""
+        for name in names:
+            if self.statuses:
+                refuse_others(name)
+            if name not in self.whole.catalogue.outputs:
+                raise self.whole.catalogue.missing(name)
+        if not self.statuses:
+            return self.whole
+        job, whole = self.whole.job, self.whole
+        place = self.selections.make(whole.run_dir, whole.out_dir, self.statuses, self.disk, job.request.geoid_height)
+        found = dataclasses.replace(whole, out_dir=place, catalogue=read_catalogue(place), statuses=self.statuses)
+        for name in names:
+            if name not in found.catalogue.outputs:  # such as a tileset without a model
+                raise found.catalogue.missing(name)
+        return found
 
 
 def _finished(job_id: JobId, store: Store, folder: Folder, caller: Reader) -> FinishedJob:
@@ -129,18 +154,19 @@ _Only = Annotated[
 
 
 def _results(
-    request: Request,
     finished: _Finished,
     selections: Selecting,
     folder: Folder,
     label: _Label = None,
     statuses: _Only = None,
-) -> FinishedJob:
+) -> AskedResults:
     """The job's results, or those of one run, or of the buildings of some statuses."""
-    found = finished if label is None else finished.run(label)
-    if statuses and "outputID" in request.path_params:
-        refuse_others(request.path_params["outputID"])
-    return found.only(statuses, selections, folder) if statuses else found
+    return AskedResults(
+        whole=finished if label is None else finished.run(label),
+        statuses=tuple(status for status in Status if status in (statuses or ())),
+        selections=selections,
+        disk=folder.disk,
+    )
 
 
 def _so_far(job: Job, store: JobStore, folder: StateFolder) -> FinishedJob:
@@ -180,8 +206,8 @@ def _run_of(finished: FinishedJob, label: str | None) -> FinishedJob:
     return finished if label is None else finished.run(label)
 
 
-Finished = Annotated[FinishedJob, Depends(_results)]
-"""The job of the path with its results; of a comparison those of one run, if it is named."""
+Asked = Annotated[AskedResults, Depends(_results)]
+"""The results of the job of the path; of a comparison those of one run, if it is named."""
 
 FinishedRun = Annotated[FinishedJob, Depends(_run)]
 """The job of the path with the results of one run."""

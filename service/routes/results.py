@@ -14,10 +14,9 @@ from starlette.exceptions import HTTPException
 from service.errors import RequestError
 from service.outputs import KINDS, OUTPUTS, output_file
 from service.outputs.kinds import HTML
-from service.outputs.selected import refuse_others
 from service.routes.answers import JOB_ID, document, header, problems
 from service.routes.bound import Base
-from service.routes.finished_jobs import Finished, FinishedJob
+from service.routes.finished_jobs import Asked, FinishedJob
 from service.routes.html import PageRoute, in_either_form
 from service.routes.negotiation import preferred
 from service.status import results_document
@@ -66,21 +65,16 @@ _EXAMPLE = {
     },
 )
 def results(
-    finished: Finished,
+    asked: Asked,
     base: Base,
     outputs: Annotated[Words, Query(description="Only these, with commas between them or the parameter again.")] = None,
 ) -> Response:
     """List the outputs of a finished job, each with media type, size and sha256."""
-    stored = finished.catalogue.outputs
     wanted = outputs or []
     unknown = [name for name in wanted if name not in KINDS]
     if unknown:
         raise RequestError([f"query outputs names {unknown[0][:80]!r}: use {', '.join(KINDS)}"])
-    missing = [name for name in wanted if name not in stored]
-    if missing and finished.statuses:
-        refuse_others(missing[0])
-    if missing:
-        raise finished.catalogue.missing(missing[0])
+    finished = asked.having(wanted)
     place = f"{base}/jobs/{finished.job.job_id}/results"
     found = results_document(finished.catalogue, lambda name: finished.address(f"{place}/{name}"), wanted)
     headers = {"Cache-Control": "private, no-cache"}
@@ -129,12 +123,13 @@ def file_answers(documents: Mapping[str, bool], **described: str) -> dict[int | 
 )
 def result(
     request: Request,
-    finished: Finished,
+    asked: Asked,
     output_id: Annotated[
         str, Path(alias="outputID", description=f"One of {', '.join(KINDS)}.", examples=["buildings"])
     ],
 ) -> Response:
     """Send one output; ranges of bytes are served, so Parquet can be read remotely."""
+    finished = asked.having([output_id])
     path = output_file(finished.out_dir, output_id)
     kind, stored = KINDS[output_id], finished.catalogue.outputs[output_id]
     preferred(request.headers.get("accept"), [kind.media_type])

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import zipfile
 from pathlib import PurePath
 
 import geopandas
@@ -11,6 +12,7 @@ import shapely
 from pipeline.errors import UnreadableInputError
 from pipeline.io import SpatialReference, find_inputs
 from pipeline.io.crs import resolve_reference
+from pipeline.io.formats import VECTOR_SUFFIXES
 from pipeline.io.tile_index import COLUMNS, TileIndex, read_tile_index
 from pipeline.io.urls import filesystem_of
 
@@ -40,8 +42,15 @@ def write_index(path, rows, column="location", crs=RD, **more):
     frame = frame if crs is None else frame.to_crs(crs)
     if path.suffix == ".parquet":
         frame.to_parquet(path)
+    elif path.suffix in {".zip", ".kmz"}:
+        inner = write_index(path.with_suffix(".shp" if path.suffix == ".zip" else ".kml"), rows, column, crs, **more)
+        with zipfile.ZipFile(path, "w") as archive:
+            for file in sorted(inner.parent.glob(f"{inner.stem}.*")):
+                if file != path:
+                    archive.write(file, file.name)
+                    file.unlink()
     else:
-        frame.to_file(path)
+        frame.to_file(path, driver={".kml": "LIBKML", ".geojsonl": "GeoJSONSeq"}.get(path.suffix))
     return path
 
 
@@ -69,11 +78,21 @@ def test_a_line_that_names_no_point_file_is_reported(folder):
         find_inputs([folder / "tiles.txt"])
 
 
-@pytest.mark.parametrize("ending", [".gpkg", ".geojson", ".shp", ".parquet"])
+@pytest.mark.parametrize("ending", [*VECTOR_SUFFIXES])
 def test_a_vector_index_names_files_in_its_column(folder, ending):
-    index = write_index(folder / f"index{ending}", ["a.laz", "below/d.laz"], sheet=["1", "2"])
+    alike = {".json": ".geojson", ".geojsons": ".geojsonl", ".ndjson": ".geojsonl", ".geoparquet": ".parquet"}
+    written = folder / f"index{alike.get(ending, ending)}"
+    crs = "EPSG:4326" if written.suffix in {".geojsonl", ".kml", ".kmz"} else RD
+    index = write_index(written, ["a.laz", "below/d.laz"], crs=crs, sheet=["1", "2"]).rename(folder / f"index{ending}")
     assert names(find_inputs([index])) == ["a.laz", "d.laz"]
     assert read_tile_index(str(index)).outlines is not None
+
+
+def test_a_zip_archive_of_point_clouds_is_not_an_index_and_named(folder):
+    with zipfile.ZipFile(folder / "tiles.zip", "w") as archive:
+        archive.write(folder / "a.laz", "a.laz")
+    with pytest.raises(UnreadableInputError, match=r"tiles\.zip: it is a zip archive of point clouds\. Give each"):
+        find_inputs([folder / "tiles.zip"])
 
 
 @pytest.mark.parametrize(

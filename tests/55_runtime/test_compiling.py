@@ -168,3 +168,25 @@ def test_groups_follow_the_settings_file_and_the_earlier_run(
     made = reconstruct(suburb, settings={"method": "kmeans"})
     invoke("rerun", made.run_dir)
     assert compiled_groups == [("reconstruct", "compare", "terrain"), ("reconstruct", "compare")]
+
+
+def test_a_batch_compiles_only_once_its_files_and_folders_are_found(
+    tmp_path: Path, suburb: Path, compiled_groups: list[tuple[str, ...]]
+) -> None:
+    batch = tmp_path / "city.toml"
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    (taken / "notes.txt").write_text("another's file")
+    for inputs, out, named in (
+        (f'paths = ["{tmp_path}/nicht.laz"]', "out", "nicht.laz"),
+        (f'paths = ["{suburb}"]\nfootprints = "nicht.gpkg"', "out", "nicht.gpkg"),
+        (f'paths = ["{suburb}"]\naoi = "nicht.geojson"', "out", "nicht.geojson"),
+        (f'paths = ["{suburb}"]', "taken", "[output] path"),
+    ):
+        batch.write_text(f'[inputs]\n{inputs}\n[output]\npath = "{out}"\n[work]\npath = "work"\n')
+        code, _, said = invoke("batch", "run", str(batch))
+        assert (code != 0, named in said.replace("\n", "")) == (True, True), said
+        assert compiled_groups == []
+    batch.write_text(f'[inputs]\npaths = ["{suburb}"]\n[output]\npath = "out"\n[work]\npath = "work"\n')
+    invoke("batch", "run", str(batch))
+    assert compiled_groups == [("reconstruct",)]

@@ -3,6 +3,7 @@
 import errno
 import os
 import signal
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 from driver_bench import Bench
 from processes import LONG_S, wait_for
 
-from service.driver import attempt_process, attempts
+from service.driver import attempt_process, attempts, process
 from service.jobs import Fault, JobStatus
 from service.store import policies
 
@@ -55,6 +56,30 @@ def test_an_attempt_that_ends_by_itself_is_tried_again_and_then_the_job_fails(
     assert words in done.failure.detail
     assert "2 attempts in a row ended by themselves at stage split" in done.failure.detail
     assert done.lost_attempts == 0
+
+
+def test_what_an_attempt_unpacked_goes_with_its_process(
+    apart: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "temporary"
+    place.mkdir()
+    monkeypatch.setenv("TMPDIR", str(place))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    apart.work = hostile_attempts.crash_with_much_unpacked
+    made: list[Path] = []
+    removed = attempt_process.remove_left_folders
+
+    def note() -> list[Path]:
+        made.extend(place.rglob("unpacked"))
+        return removed()
+
+    monkeypatch.setattr(attempt_process, "remove_left_folders", note)
+    monkeypatch.setattr(process, "remove_left_folders", list)  # the janitor's: not what is tested here
+    job = apart.submit()
+    apart.driver()
+    assert apart.over(job).own_ends == 2
+    assert len(made) == 2, "each attempt has unpacked something"
+    assert list(place.rglob("unpacked")) == []
 
 
 def test_a_process_that_takes_too_much_memory_is_ended(apart: Bench) -> None:

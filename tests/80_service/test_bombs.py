@@ -454,7 +454,7 @@ def test_what_a_child_has_unpacked_goes_with_it(
     examiner._timeout_s = 5.0
     with ThreadPoolExecutor(1) as pool:
         refused = pool.submit(examiner.examine, archive, max_points=MOST)
-        wait_for(lambda: list(place.rglob("gablework-vector-*")), "what is unpacked")
+        wait_for(lambda: list(place.rglob("large.gpkg")), "what is unpacked")
         assert examiner._child is not None
         examiner._child.send_signal(signal.SIGSTOP)
         with pytest.raises(UnreadableInputError, match="could not be read within 5 s"):

@@ -341,7 +341,7 @@ def test_a_shapefile_is_taken_by_path_only(world: World) -> None:
     points = path(world.add_file())
     world.resolve(points, footprints=path(world.add_file("b.shp", b"\0\0\x27\x0a")))
     world.settings = ServiceSettings(state=world.folder.root, input_hosts=("example.org",))
-    with pytest.raises(RequestError, match="ends in one of"):
+    with pytest.raises(RequestError, match="a Shapefile is several files"):
         world.resolve(footprints=url("https://example.org/b.shp"))
 
 

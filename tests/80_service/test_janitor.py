@@ -2,12 +2,16 @@
 
 import contextlib
 import os
+import tempfile
 import time
+from pathlib import Path
 
+import pytest
 from driver_bench import Bench
 from processes import wait_for
 from store_contract import upload
 
+from pipeline.io.temporary import temporary_folder
 from service.driver.janitor import tidy, tidy_jobs
 from service.jobs import Fault, Job, JobFailure
 from service.store import JobFilter
@@ -50,6 +54,19 @@ def test_the_janitor_removes_what_no_job_needs_and_nothing_else(bench: Bench) ->
         *(running.job_id, done.job_id, given_back.job_id, failed.job_id),
         "not ours",
     }
+
+
+def test_a_driver_removes_temporary_folders_that_killed_processes_left(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with temporary_folder() as held:
+        left = held.with_name(f"{held.name}-left")
+        left.mkdir()
+        (left / "unpacked").write_bytes(b"1")
+        bench.driver()
+        wait_for(lambda: not left.exists(), "the janitor")
+        assert held.is_dir()
 
 
 def test_the_janitor_keeps_all_results_beside_an_empty_database(bench: Bench) -> None:

@@ -301,7 +301,9 @@ def test_a_full_disk_keeps_what_it_has_and_the_upload_goes_on_later(
     assert send(client, url, 0, CONTENT[:1000]).status_code == 204
     with monkeypatch.context() as filled:
         filled.setattr(Unfinished, "write", full)
-        assert send(client, url, 1000, CONTENT[1000:]).status_code == 507
+        answer = send(client, url, 1000, CONTENT[1000:])
+    assert answer.status_code == 507
+    assert "no room on the disk for the upload. Remove finished jobs or uploads" in answer.json()["detail"]
     assert offset(client, url) == 1000
     assert send(client, url, 1000, CONTENT[1000:]).status_code == 204
 

@@ -86,6 +86,27 @@ def test_an_output_without_a_status_is_refused(client: TestClient, job_id: str, 
     assert "leave out status, or use buildings, planes" in runs.problem(answer, 404, "no-such-output")
 
 
+@pytest.mark.parametrize(
+    ("below", "outputs", "status"),
+    [
+        ("", "points", 404),  # which no selection has
+        ("", "pmtiles", 404),  # which the job was not asked for
+        ("", "buildings,nonsense", 400),
+        ("/pmtiles", None, 404),
+        ("/points", None, 404),
+        ("/nonsense", None, 404),
+    ],
+)
+def test_no_selection_is_made_for_an_output_that_is_not_there(
+    service: runs.Service, below: str, outputs: str | None, status: int
+) -> None:
+    job_id = service.finished(write_run)
+    asked = {"status": "ok"} if outputs is None else {"status": "ok", "outputs": outputs}
+    answer = service.client.get(f"/jobs/{job_id}/results{below}", params=asked)
+    assert answer.status_code == status
+    assert not (service.folder.outputs(job_id, 1) / "selected").exists()
+
+
 def test_a_word_that_is_not_a_status_is_refused(client: TestClient, job_id: str) -> None:
     answer = client.get(f"/jobs/{job_id}/results", params={"status": "fine"})
     assert "use one of ok, doubtful, fallback, failed" in runs.problem(answer, 400, "invalid-request")
@@ -171,7 +192,7 @@ def test_a_disk_that_fills_up_meanwhile_is_said_and_no_output_stays_missing(
     with monkeypatch.context() as patch:
         patch.setattr(selected, "_COMMAND", (sys.executable, "-c", f"import sys; sys.exit({code})"))
         answer = service.client.get(f"/jobs/{job_id}/results", params={"status": "ok"})
-        runs.problem(answer, 507, "no-space")
+        assert "Remove finished jobs or uploads" in runs.problem(answer, 507, "no-space")
     assert "geopackage" in service.client.get(f"/jobs/{job_id}/results", params={"status": "ok"}).json()
 
 

@@ -106,7 +106,7 @@ def eventually_empty(folder: Path) -> None:
         ("a.laz/", None),
         ("a.rar", None),
         ("a.laz.exe", None),
-        ("a.shp", None),
+        ("a.doc", None),
         ("", None),
         ("\ud800.laz", None),
     ],
@@ -204,7 +204,7 @@ def test_a_full_disk_is_reported_as_such_and_leaves_nothing(tmp_path: Path, monk
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(uploads._Sink, "write", full)
-    with pytest.raises(NoSpaceError, match=r"no room on the disk for tile\.laz"):
+    with pytest.raises(NoSpaceError, match=r"no room on the disk for tile\.laz\. Remove finished jobs or uploads"):
         take(tmp_path, las_bytes(10))
     assert list((tmp_path / "uploads").iterdir()) == []
 

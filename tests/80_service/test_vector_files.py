@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import sqlite3
 import zipfile
 from pathlib import Path
@@ -15,13 +16,14 @@ from driver_bench import Bench
 from live_service import las_bytes
 
 from pipeline.errors import InputError
+from pipeline.io.formats import POINT_SUFFIXES
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
 from service.driver.attempt import classify_request, compare_request, run_request
-from service.errors import TooLargeError
+from service.errors import RequestError, TooLargeError
 from service.fetching import Fetched, JobFiles
-from service.filenames import clean_filename
+from service.filenames import FOOTPRINT_SUFFIXES, clean_filename
 from service.jobs import Fault, InputReference, JobRequest, JobStatus
 from service.preflight import examine
 from service.settings import ServiceSettings
@@ -64,20 +66,63 @@ def shapes_of(folder: Path, name: str) -> list[Path]:
 
 @pytest.mark.parametrize(
     ("suffix", "kind"),
-    [(".fgb", "flatgeobuf"), (".gml", "gml"), (".kml", "kml"), (".geojsonl", "geojson"), (".ndjson", "geojson")],
+    [
+        (".kmz", "kml"),
+        (".fgb", "flatgeobuf"),
+        (".gml", "gml"),
+        (".kml", "kml"),
+        (".geojsonl", "geojson"),
+        (".ndjson", "geojson"),
+    ],
 )
 def test_an_upload_of_each_format_is_known_by_its_name_and_checked_by_its_content(
     tmp_path: Path, suffix: str, kind: str
 ) -> None:
-    path = write(tmp_path / f"a{'.geojsonl' if suffix == '.ndjson' else suffix}", SQUARE).rename(
-        tmp_path / f"b{suffix}"
-    )
+    path = write(tmp_path / f"a{ {'.ndjson': '.geojsonl', '.kmz': '.kml'}.get(suffix, suffix) }", SQUARE)
+    path = (zipped(tmp_path / "packed", path) if suffix == ".kmz" else path).rename(tmp_path / f"b{suffix}")
     assert clean_filename(path.name) == path.name
     found = examine(path, max_points=1)
     assert (found["kind"], found["format"], found["usable"]) == ("footprints", kind, True)
     path.write_bytes(b"\x00\x01 nothing of the kind")
     with pytest.raises(InputError):
         examine(path, max_points=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "driver", "what"),
+    [
+        ("a.sqlite", "SQLite", "SQLite that is not a GeoPackage is not read"),
+        ("a.tab", "MapInfo File", "MapInfo TAB is not read"),
+        ("a.mif", "MapInfo File", "MapInfo MIF is not read"),
+        ("a.json", "JSONFG", "JSON-FG is not read"),
+    ],
+)
+def test_a_format_that_is_not_read_is_refused_with_the_fix_by_name_and_by_content(
+    tmp_path: Path, name: str, driver: str, what: str
+) -> None:
+    gpd.GeoDataFrame({"id": ["1"]}, geometry=[SQUARE], crs="EPSG:28992").to_file(tmp_path / name, driver=driver)
+    wanted = rf"{what}\. Convert it to GeoPackage \(\.gpkg\)"
+    packed = zipped(tmp_path / "packed.zip", tmp_path / name)
+    disguised = tmp_path / ("b.gpkg" if driver == "SQLite" else "b.geojson")
+    disguised.write_bytes((tmp_path / name).read_bytes())
+    for path in (packed, disguised):
+        with pytest.raises(InputError, match=wanted):
+            examine(path, max_points=1)
+    if name != "a.json":
+        with pytest.raises(RequestError, match=wanted):
+            clean_filename(name)
+
+
+def test_a_shapefile_alone_is_refused_with_the_way_to_send_it() -> None:
+    with pytest.raises(RequestError, match=r"'houses\.shp' cannot be used: .* Send them in a zip archive"):
+        clean_filename("houses.shp")
+
+
+def test_the_page_offers_the_files_that_are_taken() -> None:
+    page = (Path(__file__).parents[2] / "service/viewer/src/submission.ts").read_text()
+    for name, taken in (("TILE", POINT_SUFFIXES), ("VECTOR", FOOTPRINT_SUFFIXES)):
+        (offered,) = re.findall(rf'const {name}_ENDINGS = "(.*)";', page)
+        assert sorted(offered.split(",")) == sorted(taken)
 
 
 def test_an_archive_counts_as_what_is_in_it(tmp_path: Path) -> None:

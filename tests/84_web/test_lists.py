@@ -181,6 +181,9 @@ def test_what_was_left_out_is_listed_counted_and_drawn_with_its_reasons(
     record = page.locator(".record")
     expect(record.get_by_role("heading", name="Not a building")).to_be_visible()
     expect(record.locator(".notice")).to_contain_text(chosen["reason_detail"])
+    confidence = chosen["detection_confidence"]
+    shown = "\N{EN DASH}" if confidence is None else f"{100 * confidence:.1f}"
+    expect(record).to_contain_text(f"Confidence that it is a building{shown}")
     assert (opened.pixels_at_rest() != still).any(axis=2).mean() > 0.01, "the view did not go there"
     page.reload()
     opened.wait_for_models()

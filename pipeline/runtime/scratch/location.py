@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from uuid import uuid4
 
 from pipeline.errors import RunError
 from pipeline.io import is_url, shown
+from pipeline.io.temporary import temporary_folder
 from pipeline.runtime.scratch.folder import Scratch
 
 SCRATCH = "scratch"
@@ -36,20 +36,22 @@ def check_scratch(run_dir: str, scratch: str | None, scheduler: str | None) -> N
 @contextlib.contextmanager
 def run_scratch(run_dir: str, scratch: str | None) -> Iterator[Scratch]:
     """Scratch for the duration of a run; raises RunError if scratch of an earlier run cannot be removed."""
-    folder = _scratch_folder(run_dir, scratch)
-    found = Scratch(str(folder / uuid4().hex))
-    found.create()
-    try:
-        yield found
-    finally:
-        remove_folder(folder)
+    with contextlib.ExitStack() as stack:
+        if scratch is None and is_url(run_dir):
+            # no other user can guess its name, or look into it: tasks trust what they read from scratch
+            folder = stack.enter_context(temporary_folder()) / SCRATCH
+        else:
+            folder = _scratch_folder(run_dir, scratch)
+        found = Scratch(str(folder / uuid4().hex))
+        found.create()
+        try:
+            yield found
+        finally:
+            remove_folder(folder)
 
 
 def _scratch_folder(run_dir: str, scratch: str | None) -> Path:
     """The folder for the scratch of a run; what an earlier run into the same place left there is removed."""
-    if scratch is None and is_url(run_dir):
-        # no other user can guess its name, or look into it: tasks trust what they read from scratch
-        return Path(tempfile.mkdtemp(prefix="gablework-"))
     if scratch is None:
         folder = Path(run_dir).resolve() / SCRATCH
     else:

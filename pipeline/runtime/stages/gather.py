@@ -25,7 +25,7 @@ from pipeline.runtime.stages.sites import CandidateSite, PointRange
 from pipeline.runtime.stages.surroundings import NO_GROUND, NO_POINT, Surroundings, surroundings_of
 from pipeline.runtime.stages.window_points import bucket_paths
 from pipeline.strip_alignment import aligned_mm
-from pipeline.terrain.lattice import CELL_MM, NO_DATA
+from pipeline.terrain.lattice import CELL_MM, HALF_DIAGONAL_M, NO_DATA
 from pipeline.tiling import MM, TileGrid, Window
 
 Area = TypeVar("Area", Polygon, MultiPolygon, Polygon | MultiPolygon)
@@ -51,8 +51,6 @@ _BESIDE_CELLS = 2
 """Points within these cells of the roof lie beside it."""
 _LARGEST_M = 2000
 """Longest side of a block by attributes: what is larger is a district, or a slip."""
-_HALF_DIAGONAL_M = 0.71
-"""A cell that a footprint touches has its centre this near."""
 _FEWEST_GROUND_CELLS = 30
 """The noise of the ground is known to 15 % from so many cells."""
 _OPEN_CELLS = 7
@@ -396,7 +394,7 @@ def _elsewhere(footprint: Polygon | MultiPolygon | None, own: BoolArray, around:
     rows, columns = np.nonzero(around.occupied & ~own)
     z = around.elevation_mm[rows, columns].astype(np.int64)
     places = np.column_stack((columns + around.column0, rows + around.row0)) * CELL_MM + CELL_MM // 2
-    within = shapely.buffer(footprint, -_HALF_DIAGONAL_M)  # ground at a wall lies in cells that the wall cuts
+    within = shapely.buffer(footprint, -HALF_DIAGONAL_M)  # ground at a wall lies in cells that the wall cuts
     shapely.prepare(within)
     inside = shapely.contains_xy(within, places / MM)
     elsewhere_mm: IntArray = np.column_stack((places, np.where(z == NO_DATA, 0, z)))[inside]
@@ -411,7 +409,7 @@ def _local(
     x = (np.arange(columns, dtype=np.int64) + around.column0) * CELL_MM + CELL_MM // 2
     y = (np.arange(rows, dtype=np.int64) + around.row0) * CELL_MM + CELL_MM // 2
     centres = np.column_stack([axis.ravel() for axis in np.meshgrid(x, y)])
-    touched = shapely.buffer(footprint, _HALF_DIAGONAL_M)
+    touched = shapely.buffer(footprint, HALF_DIAGONAL_M)
     inside = shapely.intersects_xy(touched, centres / MM)
     ground_mm, lowest_mm, _, _ = _terrain_by(centres[inside], around)
     terrain_mm, _ = _ground_mm(lowest_mm, ground_mm[:, 2], np.empty(0, np.int64), None)

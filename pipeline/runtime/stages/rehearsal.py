@@ -5,11 +5,10 @@ For a process from which others are forked: it loads them once for all of them.
 
 from __future__ import annotations
 
-import tempfile
-
 import numpy as np
 import shapely
 
+from pipeline.io.temporary import temporary_folder
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.cells import CellsTask, find_cells
@@ -49,8 +48,8 @@ def rehearse_scene(outlines: str = "") -> None:
     core = grid.core(tile)
     bits = np.ascontiguousarray(points["gps_time"]).view(np.uint64)
     zone_sums(points, bits, core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm, grid.halo_mm)
-    with tempfile.TemporaryDirectory(prefix="gablework-rehearsal-") as folder:
-        scratch = Scratch(folder)
+    with temporary_folder() as folder:
+        scratch = Scratch(str(folder))
         points.tofile(scratch.path("points", tile.key, "made-up.bin"))
         classes = ClassesInUse(ground=True, building=True)
         find_cells(CellsTask(tile=tile, grid=grid, classes=classes, scratch=scratch), settings.outliers)

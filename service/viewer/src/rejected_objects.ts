@@ -1,11 +1,14 @@
 /** The objects that are not buildings, from the table of the results; loaded only when they are wanted. */
 
 import { decompress } from "fzstd";
-import { parquetReadObjects } from "hyparquet";
+import { parquetMetadata, parquetReadObjects } from "hyparquet";
 import { ofRun } from "./address";
 import { request, type Feature } from "./api";
 import type { Listed } from "./batching";
 import { figuresOf } from "./figures";
+
+/** The columns that are shown; runs of older versions lack some. */
+const COLUMNS = ["object_id", "reason", "reason_detail", "geometry", "area_m2", "height_m", "n_points", "detection_confidence"];
 
 /**
  * Read the table of rejected objects of a run.
@@ -22,10 +25,13 @@ export async function rejectedObjects(jobPath: string, method: string | null, si
 }
 
 /** The features of a Parquet file of rejected objects. */
-async function readRejected(file: ArrayBuffer): Promise<Feature[]> {
+export async function readRejected(file: ArrayBuffer): Promise<Feature[]> {
+  const metadata = parquetMetadata(file);
+  const there = new Set(metadata.schema.map(({ name }) => name));
   const rows = await parquetReadObjects({
     file,
-    columns: ["object_id", "reason", "reason_detail", "geometry", "area_m2", "height_m", "n_points"],
+    metadata,
+    columns: COLUMNS.filter((name) => there.has(name)),
     compressors: { ZSTD: (input, size) => decompress(input, new Uint8Array(size)) },
   });
   return rows.map(({ geometry, ...properties }) => ({

@@ -5,7 +5,12 @@ import { FIGURES, figureWords, type FigureName } from "./figures";
 import { warningNotice } from "./notices";
 import { reasonWords } from "./reasons";
 
-const SHOWN: FigureName[] = ["height", "area", "points"];
+const SHOWN: [FigureName, string][] = [
+  ["height", FIGURES.height.label],
+  ["area", FIGURES.area.label],
+  ["points", FIGURES.points.label],
+  ["confidence", "Confidence that it is a building"],
+];
 
 /** What is known about an object that was left out. */
 export function rejectedRecord({ id, reason, reasonDetail, figures }: Listed): HTMLElement[] {
@@ -25,7 +30,7 @@ export function rejectedRecord({ id, reason, reasonDetail, figures }: Listed): H
       el(
         "dl",
         {},
-        ...SHOWN.flatMap((name) => [el("dt", {}, FIGURES[name].label), el("dd", {}, figureWords(name, figures) ?? "–")]),
+        ...SHOWN.flatMap(([name, label]) => [el("dt", {}, label), el("dd", {}, figureWords(name, figures) ?? "–")]),
       ),
     ),
     el(

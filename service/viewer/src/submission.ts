@@ -10,7 +10,7 @@ import { bytes, count, measure, placeWords } from "./numbers";
 import { SMALL_BYTES, send } from "./sending";
 
 const TILE_ENDINGS = ".las,.laz,.ply,.xyz,.txt,.csv,.asc,.pts";
-const VECTOR_ENDINGS = ".gpkg,.geojson,.json,.geojsonl,.geojsons,.ndjson,.parquet,.geoparquet,.fgb,.gml,.kml,.zip";
+const VECTOR_ENDINGS = ".gpkg,.geojson,.json,.geojsonl,.geojsons,.ndjson,.parquet,.geoparquet,.fgb,.gml,.kml,.zip,.kmz";
 
 /** Inputs that are one vector file each. */
 const VECTORS = ["footprints", "guides"] as const;
