@@ -13,6 +13,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
+import shapely
 
 from pipeline.model import BoolArray
 from pipeline.runtime.plan import check_windows, ground_bytes, split_grid, tiles_per_block
@@ -22,6 +23,7 @@ from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.cells import TileCells, digests_of, find_all_cells
 from pipeline.runtime.stages.cleanup import clear_tiles
+from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
 from pipeline.runtime.stages.surroundings import FOLDER
 from pipeline.runtime.stages.tile_content import ZoneSums, content_of_window, zone_sums_of
@@ -30,10 +32,15 @@ from pipeline.scene import lattice_of
 from pipeline.settings import RunSettings
 from pipeline.terrain.ground import ground_on
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
+from pipeline.terrain.roofs_alone import SUPPORT_CELLS, roofs_alone
 from pipeline.terrain.scene_settings import APRON_M, ClassesInUse
 from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
+_ABOUT_ROOFS_ALONE = (
+    "no points lie around given footprints with points on {} m2: the points there are roof, not ground, and a floor "
+    "without terrain beside it is assumed"
+)
 _SLOPE_CELLS = 3
 """Cells beyond a point that its height and slope depend on, with one to spare."""
 
@@ -54,6 +61,8 @@ class GroundTask:
     """The cells hold ground by the classes of the file."""
     scratch: Scratch
     """Cells in, terrain out."""
+    outlines: tuple[Outline, ...] = ()
+    """The given footprints that its filter sees."""
     memory_bytes: int = 0
     """Estimated peak memory of the process."""
 
@@ -66,6 +75,8 @@ class TileGround:
     """The tile."""
     zones: bytes
     """Its terrain and which cells hold points, zone by zone: the bytes of a `ZoneSums`, with such cells for points."""
+    roofs_alone: int
+    """Cells of the core with points, in footprints around which nothing was seen."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -94,25 +105,27 @@ class BlockCells:
     """How far an elevation looks."""
     classes: ClassesInUse
     """Which of the file's classes are believed."""
+    outlines: Sequence[Outline]
+    """The given footprints, where the ground is found in the points alone."""
 
 
 def cells_of_blocks(
     context: RunContext,
     settings: RunSettings,
     ingested: Sequence[Ingested],
-    *,
-    footprints: bool,
+    footprints: GivenFootprints | None,
     only: Collection[Tile] | None = None,
 ) -> BlockCells:
-    """The cells of all tiles, or of some and of what their splits see; `footprints` says whether they are given.
+    """The cells of all tiles, or of some and of what their splits see.
 
     Raises InputError if the points of a tile do not fit into a worker, now that they are counted.
     """
     grid, scene = context.plan.grid, settings.scene
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
-    reach_mm = math.ceil(scene.ground_support_m(classes) * MM)
+    outlines = () if footprints is None or classes.ground else footprints.polygons
+    reach_mm = math.ceil(scene.ground_support_m(classes) * MM) + (SUPPORT_CELLS * CELL_MM if outlines else 0)
     points = points_by_tile(ingested)
-    split_lattice = split_grid(context.plan, settings, footprints=footprints)
+    split_lattice = split_grid(context.plan, settings, footprints=footprints is not None)
     check_windows(context.plan, split_lattice, points, context.executor.memory_limit_bytes)
     drawn = set(points)
     if only is not None:
@@ -127,7 +140,9 @@ def cells_of_blocks(
     }
     wanted = {tile for tiles in seen.values() for tile in tiles}
     cells = find_all_cells(context, scene.outliers, ingested, classes, wanted)
-    return BlockCells(blocks=blocks, seen=seen, drawn=drawn, cells=cells, reach_mm=reach_mm, classes=classes)
+    return BlockCells(
+        blocks=blocks, seen=seen, drawn=drawn, cells=cells, reach_mm=reach_mm, classes=classes, outlines=outlines
+    )
 
 
 def find_ground(context: RunContext, settings: RunSettings, found: BlockCells) -> Ground:
@@ -140,11 +155,14 @@ def find_ground(context: RunContext, settings: RunSettings, found: BlockCells) -
     if outliers:
         context.progress.warn("cells", f"{outliers} gross outliers were left out")
     alike = key_of(grid, scene.ground, classes.ground)
+    tree = shapely.STRtree(found.outlines)
     tasks = {}
     for (column, row), tiles in found.blocks.items():
         around = seen[column, row]
-        key = key_of(alike, [tile.key for tile in tiles], digests_of(cells, around))
         window = _around(grid, tiles).grown(reach_mm)
+        edges_m = (edge / MM for edge in (window.x0_mm, window.y0_mm, window.x1_mm, window.y1_mm))
+        outlines = tuple(found.outlines[k] for k in sorted(tree.query(shapely.box(*edges_m)).tolist()))
+        key = key_of(alike, [tile.key for tile in tiles], digests_of(cells, around), outlines)
         tasks[Place(FOLDER, f"x{column}_y{row}", key)] = GroundTask(
             tiles=tuple(tiles),
             seen=around,
@@ -152,12 +170,16 @@ def find_ground(context: RunContext, settings: RunSettings, found: BlockCells) -
             reach_mm=reach_mm,
             trusted=classes.ground,
             scratch=context.scratch,
+            outlines=outlines,
             memory_bytes=ground_bytes(window, scene.ground),
         )
     clear_tiles(context.scratch, FOLDER, tasks, {tile.key for tile in found.drawn})
     function = functools.partial(draw_ground, settings=scene.ground)
     files: Files[GroundTask, tuple[TileGround, ...]] = Files(reads=_read, leaves=_left, intact=is_intact)
     drawn = context.map_stored("ground", function, tasks, whole, files=files)
+    alone = sum(one.roofs_alone for tiles in drawn.values() for one in tiles)
+    if alone:
+        context.progress.warn("ground", _ABOUT_ROOFS_ALONE.format(alone))
     return Ground(cells=cells, tiles={one.tile: one for tiles in drawn.values() for one in tiles})
 
 
@@ -208,13 +230,17 @@ def draw_ground(task: GroundTask, settings: GroundSettings) -> tuple[TileGround,
     inside = _around(task.grid, task.tiles)
     lowest, occupied, corner = _cells_in(task, inside.grown(task.reach_mm))
     column0, row0, columns, rows = lattice_of(inside)
+    alone = np.zeros_like(occupied)
+    if task.outlines:
+        alone = roofs_alone(lowest, occupied, corner, task.outlines)
+        lowest[alone] = NO_DATA
     wanted = (
         slice(row0 - corner[1], row0 - corner[1] + rows),
         slice(column0 - corner[0], column0 - corner[0] + columns),
     )
     task.scratch.check_cancelled()
     terrain, _ = ground_on(lowest, corner, settings, trusted=task.trusted, wanted=wanted)
-    return tuple(_stored(task, tile, terrain, occupied, corner) for tile in task.tiles)
+    return tuple(_stored(task, tile, (terrain, occupied, alone), corner) for tile in task.tiles)
 
 
 def _cells_in(task: GroundTask, window: Window) -> tuple[Elevations, BoolArray, tuple[int, int]]:
@@ -237,17 +263,25 @@ def _cells_in(task: GroundTask, window: Window) -> tuple[Elevations, BoolArray, 
 
 
 def _stored(
-    task: GroundTask, tile: Tile, terrain: Elevations, occupied: BoolArray, corner: tuple[int, int]
+    task: GroundTask, tile: Tile, found: tuple[Elevations, BoolArray, BoolArray], corner: tuple[int, int]
 ) -> TileGround:
-    """Store the terrain of one tile."""
+    """Store the terrain of one tile, from that of the block, the cells that hold points, and those of roofs alone."""
+    terrain, occupied, alone = found
     column0, row0, columns, rows = lattice_of(task.grid.core(tile).grown(APRON_M * MM))
     part = (slice(row0 - corner[1], row0 - corner[1] + rows), slice(column0 - corner[0], column0 - corner[0] + columns))
     elevations, held = np.ascontiguousarray(terrain[part]), np.ascontiguousarray(occupied[part])
     arrays = {"terrain": elevations, "occupied": held, "corner": np.array([column0, row0], np.int64)}
     task.scratch.put_arrays(f"{FOLDER}/{tile.key}", arrays)
+    core = task.grid.core(tile)
+    # of the cells that tiles share, the south-western corner says whose they are
+    own = tuple(
+        slice(-(-low // CELL_MM) - first, -(-high // CELL_MM) - first)
+        for low, high, first in ((core.y0_mm, core.y1_mm, corner[1]), (core.x0_mm, core.x1_mm, corner[0]))
+    )
     return TileGround(
         tile=tile,
         zones=_zones(elevations, held, task.grid).tobytes(),
+        roofs_alone=int(np.count_nonzero(alone[own] & occupied[own])),
     )
 
 
