@@ -147,7 +147,7 @@ def _has_ground(part: Part, rims: Counts, feet: Counts) -> bool:
 def _below_steps(lowest: Elevations) -> BoolArray:
     """Cells beside, and level with, one that lies a step below a cell near it."""
     known = lowest != NO_DATA
-    z = np.where(known, lowest, 0).astype(np.int64)
+    z = np.where(known, lowest, 0)
     foot = np.zeros_like(known)
     for rows, columns in _offsets(_STEP):
         least = _STEP_MM + round(_STEEP_MM * float(np.hypot(rows, columns)))

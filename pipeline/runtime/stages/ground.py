@@ -41,6 +41,8 @@ _ABOUT_ROOFS_ALONE = (
     "no points lie around given footprints with points on {} m2: the points there are roof, not ground, and a floor "
     "without terrain beside it is assumed"
 )
+_ROOFS_MM = SUPPORT_CELLS * CELL_MM
+"""How far beyond the filter's reach given footprints are judged."""
 _SLOPE_CELLS = 3
 """Cells beyond a point that its height and slope depend on, with one to spare."""
 
@@ -62,7 +64,7 @@ class GroundTask:
     scratch: Scratch
     """Cells in, terrain out."""
     outlines: tuple[Outline, ...] = ()
-    """The given footprints that its filter sees."""
+    """The given footprints around; empty where the ground is not found in the points alone."""
     memory_bytes: int = 0
     """Estimated peak memory of the process."""
 
@@ -123,7 +125,8 @@ def cells_of_blocks(
     grid, scene = context.plan.grid, settings.scene
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
     outlines = () if footprints is None or classes.ground else footprints.polygons
-    reach_mm = math.ceil(scene.ground_support_m(classes) * MM) + (SUPPORT_CELLS * CELL_MM if outlines else 0)
+    reach_mm = math.ceil(scene.ground_support_m(classes) * MM)
+    seen_mm = reach_mm + (_ROOFS_MM if outlines else 0)
     points = points_by_tile(ingested)
     split_lattice = split_grid(context.plan, settings, footprints=footprints is not None)
     check_windows(context.plan, split_lattice, points, context.executor.memory_limit_bytes)
@@ -135,7 +138,7 @@ def cells_of_blocks(
     for tile in sorted(drawn):
         blocks.setdefault((tile.column // side, tile.row // side), []).append(tile)
     seen = {
-        name: tuple(tile for tile in grid.tiles_over(_around(grid, tiles).grown(reach_mm)) if tile in points)
+        name: tuple(tile for tile in grid.tiles_over(_around(grid, tiles).grown(seen_mm)) if tile in points)
         for name, tiles in blocks.items()
     }
     wanted = {tile for tiles in seen.values() for tile in tiles}
@@ -160,7 +163,8 @@ def find_ground(context: RunContext, settings: RunSettings, found: BlockCells) -
     for (column, row), tiles in found.blocks.items():
         around = seen[column, row]
         window = _around(grid, tiles).grown(reach_mm)
-        edges_m = (edge / MM for edge in (window.x0_mm, window.y0_mm, window.x1_mm, window.y1_mm))
+        wide = window.grown(_ROOFS_MM)
+        edges_m = (edge / MM for edge in (wide.x0_mm, wide.y0_mm, wide.x1_mm, wide.y1_mm))
         outlines = tuple(found.outlines[k] for k in sorted(tree.query(shapely.box(*edges_m)).tolist()))
         key = key_of(alike, [tile.key for tile in tiles], digests_of(cells, around), outlines)
         tasks[Place(FOLDER, f"x{column}_y{row}", key)] = GroundTask(
@@ -228,12 +232,16 @@ def draw_ground(task: GroundTask, settings: GroundSettings) -> tuple[TileGround,
     """
     task.scratch.check_cancelled()
     inside = _around(task.grid, task.tiles)
-    lowest, occupied, corner = _cells_in(task, inside.grown(task.reach_mm))
+    wide = SUPPORT_CELLS if task.outlines else 0
+    lowest, occupied, corner = _cells_in(task, inside.grown(task.reach_mm + wide * CELL_MM))
     column0, row0, columns, rows = lattice_of(inside)
     alone = np.zeros_like(occupied)
     if task.outlines:
         alone = roofs_alone(lowest, occupied, corner, task.outlines)
         lowest[alone] = NO_DATA
+        inner = (slice(wide, -wide), slice(wide, -wide))
+        lowest, occupied, alone = lowest[inner], occupied[inner], alone[inner]
+        corner = (corner[0] + wide, corner[1] + wide)
     wanted = (
         slice(row0 - corner[1], row0 - corner[1] + rows),
         slice(column0 - corner[0], column0 - corner[0] + columns),
