@@ -52,7 +52,7 @@ def found_scene(
         scratch = Scratch(str(Path(folder, "scratch")))
         scratch.create()
         context = RunContext(plan=plan, progress=progress, executor=SerialExecutor(), scratch=scratch)
-        inputs = read_inputs(context, settings, tiles, footprints=given is not None)
+        inputs = read_inputs(context, settings, tiles, given)
         ingested, ground = inputs.ingested, find_ground(context, settings, inputs.cells)
         splits = split(context, settings, ingested, ground, given)
         roof = settings.building.roof

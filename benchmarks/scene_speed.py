@@ -91,7 +91,7 @@ def one_lap(tiles: Sequence[str], plan: Plan, settings: RunSettings, executor: E
         scratch.create()
         context = RunContext(plan=plan, progress=progress, executor=executor, scratch=scratch)
         began = time.process_time()
-        inputs = read_inputs(context, settings, tiles, footprints=False)
+        inputs = read_inputs(context, settings, tiles, None)
         ingested, ground = inputs.ingested, find_ground(context, settings, inputs.cells)
         splits = split(context, settings, ingested, ground, None)
         joined = join(context, settings.scene, settings.building.roof, splits, None)

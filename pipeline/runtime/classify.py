@@ -177,7 +177,7 @@ def classify(
         executor=executor,
         cancelled=cancelled,
     ) as context:
-        inputs = read_inputs(context, request.settings, paths, footprints=footprints is not None)
+        inputs = read_inputs(context, request.settings, paths, footprints)
         ingested = inputs.ingested
         ground = find_ground(context, request.settings, inputs.cells)
         splits = split(context, request.settings, ingested, ground, footprints)

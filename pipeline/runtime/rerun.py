@@ -264,8 +264,7 @@ class _Search:
     def _candidates(self, tiles: frozenset[Tile] | None) -> _Found:
         """The candidates of some tiles; of all tiles for None."""
         context, settings = self.context, self.request.settings
-        given = self.footprints is not None
-        cells = cells_of_blocks(context, settings, self.ingested, footprints=given, only=tiles)
+        cells = cells_of_blocks(context, settings, self.ingested, self.footprints, only=tiles)
         ground = find_ground(context, settings, cells)
         splits = split(context, settings, self.ingested, ground, self.footprints, tiles)
         joined = join(context, settings.scene, settings.building.roof, splits, self.footprints)

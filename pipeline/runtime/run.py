@@ -294,7 +294,7 @@ def _find_candidates(
     context: RunContext, settings: RunSettings, paths: Sequence[str], footprints: GivenFootprints | None
 ) -> _Candidates:
     """The stages up to the candidates."""
-    inputs = read_inputs(context, settings, paths, footprints=footprints is not None)
+    inputs = read_inputs(context, settings, paths, footprints)
     ground = find_ground(context, settings, inputs.cells)
     splits = split(context, settings, inputs.ingested, ground, footprints)
     joined = join(context, settings.scene, settings.building.roof, splits, footprints)

@@ -14,6 +14,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
+import shapely
 
 from pipeline.model import BoolArray
 from pipeline.runtime.plan import check_windows, ground_bytes, split_grid, tiles_per_block
@@ -23,6 +24,7 @@ from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.cells import TileCells, digests_of, find_all_cells
 from pipeline.runtime.stages.cleanup import clear_tiles
+from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
 from pipeline.runtime.stages.surroundings import FOLDER, NO_POINT, distances_to_terrain
 from pipeline.runtime.stages.tile_content import ZoneSums, content_of_window, zone_sums_of
@@ -31,10 +33,17 @@ from pipeline.scene import lattice_of
 from pipeline.settings import RunSettings
 from pipeline.terrain.ground import ground_on
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
+from pipeline.terrain.roofs_alone import SUPPORT_CELLS, roofs_alone
 from pipeline.terrain.scene_settings import APRON_M, ClassesInUse
 from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
+_ABOUT_ROOFS_ALONE = (
+    "no points lie around given footprints with points on {} m2: the points there are roof, not ground, and a floor "
+    "without terrain beside it is assumed"
+)
+_ROOFS_MM = SUPPORT_CELLS * CELL_MM
+"""How far beyond the filter's reach given footprints are judged."""
 _SLOPE_CELLS = 3
 """Cells beyond a point that its height and slope depend on, with one to spare."""
 
@@ -55,6 +64,8 @@ class GroundTask:
     """The cells hold ground by the classes of the file."""
     scratch: Scratch
     """Cells in, terrain out."""
+    outlines: tuple[Outline, ...] = ()
+    """The given footprints around; empty where the ground is not found in the points alone."""
     memory_bytes: int = 0
     """Estimated peak memory of the process."""
 
@@ -67,6 +78,8 @@ class TileGround:
     """The tile."""
     zones: bytes
     """Its terrain and which cells hold points, zone by zone: the bytes of a `ZoneSums`, with such cells for points."""
+    roofs_alone: int
+    """Cells of the core with points, in footprints around which nothing was seen."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -95,25 +108,28 @@ class BlockCells:
     """How far an elevation looks."""
     classes: ClassesInUse
     """Which of the file's classes are believed."""
+    outlines: Sequence[Outline]
+    """The given footprints, where the ground is found in the points alone."""
 
 
 def cells_of_blocks(
     context: RunContext,
     settings: RunSettings,
     ingested: Sequence[Ingested],
-    *,
-    footprints: bool,
+    footprints: GivenFootprints | None,
     only: Collection[Tile] | None = None,
 ) -> BlockCells:
-    """The cells of all tiles, or of some and of what their splits see; `footprints` says whether they are given.
+    """The cells of all tiles, or of some and of what their splits see.
 
     Raises InputError if the points of a tile do not fit into a worker, now that they are counted.
     """
     grid, scene = context.plan.grid, settings.scene
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
+    outlines = () if footprints is None or classes.ground else footprints.polygons
     reach_mm = math.ceil(scene.ground_support_m(classes) * MM)
+    seen_mm = reach_mm + (_ROOFS_MM if outlines else 0)
     points = points_by_tile(ingested)
-    split_lattice = split_grid(context.plan, settings, footprints=footprints)
+    split_lattice = split_grid(context.plan, settings, footprints=footprints is not None)
     check_windows(context.plan, split_lattice, points, context.executor.memory_limit_bytes)
     drawn = set(points)
     if only is not None:
@@ -123,12 +139,14 @@ def cells_of_blocks(
     for tile in sorted(drawn):
         blocks.setdefault((tile.column // side, tile.row // side), []).append(tile)
     seen = {
-        name: tuple(tile for tile in grid.tiles_over(_around(grid, tiles).grown(reach_mm)) if tile in points)
+        name: tuple(tile for tile in grid.tiles_over(_around(grid, tiles).grown(seen_mm)) if tile in points)
         for name, tiles in blocks.items()
     }
     wanted = {tile for tiles in seen.values() for tile in tiles}
     cells = find_all_cells(context, scene.outliers, ingested, classes, wanted)
-    return BlockCells(blocks=blocks, seen=seen, drawn=drawn, cells=cells, reach_mm=reach_mm, classes=classes)
+    return BlockCells(
+        blocks=blocks, seen=seen, drawn=drawn, cells=cells, reach_mm=reach_mm, classes=classes, outlines=outlines
+    )
 
 
 def find_ground(context: RunContext, settings: RunSettings, found: BlockCells) -> Ground:
@@ -141,11 +159,15 @@ def find_ground(context: RunContext, settings: RunSettings, found: BlockCells) -
     if outliers:
         context.progress.warn("cells", f"{outliers} gross outliers were left out")
     alike = key_of(grid, scene.ground, classes.ground)
+    tree = shapely.STRtree(found.outlines)
     tasks = {}
     for (column, row), tiles in found.blocks.items():
         around = seen[column, row]
-        key = key_of(alike, [tile.key for tile in tiles], digests_of(cells, around))
         window = _around(grid, tiles).grown(reach_mm)
+        wide = window.grown(_ROOFS_MM)
+        edges_m = (edge / MM for edge in (wide.x0_mm, wide.y0_mm, wide.x1_mm, wide.y1_mm))
+        outlines = tuple(found.outlines[k] for k in sorted(tree.query(shapely.box(*edges_m)).tolist()))
+        key = key_of(alike, [tile.key for tile in tiles], digests_of(cells, around), outlines)
         tasks[Place(FOLDER, f"x{column}_y{row}", key)] = GroundTask(
             tiles=tuple(tiles),
             seen=around,
@@ -153,12 +175,16 @@ def find_ground(context: RunContext, settings: RunSettings, found: BlockCells) -
             reach_mm=reach_mm,
             trusted=classes.ground,
             scratch=context.scratch,
+            outlines=outlines,
             memory_bytes=ground_bytes(window, scene.ground),
         )
     clear_tiles(context.scratch, FOLDER, tasks, {tile.key for tile in found.drawn})
     function = functools.partial(draw_ground, settings=scene.ground)
     files: Files[GroundTask, tuple[TileGround, ...]] = Files(reads=_read, leaves=_left, intact=is_intact)
     drawn = context.map_stored("ground", function, tasks, whole, files=files)
+    alone = sum(one.roofs_alone for tiles in drawn.values() for one in tiles)
+    if alone:
+        context.progress.warn("ground", _ABOUT_ROOFS_ALONE.format(alone))
     return Ground(cells=cells, tiles={one.tile: one for tiles in drawn.values() for one in tiles})
 
 
@@ -207,15 +233,23 @@ def draw_ground(task: GroundTask, settings: GroundSettings) -> tuple[TileGround,
     """
     task.scratch.check_cancelled()
     inside = _around(task.grid, task.tiles)
-    lowest, occupied, corner = _cells_in(task, inside.grown(task.reach_mm))
+    wide = SUPPORT_CELLS if task.outlines else 0
+    lowest, occupied, corner = _cells_in(task, inside.grown(task.reach_mm + wide * CELL_MM))
     column0, row0, columns, rows = lattice_of(inside)
+    alone = np.zeros_like(occupied)
+    if task.outlines:
+        alone = roofs_alone(lowest, occupied, corner, task.outlines)
+        lowest[alone] = NO_DATA
+        inner = (slice(wide, -wide), slice(wide, -wide))
+        lowest, occupied, alone = lowest[inner], occupied[inner], alone[inner]
+        corner = (corner[0] + wide, corner[1] + wide)
     wanted = (
         slice(row0 - corner[1], row0 - corner[1] + rows),
         slice(column0 - corner[0], column0 - corner[0] + columns),
     )
     task.scratch.check_cancelled()
     terrain, _ = ground_on(lowest, corner, settings, trusted=task.trusted, wanted=wanted)
-    return tuple(_stored(task, tile, terrain, lowest, occupied, corner) for tile in task.tiles)
+    return tuple(_stored(task, tile, (terrain, lowest, occupied, alone), corner) for tile in task.tiles)
 
 
 def _cells_in(task: GroundTask, window: Window) -> tuple[Elevations, BoolArray, tuple[int, int]]:
@@ -240,21 +274,27 @@ def _cells_in(task: GroundTask, window: Window) -> tuple[Elevations, BoolArray, 
 def _stored(
     task: GroundTask,
     tile: Tile,
-    terrain: Elevations,
-    lowest: Elevations,
-    occupied: BoolArray,
+    found: tuple[Elevations, Elevations, BoolArray, BoolArray],
     corner: tuple[int, int],
 ) -> TileGround:
-    """Store the terrain of one tile."""
+    """Store the terrain of a tile, `found` of its block: terrain, lowest points, cells with points, with roofs alone."""
+    terrain, lowest, occupied, alone = found
     column0, row0, columns, rows = lattice_of(task.grid.core(tile).grown(APRON_M * MM))
     part = (slice(row0 - corner[1], row0 - corner[1] + rows), slice(column0 - corner[0], column0 - corner[0] + columns))
     elevations = np.ascontiguousarray(terrain[part])
     off_mm = distances_to_terrain(lowest[part], occupied[part], elevations)
     place = np.array([column0, row0], np.int64)
     task.scratch.put_arrays(f"{FOLDER}/{tile.key}", {"terrain": elevations, "off": off_mm, "corner": place})
+    core = task.grid.core(tile)
+    # of the cells that tiles share, the south-western corner says whose they are
+    own = tuple(
+        slice(-(-low // CELL_MM) - first, -(-high // CELL_MM) - first)
+        for low, high, first in ((core.y0_mm, core.y1_mm, corner[1]), (core.x0_mm, core.x1_mm, corner[0]))
+    )
     return TileGround(
         tile=tile,
         zones=_zones(elevations, off_mm, task.grid).tobytes(),
+        roofs_alone=int(np.count_nonzero(alone[own] & occupied[own])),
     )
 
 

@@ -18,6 +18,7 @@ from pipeline.runtime.scratch.outcomes import (
     run_and_store,
     whole,
 )
+from pipeline.runtime.stages.given_footprints import GivenFootprints
 from pipeline.runtime.stages.ground import BlockCells, cells_of_blocks
 from pipeline.runtime.stages.ingest import ingest, tasks_of
 from pipeline.runtime.stages.ingested import Ingested
@@ -42,7 +43,9 @@ class Inputs:
     """By how much each flight strip was moved up, of those that share an id also 0; empty where all fit."""
 
 
-def read_inputs(context: RunContext, settings: RunSettings, paths: Sequence[str], *, footprints: bool) -> Inputs:
+def read_inputs(
+    context: RunContext, settings: RunSettings, paths: Sequence[str], footprints: GivenFootprints | None
+) -> Inputs:
     """Read all inputs; again, with whole strips moved, if these lie too far above one another or share an id.
 
     A later run of the same inputs in one work folder knows the moves before it reads, so that nothing is read again.
@@ -54,7 +57,7 @@ def read_inputs(context: RunContext, settings: RunSettings, paths: Sequence[str]
     found: Inputs | None = None
     rows = _stored(context, place)
     if rows is None:
-        found = _read(context, settings, paths, {}, footprints=footprints)
+        found = _read(context, settings, paths, {}, footprints)
         rows = counted(np.concatenate([NO_ROWS, *(rows_of(cells.strips) for cells in found.cells.cells.values())]))
     moves_mm = moves_of([rows], scene.strips)
     apart = offsets_of([rows], scene.strips)
@@ -68,15 +71,19 @@ def read_inputs(context: RunContext, settings: RunSettings, paths: Sequence[str]
         drop_outcomes(context.scratch, _STRIPS, [])
         work = OutcomeTask(function=whole, task=rows, place=place, scratch=context.scratch, brief=whole, stage="cells")
         run_and_store(work)
-    return _read(context, settings, paths, moves_mm, footprints=footprints)
+    return _read(context, settings, paths, moves_mm, footprints)
 
 
 def _read(
-    context: RunContext, settings: RunSettings, paths: Sequence[str], moves_mm: Mapping[Strip, int], *, footprints: bool
+    context: RunContext,
+    settings: RunSettings,
+    paths: Sequence[str],
+    moves_mm: Mapping[Strip, int],
+    footprints: GivenFootprints | None,
 ) -> Inputs:
     """Read all inputs with some strips moved up and separated."""
     ingested = ingest(context, paths, moves_mm)
-    cells = cells_of_blocks(context, settings, ingested, footprints=footprints)
+    cells = cells_of_blocks(context, settings, ingested, footprints)
     return Inputs(ingested=ingested, cells=cells, moves_mm=moves_mm)
 
 
