@@ -139,6 +139,6 @@ def write_list(groups: dict[str, list[Listed]], path: Path = LIST) -> None:
     """Write the list, one kernel per line to make changes easy to see."""
     parts = []
     for name, kernels in groups.items():
-        rows = sorted((one.kernel, one.arguments, one.weight) for one in kernels)
-        parts.append(f"{json.dumps(name)}: [\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]")
+        rows = sorted(json.dumps((one.kernel, one.arguments, one.weight)) for one in kernels)
+        parts.append(f"{json.dumps(name)}: [\n" + ",\n".join(rows) + "\n]")
     path.write_text("{\n" + ",\n".join(parts) + "\n}\n", encoding="utf-8")

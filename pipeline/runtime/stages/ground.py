@@ -277,7 +277,7 @@ def _stored(
     found: tuple[Elevations, Elevations, BoolArray, BoolArray],
     corner: tuple[int, int],
 ) -> TileGround:
-    """Store the terrain of a tile, `found` of its block: terrain, lowest points, cells with points, with roofs alone."""
+    """Store the terrain of a tile, `found` of its block: terrain, lowest points, cells with points, roofs alone."""
     terrain, lowest, occupied, alone = found
     column0, row0, columns, rows = lattice_of(task.grid.core(tile).grown(APRON_M * MM))
     part = (slice(row0 - corner[1], row0 - corner[1] + rows), slice(column0 - corner[0], column0 - corner[0] + columns))
