@@ -37,14 +37,14 @@ _FEWEST_NEAR = 32
 """Vertices within reach, two for 3 m2: where there are fewer, houses are mixed with what surrounds them."""
 _MOST_POINTS = 48
 """Points in a square, on average: where there are more, the squares of `terrain.glass` hold enough."""
-_MIXED_SHARE = 0.5
-"""Surrounded vertices of roofs that have a low one among their nearest. A ninth of the pulses make as many."""
+_MIXED_SHARE = 0.6
+"""Surrounded vertices of roofs that have a low one among their nearest. A sixth of the pulses make as many."""
 _COMPANY = 0.35
 """How much of the way from chance to keeping to itself the low vertices may have gone."""
 _LEVEL_SHARE = 0.8
 """Share of the vertices at the height of roofs whose surroundings are planar."""
-_FEWEST = 12
-"""Surrounded vertices of roofs: fewer show nothing."""
+_FEWEST, _FEWEST_LOW = 12, 8
+"""Surrounded vertices of roofs, and low ones: fewer show nothing."""
 _BELOW_MM = 1000
 """How far what is seen through a roof lies below it at least."""
 
@@ -212,6 +212,7 @@ def _glass(squares: IntArray) -> BoolArray:
             company = s[_Found.LOW_NEIGHBOURS] / max(s[_Found.NEIGHBOURS], 1)
             out[r, c] = (
                 s[_Found.INNER_ROOF] >= _FEWEST
+                and s[_Found.LOW] >= _FEWEST_LOW
                 and s[_Found.ROOF] >= _LEVEL_SHARE * s[_Found.HIGH]
                 and s[_Found.MIXED] >= _MIXED_SHARE * s[_Found.INNER_ROOF]
                 and company <= share + _COMPANY * (1.0 - share)

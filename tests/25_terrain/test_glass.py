@@ -48,7 +48,7 @@ def test_ground_below_glass_is_found_and_that_around_it_is_not(density: float, t
 
 @pytest.mark.parametrize("plants_m", [0.0, 1.2])
 @pytest.mark.parametrize("density", [1.0, 2.0, 4.0])
-@pytest.mark.parametrize("through", [0.3, 0.5, 0.65])
+@pytest.mark.parametrize("through", [0.4, 0.5, 0.65])
 def test_glass_is_found_where_few_points_lie_and_over_plants(density: float, through: float, plants_m: float) -> None:
     xy = strewn(density)
     house = (np.abs(xy - 20.0) < (15.0, 7.0)).all(axis=1)
