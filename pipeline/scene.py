@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.model import BoolArray, ByteArray, IntArray, KindArray, LabelArray
 from pipeline.terrain.class_codes import ClassCodeSettings
 from pipeline.terrain.facets import SceneVertices, VertexKind
-from pipeline.terrain.glass import under_glass
+from pipeline.terrain.glass import glass_of
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
 from pipeline.terrain.incomplete_classes import OnRoof, undecided_on_roofs
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
@@ -123,8 +123,8 @@ def _vertices(
     excluded: BoolArray,
     settings: SceneSettings,
     classes: ClassesInUse,
-) -> SceneVertices:
-    """The vertices of a core's TIN: thinned points with what is known of them."""
+) -> tuple[SceneVertices, BoolArray]:
+    """The vertices of a core's TIN: thinned points with what is known of them; and the points (n,) under glass."""
     used = (height_mm != NO_DATA) & (_is_last(points) | building)
     # equal coordinates of different classes must not be decided by the order of the points
     preferred = np.zeros(len(points), np.int8)
@@ -161,12 +161,16 @@ def _vertices(
     kind[(on_roof == OnRoof.YES) & (kind == VertexKind.OBJECT)] = VertexKind.JOINED
     vertices = SceneVertices(x_mm=x, y_mm=y, z_mm=z, height_mm=height_mm[chosen], kind=kind, planar=planar)
     least_mm = round(1000 * settings.candidates.min_height_m)
-    inner &= ~under_glass(vertices, points.x_mm, points.y_mm, used, ~stands, least_mm)
+    over_plants = _planar_over_plants(vertices, least_mm, settings)
+    limits_mm = round(1000 * settings.ground.tolerance_m), least_mm
+    glass = glass_of(vertices, over_plants, (points.x_mm, points.y_mm), height_mm, used, limits_mm)
+    planar[glass.roof] = over_plants[glass.roof]
+    inner &= ~glass.under
     near = np.flatnonzero(inner & ((on_roof != OnRoof.BESIDE) | (kind != VertexKind.OBJECT)))
     surfaces = settings.surfaces
     far_mm = max(surfaces.far_mm, round(1000 * surfaces.thin_m))
     near = near[needed_vertices(x[near], y[near], kind[near], 1000.0 * surfaces.max_circumradius_m, far_mm)]
-    return SceneVertices(
+    entering = SceneVertices(
         x_mm=x[near],
         y_mm=y[near],
         z_mm=z[near],
@@ -174,6 +178,7 @@ def _vertices(
         kind=kind[near],
         planar=planar[near],
     )
+    return entering, glass.seen_through
 
 
 def _on_roofs(
@@ -205,6 +210,20 @@ def _has_floor(
     return even
 
 
+def _planar_over_plants(vertices: SceneVertices, least_mm: int, settings: SceneSettings) -> KindArray:
+    """How planar the surroundings of each vertex are if nothing below the height of roofs counts.
+
+    Plants that are seen through a low roof of glass lie on the level of its vertices.
+    """
+    x, y, z, height, _, planar = vertices
+    vegetation = settings.vegetation
+    wanted = (planar == 0) & (height >= least_mm) & (height < least_mm + round(1000 * vegetation.level_m))
+    high = np.flatnonzero(height >= least_mm)
+    found = planar.copy()
+    found[high] = np.maximum(planar[high], planarity(x[high], y[high], z[high], wanted[high], vegetation))
+    return found
+
+
 def _thin(points: WindowPoints, height_mm: IntArray, vertices: SceneVertices, settings: SceneSettings) -> BoolArray:
     """Which points (n,) are low and thin between ground on both sides: garden walls, fences and hedges."""
     low_mm = round(1000 * settings.candidates.min_height_m)
@@ -234,7 +253,7 @@ def split_tile(
     height = height_above(points.x_mm, points.y_mm, points.z_mm, terrain.elevation_mm, terrain.column0, terrain.row0)
     building = (points.classification == BUILDING_CLASS) & classes.building
     excluded = never_roof(points.classification, classes)
-    vertices = _vertices(points, core, height, terrain, building, excluded, settings, classes)
+    vertices, seen_through = _vertices(points, core, height, terrain, building, excluded, settings, classes)
     core_index = np.flatnonzero(core.contains(points.x_mm, points.y_mm) & (height != NO_DATA))
     owned = points.take(core_index)
     allowed = np.where(_thin(owned, height[core_index], vertices, settings), Allowed.EVIDENCE, Allowed.ANY)
@@ -243,6 +262,7 @@ def split_tile(
     allowed[building[core_index]] = Allowed.BUILDING
     if classes.ground:
         allowed[owned.classification == GROUND_CLASS] = Allowed.NEVER
+    allowed[seen_through[core_index] & ~building[core_index]] = Allowed.UNDER_GLASS
     fragments, point_fragment = fragments_of(
         triangulate(np.column_stack((vertices.x_mm, vertices.y_mm))),
         vertices,

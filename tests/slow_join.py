@@ -379,16 +379,21 @@ def whole_join(
                 group[t, local] = lead if lead >= 0 else surface
     ranges = _ranges_by_key(splits, group)
     lowest: dict[int, tuple[int, ...]] = {}
+    glass: dict[int, tuple[int, int]] = {}
     for k in np.flatnonzero(leader >= 0).tolist():
         point = tuple(int(v) for v in surfaces.lowest_point_mm[k])
         lead = int(leader[k])
         lowest[lead] = min(lowest.get(lead, point), point)
+        seen_through, stopped = glass.get(lead, (0, 0))
+        own = surfaces.sums[k]
+        glass[lead] = seen_through + int(own[Sum.GLASS]), stopped + int(own[Sum.POINTS])
     candidates = [
         CandidateSite(
             building_id=object_id(crs_name, lowest[lead]),
             owner=grid.tile_of(lowest[lead][0], lowest[lead][1]),
             ranges=tuple(found),
             points=sum(r.stop - r.start for r in found),
+            is_glass=0 < glass[lead][0] >= 0.15 * sum(glass[lead]),
         )
         for lead, found in ranges.items()
         if lead in lowest

@@ -39,6 +39,9 @@ _NARROW_M = 1.0
 _LEAST_SEAM_M = 2.0
 """Shorter seams join nothing, as shorter borders of patches do not in `terrain.units`. Not a setting: what they join is
 divided into units again, at steps."""
+_GLASS_SHARE = 0.15
+"""Least share of the points in a candidate's outline that were seen through it. Not a setting: it is below that of
+any glass, and the tiles of a roof let none through."""
 _BLOCK = 65_536
 """Surfaces judged at once: it limits the memory to 20 MB."""
 
@@ -284,6 +287,15 @@ def are_objects(kind: KindArray, sums: IntArray, settings: CandidateSettings) ->
     """Which surfaces (k,) are large enough to be listed, as candidate or rejected."""
     large_enough: BoolArray = sums[:, Sum.AREA2] >= 2e6 * settings.min_object_area_m2
     return np.isin(kind, SOLID) & large_enough
+
+
+def are_glass(sums: IntArray, candidate: IntArray, count: int) -> BoolArray:
+    """Which of `count` candidates pulses went through; surfaces (k, N_SUMS), with the candidate of each (k,)."""
+    through, stopped = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    np.add.at(through, candidate, sums[:, Sum.GLASS])
+    np.add.at(stopped, candidate, sums[:, Sum.POINTS])
+    found: BoolArray = through >= _GLASS_SHARE * (through + stopped)
+    return found & (through > 0)
 
 
 def may_join(kind: KindArray, sums: IntArray, faults: KindArray, settings: CandidateSettings) -> BoolArray:

@@ -75,6 +75,8 @@ class Sum(IntEnum):
     GAP_YY = 37
     SEAM = 38
     """Length of the outline where building goes on in what nothing is known of, or the reverse, mm."""
+    GLASS = 39
+    """Points of ground and plants that were seen through the surface."""
 
 
 N_SUMS = len(Sum)

@@ -78,6 +78,8 @@ class Allowed(IntEnum):
     """It is building, by its trusted class."""
     EVIDENCE = 3
     """To none, since it is a low, thin object; it counts where its surface is judged."""
+    UNDER_GLASS = 4
+    """To none, since it was seen through one; the surface above it counts it."""
 
 
 class ScenePoints(NamedTuple):
@@ -125,6 +127,7 @@ def _along_strips(points: ScenePoints, ground_mm: int) -> LabelArray:
     for i in range(x.size):
         c, r = x[i] // _STRIP_MM - column0, y[i] // _STRIP_MM - row0
         wanted = points.allowed[i] != Allowed.NEVER and points.height_mm[i] >= ground_mm
+        wanted |= points.allowed[i] == Allowed.UNDER_GLASS
         keys[i] = c * rows + (r if c & 1 == 0 else rows - 1 - r) if wanted else -1
     _, members = counting_sort(keys, columns * rows)
     return members
@@ -218,6 +221,13 @@ def _lower(p: IntArray, px: int, py: int, pz: int) -> None:
         p[0], p[1], p[2] = px, py, pz
 
 
+@kernel(inline="always")
+def _count_under_glass(f: int, tin: LabelledTin, sums: IntArray) -> None:
+    """Count a point below facet f for the fragment that the facet belongs to, if it belongs to one."""
+    if f >= 0 and tin.label[f] >= 0:
+        sums[tin.label[f], Sum.GLASS] += 1
+
+
 @kernel
 def assign_points(
     points: ScenePoints,
@@ -248,6 +258,9 @@ def assign_points(
         if at_vertex < 0 and f >= 0 and on_edge >= 0:
             f = _facet_at_edge(f, on_edge, vertices, tin)
         fragment, v, over = -1, -1, 0.0
+        if points.allowed[i] == Allowed.UNDER_GLASS:
+            _count_under_glass(f, tin, sums)
+            continue
         if f < 0 or kinds[f] == FacetKind.VOID or at_vertex >= 0:
             # facets across gaps differ from tile to tile: only the nearest vertex is sure
             v = at_vertex if at_vertex >= 0 else _nearest_vertex(px, py, pz, x, y, z, limits.far)

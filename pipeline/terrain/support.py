@@ -40,7 +40,7 @@ NEAR_CELLS = 16
 
 Wider squares lie under wide objects, where the ground around them decides. The other ground looks less far."""
 
-GLASS_M = 8.0
+GLASS_M = 14.0
 """The search for glass looks at squares of up to 2 m: its own, two more to each side, and one around each of these."""
 
 PLANARITY_SCALES = 3

@@ -17,6 +17,7 @@ from pipeline.terrain.candidates import (
     Fault,
     Surfaces,
     Verdict,
+    are_glass,
     are_objects,
     judge_surface,
     judge_surfaces,
@@ -220,6 +221,7 @@ figures = st.fixed_dictionaries(
         Sum.SMOOTH: st.integers(0, 400),
         Sum.OPEN: st.integers(0, 200_000),
         Sum.SEAM: st.integers(0, 6_000),
+        Sum.GLASS: st.integers(0, 2_000),
     }
 )
 weights = st.lists(st.tuples(st.integers(1, 10**6), st.integers(0, 400), st.integers(0, 400)), max_size=6)
@@ -415,3 +417,11 @@ def test_the_numbering_of_the_surfaces_does_not_matter(
     )
     back = [order[lead] if lead >= 0 else -1 for lead in leaders(renumbered)]
     assert [back[number_of[k]] for k in range(count)] == leaders(surfaces)
+
+
+def test_a_candidate_is_of_glass_by_all_points_of_its_surfaces() -> None:
+    seen_through = [(30, 100), (0, 500), (200, 300), (0, 0), (0, 40)]
+    sums = np.zeros((5, N_SUMS), np.int64)
+    sums[:, [Sum.GLASS, Sum.POINTS]] = seen_through
+    # a conservatory of a large house, a greenhouse, nothing, tiles
+    assert are_glass(sums, np.array([0, 0, 1, 2, 3]), 4).tolist() == [False, True, False, False]

@@ -80,6 +80,47 @@ def test_a_greenhouse_that_half_of_the_pulses_go_through_is_one_building(
     assert row["height_m"] == pytest.approx(5.0, abs=0.2)
 
 
+def bays(xyz: FloatArray, through: float, count: int, plants_m: float, seed: int) -> FloatArray:
+    """The points with `count` gables of glass side by side, each 8 m wide and 30 m long, and plants below them."""
+    rng = np.random.default_rng(seed)
+    along, across = xyz[:, 0] * 0.8 + xyz[:, 1] * 0.6, xyz[:, 1] * 0.8 - xyz[:, 0] * 0.6
+    inside = (np.abs(along) < 15.0) & (np.abs(across) < 4.0 * count)
+    roof = 3.0 + 0.4 * (4.0 - np.abs((across + 4.0 * count) % 8.0 - 4.0))
+    below = plants_m * rng.random(len(xyz))
+    height = np.where(rng.random(len(xyz)) >= through, roof, below)
+    return np.column_stack((xyz[:, :2], xyz[:, 2] + np.where(inside, height, 0.0)))
+
+
+@pytest.mark.parametrize("plants_m", [0.0, 1.5])
+@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize(("through", "density"), [(0.3, 1.0), (0.5, 2.0), (0.7, 2.0), (0.5, 4.0)])
+def test_a_greenhouse_is_one_building_where_few_points_lie_whatever_its_bays(
+    through: float, density: float, count: int, plants_m: float, tmp_path: Path, reconstruct: Any
+) -> None:
+    xyz = bays(ground(density, 11), through, count, plants_m, 12)
+    (row,) = modelled(reconstruct, written(tmp_path / "glass.las", xyz), tmp_path / "run")
+    assert row["footprint_area_m2"] == pytest.approx(240.0 * count, rel=0.15)
+    assert row["height_m"] == pytest.approx(4.6, abs=0.3)
+
+
+def test_houses_of_several_bays_that_are_not_of_glass_are_divided_at_their_gutters(
+    tmp_path: Path, reconstruct: Any
+) -> None:
+    xyz = bays(ground(4.0, 11), 0.0, 3, 0.0, 12)
+    assert len(modelled(reconstruct, written(tmp_path / "rows.las", xyz), tmp_path / "run")) == 3
+
+
+@pytest.mark.parametrize("density", [1.5, 3.0])
+def test_sparse_glass_of_several_bays_is_found_whatever_the_tiles(
+    density: float, tmp_path: Path, reconstruct: Any
+) -> None:
+    file = written(tmp_path / "glass.las", bays(ground(density, 13), 0.5, 3, 1.2, 14))
+    sizes = enumerate((1000.0, 23.0, 31.7))
+    runs = [reconstruct(file, settings={"tile_size_m": size, "lattice_x_m": 3.1 * k}) for k, size in sizes]
+    assert len({one.digest for one in runs}) == 1
+    assert runs[0].statuses == {"ok": 1}
+
+
 def test_glass_is_found_whatever_the_tiles(tmp_path: Path, reconstruct: Any) -> None:
     file = written(tmp_path / "glass.las", greenhouse(ground(6.0, 7), 0.5, 33.0, 8))
     sizes = enumerate((1000.0, 23.0, 31.7))

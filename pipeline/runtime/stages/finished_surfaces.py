@@ -11,8 +11,8 @@ import dataclasses
 
 import numpy as np
 
-from pipeline.model import IntArray, KindArray
-from pipeline.terrain.candidates import NOWHERE, SOLID, Surfaces, are_objects, judge_surfaces, unite_levels
+from pipeline.model import BoolArray, IntArray, KindArray
+from pipeline.terrain.candidates import NOWHERE, SOLID, Surfaces, are_glass, are_objects, judge_surfaces, unite_levels
 from pipeline.terrain.settings import CandidateSettings
 
 
@@ -24,6 +24,8 @@ class Finished:
     """(c, 3) int64, smallest point of each candidate in mm."""
     candidate_ranges: IntArray
     """(p, 4) candidate, tile, start, stop: points in the sorted points of a tile; tiles are numbered by the caller."""
+    candidate_is_glass: BoolArray
+    """(c,) whether pulses went through it."""
     kind: KindArray
     """(r,) FacetKind of each rejected object."""
     sums: IntArray
@@ -60,6 +62,7 @@ def finished(surfaces: Surfaces, ranges: IntArray, settings: CandidateSettings) 
     return Finished(
         candidate_points_mm=points[smallest],
         candidate_ranges=_ranges_of(ranges, led, candidate, len(leader)),
+        candidate_is_glass=are_glass(surfaces.sums[led], candidate, len(leads)),
         kind=surfaces.kind[rejected],
         sums=surfaces.sums[rejected],
         boxes_mm=surfaces.boxes_mm[rejected],

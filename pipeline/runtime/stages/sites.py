@@ -50,6 +50,8 @@ class CandidateSite:
     """Its points in scratch."""
     points: int
     """Number of its points."""
+    is_glass: bool = False
+    """Pulses went through its roof: it is one building, whatever its gutters."""
     footprint: Polygon | MultiPolygon | None = None
     """Given footprint in metres; None where none was given."""
     source_id: str | None = None

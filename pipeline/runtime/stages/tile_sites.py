@@ -66,6 +66,7 @@ def by_owner(found: Finished, tiles: Sequence[Tile], grid: TileGrid) -> dict[Til
             found=Finished(
                 candidate_points_mm=found.candidate_points_mm[own],
                 candidate_ranges=np.column_stack((own_ranges[:, 0], of_own, own_ranges[:, 2:])),
+                candidate_is_glass=found.candidate_is_glass[own],
                 kind=found.kind[others],
                 sums=found.sums[others],
                 boxes_mm=found.boxes_mm[others],
@@ -114,13 +115,15 @@ def sites_of(parts: Iterable[TileSites], grid: TileGrid, settings: CandidateSett
     for part in parts:
         found = part.found
         of_candidates = _site_ranges(found.candidate_ranges, len(found.candidate_points_mm), part.tiles)
-        for point, ranges in zip(found.candidate_points_mm.tolist(), of_candidates, strict=True):
+        columns = found.candidate_points_mm.tolist(), of_candidates, found.candidate_is_glass.tolist()
+        for point, ranges, is_glass in zip(*columns, strict=True):
             candidates.append(
                 CandidateSite(
                     building_id=object_id(crs_name, point),
                     owner=owner_of(point),
                     ranges=ranges,
                     points=sum(one.stop - one.start for one in ranges),
+                    is_glass=is_glass,
                 )
             )
         judged = verdicts(found.kind, found.sums, settings)

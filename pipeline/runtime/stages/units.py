@@ -279,7 +279,11 @@ def _units_of_site(site: CandidateSite, task: UnitTask, restored: _Restored) -> 
     points = np.concatenate(pieces)
     x, y, z = points["x"].astype(np.int64), points["y"].astype(np.int64), points["z"].astype(np.int64)
     aligned = _aligned_mm(points, (x, y, z), task.roof.min_strip_offset_m)
-    unit = units_of(*aligned, task.scene.units, points["source"].astype(np.int64))
+    settings = task.scene.units
+    if site.is_glass:
+        # the bays of a greenhouse lie between gutters
+        settings = dataclasses.replace(settings, split="steps")
+    unit = units_of(*aligned, settings, points["source"].astype(np.int64))
     count = int(unit.max(initial=0)) + 1
     if count == 1:
         return [site]
