@@ -7,13 +7,12 @@ import pytest
 import shapely
 from candidates_by_hand import candidate
 
-from pipeline import reconstruct
 from pipeline.errors import SettingsError
 from pipeline.methods import LODS, Method, ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, PreparedCloud, Reason, RoofType, Segmentation, Status
 from pipeline.parameters import Parameters
 from pipeline.quality.validity import check_solid
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.settings import RunSettings
 
 
@@ -33,7 +32,7 @@ def planeless(monkeypatch: pytest.MonkeyPatch) -> None:
         return Segmentation(planes=(), labels=np.full(len(cloud.points), -1, np.int32))
 
     method = Method(name="planeless", settings_type=Parameters, segment=segment)
-    monkeypatch.setattr(reconstruct, "method_named", lambda _: method)
+    monkeypatch.setattr("pipeline.recipe.method_named", lambda _: method)
 
 
 def modelled(candidate: Candidate, *lods: str, method: str = "arrangement") -> BuildingResult:
