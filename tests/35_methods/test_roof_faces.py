@@ -14,7 +14,7 @@ from pipeline.model import BuildingResult, Candidate, RoofType, Status
 from pipeline.recipe import reconstruct_building
 from pipeline.settings import RunSettings
 
-OF_PAPERS = [name for name, entry in METHODS.items() if entry.faithful is not None]
+OF_PAPERS = [name for name, entry in METHODS.items() if entry.follows_paper]
 OUTLINE = shapely.box(0.0, 0.0, 12.0, 8.0)
 
 

@@ -10,10 +10,11 @@ import pytest
 import shapely
 from candidates_by_hand import candidate
 from faces_by_hand import plane
+from method_by_hand import MethodByHand
 from shapely import Polygon
 
 from pipeline.errors import BuildingError, SettingsError
-from pipeline.methods import METHODS, Method, ReconstructSettings, method_named
+from pipeline.methods import METHODS, ReconstructSettings, method_named
 from pipeline.model import (
     BuildingResult,
     Candidate,
@@ -26,7 +27,6 @@ from pipeline.model import (
     Solid,
     Status,
 )
-from pipeline.parameters import Parameters
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
 from pipeline.roof.settings import RoofSettings
@@ -52,8 +52,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> Install:
     """`stub(function)` makes a segmentation function the method `stub`."""
 
     def install(segment: Callable[[Candidate], Segmentation]) -> None:
-        own = {"settings_type": Parameters, "faithful": Parameters()}
-        method = Method(name="stub", segment=lambda cloud, _: segment(cloud.candidate), **own)
+        method = MethodByHand(name="stub", segment=lambda cloud, _: segment(cloud.candidate))
         monkeypatch.setattr("pipeline.recipe.method_named", lambda _: method)
 
     return install
