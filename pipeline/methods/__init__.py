@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import importlib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import SettingsError
 from pipeline.parameters import Parameters
 from pipeline.quality.settings import SupportSettings
+from pipeline.registry import loaded
 from pipeline.roof.settings import ArrangementSettings, GuideSettings, RoofSettings, RoofTypeSettings
 
 if TYPE_CHECKING:
@@ -40,12 +39,12 @@ class Method:
     @property
     def settings_type(self) -> type[Parameters]:
         """Its settings class."""
-        kind: type[Parameters] = _loaded(self.settings)
+        kind: type[Parameters] = loaded(self.settings)
         return kind
 
     def segment(self, cloud: PreparedCloud, settings: Parameters) -> Segmentation:
         """From a prepared cloud and an instance of `settings_type` to planes and labels."""
-        found: Segmentation = _loaded(self.recipe)(cloud, settings)
+        found: Segmentation = loaded(self.recipe)(cloud, settings)
         return found
 
     @property
@@ -68,13 +67,6 @@ class Method:
         kind: Any = self.settings_type
         settings: Parameters = kind() if name == "robust" else kind.faithful()
         return settings
-
-
-@functools.cache
-def _loaded(place: str) -> Any:
-    """What a "module:name" names."""
-    module, _, name = place.partition(":")
-    return getattr(importlib.import_module(module), name)
 
 
 _SETTINGS = "pipeline.methods.settings:"
