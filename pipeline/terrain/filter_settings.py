@@ -20,7 +20,7 @@ from pipeline.terrain.support import (
 
 
 class GroundFilter(NamedTuple):
-    """A filter that tells the cells of ground from those of objects."""
+    """A filter that separates the cells of ground from objects."""
 
     find: str
     """Its function, as "module:name": from the lowest points of cells (rows, columns), the column and row of the first

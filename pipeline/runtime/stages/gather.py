@@ -355,8 +355,8 @@ def _ground_mm(
 def _open_ground(off_mm: npt.NDArray[np.int16], elevation_mm: IntArray) -> IntArray:
     """The distances (rows, columns) of cells on level ground of which most neighbours hold ground, too: (n,) int64, mm.
 
-    On a slope the distance to the terrain at the cell's centre tells where in the cell the point lies. Beneath plants
-    few pulses meet the ground, and a terrain through few of them misses the others.
+    On a slope the distance to the terrain at the cell's centre depends on where in the cell the point lies. Beneath
+    plants few pulses meet the ground, and a terrain through few of them misses the others.
     """
     rows, columns = off_mm.shape
     found, count = np.empty(rows * columns, np.int64), 0
