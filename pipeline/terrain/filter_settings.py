@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from pipeline.model import BoolArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.support import (
     CLUMP_CELLS,
@@ -17,6 +16,9 @@ from pipeline.terrain.support import (
     embankments_support_m,
     wide_support_m,
 )
+
+if TYPE_CHECKING:
+    from pipeline.model import BoolArray
 
 
 class GroundFilter(NamedTuple):
