@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.filter_settings import FILTERS, HierarchicalFilterSettings, MorphologicalFilterSettings
-from pipeline.terrain.support import GLASS_M, NEAR_CELLS, PLANARITY_SCALES
+from pipeline.terrain.support import GLASS_M, GLASS_PLANARITY_M, NEAR_CELLS, PLANARITY_SCALES
 
 _MAX_SUPPORT_M = 500
 """A filter that looks farther makes a block nearly all halo."""
@@ -174,13 +174,13 @@ class VegetationSettings(Parameters):
 
     @property
     def support_m(self) -> float:
-        """How far the judgement looks: the shifted windows of the widest scale, around the vertices of a sphere."""
-        return 2.0 * self.radius_m * 2.0 ** (PLANARITY_SCALES - 1) + self.crowns_support_m
+        """How far the judgement looks: shifted windows of the widest scale around the vertices of a sphere; glass."""
+        return max(2.0 * self.radius_m * 2.0 ** (PLANARITY_SCALES - 1) + self.crowns_support_m, GLASS_M)
 
     @property
     def crowns_support_m(self) -> float:
         """How far the searches for crowns and for glass look at judged vertices: the widest sphere, some squares."""
-        return max(self.company_m * 2.0 ** (PLANARITY_SCALES - 1), GLASS_M)
+        return max(self.company_m * 2.0 ** (PLANARITY_SCALES - 1), GLASS_PLANARITY_M)
 
 
 class SurfaceSettings(Parameters):

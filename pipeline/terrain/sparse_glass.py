@@ -1,10 +1,11 @@
 """Ground and plants that are seen through a roof of glass, where a few points lie on a square metre.
 
 Each point of a greenhouse shows the roof or what is beneath it by chance, whatever its neighbours show. Alleys, yards
-and the ground around houses are places: there a low point has low neighbours. So a low vertex lies under glass if the
-vertices of level roofs surround it, if most of the surrounded vertices of roofs near it have a low one among their
-nearest, and if low vertices keep no company of their own. Crowns, through which pulses pass by chance as well, are
-rough.
+and the ground around houses are places: there a low point has low neighbours. So a low vertex lies under glass if
+higher ones surround it, if most of the surrounded higher vertices near it have a low one among their nearest, and if
+low vertices keep no company of their own. Crowns, through which pulses pass by chance as well, are rough.
+
+What squares hold rules out nearly all of a town or a wood before any neighbour is searched for.
 """
 
 from __future__ import annotations
@@ -18,33 +19,35 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
 from pipeline.terrain.binning import points_by_cell
 from pipeline.terrain.facets import SceneVertices, VertexKind
+from pipeline.terrain.support import GLASS_NEAR as NEAR
+from pipeline.terrain.support import GLASS_SQUARE_MM as SQUARE_MM
+from pipeline.terrain.support import GLASS_SQUARES as REACH
 
 # Not settings: they say what glass is, in neighbours.
-REACH_MM = 4000
-"""Farther vertices are not neighbours."""
-SQUARE_MM, NEAR = 2000, 2
-"""Side of the squares that collect what is found, and how many of them around one are judged together."""
 _AROUND = 8
-"""The nearest vertices of roofs, which surround a vertex or do not."""
+"""The nearest higher vertices, which surround a vertex or do not."""
 _AT_EDGES = 24
 """As many surround what lies under the edges of a roof that is known to be of glass."""
 _FEWEST_AROUND = 5
 """Fewer surround nothing."""
 _NEAREST = 6
-"""The nearest vertices of any kind: where 30 % of the pulses go through, seven in eight roof vertices have a low one
-among as many."""
-_FEWEST_NEAR = 32
-"""Vertices within reach, two for 3 m2: where there are fewer, houses are mixed with what surrounds them."""
-_MOST_POINTS = 48
-"""Points in a square, on average: where there are more, the squares of `terrain.glass` hold enough."""
+"""The nearest vertices of any kind: where 30 % of the pulses go through, seven in eight of a roof have a low one among
+as many."""
+_FEWEST_NEAR = 64
+"""Vertices in the squares around, two for 3 m2: where there are fewer, houses are mixed with what surrounds them."""
+_MOST_POINTS = 700
+"""Points in the squares around, 7 per m2: where there are more, the squares of `terrain.glass` hold enough."""
 _MIXED_SHARE = 0.6
-"""Surrounded vertices of roofs that have a low one among their nearest. A sixth of the pulses make as many."""
+"""Surrounded higher vertices that have a low one among their nearest. A sixth of the pulses make as many."""
 _COMPANY = 0.35
 """How much of the way from chance to keeping to itself the low vertices may have gone."""
 _LEVEL_SHARE = 0.8
-"""Share of the vertices at the height of roofs whose surroundings are planar."""
+"""Share of the higher vertices whose surroundings are planar."""
+_PAIR_SHARE = 0.12
+"""Least share of the pairs of vertices in one quarter of a square, of a higher one and another, that have a low one. As
+large is the share of the pulses that go through glass; straight walls beside open ground make half as many."""
 _FEWEST, _FEWEST_LOW = 12, 8
-"""Surrounded vertices of roofs, and low ones: fewer show nothing."""
+"""Surrounded higher vertices, and low ones: fewer show nothing."""
 _BELOW_MM = 1000
 """How far what is seen through a roof lies below it at least."""
 
@@ -53,39 +56,37 @@ class _Part(IntEnum):
     """What a vertex is."""
 
     OTHER = 0
-    """Higher than ground and plants, and rough or of unknown surroundings."""
+    """As high as roofs, but no roof by its class."""
     LOW = 1
     """Below the height of roofs."""
-    ROOF = 2
+    ROUGH = 2
+    """At the height of roofs, with rough or unknown surroundings."""
+    ROOF = 3
     """At the height of roofs, with planar surroundings, or building by its class."""
 
 
 class _Found(IntEnum):
-    """Columns of what is counted in a square."""
+    """Layers of what is counted in squares."""
 
     HIGH = 0
-    """All vertices at the height of roofs."""
-    ROOF = 1
-    INNER_ROOF = 2
-    """Surrounded by others of roofs."""
-    MIXED = 3
-    """Those with a low one, itself surrounded, among their nearest."""
-    LOW = 4
+    """Surrounded ones at the height of roofs."""
+    MIXED = 1
+    """Those of them with a low one, itself surrounded, among their nearest."""
+    LOW = 2
     """Surrounded low ones."""
-    LOW_NEIGHBOURS = 5
+    LOW_NEIGHBOURS = 3
     """Nearest vertices of these that are surrounded and low."""
-    NEIGHBOURS = 6
+    NEIGHBOURS = 4
     """Nearest vertices of these that are surrounded."""
 
 
-_COLUMNS = len(_Found)
+_LAYERS, _PARTS = len(_Found), len(_Part)
+_QUARTER_MM = SQUARE_MM // 2
 
 
 class _Cells(NamedTuple):
-    """Vertices by square cells as wide as the reach."""
+    """Some of the vertices by squares."""
 
-    x_mm: IntArray
-    y_mm: IntArray
     start: LabelArray
     members: LabelArray
     column0: int
@@ -95,170 +96,201 @@ class _Cells(NamedTuple):
 
 
 @kernel
-def _nearest(v: int, cells: _Cells, wanted: BoolArray, found: IntArray) -> tuple[int, int]:
-    """Fill `found` with the wanted vertices nearest to v, without v itself; how many, and how many of any kind near it.
+def _nearest(v: int, vertices: SceneVertices, cells: _Cells, found: IntArray) -> int:
+    """Fill `found` with the members of cells that are nearest to v, without v itself; how many there are within reach.
 
     Equal distances by number: vertices come sorted by (x, y).
     """
-    x, y = cells.x_mm, cells.y_mm
+    x, y = vertices.x_mm, vertices.y_mm
     distance = np.empty(found.size, np.int64)
-    count, within = 0, 0
-    c, r = x[v] // REACH_MM - cells.column0, y[v] // REACH_MM - cells.row0
-    for rr in range(max(r - 1, 0), min(r + 2, cells.rows)):
-        first = rr * cells.columns
-        for m in range(cells.start[first + max(c - 1, 0)], cells.start[first + min(c + 1, cells.columns - 1) + 1]):
-            w = cells.members[m]
-            away = (x[w] - x[v]) ** 2 + (y[w] - y[v]) ** 2
-            if away > REACH_MM * REACH_MM:
-                continue
-            within += 1
-            if not wanted[w] or w == v:
-                continue
-            k = min(count, found.size - 1)
-            if count == found.size and (away > distance[k] or (away == distance[k] and w > found[k])):
-                continue
-            while k > 0 and (away < distance[k - 1] or (away == distance[k - 1] and w < found[k - 1])):
-                distance[k], found[k] = distance[k - 1], found[k - 1]
-                k -= 1
-            distance[k], found[k] = away, w
-            count = min(count + 1, found.size)
-    return count, within
+    count = 0
+    c, r = x[v] // SQUARE_MM - cells.column0, y[v] // SQUARE_MM - cells.row0
+    for ring in range(REACH + 1):
+        for rr in range(max(r - ring, 0), min(r + ring + 1, cells.rows)):
+            step = 1 if abs(rr - r) == ring else 2 * ring
+            for cc in range(c - ring, c + ring + 1, step):
+                if not 0 <= cc < cells.columns:
+                    continue
+                cell = rr * cells.columns + cc
+                for m in range(cells.start[cell], cells.start[cell + 1]):
+                    w = cells.members[m]
+                    away = (x[w] - x[v]) ** 2 + (y[w] - y[v]) ** 2
+                    if w == v or away > (REACH * SQUARE_MM) ** 2:
+                        continue
+                    k = min(count, found.size - 1)
+                    if count == found.size and (away > distance[k] or (away == distance[k] and w > found[k])):
+                        continue
+                    while k > 0 and (away < distance[k - 1] or (away == distance[k - 1] and w < found[k - 1])):
+                        distance[k], found[k] = distance[k - 1], found[k - 1]
+                        k -= 1
+                    distance[k], found[k] = away, w
+                    count = min(count + 1, found.size)
+        # what lies beyond this ring is farther
+        if count == found.size and distance[count - 1] <= (ring * SQUARE_MM) ** 2:
+            break
+    return count
 
 
 @kernel
-def _are_around(v: int, cells: _Cells, around: IntArray) -> bool:
+def _are_around(v: int, vertices: SceneVertices, around: IntArray) -> bool:
     """Whether no straight line through vertex v has all of some others on one side."""
-    x, y = cells.x_mm, cells.y_mm
+    x, y = vertices.x_mm, vertices.y_mm
     for i in around:
         ux, uy = x[i] - x[v], y[i] - y[v]
         is_open = True
         for j in around:
             if ux * (y[j] - y[v]) - uy * (x[j] - x[v]) > 0:
                 is_open = False
+                break
         if is_open:
             return False
     return True
 
 
 @kernel
-def _inner(vertices: SceneVertices, part: KindArray, cells: _Cells, sparse: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """Which vertices (v,), low ones and those of roofs, lie among the nearest ones of roofs, and among more of them.
-
-    None where points are dense.
-    """
-    n = part.size
-    inner, covered = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-    is_roof, around = np.zeros(n, np.bool_), np.empty(_AT_EDGES, np.int64)
-    for v in range(n):
-        is_roof[v] = part[v] == _Part.ROOF
-    for v in range(n):
-        if part[v] == _Part.OTHER or not sparse[v]:
+def _surrounded(
+    wanted: BoolArray, vertices: SceneVertices, part: KindArray, high: _Cells, most: int, out: BoolArray
+) -> None:
+    """Which wanted vertices (v,) lie among the nearest higher ones, up to `most`; low ones also lie well below them."""
+    around = np.empty(most, np.int64)
+    for v in range(part.size):
+        if not wanted[v]:
             continue
-        count, within = _nearest(v, cells, is_roof, around)
-        if count < _FEWEST_AROUND or within < _FEWEST_NEAR:
-            continue
-        near = min(count, _AROUND)
-        if part[v] == _Part.LOW:
-            rise = 0
-            for w in around[:near]:
-                rise += vertices.z_mm[w] - vertices.z_mm[v]
-            if rise < near * _BELOW_MM:
-                continue
-        inner[v] = _are_around(v, cells, around[:near])
-        covered[v] = inner[v] or _are_around(v, cells, around[:count])
-    return inner, covered
+        count = _nearest(v, vertices, high, around)
+        near, rise = min(count, _AROUND), 0
+        for w in around[:near]:
+            rise += vertices.z_mm[w] - vertices.z_mm[v]
+        if count >= _FEWEST_AROUND and (part[v] != _Part.LOW or rise >= near * _BELOW_MM):
+            out[v] = _are_around(v, vertices, around[:count])
 
 
 @kernel
-def _count(
-    part: KindArray, inner: BoolArray, cells: _Cells, corner: tuple[int, int], shape: tuple[int, int]
-) -> IntArray:
-    """What the squares (rows, columns, C) hold, columns as in `_Found`."""
-    out = np.zeros((shape[0], shape[1], _COLUMNS), np.int64)
-    every, near = np.ones(part.size, np.bool_), np.empty(_NEAREST, np.int64)
+def _mixture(wanted: BoolArray, vertices: SceneVertices, part: KindArray, inner: BoolArray, every: _Cells) -> IntArray:
+    """What the squares (layers, rows, columns) hold by their wanted vertices (v,), layers as in `_Found`."""
+    out = np.zeros((_LAYERS, every.rows, every.columns), np.int64)
+    near = np.empty(_NEAREST, np.int64)
     for v in range(part.size):
-        square = out[cells.y_mm[v] // SQUARE_MM - corner[0], cells.x_mm[v] // SQUARE_MM - corner[1]]
-        square[_Found.HIGH] += part[v] != _Part.LOW
-        square[_Found.ROOF] += part[v] == _Part.ROOF
-        if not inner[v]:
+        if not (wanted[v] and inner[v]):
             continue
-        count, _ = _nearest(v, cells, every, near)
+        r, c = vertices.y_mm[v] // SQUARE_MM - every.row0, vertices.x_mm[v] // SQUARE_MM - every.column0
         low, known = 0, 0
-        for w in near[:count]:
+        for w in near[: _nearest(v, vertices, every, near)]:
             known += inner[w]
             low += inner[w] and part[w] == _Part.LOW
-        if part[v] == _Part.ROOF:
-            square[_Found.INNER_ROOF] += 1
-            square[_Found.MIXED] += low > 0
+        if part[v] == _Part.LOW:
+            out[_Found.LOW, r, c] += 1
+            out[_Found.LOW_NEIGHBOURS, r, c] += low
+            out[_Found.NEIGHBOURS, r, c] += known
         else:
-            square[_Found.LOW] += 1
-            square[_Found.LOW_NEIGHBOURS] += low
-            square[_Found.NEIGHBOURS] += known
-    return out
-
-
-@kernel
-def _glass(squares: IntArray) -> BoolArray:
-    """Which squares (rows, columns) lie under glass, by those around each."""
-    rows, columns = squares.shape[0], squares.shape[1]
-    out = np.zeros((rows, columns), np.bool_)
-    for r in range(rows):
-        for c in range(columns):
-            s = np.zeros(_COLUMNS, np.int64)
-            for rr in range(max(r - NEAR, 0), min(r + NEAR + 1, rows)):
-                for cc in range(max(c - NEAR, 0), min(c + NEAR + 1, columns)):
-                    s += squares[rr, cc]
-            share = s[_Found.LOW] / max(s[_Found.LOW] + s[_Found.INNER_ROOF], 1)
-            company = s[_Found.LOW_NEIGHBOURS] / max(s[_Found.NEIGHBOURS], 1)
-            out[r, c] = (
-                s[_Found.INNER_ROOF] >= _FEWEST
-                and s[_Found.LOW] >= _FEWEST_LOW
-                and s[_Found.ROOF] >= _LEVEL_SHARE * s[_Found.HIGH]
-                and s[_Found.MIXED] >= _MIXED_SHARE * s[_Found.INNER_ROOF]
-                and company <= share + _COMPANY * (1.0 - share)
-            )
+            out[_Found.HIGH, r, c] += 1
+            out[_Found.MIXED, r, c] += low > 0
     return out
 
 
 @kernel
 def _parts(vertices: SceneVertices, least_mm: int) -> KindArray:
-    """`_Part` of each vertex."""
+    """`_Part` of each vertex: by itself and how planar its surroundings are, as other tiles judge it, too."""
     out = np.empty(len(vertices.x_mm), np.int8)
     for v in range(out.size):
         kind = vertices.kind[v]
-        # not what was joined to a building: whether far vertices are, another tile decides
-        may_be = kind == VertexKind.OBJECT or kind == VertexKind.JOINED  # noqa: PLR1714 - compiled
-        if kind == VertexKind.BUILDING or (may_be and vertices.planar[v] > 0 and vertices.height_mm[v] >= least_mm):
+        if kind == VertexKind.BUILDING:
             out[v] = _Part.ROOF
         elif kind == VertexKind.GROUND or vertices.height_mm[v] < least_mm:
             out[v] = _Part.LOW
-        else:
+        elif kind == VertexKind.EXCLUDED:
             out[v] = _Part.OTHER
+        else:
+            out[v] = _Part.ROOF if vertices.planar[v] > 0 else _Part.ROUGH
     return out
 
 
 @kernel
-def _where_sparse(
-    cells: _Cells, points: tuple[IntArray, IntArray], used: BoolArray, corner: tuple[int, int], shape: tuple[int, int]
-) -> BoolArray:
-    """Which vertices (v,) lie where few points, of those that may be ground or roof, lie around."""
-    rows, columns = shape
+def _count(x_mm: IntArray, y_mm: IntArray, counted: BoolArray, cells: _Cells) -> IntArray:
+    """How many of the counted places (n,) lie in each square (rows, columns)."""
+    out = np.zeros((cells.rows, cells.columns), np.int64)
+    for i in range(counted.size):
+        if counted[i]:
+            r, c = y_mm[i] // SQUARE_MM - cells.row0, x_mm[i] // SQUARE_MM - cells.column0
+            if 0 <= r < cells.rows and 0 <= c < cells.columns:
+                out[r, c] += 1
+    return out
+
+
+@kernel
+def _held(vertices: SceneVertices, part: KindArray, cells: _Cells) -> IntArray:
+    """What the squares hold (layers, rows, columns): vertices of each `_Part`, and two layers of their quarters.
+
+    These are the higher vertices with others in the same quarter, and the share of low ones among these others, summed,
+    in thousandths.
+    """
+    rows, columns = cells.rows, cells.columns
+    out = np.zeros((_PARTS + 2, rows, columns), np.int64)
+    quarters = np.zeros((2, 2 * rows, 2 * columns), np.int64)
+    for v in range(part.size):
+        r, c = vertices.y_mm[v] // _QUARTER_MM - 2 * cells.row0, vertices.x_mm[v] // _QUARTER_MM - 2 * cells.column0
+        out[part[v], r // 2, c // 2] += 1
+        if part[v] != _Part.OTHER:
+            quarters[1 if part[v] == _Part.LOW else 0, r, c] += 1
+    for r in range(2 * rows):
+        for c in range(2 * columns):
+            high, low = quarters[0, r, c], quarters[1, r, c]
+            if high + low > 1:
+                out[_PARTS, r // 2, c // 2] += high
+                out[_PARTS + 1, r // 2, c // 2] += 1000 * high * low // (high + low - 1)
+    return out
+
+
+@kernel
+def _box_sums(squares: IntArray, near: int) -> IntArray:
+    """Sums of squares (rows, columns) up to `near` squares around each."""
+    rows, columns = squares.shape
     sums = np.zeros((rows + 1, columns + 1), np.int64)
-    for i in range(used.size):
-        r, c = points[1][i] // SQUARE_MM - corner[0], points[0][i] // SQUARE_MM - corner[1]
-        if used[i] and 0 <= r < rows and 0 <= c < columns:
-            sums[r + 1, c + 1] += 1
     for r in range(rows):
         for c in range(columns):
-            sums[r + 1, c + 1] += sums[r, c + 1] + sums[r + 1, c] - sums[r, c]
-    out = np.zeros(cells.x_mm.size, np.bool_)
-    most = _MOST_POINTS * (2 * NEAR + 1) ** 2
-    for v in range(out.size):
-        r, c = cells.y_mm[v] // SQUARE_MM - corner[0], cells.x_mm[v] // SQUARE_MM - corner[1]
-        south, north = max(r - NEAR, 0), min(r + NEAR + 1, rows)
-        west, east = max(c - NEAR, 0), min(c + NEAR + 1, columns)
-        out[v] = sums[north, east] - sums[south, east] - sums[north, west] + sums[south, west] <= most
+            sums[r + 1, c + 1] = squares[r, c] + sums[r, c + 1] + sums[r + 1, c] - sums[r, c]
+    out = np.empty((rows, columns), np.int64)
+    for r in range(rows):
+        south, north = max(r - near, 0), min(r + near + 1, rows)
+        for c in range(columns):
+            west, east = max(c - near, 0), min(c + near + 1, columns)
+            out[r, c] = sums[north, east] - sums[south, east] - sums[north, west] + sums[south, west]
     return out
+
+
+@kernel
+def _inside(x_mm: IntArray, y_mm: IntArray, squares: BoolArray, cells: _Cells) -> BoolArray:
+    """Which places (n,) lie in marked squares (rows, columns)."""
+    out = np.zeros(x_mm.size, np.bool_)
+    for i in range(x_mm.size):
+        r, c = y_mm[i] // SQUARE_MM - cells.row0, x_mm[i] // SQUARE_MM - cells.column0
+        out[i] = 0 <= r < cells.rows and 0 <= c < cells.columns and squares[r, c]
+    return out
+
+
+def _near(squares: BoolArray, near: int) -> BoolArray:
+    """Squares (rows, columns) up to `near` squares from marked ones."""
+    marked: BoolArray = _box_sums(squares.astype(np.int64), near) > 0
+    return marked
+
+
+def _glass(vertices: SceneVertices, part: KindArray, every: _Cells, high: _Cells, may_be: BoolArray) -> BoolArray:
+    """Which squares (rows, columns) lie under glass, of those that may by what the squares around them hold."""
+    x, y, is_low = vertices.x_mm, vertices.y_mm, part == _Part.LOW
+    inner = np.zeros(part.size, np.bool_)
+    # the squares around, and as far beyond them as their vertices have neighbours
+    for kind in (is_low, part >= _Part.ROUGH):
+        searched = kind & _inside(x, y, _near(may_be, NEAR + REACH), every)
+        _surrounded(searched, vertices, part, high, _AROUND, inner)
+        may_be &= _box_sums(_count(x, y, is_low & inner, every), NEAR) >= _FEWEST_LOW
+        if not may_be.any():
+            return may_be
+    layers = _mixture(_inside(x, y, _near(may_be, NEAR), every), vertices, part, inner, every)
+    inner_high, mixed, low, low_neighbours, neighbours = (_box_sums(layer, NEAR) for layer in layers)
+    share = low / np.maximum(low + inner_high, 1)
+    company = low_neighbours / np.maximum(neighbours, 1)
+    by_chance = company <= share + _COMPANY * (1.0 - share)
+    found: BoolArray = may_be & (inner_high >= _FEWEST) & (mixed >= _MIXED_SHARE * inner_high) & by_chance
+    return found
 
 
 def are_low(vertices: SceneVertices, least_mm: int) -> BoolArray:
@@ -283,13 +315,19 @@ def under_sparse_glass(
     """
     x, y = vertices.x_mm, vertices.y_mm
     part = _parts(vertices, least_mm)
-    corner = (int(y.min()) // SQUARE_MM, int(x.min()) // SQUARE_MM)
-    shape = (int(y.max()) // SQUARE_MM - corner[0] + 1, int(x.max()) // SQUARE_MM - corner[1] + 1)
-    cells = _Cells(x, y, *points_by_cell(x, y, np.ones(len(x), np.bool_), REACH_MM))
-    inner, covered = _inner(vertices, part, cells, _where_sparse(cells, (x_mm, y_mm), used, corner, shape))
-    glass = _glass(_count(part, inner, cells, corner, shape))
-    at = glass[y // SQUARE_MM - corner[0], x // SQUARE_MM - corner[1]]
-    r, c = y_mm // SQUARE_MM - corner[0], x_mm // SQUARE_MM - corner[1]
-    inside = (r >= 0) & (r < shape[0]) & (c >= 0) & (c < shape[1])
-    inside[inside] = glass[r[inside], c[inside]]
-    return at, at & covered & (part == _Part.LOW), inside
+    is_low, is_high = part == _Part.LOW, part >= _Part.ROUGH
+    high = _Cells(*points_by_cell(x, y, is_high, SQUARE_MM))
+    other, low, rough, roof, paired, mixed = (_box_sums(layer, NEAR) for layer in _held(vertices, part, high))
+    may_be = (low >= _FEWEST_LOW) & (rough + roof >= _FEWEST) & (other + low + rough + roof >= _FEWEST_NEAR)
+    may_be &= (roof >= _LEVEL_SHARE * (other + rough + roof)) & (mixed >= 1000 * _PAIR_SHARE * paired)
+    may_be &= _box_sums(_count(x_mm, y_mm, used, high), NEAR) <= _MOST_POINTS
+    glass = may_be
+    if may_be.any():
+        every = _Cells(*points_by_cell(x, y, np.ones(len(x), np.bool_), SQUARE_MM))
+        glass = _glass(vertices, part, every, high, may_be)
+    at, under = np.zeros((2, len(x)), np.bool_)
+    if not glass.any():
+        return at, under, np.zeros(len(x_mm), np.bool_)
+    at = _inside(x, y, glass, high)
+    _surrounded(at & is_low, vertices, part, high, _AT_EDGES, under)
+    return at, under, _inside(x_mm, y_mm, glass, high)

@@ -40,8 +40,14 @@ NEAR_CELLS = 16
 
 Wider squares lie under wide objects, where the ground around them decides. The other ground looks less far."""
 
-GLASS_M = 14.0
-"""The search for glass looks at squares of up to 2 m: its own, two more to each side, and one around each of these."""
+GLASS_SQUARE_MM, GLASS_NEAR, GLASS_SQUARES = 2000, 2, 2
+"""The search for glass: side of its squares, how many around one are judged together, and how many hold neighbours."""
+
+GLASS_M = GLASS_SQUARE_MM / 1000.0 * (GLASS_NEAR + 1 + 2 * GLASS_SQUARES)
+"""How far it looks at points: its own square and those around it, and neighbours of neighbours."""
+
+GLASS_PLANARITY_M = GLASS_SQUARE_MM / 1000.0 * (GLASS_NEAR + 1)
+"""How far it looks at the planarity of vertices: its own square, and those around it."""
 
 PLANARITY_SCALES = 3
 """Planarity is judged in windows of one, two and four radii."""
