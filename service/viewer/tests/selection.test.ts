@@ -1,7 +1,7 @@
 import { describe, expect, it } from "vitest";
-import type { Listed } from "../src/batching";
-import { figureWords, figuresOf, flagsOf } from "../src/figures";
-import { CATEGORY_NAMES, type Category } from "../src/roof_types";
+import type { Listed } from "../src/models/batching";
+import { figureWords, figuresOf, flagsOf } from "../src/models/figures";
+import { CATEGORY_NAMES, type Category } from "../src/words/roof_types";
 import {
   SORTS,
   STATUSES,
@@ -14,7 +14,7 @@ import {
   unfiltered,
   wantedOf,
   type Wanted,
-} from "../src/selection";
+} from "../src/models/selection";
 
 function listed(id: string, category: Category, others: Partial<Listed> = {}): Listed {
   return { id, category, reason: null, reasonDetail: null, sourceId: null, figures: {}, flags: [], ...others };
