@@ -18,14 +18,13 @@ import { CATEGORIES } from "../words/roof_types";
 import { ModelScene } from "../scene/scene";
 import { nothing, table } from "../page/tables";
 import { modelUnits } from "../models/units";
+import type { OnMove } from "../scene/camera";
 import "./changes_view.css";
 import "../page/dialogs.css";
 import "../page/pages.css";
 
 const OFFERED = 100;
 const STEP = 100;
-
-type OnMove = Parameters<ModelScene["watchCamera"]>[0];
 
 /** One side: a job, and the run of it if it is a comparison. */
 interface Side {

@@ -2,7 +2,7 @@ import { BufferGeometry, Float32BufferAttribute, Group, Points, PointsMaterial, 
 import { LineMaterial } from "three/addons/lines/LineMaterial.js";
 import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
-import type { Layer } from "../scene/scene";
+import type { Layer } from "../scene/layer";
 
 /** Seen on every roof and on both backgrounds: a dark line with a bright core. */
 const CASING = "#101418";
