@@ -17,3 +17,29 @@ export function field(label: string, control: HTMLElement, hint?: string): HTMLE
 export function choice(id: string, options: Record<string, string>, chosen?: string): HTMLSelectElement {
   return el("select", { id }, ...Object.entries(options).map(([value, label]) => el("option", { value, selected: value === chosen }, label)));
 }
+
+/** A set of checkboxes. */
+export class Boxes {
+  readonly element = el("div", { class: "boxes" });
+  private boxes: HTMLInputElement[] = [];
+
+  /** Offer these words with their labels; the chosen ones are checked. */
+  offer(labels: Readonly<Record<string, string>>, chosen: readonly string[] = []): void {
+    const words = Object.keys(labels);
+    this.boxes = words.map((value) => el("input", { type: "checkbox", value, checked: chosen.includes(value) }));
+    this.element.replaceChildren(...this.boxes.map((box) => el("label", {}, box, ` ${labels[box.value]}`)));
+  }
+
+  get isEmpty(): boolean {
+    return this.boxes.length === 0;
+  }
+
+  get chosen(): string[] {
+    return this.boxes.filter(({ checked }) => checked).map(({ value }) => value);
+  }
+
+  /** Boxes that cannot be set at the moment. */
+  disable(isOff: (value: string) => boolean): void {
+    for (const box of this.boxes) box.disabled = isOff(box.value);
+  }
+}
