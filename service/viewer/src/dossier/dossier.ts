@@ -19,6 +19,7 @@ import { RESIDUALS } from "../points/points_colouring";
 import { ringsOf } from "../models/rings";
 import { CATEGORIES, categoryOf } from "../words/roof_types";
 import { elevationUnitM, inMetres, modelUnits } from "../models/units";
+import { COLUMNS, shown } from "../models/columns";
 
 interface Loaded {
   properties: Feature["properties"];
@@ -228,6 +229,8 @@ function figure(title: string, words: string, content: HTMLElement): HTMLElement
   return el("figure", {}, el("h2", {}, title), content, el("figcaption", {}, words));
 }
 
+const FACTS = ["height_m", "footprint_area_m2", "volume_m3", "n_planes", "n_points", "density_per_m2"] as const;
+
 /** The most important facts in one line each. */
 function facts(properties: Feature["properties"], crs: string): HTMLElement {
   const category = categoryOf(properties["status"], properties["roof_type"]);
@@ -235,12 +238,7 @@ function facts(properties: Feature["properties"], crs: string): HTMLElement {
   const rows: [string, string][] = [
     ["Form", `${CATEGORIES[category].label}${lod}`],
     ["Method", String(properties["method"] ?? "–")],
-    ["Ridge above floor", measure(properties["height_m"], 2, "m")],
-    ["Footprint", measure(properties["footprint_area_m2"], 1, "m²")],
-    ["Volume", measure(properties["volume_m3"], 0, "m³")],
-    ["Roof planes", measure(properties["n_planes"], 0)],
-    ["Points", measure(properties["n_points"], 0)],
-    ["Density", measure(properties["density_per_m2"], 1, "per m²")],
+    ...FACTS.map((name): [string, string] => [COLUMNS[name].label, shown(name, properties[name])]),
     ["CRS", crs],
   ];
   return el("dl", { class: "dossier-facts" }, ...rows.map(([name, value]) => el("div", {}, el("dt", {}, name), el("dd", {}, value))));

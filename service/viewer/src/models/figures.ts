@@ -1,29 +1,27 @@
 /** The figures and marks of a record by which the list is sorted and filtered. */
 
-import { count, measure } from "../words/numbers";
+import { COLUMNS, shown, type ColumnName } from "./columns";
 
 interface Figure {
   label: string;
   /** The column of the record, and that of a rejected object if it has another name. */
-  column: string;
+  column: ColumnName;
   ofRejected?: string;
-  unit: string;
-  digits: number;
-  /** Shown value over stored value. */
-  factor?: number;
+  /** Decimals; those of the column if none are given. */
+  digits?: number;
 }
 
 export const FIGURES = {
-  height: { label: "Height", column: "height_m", unit: "m", digits: 1 },
-  area: { label: "Area", column: "footprint_area_m2", ofRejected: "area_m2", unit: "m²", digits: 0 },
-  within: { label: "Within 0.2 m of the roof", column: "share_within_0_2m", unit: "%", digits: 1, factor: 100 },
-  residual: { label: "Residual (RMSE)", column: "rmse_m", unit: "m", digits: 3 },
-  planes: { label: "Roof faces", column: "n_planes", unit: "", digits: 0 },
-  confidence: { label: "Confidence", column: "detection_confidence", unit: "%", digits: 1, factor: 100 },
-  volume: { label: "Volume", column: "volume_m3", unit: "m³", digits: 0 },
-  points: { label: "Points", column: "n_points", unit: "", digits: 0 },
-  density: { label: "Points per m²", column: "density_per_m2", unit: "per m²", digits: 1 },
-  coverage: { label: "Points covered", column: "coverage", unit: "%", digits: 1, factor: 100 },
+  height: { label: "Height", column: "height_m", digits: 1 },
+  area: { label: "Area", column: "footprint_area_m2", ofRejected: "area_m2", digits: 0 },
+  within: { label: COLUMNS.share_within_0_2m.label, column: "share_within_0_2m" },
+  residual: { label: "Residual (RMSE)", column: "rmse_m" },
+  planes: { label: "Roof faces", column: "n_planes" },
+  confidence: { label: "Confidence", column: "detection_confidence" },
+  volume: { label: COLUMNS.volume_m3.label, column: "volume_m3" },
+  points: { label: COLUMNS.n_points.label, column: "n_points" },
+  density: { label: "Points per m²", column: "density_per_m2" },
+  coverage: { label: COLUMNS.coverage.label, column: "coverage" },
 } as const satisfies Record<string, Figure>;
 
 export type FigureName = keyof typeof FIGURES;
@@ -72,12 +70,6 @@ export function flagsOf(record: Record<string, unknown>): Flag[] {
 export function figureWords(name: FigureName, figures: Figures): string | null {
   const value = figures[name];
   if (value === undefined) return null;
-  const { digits, unit, factor = 1 }: Figure = FIGURES[name];
-  return unit === "" && digits === 0 ? count(value) : measure(value * factor, digits, unit);
-}
-
-/** Shown value over stored value. */
-export function factorOf(name: FigureName): number {
-  const { factor = 1 }: Figure = FIGURES[name];
-  return factor;
+  const { column, digits }: Figure = FIGURES[name];
+  return shown(column, value, 1, digits);
 }

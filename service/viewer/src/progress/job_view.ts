@@ -10,75 +10,11 @@ import { announce, asProblem, problemNotice, warningNotice } from "../page/notic
 import { count, duration } from "../words/numbers";
 import { BuildingsSoFar } from "./so_far";
 import type { Hooks } from "../page/view";
+import { stagesOf, stageNamed, type Stage } from "./stages";
 import "./job_view.css";
-
-/** The stages of a job, in order: name, description, and the counted unit. */
-const STAGES: [string, string, string][] = [
-  ["inputs", "Prepare the inputs", "files"],
-  ["plan", "Plan the tiles", ""],
-  ["ingest", "Read the points", "files"],
-  ["cells", "Mark duplicates and outliers", "tiles"],
-  ["ground", "Find the ground", ""],
-  ["split", "Find walls and roofs", "tiles"],
-  ["join", "Join surfaces over borders", ""],
-  ["outline", "Separate and outline the buildings", ""],
-  ["reconstruct", "Model the buildings", "buildings"],
-  ["publish", "Write the results", "tiles"],
-  ["outputs", "Assemble the downloads", ""],
-];
-
-/** The stage before all others, of the first jobs of a new installation. */
-const COMPILE: (typeof STAGES)[number] = ["compile", "Compile, once on this machine", "kernels"];
-
-/** Number of stages up to the buildings that are to be modelled. */
-const FOUND = 1 + STAGES.findIndex(([name]) => name === "outline");
-
-/** Stages of a classification that differ from those of a reconstruction. */
-const CLASSIFIED: typeof STAGES = [
-  ["classify", "Classify the points", "tiles"],
-  ["write", "Write the files", "files"],
-  ["rasters", "Draw the rasters", "tiles"],
-  ["mosaics", "Join the rasters", ""],
-];
-
-/** Further stages of a comparison, before its downloads are assembled. */
-const SIDE_BY_SIDE: typeof STAGES = [
-  ["records", "Compare the runs", ""],
-  ["points", "Read points for the pictures", ""],
-  ["pictures", "Draw the pictures", ""],
-  ["page", "Write the page", ""],
-];
 
 /** Stages in which a job has some of its buildings. */
 const HAS_MODELS = new Set(["reconstruct", "publish", "formats", "outputs"]);
-
-/** The further stage of a job that keeps the points. */
-const WITH_POINTS: typeof STAGES = [["octree", "Write the points", "tiles"]];
-
-/** The further stage of a job that writes the terrain. */
-const WITH_TERRAIN: typeof STAGES = [["terrain", "Write the terrain", "tiles"]];
-
-/** The further stage of a job that publishes other formats. */
-const WITH_FORMATS: typeof STAGES = [["formats", "Write other formats", "formats"]];
-
-interface Asked {
-  points?: boolean;
-  publish?: string[];
-  settings?: { terrain?: string };
-}
-
-function stagesOf(job: StatusInfo): typeof STAGES {
-  if (job.processID === "echo") return [];
-  if (job.processID === "classify") return [...STAGES.slice(0, FOUND), ...CLASSIFIED, ...STAGES.slice(-1)];
-  const asked = (job.request?.inputs ?? {}) as Asked;
-  const beside = [
-    ...(asked.points === true ? WITH_POINTS : []),
-    ...(asked.settings?.terrain === "tin" ? WITH_TERRAIN : []),
-    ...((asked.publish ?? []).length > 0 ? WITH_FORMATS : []),
-  ];
-  const more = job.processID === "compare" ? SIDE_BY_SIDE : beside;
-  return [...STAGES.slice(0, -1), ...more, ...STAGES.slice(-1)];
-}
 
 /** Show a job: its progress, its failure or its results. Returns a function that ends the view. */
 export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => void {
@@ -190,7 +126,7 @@ class ProgressView {
     hooks: Hooks,
   ) {
     this.started = Date.parse(job.started ?? job.created ?? new Date().toISOString());
-    for (const [name, words] of stagesOf(job)) this.addStage(name, words);
+    for (const stage of stagesOf(job)) this.addStage(stage);
     const button = el("button", { type: "button", class: "quiet" }, "Cancel the job");
     button.addEventListener("click", () => {
       // a second request would remove the job that the first has stopped
@@ -260,18 +196,14 @@ class ProgressView {
 
   private enter(stage: string, event?: JobEvent): void {
     if (HAS_MODELS.has(stage)) this.soFar?.begin();
-    if (!this.rows.has(stage)) {
-      if (stage === COMPILE[0]) this.addStage(stage, COMPILE[1], true);
-      else this.addStage(stage, stage);
-    }
+    if (!this.rows.has(stage)) this.addStage(stageNamed(stage), stage === "compile");
     let before = true;
     for (const [name, { row, figure }] of this.rows) {
       if (name === stage) {
         before = false;
         row.className = "stage stage-now";
         row.setAttribute("aria-current", "step");
-        const noun = [COMPILE, ...STAGES].find(([known]) => known === name)?.[2] ?? "";
-        if (event !== undefined && event.total > 1) figure.textContent = `${count(event.done)} of ${count(event.total)} ${noun}`;
+        if (event !== undefined && event.total > 1) figure.textContent = `${count(event.done)} of ${count(event.total)} ${stageNamed(name).unit}`;
       } else {
         row.className = before ? "stage stage-done" : "stage";
         row.removeAttribute("aria-current");
@@ -279,7 +211,7 @@ class ProgressView {
     }
   }
 
-  private addStage(name: string, words: string, isFirst = false): void {
+  private addStage({ name, words }: Stage, isFirst = false): void {
     const figure = el("span", { class: "stage-figure" });
     const row = el("li", { class: "stage" }, el("span", { class: "stage-name" }, words), figure);
     if (isFirst) {

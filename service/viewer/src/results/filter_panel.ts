@@ -1,11 +1,12 @@
 import { tallyWords } from "./building_list";
 import { el, swatch } from "../page/elements";
 import { capital } from "../words/fields";
-import { FIGURES, FIGURE_NAMES, FLAGS, FLAG_NAMES, factorOf, type FigureName } from "../models/figures";
+import { FIGURES, FIGURE_NAMES, FLAGS, FLAG_NAMES, type FigureName } from "../models/figures";
 import { count } from "../words/numbers";
 import { reasonWords } from "../words/reasons";
 import { CATEGORIES, type Category } from "../words/roof_types";
 import { SORTS, STATUSES, isFiltered, unfiltered, type Range, type Sort, type Wanted } from "../models/selection";
+import { COLUMNS, factorOf } from "../models/columns";
 import "./filter_panel.css";
 
 /** What the panel shows beside the filters themselves. */
@@ -202,7 +203,8 @@ export class FilterPanel {
   // --- ranges
 
   private bound(name: FigureName, end: 0 | 1): HTMLInputElement {
-    const { label, unit } = FIGURES[name];
+    const { label, column } = FIGURES[name];
+    const { unit } = COLUMNS[column];
     const field = el("input", {
       type: "number",
       step: "any",
@@ -221,7 +223,8 @@ export class FilterPanel {
   }
 
   private range(name: FigureName): HTMLElement[] {
-    const { label, unit } = FIGURES[name];
+    const { label, column } = FIGURES[name];
+    const { unit } = COLUMNS[column];
     const words = unit === "" || label.includes(unit) ? label : `${label}, ${unit}`;
     return [el("span", { "aria-hidden": "true" }, words), ...(this.bounds.get(name) ?? [])];
   }
@@ -262,9 +265,9 @@ function changed<T>(set: ReadonlySet<T>, members: readonly T[], added: boolean):
 // factors are whole: rounding keeps what was typed, 95 % and not 94.99999
 
 function shownBound(name: FigureName, bound: number | null): string {
-  return bound === null ? "" : String(Number((bound * factorOf(name)).toPrecision(12)));
+  return bound === null ? "" : String(Number((bound * factorOf(FIGURES[name].column)).toPrecision(12)));
 }
 
 function storedBound(name: FigureName, shown: number): number {
-  return Number((shown / factorOf(name)).toPrecision(12));
+  return Number((shown / factorOf(FIGURES[name].column)).toPrecision(12));
 }

@@ -6,66 +6,22 @@ import { downloadLink } from "../jobs/downloads";
 import { el, swatch } from "../page/elements";
 import { capital } from "../words/fields";
 import { asProblem, problemNotice, warningNotice } from "../page/notices";
-import { count, measure } from "../words/numbers";
+import { measure } from "../words/numbers";
 import { reasonWords } from "../words/reasons";
 import { CATEGORIES, categoryOf } from "../words/roof_types";
-import { inMetres } from "../models/units";
+import { COLUMN_NAMES, COLUMNS, shown } from "../models/columns";
+import { fact } from "../page/tables";
 
 type Record_ = Feature["properties"];
 
-interface Row {
-  label: string;
-  column: string;
-  show: (value: unknown) => string;
-}
-
-const metres = (digits: number) => (value: unknown) => measure(value, digits, "m");
-const percent = (value: unknown): string => (typeof value === "number" ? measure(100 * value, 1, "%") : "–");
-const whole = (value: unknown): string => (typeof value === "number" ? count(value) : "–");
-
-/** The most important columns of the record; the file has all of them. */
-function groups(elevationUnitM: number): [string, Row[]][] {
-  const elevation = (value: unknown): string => measure(inMetres(value, elevationUnitM), 2, "m");
-  return [
-    [
-      "Height",
-      [
-        { label: "Ridge above floor", column: "height_m", show: metres(2) },
-        { label: "Ground", column: "ground_z", show: elevation },
-        { label: "Eaves", column: "eave_z", show: elevation },
-        { label: "Ridge", column: "ridge_z", show: elevation },
-        { label: "Median of the roof", column: "h_50p", show: elevation },
-      ],
-    ],
-    [
-      "Size",
-      [
-        { label: "Footprint", column: "footprint_area_m2", show: (v) => measure(v, 1, "m²") },
-        { label: "Roof, slanted", column: "roof_area_m2", show: (v) => measure(v, 1, "m²") },
-        { label: "Volume", column: "volume_m3", show: (v) => measure(v, 0, "m³") },
-        { label: "Roof planes", column: "n_planes", show: whole },
-      ],
-    ],
-    [
-      "Fit to the points",
-      [
-        { label: "Within 0.2 m of the roof", column: "share_within_0_2m", show: percent },
-        { label: "RMSE", column: "rmse_m", show: metres(3) },
-        { label: "95th percentile", column: "p95_m", show: metres(3) },
-        { label: "Points covered", column: "coverage", show: percent },
-        { label: "Points on facades and below", column: "share_below_roof", show: percent },
-        { label: "Given footprint covered", column: "footprint_share", show: percent },
-        { label: "Noise of the points", column: "noise_m", show: metres(3) },
-        { label: "Ridge uncertainty (one sigma)", column: "ridge_z_sigma_m", show: metres(3) },
-        { label: "Roof unexplained by points", column: "unexplained_m2", show: (v) => measure(v, 1, "m²") },
-        { label: "Roof that was not seen", column: "extrapolated_share", show: percent },
-        { label: "Largest hole in the points", column: "largest_hole_m", show: metres(1) },
-        { label: "Confidence that it is a building", column: "detection_confidence", show: percent },
-        { label: "Points", column: "n_points", show: whole },
-        { label: "Density", column: "density_per_m2", show: (v) => measure(v, 1, "per m²") },
-      ],
-    ],
-  ];
+/** The most important columns of the record, by section; the file has all of them. */
+function tables(properties: Record_, elevationUnitM: number): HTMLElement[] {
+  const sections = [...new Set(COLUMN_NAMES.map((name) => COLUMNS[name].section))];
+  return sections.map((section) => {
+    const names = COLUMN_NAMES.filter((name) => COLUMNS[name].section === section);
+    const rows = names.flatMap((name) => fact(COLUMNS[name].label, shown(name, properties[name], elevationUnitM)));
+    return el("section", {}, el("h3", {}, section), el("dl", {}, ...rows));
+  });
 }
 
 /** Show the record of one building; returns a function that stops the loading. */
@@ -127,25 +83,13 @@ function record(
       ? warningNotice(`${capital(reasonWords(reason))}${typeof detail === "string" && detail !== "" ? `: ${detail}` : "."}`)
       : null;
   const codes = Array.isArray(properties["validity_codes"]) ? properties["validity_codes"] : [];
-  const tables = groups(elevationUnitM).map(([title, rows]) =>
-    el(
-      "section",
-      {},
-      el("h3", {}, title),
-      el(
-        "dl",
-        {},
-        ...rows.flatMap(({ label, column, show }) => [el("dt", {}, label), el("dd", {}, show(properties[column]))]),
-      ),
-    ),
-  );
   return [
     heading,
     marks,
     ...(why === null ? [] : [why]),
     el("div", { class: "record-links" }, dossierLink()),
     ...(codes.length > 0 ? [el("p", { class: "hint" }, `Codes of the method's own solid: ${codes.join(", ")}`)] : []),
-    ...tables,
+    ...tables(properties, elevationUnitM),
     ...planes(properties["planes"]),
     ...(modelled ? [takeAway(properties["mesh_path"], path, method, buildingId)] : []),
   ];
