@@ -2,7 +2,7 @@ import { getJson, sendJson, pathOfJob } from "../api/requests";
 import type { StatusInfo, InputDescription } from "../api/types";
 import { openForm } from "../page/dialogs";
 import { el } from "../page/elements";
-import { choice } from "../page/form_fields";
+import { choice, Boxes } from "../page/form_fields";
 import type { Hooks } from "../page/view";
 import { titleOf } from "./job_words";
 import { announce } from "../page/notices";
@@ -95,15 +95,9 @@ function fieldOf(name: string, { title, description, schema }: InputDescription,
 }
 
 function boxesOf(name: string, label: string, hint: HTMLElement, words: string[], given: unknown): Field {
-  const chosen = Array.isArray(given) ? given.map(String) : [];
-  const boxes = words.map((value) => el("input", { type: "checkbox", value, checked: chosen.includes(value) }));
-  const element = el(
-    "fieldset",
-    { class: "field", "aria-describedby": hint.id },
-    el("legend", {}, label),
-    el("div", { class: "boxes" }, ...boxes.map((box, at) => el("label", {}, box, ` ${words[at]?.replace(":", ", ")}`))),
-    hint,
-  );
-  const now = (): string => boxes.filter(({ checked }) => checked).map(({ value }) => value).join(",");
+  const boxes = new Boxes();
+  boxes.offer(Object.fromEntries(words.map((value) => [value, value.replace(":", ", ")])), Array.isArray(given) ? given.map(String) : []);
+  const element = el("fieldset", { class: "field", "aria-describedby": hint.id }, el("legend", {}, label), boxes.element, hint);
+  const now = (): string => boxes.chosen.join(",");
   return { name, element, before: now(), now, value: (text) => text.split(",") };
 }
