@@ -1,15 +1,15 @@
 /** The page: it shows what the address names. */
 
-import { partsOf, placeOf } from "./page/address";
-import { Problem, currentKey, getJson, keepKey } from "./api/requests";
-import { byId, el } from "./page/elements";
+import { currentKey, getJson, keepKey, Problem } from "./api/requests";
 import { JobList } from "./jobs/job_list";
-import { showJob } from "./progress/job_view";
+import { partsOf, placeOf } from "./page/address";
+import { byId, el } from "./page/elements";
 import { problemNotice } from "./page/notices";
-import { Submission } from "./submit/submission";
-import { hasView, showView } from "./views";
 import type { View } from "./page/view";
 import { welcome } from "./page/welcome";
+import { showJob } from "./progress/job_view";
+import { Submission } from "./submit/submission";
+import { hasView, showView } from "./views";
 import "./frame.css";
 
 const main = byId("main");

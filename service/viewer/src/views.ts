@@ -1,10 +1,10 @@
 /** The views beside the jobs themselves. Each is loaded when it is opened first. */
 
-import type { Address } from "./page/address";
 import { unreachable } from "./api/requests";
+import type { Address } from "./page/address";
 import { el } from "./page/elements";
-import type { Hooks, Show, View } from "./page/view";
 import { problemNotice } from "./page/notices";
+import type { Hooks, Show, View } from "./page/view";
 
 const VIEWS: Record<string, () => Promise<Show>> = {
   jobs: async () => (await import("./jobs/history")).showHistory,

@@ -2,13 +2,13 @@
 /** What the views of models do when the address changes while they load. The 3D view and the reader are stand-ins. */
 
 import { afterEach, beforeEach, describe, expect, test, vi } from "vitest";
-import { hashOf, partsOf } from "../src/page/address";
 import type { StatusInfo } from "../src/api/types";
-import type { Listed } from "../src/models/batching";
 import { showChanges } from "../src/changes/changes_view";
+import type { Listed } from "../src/models/batching";
 import type { FromLoading } from "../src/models/loading_messages";
-import type { Ground } from "../src/scene/ground";
+import { hashOf, partsOf } from "../src/page/address";
 import { showResults } from "../src/results/results_view";
+import type { Ground } from "../src/scene/ground";
 import { FakeService, press, settled } from "./fake_service";
 
 /** What was selected in the 3D views, and whether the camera flew there. */

@@ -1,7 +1,7 @@
 import { describe, expect, test } from "vitest";
 import { hashOf, partsOf } from "../src/page/address";
-import { bodyText, deliveryRemedy, receiverState, unsentWords } from "../src/service/delivery_view";
 import { offsetOf, pageWords } from "../src/page/paging";
+import { bodyText, deliveryRemedy, receiverState, unsentWords } from "../src/service/delivery_view";
 import { clockWords, countWords, slotWords, tileLines, withTiles } from "../src/service/schedules";
 
 describe("addresses of lists", () => {

@@ -1,4 +1,4 @@
-import { PerspectiveCamera, Ray, Vector2, Vector3, Box3 } from "three";
+import { Box3, PerspectiveCamera, Ray, Vector2, Vector3 } from "three";
 import { beforeEach, expect, test } from "vitest";
 import { groundDistance, groundThrough, heightAt } from "../src/scene/ground";
 import { EYE_M, Navigation, type Surfaces } from "../src/scene/navigation";

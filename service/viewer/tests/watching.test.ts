@@ -1,7 +1,7 @@
 // @vitest-environment happy-dom
 import { afterEach, beforeEach, expect, test, vi } from "vitest";
-import { partsOf } from "../src/page/address";
 import { showHistory } from "../src/jobs/history";
+import { partsOf } from "../src/page/address";
 import { showSchedules } from "../src/service/schedules_view";
 import { showWebhooks } from "../src/service/webhooks_view";
 import { FakeService, press, settled } from "./fake_service";

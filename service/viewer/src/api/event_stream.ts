@@ -1,5 +1,5 @@
-import { Problem, request } from "./requests";
 import { chunks } from "./json_lines";
+import { Problem, request } from "./requests";
 
 /** One server-sent event. */
 export interface ServerEvent {

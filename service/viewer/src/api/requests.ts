@@ -1,7 +1,7 @@
 /** The service's REST interface, as far as the page uses it. */
 
 import { counted } from "../words/numbers";
-import type { Status, UploadInfo, Preflight, RunReport } from "./types";
+import type { Preflight, RunReport, Status, UploadInfo } from "./types";
 
 const KEY = "gablework.key";
 

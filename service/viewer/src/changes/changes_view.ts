@@ -1,24 +1,22 @@
 /** Two runs side by side, by one camera: methods of a comparison, other settings, or two epochs; and what differs. */
 
-import { hashOf, partsOf, type Address } from "../page/address";
-import { ofRun, runReport, pathOfJob } from "../api/requests";
-import { getJson } from "../api/requests";
-import type { StatusInfo, Crs } from "../api/types";
+import { getJson, pathOfJob } from "../api/requests";
+import type { StatusInfo } from "../api/types";
+import { titleOf } from "../jobs/job_words";
 import type { Batch, Listed } from "../models/batching";
 import { originInMetres } from "../models/building_mesh";
+import { CHANGES, LIMITS, pairs, type Change, type Pair, type Placed } from "../models/pairing";
+import { RunObjects } from "../models/run_objects";
+import { hashOf, partsOf, type Address } from "../page/address";
 import { colourSwatch, el } from "../page/elements";
 import { choice, field } from "../page/form_fields";
-import type { Hooks, View } from "../page/view";
-import { titleOf } from "../jobs/job_words";
-import { loadModels } from "../models/model_loading";
 import { announce, asProblem, problemNotice, warningNotice } from "../page/notices";
-import { ago, count, counted, measure } from "../words/numbers";
-import { CHANGES, LIMITS, pairs, type Change, type Pair, type Placed } from "../models/pairing";
-import { CATEGORIES } from "../words/roof_types";
-import { ModelScene } from "../scene/scene";
 import { nothing, table } from "../page/tables";
-import { modelUnits } from "../models/units";
+import type { Hooks, View } from "../page/view";
 import type { OnMove } from "../scene/camera";
+import { ModelScene } from "../scene/scene";
+import { ago, count, counted, measure } from "../words/numbers";
+import { CATEGORIES } from "../words/roof_types";
 import "./changes_view.css";
 import "../page/dialogs.css";
 import "../page/pages.css";
@@ -32,11 +30,9 @@ interface Side {
   method: string | null;
 }
 
-/** What was read of a side; places are metres from its own origin. */
+/** What was read of a side. */
 interface Loaded {
-  origin: readonly [number, number, number];
-  crs: Crs;
-  listed: Listed[];
+  objects: RunObjects;
   batches: Batch[];
 }
 
@@ -188,10 +184,10 @@ class Changes implements View {
     }
     const [before, after] = await Promise.all([read(old, signal), read(now, signal)]);
     if (signal.aborted) return;
-    const [one, other] = [before.crs.wkt ?? before.crs.name ?? null, after.crs.wkt ?? after.crs.name ?? null];
-    if (one !== other) {
+    const [older, newer] = [before, after].map(({ objects }) => objects.report.crs ?? {});
+    if ((older.wkt ?? older.name ?? null) !== (newer.wkt ?? newer.name ?? null)) {
       this.note.replaceChildren(
-        warningNotice(`The runs have different coordinate reference systems, ${before.crs.name ?? "unknown"} and ${after.crs.name ?? "unknown"}: they cannot be laid side by side.`),
+        warningNotice(`The runs have different coordinate reference systems, ${older.name ?? "unknown"} and ${newer.name ?? "unknown"}: they cannot be laid side by side.`),
       );
       return;
     }
@@ -336,31 +332,24 @@ class Changes implements View {
 }
 
 async function read({ job, method }: Side, signal: AbortSignal): Promise<Loaded> {
-  const path = pathOfJob(job);
-  const { crs = {} } = await runReport(path, method, signal);
-  const loaded: Loaded = { origin: [0, 0, 0], crs, listed: [], batches: [] };
-  const reading = { ...modelUnits(crs), lod: null };
-  await loadModels(
-    ofRun(`${path}/results/cityjson`, method),
-    reading,
-    (message) => {
-      if (message.kind === "frame") loaded.origin = message.origin;
-      if (message.kind !== "buildings") return;
-      loaded.listed.push(...message.listed);
-      loaded.batches.push(...message.batches);
-    },
-    signal,
-  );
-  return loaded;
+  const objects = new RunObjects(pathOfJob(job), method);
+  await objects.readReport(signal);
+  const batches: Batch[] = [];
+  const take = (read: { listed: Listed[]; batches: Batch[] }): void => {
+    objects.add(read.listed);
+    batches.push(...read.batches);
+  };
+  await objects.readModels(null, take, signal);
+  return { objects, batches };
 }
 
 /** From the origin of the left side to that of the right one, in metres. */
-function shiftOf({ origin, crs }: Loaded, other: Loaded): [number, number, number] {
-  const [from, to] = [originInMetres({ origin, ...modelUnits(crs) }), originInMetres({ origin: other.origin, ...modelUnits(other.crs) })];
+function shiftOf(left: Loaded, right: Loaded): [number, number, number] {
+  const [from, to] = [originInMetres(left.objects.frame), originInMetres(right.objects.frame)];
   return [to[0] - from[0], to[1] - from[1], to[2] - from[2]];
 }
 
-function placed({ listed, batches }: Loaded, [x, y]: readonly number[]): Placed[] {
+function placed({ objects, batches }: Loaded, [x, y]: readonly number[]): Placed[] {
   const plans = new Map<string, [number, number, number, number]>();
   for (const { ids, boxes } of batches) {
     ids.forEach((id, n) => {
@@ -368,7 +357,7 @@ function placed({ listed, batches }: Loaded, [x, y]: readonly number[]): Placed[
       plans.set(id, [west + (x ?? 0), south + (y ?? 0), east + (x ?? 0), north + (y ?? 0)]);
     });
   }
-  return listed.map((one) => ({ listed: one, plan: plans.get(one.id) ?? null }));
+  return objects.listed.map((one) => ({ listed: one, plan: plans.get(one.id) ?? null }));
 }
 
 /** Differences first, the largest of each kind first. */

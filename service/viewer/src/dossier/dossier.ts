@@ -1,25 +1,24 @@
 /** The dossier of a building: its points over the model, the figures that decided, the forms that were tried. */
 
-import "./dossier.css";
-import { ofRun, runReport, orNull } from "../api/requests";
-import { getJson, request } from "../api/requests";
-import type { Feature, Decision } from "../api/types";
+import { getJson, ofRun, orNull, request, runReport } from "../api/requests";
+import type { Decision, Feature } from "../api/types";
 import type { SceneFrame } from "../models/building_mesh";
 import { SequenceReader, type Building } from "../models/cityjson";
 import { CYCLE } from "../models/colouring";
+import { COLUMNS, shown } from "../models/columns";
+import { ringsOf } from "../models/rings";
+import { elevationUnitM, inMetres, modelUnits } from "../models/units";
+import { el, svg } from "../page/elements";
+import { asProblem, problemNotice } from "../page/notices";
+import { RESIDUALS } from "../points/points_colouring";
+import { capital } from "../words/fields";
+import { count, counted, measure } from "../words/numbers";
+import { CATEGORIES, categoryOf } from "../words/roof_types";
 import { histogramDrawing, planDrawing, planeColour, sectionDrawing, type Colouring, type Rings } from "./dossier_drawings";
 import { histogram, modelOf, roofEdges, sectionOf, strip, stripWidth, type Points } from "./dossier_geometry";
 import { pointsIn } from "./dossier_points";
 import { checkRows, formRows, LEAD, trust, trustFigures, withinWords } from "./dossier_words";
-import { el, svg } from "../page/elements";
-import { capital } from "../words/fields";
-import { asProblem, problemNotice } from "../page/notices";
-import { count, counted, measure } from "../words/numbers";
-import { RESIDUALS } from "../points/points_colouring";
-import { ringsOf } from "../models/rings";
-import { CATEGORIES, categoryOf } from "../words/roof_types";
-import { elevationUnitM, inMetres, modelUnits } from "../models/units";
-import { COLUMNS, shown } from "../models/columns";
+import "./dossier.css";
 
 interface Loaded {
   properties: Feature["properties"];

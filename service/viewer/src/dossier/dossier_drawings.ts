@@ -1,11 +1,21 @@
 /** The drawings of a dossier as SVG: plan, section across the ridge, residuals. Lengths are metres, without exaggeration. */
 
 import { CYCLE } from "../models/colouring";
-import { svg } from "../page/elements";
-import { cutModel, histogram, strip, type Cut, type EdgeKind, type Model, type Points, type RoofEdge, type Section } from "./dossier_geometry";
-import { count, measure } from "../words/numbers";
-import { NONE, residualNumber, RESIDUALS } from "../points/points_colouring";
 import type { Point } from "../models/rings";
+import { svg } from "../page/elements";
+import { NONE, residualNumber, RESIDUALS } from "../points/points_colouring";
+import { count, measure } from "../words/numbers";
+import {
+  cutModel,
+  histogram,
+  strip,
+  type Cut,
+  type EdgeKind,
+  type Model,
+  type Points,
+  type RoofEdge,
+  type Section,
+} from "./dossier_geometry";
 
 export type Colouring = "residual" | "plane";
 

@@ -1,8 +1,8 @@
 /** The points of one building, from the binary glTF of the service. */
 
 import { originInMetres, type SceneFrame } from "../models/building_mesh";
-import type { Points } from "./dossier_geometry";
 import { NO_PLANE, NO_RESIDUAL, readNodes, RESIDUAL_SHIFT } from "../points/points_glb";
+import type { Points } from "./dossier_geometry";
 
 /**
  * Points in metres around the frame's origin, of all nodes of the file.

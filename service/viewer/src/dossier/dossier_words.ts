@@ -1,6 +1,6 @@
 /** The sentences of a dossier: what of a model deserves trust, which figures decided, which forms were tried. */
 
-import type { Feature, Decision } from "../api/types";
+import type { Decision, Feature } from "../api/types";
 import { capital } from "../words/fields";
 import { counted, measure } from "../words/numbers";
 import { reasonWords } from "../words/reasons";

@@ -1,5 +1,4 @@
-import { ofRun } from "../api/requests";
-import { currentKey, getJson, request, serviceUrl } from "../api/requests";
+import { currentKey, getJson, ofRun, request, serviceUrl } from "../api/requests";
 import type { Link } from "../api/types";
 import { el } from "../page/elements";
 import { asProblem, problemNotice } from "../page/notices";

@@ -1,18 +1,18 @@
 /** All jobs: searched, filtered, page by page. */
 
-import { hashOf, partsOf, type Address } from "../page/address";
 import { getJson, isOver } from "../api/requests";
 import type { StatusInfo } from "../api/types";
+import { hashOf, partsOf, type Address } from "../page/address";
 import { el } from "../page/elements";
 import { choice, field } from "../page/form_fields";
-import { jobMenu } from "./job_actions";
-import type { Hooks, View } from "../page/view";
-import { PROCESS_WORDS, STATUS_WORDS, durationWords, resultWords, statusWords, titleOf } from "./job_words";
 import { announce } from "../page/notices";
-import { ago, counted } from "../words/numbers";
 import { offsetOf, pager } from "../page/paging";
 import { nothing, table } from "../page/tables";
+import type { Hooks, View } from "../page/view";
 import { Watching } from "../page/watching";
+import { ago, counted } from "../words/numbers";
+import { jobMenu } from "./job_actions";
+import { durationWords, PROCESS_WORDS, resultWords, STATUS_WORDS, statusWords, titleOf } from "./job_words";
 import "../page/pages.css";
 
 const SIZE = 25;

@@ -1,14 +1,13 @@
 /** What can be done with a job: try it again, keep it, repeat it, cancel it, remove it. */
 
+import { getJson, isOver, pathOfJob, request, sendJson, unreachable } from "../api/requests";
+import type { Status, StatusInfo } from "../api/types";
 import { actionMenu, type Item } from "../page/action_menu";
 import { hashOf } from "../page/address";
-import { getJson, isOver, request, unreachable, pathOfJob, sendJson } from "../api/requests";
-import type { StatusInfo } from "../api/types";
-import type { Status } from "../api/types";
 import { ask } from "../page/dialogs";
+import { announce } from "../page/notices";
 import type { Hooks } from "../page/view";
 import { MODELLED, titleOf } from "./job_words";
-import { announce } from "../page/notices";
 
 /** A menu of all of it. */
 export function jobMenu(job: StatusInfo, hooks: Hooks): HTMLElement {

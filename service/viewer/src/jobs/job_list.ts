@@ -1,11 +1,11 @@
-import { getJson, isOver, type Problem, pathOfJob } from "../api/requests";
+import { getJson, isOver, pathOfJob, type Problem } from "../api/requests";
 import type { StatusInfo } from "../api/types";
-import { pageLink } from "./downloads";
+import { hashOf } from "../page/address";
 import { el } from "../page/elements";
-import { statusWords, titleOf } from "./job_words";
 import { asProblem, problemNotice } from "../page/notices";
 import { ago } from "../words/numbers";
-import { hashOf } from "../page/address";
+import { pageLink } from "./downloads";
+import { statusWords, titleOf } from "./job_words";
 
 const SHOWN = 20;
 const REFRESH_MS = 4000;

@@ -1,7 +1,6 @@
 /** Jobs in words. */
 
-import type { StatusInfo } from "../api/types";
-import type { Summary } from "../api/types";
+import type { StatusInfo, Summary } from "../api/types";
 import { count, counted, duration } from "../words/numbers";
 
 export const STATUS_WORDS: Record<StatusInfo["status"], string> = {

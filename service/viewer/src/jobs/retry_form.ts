@@ -1,11 +1,11 @@
-import { getJson, sendJson, pathOfJob } from "../api/requests";
-import type { StatusInfo, InputDescription } from "../api/types";
+import { getJson, pathOfJob, sendJson } from "../api/requests";
+import type { InputDescription, StatusInfo } from "../api/types";
 import { openForm } from "../page/dialogs";
 import { el } from "../page/elements";
-import { choice, Boxes } from "../page/form_fields";
+import { Boxes, choice } from "../page/form_fields";
+import { announce } from "../page/notices";
 import type { Hooks } from "../page/view";
 import { titleOf } from "./job_words";
-import { announce } from "../page/notices";
 import { changes, flat } from "./settings_changes";
 import { SettingsEditor } from "./settings_editor";
 

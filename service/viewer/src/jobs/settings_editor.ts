@@ -1,7 +1,7 @@
+import type { SettingSchema } from "../api/types";
 import { el } from "../page/elements";
 import { announce } from "../page/notices";
 import { known, rangeWords, textOf, valueOf, type Flat } from "./settings_changes";
-import type { SettingSchema } from "../api/types";
 import "./settings_editor.css";
 
 /** The settings that differ from the usual ones: one row each, and a field that adds any of the others. */

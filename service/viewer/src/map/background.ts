@@ -1,7 +1,6 @@
 /** Tiles in Web Mercator beneath the outlines, if the operator of the service names some; they are bent to the map's plane. */
 
-import { ofRun } from "../api/requests";
-import { getJson } from "../api/requests";
+import { getJson, ofRun } from "../api/requests";
 import type { Feature } from "../api/types";
 import { georeference, pairsOf, type Georeference, type Xy } from "./georeference";
 import type { MapView } from "./map_view";

@@ -1,9 +1,9 @@
 /** The outlines in plan, north up, drawn on a canvas. It is independent of the service, of lists and of the 3D view. */
 
-import { el } from "../page/elements";
-import { MapView, scaleBar, type Box } from "./map_view";
 import type { Outlines } from "../models/outlines";
+import { el } from "../page/elements";
 import { CATEGORIES, CATEGORY_NAMES, isFlat, type Category } from "../words/roof_types";
+import { MapView, scaleBar, type Box } from "./map_view";
 import "./outline_map.css";
 
 const CELLS = 24; // paths per side of the map: those out of sight are not drawn

@@ -1,8 +1,8 @@
+import { categoryOf, type Category } from "../words/roof_types";
 import { buildingMesh, type SceneFrame } from "./building_mesh";
 import type { Building, SurfaceKind } from "./cityjson";
 import { figuresOf, flagsOf, type Figures, type Flag } from "./figures";
 import { OutlinesInMaking, type Outlines } from "./outlines";
-import { categoryOf, type Category } from "../words/roof_types";
 
 /** The part of a record that the page lists, sorts and filters; a building's whole record is loaded when it is opened. */
 export interface Listed {

@@ -1,8 +1,8 @@
 /** What the colour of a roof shows: the choices of the view, their classes and their colours. */
 
-import { SURFACE, type Batch, type Listed } from "./batching";
 import { reasonWords } from "../words/reasons";
-import { CATEGORIES, bytesOf, type Category } from "../words/roof_types";
+import { bytesOf, CATEGORIES, type Category } from "../words/roof_types";
+import { SURFACE, type Batch, type Listed } from "./batching";
 
 /** A colour with its meaning. */
 export interface ColourClass {

@@ -1,6 +1,6 @@
-import { request } from "../api/requests";
 import { chunks } from "../api/json_lines";
-import type { Reading, FromLoading, ToLoading } from "./loading_messages";
+import { request } from "../api/requests";
+import type { FromLoading, Reading, ToLoading } from "./loading_messages";
 
 /**
  * Fetches models and reads them in a worker.

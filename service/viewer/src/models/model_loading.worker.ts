@@ -1,8 +1,8 @@
 /** Reads and triangulates the models in a worker, which keeps the page responsive. It fetches nothing itself. */
 
+import { jsonLines } from "../api/json_lines";
 import { Batcher } from "./batching";
 import { SequenceReader, type Building } from "./cityjson";
-import { jsonLines } from "../api/json_lines";
 import type { FromLoading, Reading, ToLoading } from "./loading_messages";
 
 const FIRST_BATCH = 200; // buildings; each batch is twice as large: something to see at once, few batches in the end

@@ -1,6 +1,6 @@
+import { isFlat, type Category } from "../words/roof_types";
 import { inScene, type SceneFrame } from "./building_mesh";
 import type { Building } from "./cityjson";
-import { isFlat, type Category } from "../words/roof_types";
 
 /** The outlines of many objects in plan, packed so that they can be handed from a worker to the page. */
 export interface Outlines {

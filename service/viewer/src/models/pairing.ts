@@ -1,8 +1,8 @@
 /** Which buildings of two runs belong together, and what differs between them. No drawing, no service. */
 
-import type { Listed } from "./batching";
 import { measure } from "../words/numbers";
 import { CATEGORIES } from "../words/roof_types";
+import type { Listed } from "./batching";
 
 /** A building of one run with its plan: west, south, east, north in metres, in the frame of both runs. */
 export interface Placed {

@@ -2,8 +2,7 @@
 
 import { decompress } from "fzstd";
 import { parquetMetadata, parquetReadObjects } from "hyparquet";
-import { ofRun } from "../api/requests";
-import { request } from "../api/requests";
+import { ofRun, request } from "../api/requests";
 import type { Feature } from "../api/types";
 import type { Listed } from "./batching";
 import { figuresOf } from "./figures";

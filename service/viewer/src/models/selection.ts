@@ -1,9 +1,9 @@
 /** Which objects of a result are shown, and in which order; the address holds it, so a link shows the same. */
 
-import type { Listed } from "./batching";
-import { FIGURE_NAMES, FLAG_NAMES, type FigureName, type Flag } from "./figures";
 import { reasonWords } from "../words/reasons";
 import { CATEGORIES, CATEGORY_NAMES, type Category } from "../words/roof_types";
+import type { Listed } from "./batching";
+import { FIGURE_NAMES, FLAG_NAMES, type FigureName, type Flag } from "./figures";
 
 export const SORTS = ["problems", "id", "roof", "reason", ...FIGURE_NAMES] as const;
 

@@ -1,6 +1,6 @@
 import { Problem } from "../api/requests";
-import { el } from "./elements";
 import { inFields } from "../words/fields";
+import { el } from "./elements";
 
 /** An error as the service reported it, with the fix. */
 export function problemNotice(problem: Problem, again?: () => void): HTMLElement {

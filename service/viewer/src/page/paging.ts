@@ -1,5 +1,5 @@
-import { el } from "./elements";
 import { count } from "../words/numbers";
+import { el } from "./elements";
 
 /** `1 to 25 of 312`; without a total `1 to 25`. */
 export function pageWords(offset: number, shown: number, total: number | null): string {

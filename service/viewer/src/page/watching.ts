@@ -1,6 +1,6 @@
 import { el } from "./elements";
-import type { Hooks } from "./view";
 import { asProblem, problemNotice } from "./notices";
+import type { Hooks } from "./view";
 
 /** A view, or a part of one, that looks at the service again and again until it is left. */
 export abstract class Watching {

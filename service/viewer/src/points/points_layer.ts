@@ -1,22 +1,11 @@
 /** Points over the models, streamed by level of detail. */
 
-import {
-  Box3,
-  BufferAttribute,
-  BufferGeometry,
-  Frustum,
-  Group,
-  Matrix4,
-  Points,
-  Ray,
-  Vector3,
-  type PerspectiveCamera,
-} from "three";
+import { Box3, BufferAttribute, BufferGeometry, Frustum, Group, Matrix4, Points, Ray, Vector3, type PerspectiveCamera } from "three";
+import type { Layer } from "../scene/layer";
 import { readPoints, type NodePoints } from "./points_glb";
 import { PointsMaterial } from "./points_material";
 import { selected } from "./points_selection";
 import { rootOf, type RawTileset, type Tile, type Xyz } from "./points_tileset";
-import type { Layer } from "../scene/layer";
 
 const LOADS = 6; // at once: as many as browsers send to one host
 const KEPT = 1.5; // of the budget stays in memory, so that a turn of the view loads nothing again

@@ -1,7 +1,15 @@
 import { Color, GLSL3, RawShaderMaterial } from "three";
-import { NO_PLANE, NO_RESIDUAL, RESIDUAL_SHIFT } from "./points_glb";
-import { classNumber, MOST_CLASSES, palette, POINT_COLOURING_NAMES, RESIDUAL_ENDS_MM, residualNumber, type PointColouring } from "./points_colouring";
 import { CYCLE } from "../models/colouring";
+import {
+  classNumber,
+  MOST_CLASSES,
+  palette,
+  POINT_COLOURING_NAMES,
+  RESIDUAL_ENDS_MM,
+  residualNumber,
+  type PointColouring,
+} from "./points_colouring";
+import { NO_PLANE, NO_RESIDUAL, RESIDUAL_SHIFT } from "./points_glb";
 
 const SIZE_M = 0.22; // of a point
 const SMALLEST_PX = 1.5;

@@ -1,16 +1,16 @@
-import type { Place } from "../page/address";
-import { Problem, getJson, isOver, pathOfJob } from "../api/requests";
-import type { StatusInfo, JobEvent } from "../api/types";
-import { downloadList } from "../jobs/downloads";
-import { el } from "../page/elements";
 import { follow, type ServerEvent } from "../api/event_stream";
+import { getJson, isOver, pathOfJob, Problem } from "../api/requests";
+import type { JobEvent, StatusInfo } from "../api/types";
+import { downloadList } from "../jobs/downloads";
 import { cancellation, jobMenu, retry } from "../jobs/job_actions";
-import { MODELLED, failureRemedy, titleOf } from "../jobs/job_words";
+import { failureRemedy, MODELLED, titleOf } from "../jobs/job_words";
+import type { Place } from "../page/address";
+import { el } from "../page/elements";
 import { announce, asProblem, problemNotice, warningNotice } from "../page/notices";
+import type { Hooks } from "../page/view";
 import { count, duration } from "../words/numbers";
 import { BuildingsSoFar } from "./so_far";
-import type { Hooks } from "../page/view";
-import { stagesOf, stageNamed, type Stage } from "./stages";
+import { stageNamed, stagesOf, type Stage } from "./stages";
 import "./job_view.css";
 
 /** Stages in which a job has some of its buildings. */

@@ -1,8 +1,8 @@
 import { getJson } from "../api/requests";
 import type { Feature } from "../api/types";
+import { ringsOf, type Point } from "../models/rings";
 import { el, svg } from "../page/elements";
 import { counted } from "../words/numbers";
-import { ringsOf, type Point } from "../models/rings";
 import { CATEGORIES, categoryOf } from "../words/roof_types";
 
 const PAUSE_MS = 3000;

@@ -1,6 +1,6 @@
 import type { Listed } from "../models/batching";
-import { el, swatch } from "../page/elements";
 import { FIGURES, figureWords, type FigureName } from "../models/figures";
+import { el, swatch } from "../page/elements";
 import { count } from "../words/numbers";
 import { reasonWords } from "../words/reasons";
 import { CATEGORIES } from "../words/roof_types";

@@ -1,12 +1,12 @@
-import { tallyWords } from "./building_list";
+import { COLUMNS, factorOf } from "../models/columns";
+import { FIGURE_NAMES, FIGURES, FLAG_NAMES, FLAGS, type FigureName } from "../models/figures";
+import { isFiltered, SORTS, STATUSES, unfiltered, type Range, type Sort, type Wanted } from "../models/selection";
 import { el, swatch } from "../page/elements";
 import { capital } from "../words/fields";
-import { FIGURES, FIGURE_NAMES, FLAGS, FLAG_NAMES, type FigureName } from "../models/figures";
 import { count } from "../words/numbers";
 import { reasonWords } from "../words/reasons";
 import { CATEGORIES, type Category } from "../words/roof_types";
-import { SORTS, STATUSES, isFiltered, unfiltered, type Range, type Sort, type Wanted } from "../models/selection";
-import { COLUMNS, factorOf } from "../models/columns";
+import { tallyWords } from "./building_list";
 import "./filter_panel.css";
 
 /** What the panel shows beside the filters themselves. */

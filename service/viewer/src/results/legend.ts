@@ -1,5 +1,5 @@
 import type { Listed } from "../models/batching";
-import { classesOf, CYCLE, COLOURINGS, COLOURING_NAMES, type Colouring } from "../models/colouring";
+import { classesOf, COLOURING_NAMES, COLOURINGS, CYCLE, type Colouring } from "../models/colouring";
 import { colourSwatch, el, swatch } from "../page/elements";
 import { announce } from "../page/notices";
 import { count } from "../words/numbers";

@@ -1,5 +1,5 @@
-import { el } from "../page/elements";
 import { levelWords } from "../models/levels_of_detail";
+import { el } from "../page/elements";
 
 /** Buttons for the levels of detail of the shown models; hidden if there is nothing to choose. */
 export class LevelChoice {

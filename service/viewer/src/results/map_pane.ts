@@ -2,9 +2,9 @@
 
 import type { OutlineMap } from "../map/outline_map";
 import type { Outlines } from "../models/outlines";
-import type { Category } from "../words/roof_types";
+import { RunObjects } from "../models/run_objects";
 import { measure } from "../words/numbers";
-import { RunObjects } from "./run_objects";
+import type { Category } from "../words/roof_types";
 
 export class MapPane {
   private map: OutlineMap | null = null;

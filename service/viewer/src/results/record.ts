@@ -1,16 +1,15 @@
-import { ofRun } from "../api/requests";
-import { getJson, type Problem } from "../api/requests";
+import { getJson, ofRun, type Problem } from "../api/requests";
 import type { Feature } from "../api/types";
 import { dossierLink, followDossier } from "../dossier/dossier_link";
 import { downloadLink } from "../jobs/downloads";
+import { COLUMN_NAMES, COLUMNS, shown } from "../models/columns";
 import { el, swatch } from "../page/elements";
-import { capital } from "../words/fields";
 import { asProblem, problemNotice, warningNotice } from "../page/notices";
+import { fact } from "../page/tables";
+import { capital } from "../words/fields";
 import { measure } from "../words/numbers";
 import { reasonWords } from "../words/reasons";
 import { CATEGORIES, categoryOf } from "../words/roof_types";
-import { COLUMN_NAMES, COLUMNS, shown } from "../models/columns";
-import { fact } from "../page/tables";
 
 type Record_ = Feature["properties"];
 

@@ -1,8 +1,8 @@
 import type { Listed } from "../models/batching";
-import { el, swatch } from "../page/elements";
-import { capital } from "../words/fields";
 import { FIGURES, figureWords, type FigureName } from "../models/figures";
+import { el, swatch } from "../page/elements";
 import { warningNotice } from "../page/notices";
+import { capital } from "../words/fields";
 import { reasonWords } from "../words/reasons";
 
 const SHOWN: [FigureName, string][] = [

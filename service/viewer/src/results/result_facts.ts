@@ -2,12 +2,12 @@
 
 import type { RunReport } from "../api/types";
 import { buildingWords } from "../jobs/job_words";
+import { RunObjects } from "../models/run_objects";
 import { el } from "../page/elements";
 import { warningNotice } from "../page/notices";
 import { capital } from "../words/fields";
 import { count, counted, duration } from "../words/numbers";
 import type { Category } from "../words/roof_types";
-import { RunObjects } from "./run_objects";
 
 /** The facts of a run in one line: what was found, from how many points, in what time. */
 export function resultFacts({ report, counts, candidates }: RunObjects): (string | HTMLElement)[] {

@@ -1,14 +1,14 @@
 /** One message of the log: its attempts, its body, and a way to send it again. */
 
-import { hashOf } from "../page/address";
 import { getJson, request } from "../api/requests";
-import { el } from "../page/elements";
-import type { Hooks, View } from "../page/view";
-import { announce, asProblem, problemNotice } from "../page/notices";
-import { count, counted } from "../words/numbers";
-import { fact, table } from "../page/tables";
-import { Watching } from "../page/watching";
 import type { Delivery } from "../api/types";
+import { hashOf } from "../page/address";
+import { el } from "../page/elements";
+import { announce, asProblem, problemNotice } from "../page/notices";
+import { fact, table } from "../page/tables";
+import type { Hooks, View } from "../page/view";
+import { Watching } from "../page/watching";
+import { count, counted } from "../words/numbers";
 
 const REFRESH_MS = 2000;
 

@@ -1,15 +1,15 @@
 /** The form of a schedule: its times, and the request of its jobs. */
 
-import { hashOf, type Address } from "../page/address";
 import { getJson, pathOfJob, sendJson } from "../api/requests";
-import type { StatusInfo, Schedule } from "../api/types";
+import type { Schedule, StatusInfo } from "../api/types";
+import { PROCESS_WORDS, titleOf } from "../jobs/job_words";
+import { hashOf, type Address } from "../page/address";
 import { el } from "../page/elements";
 import { choice, field } from "../page/form_fields";
-import type { Hooks, View } from "../page/view";
-import { PROCESS_WORDS, titleOf } from "../jobs/job_words";
 import { announce, asProblem, problemNotice } from "../page/notices";
-import { USUAL, tileLines, withTiles } from "./schedules";
+import type { Hooks, View } from "../page/view";
 import { ago } from "../words/numbers";
+import { tileLines, USUAL, withTiles } from "./schedules";
 import "../page/dialogs.css";
 import "../page/pages.css";
 

@@ -1,7 +1,7 @@
 /** Schedules as the service shows them, in words. */
 
-import { counted } from "../words/numbers";
 import type { ScheduleRun } from "../api/types";
+import { counted } from "../words/numbers";
 
 export const OUTCOME_WORDS: Record<string, string> = {
   submitted: "started",

@@ -1,20 +1,20 @@
 /** Schedules: the list, and one of them with its next times and its runs. */
 
+import { getJson, request, sendJson } from "../api/requests";
+import type { Schedule, ScheduleRun, StatusInfo } from "../api/types";
+import { PROCESS_WORDS } from "../jobs/job_words";
 import { actionMenu, type Item } from "../page/action_menu";
 import { hashOf, type Address } from "../page/address";
-import { getJson, request, sendJson } from "../api/requests";
-import type { StatusInfo, ScheduleRun, Schedule } from "../api/types";
 import { ask, openForm } from "../page/dialogs";
 import { el } from "../page/elements";
-import type { Hooks, View } from "../page/view";
-import { PROCESS_WORDS } from "../jobs/job_words";
 import { announce } from "../page/notices";
-import { ago } from "../words/numbers";
 import { offsetOf, pager } from "../page/paging";
-import { TimeFields, showNewSchedule } from "./schedule_form";
-import { OUTCOME_WORDS, clockWords, countWords, slotWords, tileLines } from "./schedules";
 import { fact, nothing, table } from "../page/tables";
+import type { Hooks, View } from "../page/view";
 import { Watching } from "../page/watching";
+import { ago } from "../words/numbers";
+import { showNewSchedule, TimeFields } from "./schedule_form";
+import { clockWords, countWords, OUTCOME_WORDS, slotWords, tileLines } from "./schedules";
 import "../page/pages.css";
 
 const SIZE = 25;

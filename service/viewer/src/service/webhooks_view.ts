@@ -1,19 +1,19 @@
 /** Webhooks: the receivers of all jobs, the secret of this key, and the log of what was sent. */
 
+import { getJson, request, type Problem } from "../api/requests";
+import type { Delivery, Secret, Webhook } from "../api/types";
 import { actionMenu, type Item } from "../page/action_menu";
 import { hashOf, type Address } from "../page/address";
-import { getJson, request, type Problem } from "../api/requests";
-import { DELIVERY_WORDS, EVENT_WORDS, receiverState, showDelivery, unsentWords } from "./delivery_view";
-import type { Delivery, Webhook, Secret } from "../api/types";
 import { ask, openDialog, openForm } from "../page/dialogs";
 import { el } from "../page/elements";
 import { choice, field } from "../page/form_fields";
-import type { Hooks, View } from "../page/view";
 import { announce, asProblem, problemNotice } from "../page/notices";
-import { ago } from "../words/numbers";
 import { offsetOf, pager } from "../page/paging";
 import { nothing, table } from "../page/tables";
+import type { Hooks, View } from "../page/view";
 import { Watching } from "../page/watching";
+import { ago } from "../words/numbers";
+import { DELIVERY_WORDS, EVENT_WORDS, receiverState, showDelivery, unsentWords } from "./delivery_view";
 import "../page/pages.css";
 
 const SIZE = 25;

@@ -2,7 +2,7 @@
 
 import { getJson, variantOf } from "../api/requests";
 import type { InputDescription } from "../api/types";
-import { levelWords, levelsOffered, lodsInput } from "../models/levels_of_detail";
+import { levelsOffered, levelWords, lodsInput } from "../models/levels_of_detail";
 import { el } from "../page/elements";
 import { Boxes, choice, field } from "../page/form_fields";
 import { FORMATS, LABELS } from "../words/fields";

@@ -1,9 +1,8 @@
 /** Large files, by tus: what has arrived is kept. This module and its library are loaded when such a file is sent. */
 
-import { type DetailedError, Upload } from "tus-js-client";
-import { Problem, authorization, getJson, problemOf, serviceUrl } from "../api/requests";
-import type { UploadInfo } from "../api/types";
-import type { Preflight } from "../api/types";
+import { Upload, type DetailedError } from "tus-js-client";
+import { authorization, getJson, Problem, problemOf, serviceUrl } from "../api/requests";
+import type { Preflight, UploadInfo } from "../api/types";
 import { fingerprint, keyOf, memory, placeOf } from "./interrupted";
 
 /** Hears how far a file is. */

@@ -6,7 +6,7 @@ import { el } from "../page/elements";
 import { announce, asProblem, problemNotice, warningNotice } from "../page/notices";
 import { capital } from "../words/fields";
 import { bytes, count, measure, placeWords } from "../words/numbers";
-import { SMALL_BYTES, send } from "./sending";
+import { send, SMALL_BYTES } from "./sending";
 
 /** The calls of a file to its form. */
 export interface FileHooks {

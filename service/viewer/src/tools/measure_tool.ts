@@ -1,10 +1,10 @@
 import type { Vector3 } from "three";
 import { el } from "../page/elements";
+import { announce } from "../page/notices";
+import type { Tool } from "../scene/layer";
+import type { ModelScene } from "../scene/scene";
 import { MeasureDrawing } from "./measure_drawing";
 import { inWords, measured } from "./measuring";
-import { announce } from "../page/notices";
-import type { ModelScene } from "../scene/scene";
-import type { Tool } from "../scene/layer";
 
 const STEP_PX = 16; // of the cross, with an arrow key
 const FINE_PX = 1; // the same with Shift

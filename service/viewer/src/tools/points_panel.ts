@@ -1,13 +1,12 @@
-import { ofRun } from "../api/requests";
-import { request, serviceUrl } from "../api/requests";
+import { ofRun, request, serviceUrl } from "../api/requests";
 import { originInMetres, type SceneFrame } from "../models/building_mesh";
 import { colourSwatch, el } from "../page/elements";
 import { announce, asProblem } from "../page/notices";
-import { count, counted } from "../words/numbers";
-import { legendLines, POINT_COLOURINGS, POINT_COLOURING_NAMES, type PointColouring } from "../points/points_colouring";
+import { legendLines, POINT_COLOURING_NAMES, POINT_COLOURINGS, type PointColouring } from "../points/points_colouring";
 import { PointsLayer, type Figures } from "../points/points_layer";
 import { factsOf, rootOf, type RawTileset, type TilesetFacts, type Xyz } from "../points/points_tileset";
 import type { ModelScene } from "../scene/scene";
+import { count, counted } from "../words/numbers";
 
 const BUDGET = 3_000_000; // points in a view
 const BUDGET_OF_PHONES = 1_000_000;

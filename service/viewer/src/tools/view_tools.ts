@@ -1,13 +1,12 @@
-import { ofRun } from "../api/requests";
-import { getJson } from "../api/requests";
+import { getJson, ofRun } from "../api/requests";
 import { originInMetres, type SceneFrame } from "../models/building_mesh";
 import { el } from "../page/elements";
-import { groundOf, type TerrainFile } from "../scene/ground";
-import { MeasureTool } from "./measure_tool";
 import { announce, asProblem, problemNotice } from "../page/notices";
-import type { PointsPanel } from "./points_panel";
 import { factsOf, type RawTileset } from "../points/points_tileset";
+import { groundOf, type TerrainFile } from "../scene/ground";
 import type { ModelScene } from "../scene/scene";
+import { MeasureTool } from "./measure_tool";
+import type { PointsPanel } from "./points_panel";
 import "./view_tools.css";
 
 /** The switches over the 3D view, and the cards that belong to them. */

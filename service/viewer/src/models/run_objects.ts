@@ -2,12 +2,12 @@
 
 import { getJson, ofRun, runReport } from "../api/requests";
 import type { Feature, RunReport } from "../api/types";
-import type { Listed } from "../models/batching";
-import type { SceneFrame } from "../models/building_mesh";
-import type { FromLoading } from "../models/loading_messages";
-import { loadModels } from "../models/model_loading";
-import { modelUnits } from "../models/units";
 import type { Category } from "../words/roof_types";
+import type { Listed } from "./batching";
+import type { SceneFrame } from "./building_mesh";
+import type { FromLoading } from "./loading_messages";
+import { loadModels } from "./model_loading";
+import { modelUnits } from "./units";
 
 type Buildings = Extract<FromLoading, { kind: "buildings" }>;
 
@@ -73,7 +73,7 @@ export class RunObjects {
 
   /** Read the objects that were left out; they are listed by `add`. */
   async readRejected(signal: AbortSignal): Promise<Feature[]> {
-    const { listedRejected, rejectedObjects } = await import("../models/rejected_objects");
+    const { listedRejected, rejectedObjects } = await import("./rejected_objects");
     const features = await rejectedObjects(this.jobPath, this.method, signal);
     for (const object of features.map(listedRejected)) this.rejected.set(object.id, object);
     this.placeBy(features);
