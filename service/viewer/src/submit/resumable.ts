@@ -5,8 +5,8 @@ import { authorization, getJson, Problem, problemOf, serviceUrl } from "../api/r
 import type { Preflight, UploadInfo } from "../api/types";
 import { fingerprint, keyOf, memory, placeOf } from "./interrupted";
 
-/** Hears how far a file is. */
-export interface Hearer {
+/** Gets how far a file is. */
+export interface ProgressReport {
   /** The share that has left this machine, 0 to 1. */
   progress(share: number): void;
   /** Why nothing is sent at the moment; null if it is. */
@@ -22,7 +22,7 @@ const PATIENCE = 12;
 const GONE = new Set([400, 404, 410, 413, 415, 422]);
 
 /** As `send`. */
-export function sendResumably(file: File, report: Hearer, signal: AbortSignal): Promise<UploadInfo> {
+export function sendResumably(file: File, report: ProgressReport, signal: AbortSignal): Promise<UploadInfo> {
   return new Promise((resolve, reject) => {
     new Sending(file, report, signal, resolve, reject).begin().catch(reject);
   });
@@ -38,7 +38,7 @@ class Sending {
 
   constructor(
     private readonly file: File,
-    private readonly report: Hearer,
+    private readonly report: ProgressReport,
     private readonly signal: AbortSignal,
     private readonly resolve: (uploaded: UploadInfo) => void,
     private readonly reject: (reason: unknown) => void,
