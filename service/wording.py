@@ -1,6 +1,6 @@
 """Rewrites messages of the engine for clients: inputs of a process in place of options of the command line.
 
-The page writes the labels of its fields in place of these inputs (`service/viewer/src/fields.ts`).
+The page writes the labels of its fields in place of these inputs (`service/viewer/src/words/fields.ts`).
 """
 
 from __future__ import annotations

@@ -119,7 +119,7 @@ def test_a_shapefile_alone_is_refused_with_the_way_to_send_it() -> None:
 
 
 def test_the_page_offers_the_files_that_are_taken() -> None:
-    page = (Path(__file__).parents[2] / "service/viewer/src/submission.ts").read_text()
+    page = (Path(__file__).parents[2] / "service/viewer/src/submit/submission.ts").read_text()
     for name, taken in (("TILE", POINT_SUFFIXES), ("VECTOR", FOOTPRINT_SUFFIXES)):
         (offered,) = re.findall(rf'const {name}_ENDINGS = "(.*)";', page)
         assert sorted(offered.split(",")) == sorted(taken)

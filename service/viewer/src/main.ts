@@ -1,14 +1,15 @@
 /** The page: it shows what the address names. */
 
-import { partsOf, placeOf } from "./address";
-import { Problem, currentKey, getJson, keepKey } from "./api";
-import { byId, el } from "./elements";
-import { JobList } from "./job_list";
-import { showJob } from "./job_view";
-import { problemNotice } from "./notices";
-import { Submission } from "./submission";
-import { hasView, showView, type View } from "./views";
-import { welcome } from "./welcome";
+import { currentKey, getJson, keepKey, Problem } from "./api/requests";
+import { JobList } from "./jobs/job_list";
+import { partsOf, placeOf } from "./page/address";
+import { byId, el } from "./page/elements";
+import { problemNotice } from "./page/notices";
+import type { View } from "./page/view";
+import { welcome } from "./page/welcome";
+import { showJob } from "./progress/job_view";
+import { Submission } from "./submit/submission";
+import { hasView, showView } from "./views";
 import "./frame.css";
 
 const main = byId("main");

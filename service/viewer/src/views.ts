@@ -1,25 +1,16 @@
 /** The views beside the jobs themselves. Each is loaded when it is opened first. */
 
-import type { Address } from "./address";
-import { unreachable } from "./api";
-import { el } from "./elements";
-import type { Hooks } from "./job_view";
-import { problemNotice } from "./notices";
-
-/** A view that is shown. */
-export interface View {
-  /** Show another address of the same path: the query has changed. */
-  follow(address: Address): void;
-  leave(): void;
-}
-
-export type Show = (place: HTMLElement, address: Address, hooks: Hooks) => View;
+import { unreachable } from "./api/requests";
+import type { Address } from "./page/address";
+import { el } from "./page/elements";
+import { problemNotice } from "./page/notices";
+import type { Hooks, Show, View } from "./page/view";
 
 const VIEWS: Record<string, () => Promise<Show>> = {
-  jobs: async () => (await import("./history")).showHistory,
-  changes: async () => (await import("./changes_view")).showChanges,
-  schedules: async () => (await import("./schedules_view")).showSchedules,
-  webhooks: async () => (await import("./webhooks_view")).showWebhooks,
+  jobs: async () => (await import("./jobs/history")).showHistory,
+  changes: async () => (await import("./changes/changes_view")).showChanges,
+  schedules: async () => (await import("./service/schedules_view")).showSchedules,
+  webhooks: async () => (await import("./service/webhooks_view")).showWebhooks,
 };
 
 export const hasView = (name: string): boolean => Object.hasOwn(VIEWS, name);

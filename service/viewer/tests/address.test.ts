@@ -1,5 +1,6 @@
 import { describe, expect, it } from "vitest";
-import { addressOf, ofRun, placeOf, variantOf } from "../src/address";
+import { ofRun, variantOf } from "../src/api/requests";
+import { addressOf, placeOf } from "../src/page/address";
 import { hasView } from "../src/views";
 
 describe("addresses of the page", () => {

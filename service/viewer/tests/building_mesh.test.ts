@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
-import { buildingMesh } from "../src/building_mesh";
-import { SequenceReader, type Building } from "../src/cityjson";
+import { buildingMesh } from "../src/models/building_mesh";
+import { SequenceReader, type Building } from "../src/models/cityjson";
 import { GABLE, METADATA } from "./gable";
 
 const FRAME = { origin: [565005, 5934003, 90], horizontalUnitM: 1, verticalUnitM: 1 } as const;

@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { SequenceReader } from "../src/cityjson";
+import { SequenceReader } from "../src/models/cityjson";
 import { GABLE, METADATA } from "./gable";
 
 const read = (...lines: unknown[]) => readAt(null, ...lines);

@@ -1,8 +1,8 @@
 import { expect, test } from "vitest";
-import { Batcher, SURFACE, type Batch } from "../src/batching";
-import { SequenceReader, type Building } from "../src/cityjson";
-import { classesOf, coloursOf, CYCLE, outlineColour, type Colouring } from "../src/colouring";
-import { bytesOf, CATEGORIES } from "../src/roof_types";
+import { Batcher, SURFACE, type Batch } from "../src/models/batching";
+import { SequenceReader, type Building } from "../src/models/cityjson";
+import { classesOf, coloursOf, CYCLE, outlineColour, type Colouring } from "../src/models/colouring";
+import { bytesOf, CATEGORIES } from "../src/words/roof_types";
 import { GABLE, METADATA } from "./gable";
 
 /** The house with other attributes. */

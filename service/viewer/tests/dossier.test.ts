@@ -1,12 +1,13 @@
 import { expect, test } from "vitest";
-import { placeOf } from "../src/address";
-import { SequenceReader } from "../src/cityjson";
-import { pointColour, tickStep } from "../src/dossier_drawings";
-import { cutModel, histogram, modelOf, roofEdges, sectionOf, strip, stripWidth, type Points } from "../src/dossier_geometry";
-import { dossierAddress, isDossier } from "../src/dossier_link";
-import { pointsIn } from "../src/dossier_points";
-import { checkRows, formRows, trust, trustFigures, withinWords, type Decision } from "../src/dossier_words";
-import { palette } from "../src/points_colouring";
+import type { Decision } from "../src/api/types";
+import { pointColour, tickStep } from "../src/dossier/dossier_drawings";
+import { cutModel, histogram, modelOf, roofEdges, sectionOf, strip, stripWidth, type Points } from "../src/dossier/dossier_geometry";
+import { dossierAddress, isDossier } from "../src/dossier/dossier_link";
+import { pointsIn } from "../src/dossier/dossier_points";
+import { checkRows, formRows, trust, trustFigures, withinWords } from "../src/dossier/dossier_words";
+import { SequenceReader } from "../src/models/cityjson";
+import { placeOf } from "../src/page/address";
+import { palette } from "../src/points/points_colouring";
 import { GABLE, METADATA } from "./gable";
 
 const FRAME = { origin: [565000, 5934000, 90] as const, horizontalUnitM: 1, verticalUnitM: 1 };

@@ -1,6 +1,6 @@
 // @vitest-environment happy-dom
 import { afterEach, beforeEach, expect, test, vi } from "vitest";
-import { downloadMenu } from "../src/downloads";
+import { downloadMenu } from "../src/jobs/downloads";
 import { FakeService } from "./fake_service";
 
 const ALL = { buildings: { href: "", bytes: 2000 }, report: { href: "", bytes: 10 } };

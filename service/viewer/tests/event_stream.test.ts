@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { EventStreamReader, type ServerEvent } from "../src/event_stream";
+import { EventStreamReader, type ServerEvent } from "../src/api/event_stream";
 
 const STREAM = ': hello\nretry: 1500\n\nid: 1\nevent: stage\ndata: {"a":1}\n\ndata: two\ndata: lines\nid: 2\n\nevent: idle\n\ndata:last\r\n\r\n';
 

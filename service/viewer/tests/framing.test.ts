@@ -1,6 +1,6 @@
 import { Box3, PerspectiveCamera, Vector3 } from "three";
 import { expect, test } from "vitest";
-import { framing } from "../src/framing";
+import { framing } from "../src/scene/framing";
 
 const BOXES = [
   new Box3(new Vector3(-40, 10, 0), new Vector3(-30, 22, 9)),

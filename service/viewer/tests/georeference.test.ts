@@ -1,6 +1,6 @@
 import { describe, expect, it } from "vitest";
-import type { Feature } from "../src/api";
-import { georeference, mercatorOf, pairsOf, type Xy } from "../src/georeference";
+import type { Feature } from "../src/api/types";
+import { georeference, mercatorOf, pairsOf, type Xy } from "../src/map/georeference";
 
 const EARTH_M = 6_378_137;
 

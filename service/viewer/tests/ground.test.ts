@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { groundDistance, groundOf, groundThrough, heightAt } from "../src/ground";
+import { groundDistance, groundOf, groundThrough, heightAt } from "../src/scene/ground";
 
 const BOX = [-10, -10, 110, 60];
 

@@ -1,8 +1,8 @@
 // @vitest-environment happy-dom
 import { afterEach, beforeEach, expect, test, vi } from "vitest";
-import type { StatusInfo } from "../src/api";
-import { cancellation, jobMenu } from "../src/job_actions";
-import { showJob } from "../src/job_view";
+import type { StatusInfo } from "../src/api/types";
+import { cancellation, jobMenu } from "../src/jobs/job_actions";
+import { showJob } from "../src/progress/job_view";
 import { FakeService, press, settled } from "./fake_service";
 
 const WAITING: StatusInfo = { jobID: "1", status: "accepted", title: "a town" };

@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
-import type { StatusInfo } from "../src/api";
-import { durationWords, failureRemedy, resultWords, statusWords, titleOf } from "../src/job_words";
+import type { StatusInfo } from "../src/api/types";
+import { durationWords, failureRemedy, resultWords, statusWords, titleOf } from "../src/jobs/job_words";
 
 const job = (more: Partial<StatusInfo>): StatusInfo => ({ jobID: "3f2a9c0d5e6b47189a0b1c2d3e4f5a6b", status: "successful", ...more });
 

@@ -2,13 +2,13 @@
 /** What the views of models do when the address changes while they load. The 3D view and the reader are stand-ins. */
 
 import { afterEach, beforeEach, describe, expect, test, vi } from "vitest";
-import { hashOf, partsOf } from "../src/address";
-import type { StatusInfo } from "../src/api";
-import type { Listed } from "../src/batching";
-import { showChanges } from "../src/changes_view";
-import type { FromLoading } from "../src/model_loading";
-import type { Ground } from "../src/ground";
-import { showResults } from "../src/results_view";
+import type { StatusInfo } from "../src/api/types";
+import { showChanges } from "../src/changes/changes_view";
+import type { Listed } from "../src/models/batching";
+import type { FromLoading } from "../src/models/loading_messages";
+import { hashOf, partsOf } from "../src/page/address";
+import { showResults } from "../src/results/results_view";
+import type { Ground } from "../src/scene/ground";
 import { FakeService, press, settled } from "./fake_service";
 
 /** What was selected in the 3D views, and whether the camera flew there. */
@@ -17,7 +17,7 @@ const { scenes, loading } = vi.hoisted(() => ({
   loading: { read: (_onMessage: (message: unknown) => void): Promise<string[]> => Promise.resolve([]) },
 }));
 
-vi.mock("../src/scene", () => ({
+vi.mock("../src/scene/scene", () => ({
   ModelScene: class {
     readonly selections: [string | null, boolean][] = [];
     constructor(
@@ -44,12 +44,12 @@ vi.mock("../src/scene", () => ({
   },
 }));
 
-vi.mock("../src/model_loading", () => ({
+vi.mock("../src/models/model_loading", () => ({
   loadModels: (_path: string, _reading: unknown, onMessage: (message: unknown) => void) => loading.read(onMessage),
 }));
 
-vi.mock("../src/rejected_objects", async (original) => {
-  const { request } = await import("../src/api");
+vi.mock("../src/models/rejected_objects", async (original) => {
+  const { request } = await import("../src/api/requests");
   return {
     ...(await original<object>()),
     rejectedObjects: async (path: string) => (await request(`${path}/results/rejected`)).json(),

@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { levelShown, levelWords, levelsOffered, lodsInput } from "../src/levels_of_detail";
+import { levelShown, levelsOffered, levelWords, lodsInput } from "../src/models/levels_of_detail";
 
 const SETS = ["1.2", "1.3", "2.2", "1.2,1.3", "1.2,2.2", "1.3,2.2", "1.2,1.3,2.2"]; // of the process description
 

@@ -1,8 +1,8 @@
 import { describe, expect, test } from "vitest";
-import { hashOf, partsOf } from "../src/address";
-import { bodyText, deliveryRemedy, receiverState, unsentWords } from "../src/delivery_view";
-import { offsetOf, pageWords } from "../src/paging";
-import { clockWords, countWords, slotWords, tileLines, withTiles } from "../src/schedules";
+import { hashOf, partsOf } from "../src/page/address";
+import { offsetOf, pageWords } from "../src/page/paging";
+import { bodyText, deliveryRemedy, receiverState, unsentWords } from "../src/service/delivery_view";
+import { clockWords, countWords, slotWords, tileLines, withTiles } from "../src/service/schedules";
 
 describe("addresses of lists", () => {
   test("lead to what they were made of, whatever is searched", () => {

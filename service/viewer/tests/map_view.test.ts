@@ -1,5 +1,5 @@
 import { describe, expect, it } from "vitest";
-import { MapView, scaleBar } from "../src/map_view";
+import { MapView, scaleBar } from "../src/map/map_view";
 
 function view(): MapView {
   return Object.assign(new MapView(), { width: 800, height: 600, east: 100, north: 50, scale: 2 });

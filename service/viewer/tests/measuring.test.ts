@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { inWords, measured } from "../src/measuring";
+import { inWords, measured } from "../src/tools/measuring";
 
 test("the slope distance is the hypotenuse of plan and height", () => {
   expect(measured([1, 2, 10], [4, 6, 22])).toEqual({

@@ -1,7 +1,7 @@
-import { PerspectiveCamera, Ray, Vector2, Vector3, Box3 } from "three";
+import { Box3, PerspectiveCamera, Ray, Vector2, Vector3 } from "three";
 import { beforeEach, expect, test } from "vitest";
-import { groundDistance, groundThrough, heightAt } from "../src/ground";
-import { EYE_M, Navigation, type Surfaces } from "../src/navigation";
+import { groundDistance, groundThrough, heightAt } from "../src/scene/ground";
+import { EYE_M, Navigation, type Surfaces } from "../src/scene/navigation";
 
 /** A valley between two hillsides of 30 degrees, 1 km wide and 280 m deep. */
 const floors: number[] = [];

@@ -1,8 +1,8 @@
 import { describe, expect, it } from "vitest";
-import type { Feature } from "../src/api";
-import { Batcher } from "../src/batching";
-import { SequenceReader } from "../src/cityjson";
-import { flatOutlines } from "../src/failed_footprints";
+import type { Feature } from "../src/api/types";
+import { Batcher } from "../src/models/batching";
+import { SequenceReader } from "../src/models/cityjson";
+import { flatOutlines } from "../src/models/failed_footprints";
 import { GABLE, METADATA } from "./gable";
 
 const FRAME = { origin: [565_000, 5_934_000, 90] as const, horizontalUnitM: 1, verticalUnitM: 1 };

@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
-import type { Listed } from "../src/batching";
-import { pairs, type Placed } from "../src/pairing";
+import type { Listed } from "../src/models/batching";
+import { pairs, type Placed } from "../src/models/pairing";
 
 type Plan = [number, number, number, number];
 

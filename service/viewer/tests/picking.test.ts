@@ -1,7 +1,7 @@
 import { expect, test } from "vitest";
-import { Batcher, type Batch } from "../src/batching";
-import { SequenceReader, type Building } from "../src/cityjson";
-import { boxDistance, pick } from "../src/picking";
+import { Batcher, type Batch } from "../src/models/batching";
+import { SequenceReader, type Building } from "../src/models/cityjson";
+import { boxDistance, pick } from "../src/scene/picking";
 import { GABLE, METADATA } from "./gable";
 
 /** Houses side by side, 20 m apart, the first in the middle of the frame. */

@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { NO_PLANE, NO_RESIDUAL, readPoints } from "../src/points_glb";
+import { NO_PLANE, NO_RESIDUAL, readPoints } from "../src/points/points_glb";
 import { glbOf } from "./point_files";
 
 const POINTS = [

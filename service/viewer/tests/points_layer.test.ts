@@ -1,9 +1,9 @@
 import { Matrix4, PerspectiveCamera, Ray, Vector3 } from "three";
 import { expect, test } from "vitest";
-import { classNumber, type PointColouring } from "../src/points_colouring";
-import { NO_PLANE, NO_RESIDUAL } from "../src/points_glb";
-import { PointsLayer } from "../src/points_layer";
-import type { Tile } from "../src/points_tileset";
+import { classNumber, type PointColouring } from "../src/points/points_colouring";
+import { NO_PLANE, NO_RESIDUAL } from "../src/points/points_glb";
+import { PointsLayer } from "../src/points/points_layer";
+import type { Tile } from "../src/points/points_tileset";
 import { glbOf } from "./point_files";
 
 const COUNT = 100;

@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
-import { selected, type View } from "../src/points_selection";
-import type { Tile, Xyz } from "../src/points_tileset";
+import { selected, type View } from "../src/points/points_selection";
+import type { Tile, Xyz } from "../src/points/points_tileset";
 
 const COUNT = 1000;
 

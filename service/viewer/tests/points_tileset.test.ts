@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { factsOf, rootOf, type RawTileset } from "../src/points_tileset";
+import { factsOf, rootOf, type RawTileset } from "../src/points/points_tileset";
 
 const ADDRESS = "https://service.example/jobs/1/points/tileset.json";
 const BOX = { box: [10, 20, 5, 10, 0, 0, 0, 20, 0, 0, 0, 5] };

@@ -1,5 +1,5 @@
 import { expect, it } from "vitest";
-import { Rows } from "../src/rows";
+import { Rows } from "../src/results/rows";
 
 const rows = new Rows([50, 68, 50, 50, 68]);
 

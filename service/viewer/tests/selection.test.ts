@@ -1,20 +1,20 @@
 import { describe, expect, it } from "vitest";
-import type { Listed } from "../src/batching";
-import { figureWords, figuresOf, flagsOf } from "../src/figures";
-import { CATEGORY_NAMES, type Category } from "../src/roof_types";
+import type { Listed } from "../src/models/batching";
+import { figuresOf, figureWords, flagsOf } from "../src/models/figures";
 import {
-  SORTS,
-  STATUSES,
-  USUAL,
   addressed,
   isFiltered,
   queryWith,
   selected,
+  SORTS,
+  STATUSES,
   tallies,
   unfiltered,
+  USUAL,
   wantedOf,
   type Wanted,
-} from "../src/selection";
+} from "../src/models/selection";
+import { CATEGORY_NAMES, type Category } from "../src/words/roof_types";
 
 function listed(id: string, category: Category, others: Partial<Listed> = {}): Listed {
   return { id, category, reason: null, reasonDetail: null, sourceId: null, figures: {}, flags: [], ...others };

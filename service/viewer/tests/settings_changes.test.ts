@@ -1,5 +1,6 @@
 import { expect, test } from "vitest";
-import { changes, flat, known, rangeWords, textOf, valueOf, type SettingSchema } from "../src/settings_changes";
+import type { SettingSchema } from "../src/api/types";
+import { changes, flat, known, rangeWords, textOf, valueOf } from "../src/jobs/settings_changes";
 
 const SCHEMA: SettingSchema = {
   properties: {

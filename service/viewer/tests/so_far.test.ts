@@ -1,6 +1,6 @@
 import { describe, expect, it } from "vitest";
-import { ringsOf } from "../src/rings";
-import { grown, pathOf } from "../src/so_far";
+import { ringsOf } from "../src/models/rings";
+import { grown, pathOf } from "../src/progress/so_far";
 
 const square = [
   [10, 20],

@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { ringNormal, triangulate } from "../src/triangulation";
+import { ringNormal, triangulate } from "../src/models/triangulation";
 
 /** Twice the signed area of the triangles, seen along the normal. */
 function area(vertices: Float64Array, triangles: number[], normal: readonly number[]): number {

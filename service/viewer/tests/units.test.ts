@@ -1,8 +1,8 @@
 // @vitest-environment happy-dom
 
 import { afterEach, describe, expect, it, vi } from "vitest";
-import { showRecord } from "../src/record";
-import { elevationUnitM, inMetres, modelUnits } from "../src/units";
+import { elevationUnitM, inMetres, modelUnits } from "../src/models/units";
+import { showRecord } from "../src/results/record";
 
 const FOOT_M = 1200 / 3937;
 

@@ -1,9 +1,9 @@
 // @vitest-environment happy-dom
 import { afterEach, beforeEach, expect, test, vi } from "vitest";
-import { partsOf } from "../src/address";
-import { showHistory } from "../src/history";
-import { showSchedules } from "../src/schedules_view";
-import { showWebhooks } from "../src/webhooks_view";
+import { showHistory } from "../src/jobs/history";
+import { partsOf } from "../src/page/address";
+import { showSchedules } from "../src/service/schedules_view";
+import { showWebhooks } from "../src/service/webhooks_view";
 import { FakeService, press, settled } from "./fake_service";
 
 const hooks = { onChange: vi.fn(), onProblem: vi.fn() };

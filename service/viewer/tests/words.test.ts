@@ -1,8 +1,8 @@
 import { expect, test } from "vitest";
-import { problemOf } from "../src/api";
-import { inFields } from "../src/fields";
-import { bytes, count, counted, duration, measure, placeWords } from "../src/numbers";
-import { CATEGORIES, categoryOf } from "../src/roof_types";
+import { problemOf } from "../src/api/requests";
+import { inFields } from "../src/words/fields";
+import { bytes, count, counted, duration, measure, placeWords } from "../src/words/numbers";
+import { CATEGORIES, categoryOf } from "../src/words/roof_types";
 
 test("numbers are grouped and carry their unit", () => {
   expect(count(1234567)).toBe("1\u202f234\u202f567");

@@ -1,0 +1,189 @@
+/** The service's REST interface, as far as the page uses it. */
+
+import { counted } from "../words/numbers";
+import type { Preflight, RunReport, Status, UploadInfo } from "./types";
+
+const KEY = "gablework.key";
+
+/** An error from the service as application/problem+json, or from the network. */
+export class Problem extends Error {
+  constructor(
+    readonly status: number,
+    readonly title: string,
+    readonly detail: string,
+    /** What to do about it. */
+    readonly remedy: string,
+    /** The kind of problem, the last part of its URI; empty if it has none. */
+    readonly kind = "",
+  ) {
+    super(detail === "" ? title : `${title}: ${detail}`);
+  }
+}
+
+export const isOver = (status: Status): boolean => status !== "accepted" && status !== "running";
+
+/** The service's URL: the folder of the page, which includes the path prefix of a proxy. */
+export function serviceUrl(path: string): string {
+  return new URL(path, new URL(".", document.baseURI)).href;
+}
+
+/** The path of a job at the service. */
+export const pathOfJob = (id: string): string => `jobs/${encodeURIComponent(id)}`;
+
+/** A path of the service for one run of a comparison. */
+export function ofRun(path: string, method: string | null): string {
+  if (method === null) return path;
+  return `${path}${path.includes("?") ? "&" : "?"}method=${encodeURIComponent(method)}`;
+}
+
+/** The name of a variant in a comparison: the preset is named only if it is not the usual one. */
+export function variantOf(method: string, preset: string, usualPreset: string): string {
+  return preset === "" || preset === usualPreset ? method : `${method}:${preset}`;
+}
+
+/** The key of this browser tab; never stored for longer, never part of an address. */
+export function currentKey(): string | null {
+  return sessionStorage.getItem(KEY);
+}
+
+export function keepKey(key: string | null): void {
+  if (key === null || key.trim() === "") sessionStorage.removeItem(KEY);
+  else sessionStorage.setItem(KEY, key.trim());
+}
+
+export function authorization(): Record<string, string> {
+  const key = currentKey();
+  return key === null ? {} : { Authorization: `Bearer ${key}` };
+}
+
+/**
+ * One request; the answer's status is 2xx.
+ *
+ * @throws Problem for every other answer, and if there is none.
+ */
+export async function request(path: string, options: RequestInit = {}): Promise<Response> {
+  let response: Response;
+  try {
+    response = await fetch(serviceUrl(path), {
+      cache: "no-store",
+      ...options,
+      headers: { Accept: "application/json", ...authorization(), ...(options.headers as Record<string, string>) },
+    });
+  } catch (error) {
+    if (error instanceof DOMException && error.name === "AbortError") throw error;
+    throw unreachable();
+  }
+  if (response.ok) return response;
+  throw problemOf(response.status, response.statusText, await response.text(), response.headers.get("Retry-After"));
+}
+
+export async function getJson<T>(path: string, options: RequestInit = {}): Promise<T> {
+  return (await (await request(path, options)).json()) as T;
+}
+
+/** One request with a JSON document as its body. */
+export function sendJson(method: string, path: string, body: unknown, headers: Record<string, string> = {}): Promise<Response> {
+  return request(path, { method, headers: { "Content-Type": "application/json", ...headers }, body: JSON.stringify(body) });
+}
+
+/** The report of a run; empty if the request left it out. */
+export async function runReport(jobPath: string, method: string | null, signal: AbortSignal): Promise<RunReport> {
+  return (await orNull(getJson<RunReport>(ofRun(`${jobPath}/results/report`, method), { signal }))) ?? {};
+}
+
+/** Null for what the service does not have, such as the decisions of older jobs. */
+export async function orNull<T>(asked: Promise<T>): Promise<T | null> {
+  try {
+    return await asked;
+  } catch (error) {
+    if (error instanceof Problem && error.status === 404) return null;
+    throw error;
+  }
+}
+
+export function unreachable(): Problem {
+  return new Problem(0, "The service does not answer", "", "Check that it runs and that this machine can reach it, then try again.");
+}
+
+/** A problem from an answer; for another body the text of the status line. */
+export function problemOf(status: number, reason: string, body: string, retryAfter: string | null): Problem {
+  let document: { type?: unknown; title?: unknown; detail?: unknown } = {};
+  try {
+    document = JSON.parse(body) as typeof document;
+  } catch {
+    document = {};
+  }
+  const title = typeof document?.title === "string" ? document.title : reason || `Status ${status}`;
+  const detail = typeof document?.detail === "string" ? document.detail : "";
+  const kind = typeof document?.type === "string" ? (document.type.split(/[:/]/).at(-1) ?? "") : "";
+  // about keys, the service speaks to programmers and operators
+  if (kind === "unauthorized") return new Problem(status, "This service needs a key", "", remedyOf(status, retryAfter), kind);
+  if (kind === "forbidden") return new Problem(status, title, detail.split(": ")[0] ?? "", remedyOf(status, retryAfter), kind);
+  return new Problem(status, title, detail, REMEDIES[kind] ?? remedyOf(status, retryAfter), kind);
+}
+
+/** What to do about a kind of problem, if its status does not say enough. */
+const REMEDIES: Record<string, string> = {
+  "target-refused": "Use another URL, or ask the operator of this service to allow this one.",
+  "input-refused": "Use files that this service may read, or ask its operator to allow this one.",
+  "no-such-upload": "The service no longer has this file. Send it again as a new job.",
+  "schedule-busy": "Wait until that job is over, or cancel it.",
+  "changed-meanwhile": "Close this, look at it as it is now, then change it.",
+  "not-replayable": "Wait until the attempt that is under way is over.",
+};
+
+function remedyOf(status: number, retryAfter: string | null): string {
+  switch (status) {
+    case 401:
+      return "Enter a valid key. The operator of this service gives you one.";
+    case 403:
+      return "Your key may not do that. Ask the operator of this service for one that may.";
+    case 404:
+    case 410:
+      return "It may have been removed. Go back to the list.";
+    case 413:
+      return "Split the tile, or ask the service's operator to raise the limit.";
+    case 429: {
+      const seconds = Number(retryAfter);
+      return seconds > 0 ? `Try again in ${counted(Math.ceil(seconds), "second")}.` : "Wait a little, then try again.";
+    }
+    case 400:
+    case 415:
+    case 422:
+      return "Correct what is named above and send it again.";
+    case 503:
+      return "The service cannot take work at the moment. Try again in a minute.";
+    default:
+      return status >= 500 ? "This is a fault of the service: its operator finds more in its log." : "";
+  }
+}
+
+/**
+ * Sends a file as it is; `onProgress` gets the share that has left this machine, 0 to 1.
+ *
+ * @throws Problem when it is refused, AbortError when it is cancelled.
+ */
+export function upload(file: File, onProgress: (share: number) => void, signal: AbortSignal): Promise<UploadInfo> {
+  // fetch reports no progress of uploads
+  return new Promise((resolve, reject) => {
+    const sending = new XMLHttpRequest();
+    sending.open("POST", serviceUrl(`uploads?filename=${encodeURIComponent(file.name)}`));
+    for (const [name, value] of Object.entries(authorization())) sending.setRequestHeader(name, value);
+    sending.setRequestHeader("Content-Type", "application/octet-stream");
+    sending.setRequestHeader("Accept", "application/json");
+    sending.upload.onprogress = (event) => onProgress(event.total > 0 ? event.loaded / event.total : 0);
+    sending.onload = () => {
+      if (sending.status < 200 || sending.status > 299) {
+        const retryAfter = sending.getResponseHeader("Retry-After");
+        reject(problemOf(sending.status, sending.statusText, sending.responseText, retryAfter));
+        return;
+      }
+      const { uploadID, preflight } = JSON.parse(sending.responseText) as { uploadID: string; preflight: Preflight };
+      resolve({ href: serviceUrl(`uploads/${uploadID}`), preflight });
+    };
+    sending.onerror = () => reject(unreachable());
+    sending.onabort = () => reject(new DOMException("cancelled", "AbortError"));
+    signal.addEventListener("abort", () => sending.abort());
+    sending.send(file);
+  });
+}

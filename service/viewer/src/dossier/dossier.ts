@@ -1,0 +1,301 @@
+/** The dossier of a building: its points over the model, the figures that decided, the forms that were tried. */
+
+import { getJson, ofRun, orNull, request, runReport } from "../api/requests";
+import type { Decision, Feature } from "../api/types";
+import type { SceneFrame } from "../models/building_mesh";
+import { SequenceReader, type Building } from "../models/cityjson";
+import { CYCLE } from "../models/colouring";
+import { COLUMNS, shown } from "../models/columns";
+import { ringsOf } from "../models/rings";
+import { elevationUnitM, inMetres, modelUnits } from "../models/units";
+import { el, svg } from "../page/elements";
+import { asProblem, problemNotice } from "../page/notices";
+import { RESIDUALS } from "../points/points_colouring";
+import { capital } from "../words/fields";
+import { count, counted, measure } from "../words/numbers";
+import { CATEGORIES, categoryOf } from "../words/roof_types";
+import { histogramDrawing, planDrawing, planeColour, sectionDrawing, type Colouring, type Rings } from "./dossier_drawings";
+import { histogram, modelOf, roofEdges, sectionOf, strip, stripWidth, type Points } from "./dossier_geometry";
+import { pointsIn } from "./dossier_points";
+import { checkRows, formRows, LEAD, trust, trustFigures, withinWords } from "./dossier_words";
+import "./dossier.css";
+
+interface Loaded {
+  properties: Feature["properties"];
+  outline: Rings;
+  building: Building;
+  frame: SceneFrame;
+  crs: string;
+  /** Null where the service recorded none. */
+  decisions: Decision[] | null;
+  /** Null where the run holds no points. */
+  points: Points | null;
+}
+
+/** Show the dossier in front of the page; returns a function that closes it. `onClose` hears of the user's closing. */
+export function openDossier(jobPath: string, method: string | null, buildingId: string, onClose: () => void): () => void {
+  const calledOff = new AbortController();
+  const body = el("div", { class: "dossier-body", "aria-live": "polite" }, el("p", { class: "loading" }, "Loading…"));
+  const dialog = el("dialog", { class: "dossier", "aria-labelledby": "dossier-title" });
+  dialog.append(
+    el(
+      "div",
+      { class: "dossier-bar" },
+      el("h1", { id: "dossier-title" }, "Dossier"),
+      el("code", {}, buildingId),
+      el("span", { class: "spacer" }),
+      el("button", { type: "button", class: "quiet", onclick: () => window.print() }, "Print"),
+      el("button", { type: "button", class: "quiet", autofocus: true, onclick: () => dialog.close() }, "Close"),
+    ),
+    body,
+  );
+  let end: () => void = () => undefined;
+  dialog.addEventListener("close", () => {
+    close();
+    onClose();
+  });
+  document.body.append(dialog);
+  document.body.classList.add("has-dossier");
+  dialog.showModal();
+  load(jobPath, method, buildingId, calledOff.signal).then(
+    (loaded) => {
+      if (!calledOff.signal.aborted) end = draw(body, loaded);
+    },
+    (error: unknown) => {
+      if (!calledOff.signal.aborted) body.replaceChildren(problemNotice(asProblem(error)));
+    },
+  );
+  function close(): void {
+    if (calledOff.signal.aborted) return;
+    calledOff.abort();
+    end();
+    dialog.remove();
+    document.body.classList.remove("has-dossier");
+  }
+  return close;
+}
+
+async function load(jobPath: string, method: string | null, buildingId: string, signal: AbortSignal): Promise<Loaded> {
+  const path = `${jobPath}/buildings/${encodeURIComponent(buildingId)}`;
+  const geojson = { signal, headers: { Accept: "application/geo+json" } };
+  const offered = await getJson<Record<string, unknown>>(ofRun(`${jobPath}/results`, method), { signal });
+  const [feature, document, report, decisions, points] = await Promise.all([
+    getJson<Feature>(ofRun(`${path}?crs=native`, method), geojson),
+    getJson<{ CityObjects: unknown; vertices: unknown }>(ofRun(`${path}?f=cityjson`, method), { signal }),
+    "report" in offered ? runReport(jobPath, method, signal) : null,
+    orNull(getJson<{ decisions: Decision[] }>(ofRun(`${path}/decisions`, method), { signal })),
+    "tileset" in offered ? pointsOf(ofRun(`${path}/points`, method), signal) : null,
+  ]);
+  const reader = new SequenceReader();
+  reader.read(JSON.stringify({ ...document, CityObjects: {}, vertices: [] }));
+  const { CityObjects, vertices } = document;
+  const building = reader.read(JSON.stringify({ type: "CityJSONFeature", id: buildingId, CityObjects, vertices }));
+  if (building === null) throw new Error("the model of the building cannot be read");
+  const rings = ringsOf(feature.geometry);
+  const [x, y] = rings[0]?.[0] ?? [building.vertices[0] ?? 0, building.vertices[1] ?? 0];
+  const units = modelUnits(report?.crs);
+  const groundM = inMetres(feature.properties["ground_z"], elevationUnitM(report?.crs)) ?? 0;
+  const frame: SceneFrame = { origin: [Math.floor(x), Math.floor(y), groundM / units.verticalUnitM], ...units };
+  const outline = rings.map((ring) =>
+    ring.map(([e, n]) => [(e - frame.origin[0]) * frame.horizontalUnitM, (n - frame.origin[1]) * frame.horizontalUnitM] as const),
+  );
+  return {
+    properties: feature.properties,
+    outline,
+    building,
+    frame,
+    crs: report?.crs?.name ?? "CRS unknown",
+    decisions: decisions?.decisions ?? null,
+    points: points === null ? null : pointsIn(points, frame),
+  };
+}
+
+/** The points of a building; null for one whose process ended before they were assigned to it. */
+async function pointsOf(path: string, signal: AbortSignal): Promise<ArrayBuffer | null> {
+  return orNull(request(path, { signal, headers: { Accept: "model/gltf-binary" } }).then((response) => response.arrayBuffer()));
+}
+
+/** Fill the dialog; returns a function that frees what the drawings hold. */
+function draw(body: HTMLElement, loaded: Loaded): () => void {
+  const { properties, points, building, frame, decisions, outline } = loaded;
+  const model = modelOf(building, frame);
+  const edges = roofEdges(model);
+  const section = sectionOf(model, edges);
+  const halfWidthM = points === null || section === null ? 0.5 : stripWidth(points, section);
+  const plan = el("div", { class: "dossier-drawing" });
+  const profile = el("div", { class: "dossier-drawing" });
+  const key = el("ul", { class: "dossier-key" });
+  let scene: { colour: (colouring: Colouring) => void; dispose: () => void } | null = null;
+  let over = false;
+  const paint = (colouring: Colouring): void => {
+    plan.replaceChildren(planDrawing(outline, edges, section, points, colouring));
+    if (section !== null) profile.replaceChildren(sectionDrawing(model, section, 0, points, halfWidthM, colouring));
+    key.replaceChildren(...(points === null ? [] : colourKey(points, colouring)));
+    scene?.colour(colouring);
+  };
+  const canvas = el("canvas", {
+    class: "dossier-canvas",
+    tabindex: 0,
+    role: "img",
+    "aria-label": "The model and its points in 3D. Arrow keys turn, plus and minus zoom.",
+  });
+  const hasModel = building.faces.length > 0;
+  const space = hasModel || points !== null ? figure("In 3D", "Drag to turn, the wheel zooms.", canvas) : null;
+  const inStrip = points === null || section === null ? 0 : strip(points, section, halfWidthM).length;
+  const stripWords = points === null ? "" : ` ${counted(inStrip, "point")} within ${measure(halfWidthM, 1, "m")} of the line.`;
+  body.replaceChildren(
+    facts(properties, loaded.crs),
+    verdict(properties, decisions ?? []),
+    points === null
+      ? el("p", { class: "hint dossier-nopoints" }, "This run holds no points, so only the model is drawn. Runs that write points show them here.")
+      : el("div", { class: "dossier-colours" }, colourChoice(paint), key),
+    el(
+      "div",
+      { class: "dossier-figures" },
+      figure("Plan", section === null ? "North is up." : "North is up; A to B is the line of the section.", plan),
+      section === null ? null : figure("Section", `${capital(section.through)}, not exaggerated.${stripWords}`, profile),
+      space,
+      points === null ? null : figure("Residuals", residualWords(points, properties), el("div", { class: "dossier-drawing" }, histogramDrawing(points.residuals))),
+    ),
+    figuresTable(properties, decisions ?? []),
+    formsTable(properties, decisions),
+  );
+  const first: Colouring = "residual";
+  paint(first);
+  if (space !== null) {
+    import("./dossier_scene").then(
+      ({ DossierScene }) => {
+        if (over) return;
+        try {
+          scene = new DossierScene(canvas, building, frame, points, colouringOf(body));
+        } catch {
+          canvas.replaceWith(el("p", { class: "hint" }, "This browser cannot draw in 3D."));
+        }
+      },
+      () => canvas.replaceWith(el("p", { class: "hint" }, "The 3D view could not be loaded.")),
+    );
+  }
+  return () => {
+    over = true;
+    scene?.dispose();
+  };
+}
+
+function colouringOf(body: HTMLElement): Colouring {
+  return body.querySelector<HTMLInputElement>("input[name=dossier-colour]:checked")?.value === "plane" ? "plane" : "residual";
+}
+
+function colourChoice(onChoice: (colouring: Colouring) => void): HTMLElement {
+  const option = (value: Colouring, words: string): HTMLElement =>
+    el(
+      "label",
+      {},
+      el("input", { type: "radio", name: "dossier-colour", value, checked: value === "residual", onchange: () => onChoice(value) }),
+      words,
+    );
+  return el("fieldset", {}, el("legend", {}, "Points coloured by"), option("residual", "residual"), option("plane", "roof plane"));
+}
+
+/** The colours in use, each with its meaning. */
+function colourKey(points: Points, colouring: Colouring): HTMLElement[] {
+  const mark = (colour: string): Element =>
+    svg("svg", { viewBox: "0 0 10 10", class: "dossier-dot", "aria-hidden": "true" }, svg("circle", { cx: 5, cy: 5, r: 4.5, fill: colour }));
+  const entry = (colour: string, words: string): HTMLElement => el("li", {}, mark(colour), words);
+  if (colouring === "residual") {
+    const { uncovered } = histogram(points.residuals);
+    const shown = uncovered > 0 ? RESIDUALS : RESIDUALS.slice(0, -1);
+    return shown.map(({ colour, label }) => entry(colour, label));
+  }
+  const used = [...new Set(points.planes)].sort((a, b) => a - b);
+  const shown = used.filter((plane) => plane >= 0).slice(0, CYCLE.length);
+  return [
+    ...shown.map((plane) => entry(planeColour(plane), `plane ${plane}`)),
+    ...(used.length > shown.length + 1 ? [el("li", {}, "further planes repeat the colours")] : []),
+    ...(used.includes(-1) ? [entry(planeColour(-1), "no plane")] : []),
+  ];
+}
+
+function residualWords(points: Points, properties: Feature["properties"]): string {
+  const { total, uncovered, below, above, reachM } = histogram(points.residuals);
+  const within = points.residuals.filter((residual) => Math.abs(residual) <= 0.2).length;
+  const share = points.residuals.length === 0 ? 0 : within / points.residuals.length;
+  const beyond = below + above > 0 ? ` ${count(below + above)} differ by more than ${measure(reachM, 1, "m")} and are not drawn.` : "";
+  const bare = uncovered > 0 ? ` ${count(uncovered)} have no roof above or below them.` : "";
+  return `${counted(total, "point")} over the roof; ${withinWords(share, properties)}.${beyond}${bare}`;
+}
+
+function figure(title: string, words: string, content: HTMLElement): HTMLElement {
+  return el("figure", {}, el("h2", {}, title), content, el("figcaption", {}, words));
+}
+
+const FACTS = ["height_m", "footprint_area_m2", "volume_m3", "n_planes", "n_points", "density_per_m2"] as const;
+
+/** The most important facts in one line each. */
+function facts(properties: Feature["properties"], crs: string): HTMLElement {
+  const category = categoryOf(properties["status"], properties["roof_type"]);
+  const lod = typeof properties["lod"] === "string" ? ` · LoD${properties["lod"]}` : "";
+  const rows: [string, string][] = [
+    ["Form", `${CATEGORIES[category].label}${lod}`],
+    ["Method", String(properties["method"] ?? "–")],
+    ...FACTS.map((name): [string, string] => [COLUMNS[name].label, shown(name, properties[name])]),
+    ["CRS", crs],
+  ];
+  return el("dl", { class: "dossier-facts" }, ...rows.map(([name, value]) => el("div", {}, el("dt", {}, name), el("dd", {}, value))));
+}
+
+function verdict(properties: Feature["properties"], decisions: Decision[]): HTMLElement {
+  const { good, bad } = trust(properties, decisions);
+  const list = (name: string, title: string, sentences: string[]): HTMLElement | null =>
+    sentences.length === 0 ? null : el("section", { class: name }, el("h2", {}, title), el("ul", {}, ...sentences.map((words) => el("li", {}, words))));
+  return el("div", { class: "dossier-verdict" }, list("trusted", "You can rely on", good), list("doubted", "Look twice at", bad));
+}
+
+function table(caption: string, heads: string[], rows: (string | Node)[][], marked: (row: number) => string | null = () => null): HTMLElement {
+  return el(
+    "section",
+    { class: "dossier-table" },
+    el("h2", {}, caption),
+    el(
+      "div",
+      { class: "dossier-scroll", tabindex: 0, role: "region", "aria-label": caption },
+      el(
+        "table",
+        {},
+        el("thead", {}, el("tr", {}, ...heads.map((head) => el("th", { scope: "col" }, head)))),
+        el("tbody", {}, ...rows.map((cells, i) => el("tr", { class: marked(i) }, ...cells.map((cell) => el("td", {}, cell))))),
+      ),
+    ),
+  );
+}
+
+function figuresTable(properties: Feature["properties"], decisions: Decision[]): HTMLElement {
+  const checks = checkRows(decisions).map(({ label, value, limit, words }) => [label, value, limit, words]);
+  const figures = trustFigures(properties).map(({ label, value, limit, good }) => [label, value, limit, good ? "good" : "look twice"]);
+  return table("The figures that decided", ["Figure", "Value", "Limit", "Meaning"], [...checks, ...figures]);
+}
+
+function formsTable(properties: Feature["properties"], decisions: Decision[] | null): HTMLElement {
+  if (decisions === null) {
+    return el("section", {}, el("h2", {}, "The forms that were tried"), el("p", { class: "hint" }, "This job was made by a version that recorded none."));
+  }
+  type FormRow = ReturnType<typeof formRows>[number];
+  const rows: FormRow[] = formRows(decisions, properties);
+  if (rows.length === 0) return el("section", {}, el("h2", {}, "The forms that were tried"), el("p", { class: "hint" }, "None was tried."));
+  const columns: [string, (row: FormRow) => string][] = [
+    ["Form", (row) => row.form],
+    ["Outcome", (row) => row.outcome],
+    ["Faces", (row) => row.faces],
+    ["Planes", (row) => row.planes],
+    ["Points explained", (row) => row.explained],
+    ["RMSE", (row) => row.rmse],
+    [LEAD, (row) => row.margin],
+    ["Notes", (row) => row.detail],
+  ];
+  const filled = columns.filter(([, show]) => rows.some((row) => !["", "–"].includes(show(row))));
+  return table(
+    "The forms that were tried",
+    filled.map(([head]) => head),
+    rows.map((row) => filled.map(([, show]) => show(row))),
+    (i) => (rows[i].chosen ? "dossier-chosen" : null),
+  );
+}

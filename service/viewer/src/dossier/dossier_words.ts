@@ -1,0 +1,221 @@
+/** The sentences of a dossier: what of a model deserves trust, which figures decided, which forms were tried. */
+
+import type { Decision, Feature } from "../api/types";
+import { capital } from "../words/fields";
+import { counted, measure } from "../words/numbers";
+import { reasonWords } from "../words/reasons";
+
+type Properties = Feature["properties"];
+
+/** A figure beside its limit. */
+export interface Figure {
+  label: string;
+  value: string;
+  limit: string;
+  good: boolean;
+  /** What it means, in a sentence. */
+  words: string;
+}
+
+const number = (value: unknown): number | null => (typeof value === "number" && Number.isFinite(value) ? value : null);
+const percent = (value: number): string => measure(100 * value, 0, "%");
+
+/** The limits of trust are conventions of this page: the record holds the figures themselves. */
+const WITHIN_SHARE = 0.85;
+const UNEXPLAINED_SHARE = 0.05;
+const HOLE_M = 3;
+const RIDGE_SIGMA_M = 0.1;
+const RMSE_M = 0.15;
+const BIC_MARGIN = 10;
+const CONFIDENCE = 0.9;
+const FOOTPRINT_SHARE = 0.98;
+
+/** The name of `bic_margin` in both tables. */
+export const LEAD = "Lead over the next form";
+
+/** The figures that say how far the model can be trusted, those that are known. */
+export function trustFigures(properties: Properties): Figure[] {
+  const figures: Figure[] = [];
+  const add = (
+    column: string,
+    label: string,
+    show: (value: number) => string,
+    limit: number,
+    least: boolean,
+    good: (shown: string) => string,
+    bad: (shown: string) => string,
+  ): void => {
+    const value = number(properties[column]);
+    if (value === null) return;
+    const met = least ? value >= limit : value <= limit;
+    const shown = show(value);
+    figures.push({
+      label,
+      value: shown,
+      limit: `${least ? "at least" : "at most"} ${show(limit)}`,
+      good: met,
+      words: met ? good(shown) : bad(shown),
+    });
+  };
+  const metres = (digits: number) => (value: number) => measure(value, digits, "m");
+  const squares = (value: number): string => measure(value, 1, "m²");
+  const area = number(properties["footprint_area_m2"]) ?? 0;
+  const judged = judgedPoints(properties);
+  add("share_within_0_2m", `${capital(judged)} within 0.2 m of the roof`, percent, WITHIN_SHARE, true,
+    (shown) => `${shown} of the ${judged} lie within 0.2 m of the roof.`,
+    (shown) => `Only ${shown} of the ${judged} lie within 0.2 m of the roof: its form is not the measured one everywhere.`);
+  add("rmse_m", `RMSE of the ${judged}`, metres(3), RMSE_M, false,
+    (shown) => `The ${judged} differ from the roof by ${shown} (RMSE).`,
+    (shown) => `The ${judged} differ from the roof by ${shown} (RMSE): dormers, chimneys or trees are not modelled.`);
+  add("unexplained_m2", "Roof without a point near it", squares, Math.max(2, UNEXPLAINED_SHARE * area), false,
+    (shown) => (shown.startsWith("0.0") ? "Points lie on all of the roof." : `Points lie on nearly all of the roof; ${shown} have none.`),
+    (shown) => `${shown} of the roof have no point near them: the form there is assumed.`);
+  add("largest_hole_m", "Largest hole in the points", metres(1), HOLE_M, false,
+    (shown) => `The largest hole in the points is ${shown} wide.`,
+    (shown) => `The points have a hole ${shown} wide: what is there was not measured.`);
+  add("ridge_z_sigma_m", "Uncertainty of the ridge's height", metres(3), RIDGE_SIGMA_M, false,
+    (shown) => `The height of the ridge is known to ${shown} (one sigma).`,
+    (shown) => `The height of the ridge is known to ${shown} only (one sigma).`);
+  add("bic_margin", LEAD, (value) => measure(value, 1), BIC_MARGIN, true,
+    (shown) => `No other form that was tried explains the points as well (lead ${shown}).`,
+    (shown) => `Another form explains the points almost as well (lead ${shown}): the roof's form is uncertain.`);
+  add("detection_confidence", "Confidence that it is a building", percent, CONFIDENCE, true,
+    (shown) => `It is a building with a confidence of ${shown}.`,
+    (shown) => `It may not be a building: the confidence is ${shown}.`);
+  add("footprint_share", "Given footprint covered", percent, FOOTPRINT_SHARE, true,
+    (shown) => `The model fills ${shown} of the given footprint.`,
+    (shown) => `The model fills only ${shown} of the given footprint: the rest has no points.`);
+  return figures;
+}
+
+/** The points that the figures of fit are of: older runs did not leave out facades. */
+function judgedPoints(properties: Properties): string {
+  return number(properties["share_below_roof"]) === null ? "points" : "roof returns";
+}
+
+/** How many of all points lie near the roof, and what the record says of the roof returns among them. */
+export function withinWords(shareOfAll: number, properties: Properties): string {
+  const [within, below] = [number(properties["share_within_0_2m"]), number(properties["share_below_roof"])];
+  const all = `${percent(shareOfAll)} of all lie within 0.2 m`;
+  if (within === null || below === null || below === 0) return all;
+  return `${all}; without the ${percent(below)} on facades and below the roof, ${percent(within)}`;
+}
+
+/** What deserves trust and what does not, in sentences. */
+export function trust(properties: Properties, decisions: readonly Decision[]): { good: string[]; bad: string[] } {
+  const good: string[] = [];
+  const bad: string[] = [];
+  const { status, reason, valid } = properties;
+  const words = typeof reason === "string" ? reasonWords(reason) : "";
+  if (status === "failed") bad.push(`There is no model: ${words}.`);
+  const detail = typeof properties["reason_detail"] === "string" ? properties["reason_detail"] : "";
+  if (status === "doubtful") bad.push(`The model is doubtful: ${[words, detail].filter(Boolean).join(": ")}.`);
+  if (status === "fallback") bad.push(`The roof is not modelled, the building is a block: ${words}.`);
+  if (valid === true) good.push("The solid is closed and valid by the rules of ISO 19107.");
+  for (const figure of trustFigures(properties)) (figure.good ? good : bad).push(figure.words);
+  if (properties["is_curved"] === true) bad.push("The roof is curved: planes only approximate it.");
+  if (properties["touches_data_edge"] === true) bad.push("It touches the edge of the data: a part of it may be missing.");
+  const offset = number(properties["strip_offset_m"]);
+  if (offset !== null) bad.push(`Flight strips differed by ${measure(offset, 2, "m")} here; they were aligned first.`);
+  const levelled = decisions.find(({ kind, outcome }) => kind === "form" && outcome === "chosen")?.levelled_share ?? 0;
+  if (levelled > 0) bad.push(`Faces of ${percent(levelled)} of the plan were made level, since no plane fits the points there.`);
+  if (typeof properties["source_id"] === "string") good.push("The outline is the given footprint.");
+  else if (status === "ok" || status === "doubtful") {
+    const spacing = number(properties["point_spacing_m"]);
+    if (spacing !== null) good.push(`The outline is drawn from the points, which are ${measure(spacing, 2, "m")} apart.`);
+  }
+  if (typeof properties["overridden"] === "string") good.push(`An operator corrected it: ${properties["overridden"]}.`);
+  return { good, bad };
+}
+
+interface Check {
+  label: string;
+  show: (value: number) => string;
+  /** Whether the limit is the largest allowed value; else it is the least. */
+  isMost?: boolean;
+  met: string;
+  missed: string;
+}
+
+const CHECKS: Record<string, Check> = {
+  roof_points: { label: "Roof points", show: (v) => counted(v, "point"), met: "enough for a model", missed: "too few for a model without further proof" },
+  planes_found: { label: "Planes found in the points", show: (v) => counted(v, "plane"), met: "a roof can be drawn", missed: "no plane was found" },
+  points_on_planes_share: { label: "Roof points on a plane", show: percent, met: "the others are dormers, trees or noise", missed: "" },
+  point_spacing_m: {
+    label: "Distance of neighbouring points",
+    show: (v) => measure(v, 2, "m"),
+    met: "sparse: simple shapes compete with the arrangement",
+    missed: "dense: the arrangement is drawn without competition",
+  },
+  scatter_m: { label: "Scatter of the points about the roof", show: (v) => measure(v, 2, "m"), isMost: true, met: "like that of a roof", missed: "more than that of a roof: the model is doubtful" },
+  share_on_roof: { label: "Points on the roof", show: percent, met: "enough", missed: "too few: the model is doubtful" },
+  unseen_share: { label: "Roof without points", show: percent, isMost: true, met: "little", missed: "too much: the model is doubtful" },
+  beside_share: { label: "Area without points beside the roof", show: percent, isMost: true, met: "little", missed: "too much: the model is doubtful" },
+  returns_per_face: { label: "Points per roof face", show: (v) => measure(v, 1), met: "enough", missed: "too few: the model is doubtful" },
+  detection_confidence: { label: "Confidence that it is a building", show: percent, met: "enough", missed: "too low: the model is doubtful" },
+  level_side_share: { label: "Outline at which the ground is as high", show: percent, isMost: true, met: "little", missed: "too much: the model is doubtful" },
+  above_points_m: { label: "Height of a face above its points", show: (v) => measure(v, 2, "m"), isMost: true, met: "near them", missed: "too high: the model is doubtful" },
+  level_on_slope_share: { label: "Points of a level face that lie on a slope", show: percent, isMost: true, met: "few", missed: "too many: the model is doubtful" },
+  explained_share: { label: "Roof points that the model explains", show: percent, met: "enough for so few points", missed: "too few: the model is not delivered" },
+};
+
+/** The figures that decided which forms were tried, next to their limits. */
+export function checkRows(decisions: readonly Decision[]): { label: string; value: string; limit: string; words: string }[] {
+  return decisions
+    .filter(({ kind }) => kind === "check")
+    .map(({ name, value, limit, outcome, detail }) => {
+      const known = CHECKS[name];
+      const show = known?.show ?? ((v: number) => measure(v, 3));
+      return {
+        label: known?.label ?? capital(name.replaceAll("_", " ")),
+        value: value === undefined ? "–" : show(value),
+        limit: limit === undefined || limit === 0 ? "–" : `${known?.isMost ? "up to" : "from"} ${show(limit)}`,
+        words: (outcome === "met" ? known?.met : known?.missed) ?? detail,
+      };
+    });
+}
+
+const FORMS: Record<string, string> = {
+  arrangement: "Arrangement of the planes' lines",
+  templates: "Simple shapes",
+  traced: "Traced faces",
+  primitive: "The method's whole form",
+  block: "Level block",
+  further: "Further forms",
+  guides: "Guides, which were left out",
+};
+
+const OUTCOMES: Record<string, string> = {
+  chosen: "chosen",
+  outdone: "another is better",
+  invalid: "not a valid solid",
+  undrawable: "cannot be drawn",
+  withdrawn: "given up: see below",
+  met: "met",
+  missed: "not met",
+};
+
+/** The forms and levels of detail that were tried, one row each, in their order. */
+export function formRows(
+  decisions: readonly Decision[],
+  properties: Properties,
+): { form: string; outcome: string; chosen: boolean; faces: string; planes: string; explained: string; rmse: string; margin: string; detail: string }[] {
+  const delivered = decisions.filter(({ kind, outcome }) => kind === "form" && outcome === "chosen").at(-1);
+  return decisions
+    .filter(({ kind }) => kind !== "check")
+    .map((entry) => {
+      const codes = entry.validity_codes ?? [];
+      const details = [entry.detail, codes.length > 0 ? `codes ${codes.join(", ")}` : ""].filter((part) => part !== "");
+      return {
+        form: entry.kind === "level" ? `LoD${entry.name}` : (FORMS[entry.name] ?? entry.name),
+        outcome: entry.kind === "level" && entry.outcome === "chosen" ? "made" : (OUTCOMES[entry.outcome] ?? entry.outcome),
+        chosen: entry.outcome === "chosen",
+        faces: entry.n_faces === undefined ? "–" : String(entry.n_faces),
+        planes: entry.n_planes === undefined ? "–" : String(entry.n_planes),
+        explained: entry.explained_share === undefined ? "–" : percent(entry.explained_share),
+        rmse: entry === delivered ? measure(properties["rmse_m"], 3, "m") : "–",
+        margin: entry.bic_margin === undefined ? "–" : measure(entry.bic_margin, 1),
+        detail: details.join("; "),
+      };
+    });
+}

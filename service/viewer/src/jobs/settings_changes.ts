@@ -1,0 +1,72 @@
+/** Settings of a job as a flat list of names and values, and back. */
+
+import type { SettingSchema } from "../api/types";
+
+/** Settings by name: `candidates.min_area_m2`, or `tile_size_m` for a general one. */
+export type Flat = Map<string, unknown>;
+
+/** The settings of nested tables. */
+export function flat(tables: Readonly<Record<string, unknown>>): Flat {
+  const found: Flat = new Map();
+  for (const [name, value] of Object.entries(tables)) {
+    if (typeof value === "object" && value !== null && !Array.isArray(value)) {
+      for (const [key, one] of Object.entries(value)) found.set(`${name}.${key}`, one);
+    } else {
+      found.set(name, value);
+    }
+  }
+  return found;
+}
+
+/** All settings that a process knows, by the same names. */
+export function known(schema: SettingSchema): Map<string, SettingSchema> {
+  const found = new Map<string, SettingSchema>();
+  for (const [name, one] of Object.entries(schema.properties ?? {})) {
+    if (one.properties === undefined) found.set(name, one);
+    else for (const [key, setting] of Object.entries(one.properties)) found.set(`${name}.${key}`, setting);
+  }
+  return found;
+}
+
+/** The value of a text; a text that does not fit stays a text, and the service says what is wrong with it. */
+export function valueOf(text: string, { type }: SettingSchema): unknown {
+  const trimmed = text.trim();
+  if (type === "boolean" && (trimmed === "true" || trimmed === "false")) return trimmed === "true";
+  if (type === "array") return trimmed.split(",").map((part) => number(part.trim()));
+  return type === "string" ? trimmed : number(trimmed);
+}
+
+/** A value as the text of a field. */
+export const textOf = (value: unknown): string => (Array.isArray(value) ? value.join(", ") : String(value ?? ""));
+
+function number(text: string): number | string {
+  return text !== "" && Number.isFinite(Number(text)) ? Number(text) : text;
+}
+
+/** What leads from one list to another, as nested tables: null takes a setting away. */
+export function changes(before: Flat, after: Flat): Record<string, unknown> {
+  const found: Record<string, unknown> = {};
+  for (const name of new Set([...before.keys(), ...after.keys()])) {
+    const value = after.has(name) ? after.get(name) : null;
+    if (JSON.stringify(value) === JSON.stringify(before.has(name) ? before.get(name) : null)) continue;
+    const [table = "", key] = name.split(/\.(.*)/s);
+    if (key === undefined) found[table] = value;
+    else found[table] = { ...(found[table] as Record<string, unknown> | undefined), [key]: value };
+  }
+  return found;
+}
+
+/** Unit, range and default of a setting in one sentence. */
+export function rangeWords({ default: usual, minimum, maximum, enum: words }: SettingSchema): string {
+  const range =
+    words !== undefined
+      ? words.join(", ")
+      : minimum !== undefined && maximum !== undefined
+        ? `${minimum} to ${maximum}`
+        : minimum !== undefined
+          ? `at least ${minimum}`
+          : maximum !== undefined
+            ? `at most ${maximum}`
+            : "";
+  return [range, usual === undefined || usual === "" ? "" : `usually ${textOf(usual)}`].filter((part) => part !== "").join("; ");
+}

@@ -1,0 +1,145 @@
+import { categoryOf, type Category } from "../words/roof_types";
+import { buildingMesh, type SceneFrame } from "./building_mesh";
+import type { Building, SurfaceKind } from "./cityjson";
+import { figuresOf, flagsOf, type Figures, type Flag } from "./figures";
+import { OutlinesInMaking, type Outlines } from "./outlines";
+
+/** The part of a record that the page lists, sorts and filters; a building's whole record is loaded when it is opened. */
+export interface Listed {
+  id: string;
+  category: Category;
+  reason: string | null;
+  reasonDetail: string | null;
+  /** The id of the given footprint; null without one. */
+  sourceId: string | null;
+  figures: Figures;
+  flags: Flag[];
+}
+
+/** Buildings of one category, merged into one set of triangles. */
+export interface Batch {
+  category: Category;
+  ids: string[];
+  /** Of each building; null for buildings that are `ok`. */
+  reasons: (string | null)[];
+  /** Share of the roof returns of each building within 0.2 m of its roof; null if unknown. */
+  withinShare: (number | null)[];
+  /** Corner at which each building begins, and the number of corners after the last. */
+  starts: Uint32Array;
+  /** The same for the ends of the edges. */
+  edgeStarts: Uint32Array;
+  /** x_min, y_min, z_min, x_max, y_max, z_max of each building. */
+  boxes: Float32Array;
+  /** 1 for each building that is shown; missing if all are. */
+  shown?: Uint8Array;
+  positions: Float32Array;
+  normals: Int8Array;
+  /** The surface of each corner: its roof plane, or one of `SURFACE`. */
+  surfaces: Int16Array;
+  edges: Float32Array;
+}
+
+/** Surfaces that are not a numbered roof plane. */
+export const SURFACE = { wall: -1, ground: -2, roof: -3 } as const satisfies Record<SurfaceKind, number>;
+
+/** Gathers buildings by category until they are taken as batches. */
+export class Batcher {
+  private readonly open = new Map<Category, Gathered>();
+  private outlines = new OutlinesInMaking();
+
+  constructor(private readonly frame: SceneFrame) {}
+
+  /** Add a building; returns its entry for the list. */
+  add(building: Building): Listed {
+    const { attributes } = building;
+    const category = categoryOf(attributes["status"], attributes["roof_type"]);
+    const mesh = buildingMesh(building, this.frame);
+    const [reason, figures] = [text(attributes["reason"]), figuresOf(attributes)];
+    if (mesh.positions.length > 0) {
+      const gathered = this.open.get(category) ?? new Gathered(category);
+      this.open.set(category, gathered);
+      gathered.meshes.push({ id: building.id, reason, withinShare: figures.within ?? null, mesh });
+      this.outlines.add(building, category, this.frame);
+    }
+    return {
+      id: building.id,
+      category,
+      reason,
+      reasonDetail: text(attributes["reason_detail"]),
+      sourceId: text(attributes["source_id"]),
+      figures,
+      flags: flagsOf(attributes),
+    };
+  }
+
+  /** The batches of what was added since the last call. */
+  take(): Batch[] {
+    const batches = [...this.open.values()].map((gathered) => gathered.merged());
+    this.open.clear();
+    return batches;
+  }
+
+  /** The outlines of what was added since the last call. */
+  takeOutlines(): Outlines {
+    const { outlines } = this;
+    this.outlines = new OutlinesInMaking();
+    return outlines.packed();
+  }
+}
+
+class Gathered {
+  readonly meshes: { id: string; reason: string | null; withinShare: number | null; mesh: ReturnType<typeof buildingMesh> }[] = [];
+
+  constructor(private readonly category: Category) {}
+
+  merged(): Batch {
+    const n = this.meshes.length;
+    const starts = new Uint32Array(n + 1);
+    const edgeStarts = new Uint32Array(n + 1);
+    this.meshes.forEach(({ mesh }, i) => {
+      starts[i + 1] = starts[i] + mesh.positions.length / 3;
+      edgeStarts[i + 1] = edgeStarts[i] + mesh.edges.length / 3;
+    });
+    const corners = starts[n];
+    const batch: Batch = {
+      category: this.category,
+      ids: this.meshes.map(({ id }) => id),
+      reasons: this.meshes.map(({ reason }) => reason),
+      withinShare: this.meshes.map(({ withinShare }) => withinShare),
+      starts,
+      edgeStarts,
+      boxes: new Float32Array(6 * n),
+      positions: new Float32Array(3 * corners),
+      normals: new Int8Array(4 * corners), // four bytes per corner: graphics cards need that alignment
+      surfaces: new Int16Array(corners),
+      edges: new Float32Array(3 * edgeStarts[n]),
+    };
+    this.meshes.forEach(({ mesh }, i) => {
+      const { kinds, planes, normals } = mesh;
+      batch.positions.set(mesh.positions, 3 * starts[i]);
+      batch.edges.set(mesh.edges, 3 * edgeStarts[i]);
+      batch.boxes.set(boxOf(mesh.positions), 6 * i);
+      for (let corner = 0; corner < kinds.length; corner++) {
+        const at = starts[i] + corner;
+        for (let part = 0; part < 3; part++) batch.normals[4 * at + part] = normals[3 * corner + part];
+        const numbered = kinds[corner] === "roof" && planes[corner] >= 0;
+        batch.surfaces[at] = numbered ? planes[corner] : SURFACE[kinds[corner]];
+      }
+    });
+    return batch;
+  }
+}
+
+function boxOf(positions: readonly number[]): number[] {
+  const box = [Infinity, Infinity, Infinity, -Infinity, -Infinity, -Infinity];
+  for (let i = 0; i < positions.length; i++) {
+    const axis = i % 3;
+    if (positions[i] < box[axis]) box[axis] = positions[i];
+    if (positions[i] > box[axis + 3]) box[axis + 3] = positions[i];
+  }
+  return box;
+}
+
+function text(value: unknown): string | null {
+  return typeof value === "string" && value !== "" ? value : null;
+}

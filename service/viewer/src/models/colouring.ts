@@ -1,0 +1,144 @@
+/** What the colour of a roof shows: the choices of the view, their classes and their colours. */
+
+import { reasonWords } from "../words/reasons";
+import { bytesOf, CATEGORIES, type Category } from "../words/roof_types";
+import { SURFACE, type Batch, type Listed } from "./batching";
+
+/** A colour with its meaning. */
+export interface ColourClass {
+  label: string;
+  colour: string;
+  hatched?: boolean;
+}
+
+export const COLOURINGS = {
+  type: "Roof type",
+  plane: "Roof plane",
+  residual: "Residual",
+  status: "Status",
+  reason: "Reason",
+  plain: "None",
+} as const;
+
+export type Colouring = keyof typeof COLOURINGS;
+
+export const COLOURING_NAMES = Object.keys(COLOURINGS) as Colouring[];
+
+const GREY = "#8d99a6";
+const PLAIN = "#cbc3b6"; // of roofs below coloured points
+
+/** Colours of things without an order, from the palette of Okabe and Ito (2008); they repeat. */
+export const CYCLE = ["#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#0072b2", "#d55e00", "#f0e442"] as const;
+
+/** Share of the roof returns within 0.2 m of the roof, from large to small: a chimney or a mast has few of them. */
+const RESIDUALS: readonly (ColourClass & { fromShare: number })[] = [
+  { label: "95 % or more within 0.2 m", colour: "#0072b2", fromShare: 0.95 },
+  { label: "90 to 95 %", colour: "#56b4e9", fromShare: 0.9 },
+  { label: "75 to 90 %", colour: "#f0e442", fromShare: 0.75 },
+  { label: "50 to 75 %", colour: "#e69f00", fromShare: 0.5 },
+  { label: "under 50 %", colour: "#d55e00", fromShare: 0 },
+  { label: "unknown", colour: GREY, fromShare: NaN },
+];
+
+const STATUSES: readonly ColourClass[] = [
+  { label: "Modelled", colour: "#56b4e9" },
+  { label: "Doubtful model", colour: CATEGORIES.doubtful.colour, hatched: true },
+  { label: "Fallback block", colour: CATEGORIES.fallback.colour, hatched: true },
+  { label: "No model", colour: CATEGORIES.failed.colour, hatched: true },
+];
+
+/** Objects that were judged not to be buildings. */
+const LEFT_OUT: ColourClass = { label: "Left out", colour: CATEGORIES.rejected.colour, hatched: true };
+
+const REASON_COLOURS: Record<string, string> = {
+  too_few_points: "#56b4e9",
+  no_plane: "#e69f00",
+  no_partition: "#009e73",
+  invalid_solid: "#cc79a7",
+  too_complex: "#0072b2",
+  no_footprint: "#f0e442",
+  height_given: "#882255",
+  above_points: "#aa4499",
+  level_through_slope: "#117733",
+};
+const REASONS = new Map(Object.entries(REASON_COLOURS).map(([name, colour]) => [name, { label: reasonWords(name), colour }]));
+const NO_REASON: ColourClass = { label: "none: modelled in full", colour: GREY };
+const OTHER_REASON: ColourClass = { label: "a fault, a crash, or a limit of time or memory", colour: "#d55e00" };
+
+/** A class with the number of its buildings. */
+export type Counted = ColourClass & { count: number };
+
+/** The classes that the buildings have, with the number of each. */
+export function classesOf(colouring: "residual" | "status" | "reason", buildings: readonly Listed[]): Counted[] {
+  const counts = new Map<ColourClass, number>();
+  for (const building of buildings) {
+    const one = classOf(colouring, building.category, building.reason, building.figures.within ?? null);
+    counts.set(one, (counts.get(one) ?? 0) + 1);
+  }
+  const order: readonly ColourClass[] =
+    colouring === "residual" ? RESIDUALS : colouring === "status" ? STATUSES : [NO_REASON, ...REASONS.values(), OTHER_REASON];
+  return [...order, LEFT_OUT].flatMap((one) => (counts.has(one) ? [{ ...one, count: counts.get(one) ?? 0 }] : []));
+}
+
+function classOf(
+  colouring: "residual" | "status" | "reason",
+  category: Category,
+  reason: string | null,
+  withinShare: number | null,
+): ColourClass {
+  if (category === "rejected") return LEFT_OUT;
+  switch (colouring) {
+    case "residual":
+      return RESIDUALS.find(({ fromShare }) => withinShare !== null && withinShare >= fromShare) ?? RESIDUALS[RESIDUALS.length - 1];
+    case "status":
+      return STATUSES[["doubtful", "fallback", "failed"].indexOf(category) + 1];
+    case "reason":
+      return reason === null ? NO_REASON : (REASONS.get(reason) ?? OTHER_REASON);
+  }
+}
+
+/** The colour of an object's outline on the map; outlines have no planes. */
+export function outlineColour(colouring: Colouring, { category, reason, figures }: Listed): string {
+  switch (colouring) {
+    case "type":
+      return CATEGORIES[category].colour;
+    case "plane":
+    case "plain":
+      return GREY;
+    default:
+      return classOf(colouring, category, reason, figures.within ?? null).colour;
+  }
+}
+
+/** Red, green, blue, opaque for each corner of a batch; in the linear space that three works in. */
+export function coloursOf(batch: Batch, colouring: Colouring): Uint8Array {
+  const colours = new Uint8Array(4 * batch.surfaces.length).fill(255);
+  const cycle = CYCLE.map(linear);
+  for (let building = 0; building < batch.ids.length; building++) {
+    let roof = linear(GREY); // of faces without a numbered plane
+    if (colouring === "type") roof = linear(CATEGORIES[batch.category].colour);
+    else if (colouring === "plain") roof = linear(PLAIN);
+    else if (colouring !== "plane") {
+      roof = linear(classOf(colouring, batch.category, batch.reasons[building], batch.withinShare[building]).colour);
+    }
+    for (let corner = batch.starts[building]; corner < batch.starts[building + 1]; corner++) {
+      const surface = batch.surfaces[corner];
+      let colour = roof;
+      if (surface === SURFACE.wall) colour = WALL;
+      else if (surface === SURFACE.ground) colour = FLOOR;
+      else if (colouring === "plane" && surface >= 0) colour = cycle[surface % cycle.length];
+      for (let part = 0; part < 3; part++) colours[4 * corner + part] = colour[part];
+    }
+  }
+  return colours;
+}
+
+/** IEC 61966-2-1: sRGB to linear light, both as bytes. */
+export function linear(colour: string): number[] {
+  return bytesOf(colour).map((byte) => {
+    const value = byte / 255;
+    return Math.round(255 * (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4));
+  });
+}
+
+const [WALL, FLOOR] = [linear("#ece7de"), linear("#b9b3a8")];

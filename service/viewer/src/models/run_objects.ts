@@ -1,0 +1,96 @@
+/** The objects of a run as they arrive: the candidates, and once they are wanted those that were left out. */
+
+import { getJson, ofRun, runReport } from "../api/requests";
+import type { Feature, RunReport } from "../api/types";
+import type { Category } from "../words/roof_types";
+import type { Listed } from "./batching";
+import type { SceneFrame } from "./building_mesh";
+import type { FromLoading } from "./loading_messages";
+import { loadModels } from "./model_loading";
+import { modelUnits } from "./units";
+
+type Buildings = Extract<FromLoading, { kind: "buildings" }>;
+
+export class RunObjects {
+  readonly listed: Listed[] = [];
+  /** Those that were left out, by id; they are listed, too. */
+  readonly rejected = new Map<string, Listed>();
+  /** Objects by category; those that were left out as the report counts them. */
+  readonly counts = new Map<Category, number>();
+  report: RunReport = {};
+  private readonly byId = new Map<string, Listed>();
+  private origin: readonly [number, number, number] | null = null;
+
+  /** @param method The run of a comparison; null for other jobs. */
+  constructor(
+    readonly jobPath: string,
+    readonly method: string | null,
+  ) {}
+
+  /** The scene in the coordinates of the job. */
+  get frame(): SceneFrame {
+    return { origin: this.origin ?? [0, 0, 0], ...modelUnits(this.report.crs) };
+  }
+
+  /** Number of objects that are not left out. */
+  get candidates(): number {
+    return this.listed.length - this.rejected.size;
+  }
+
+  find(id: string): Listed | undefined {
+    return this.byId.get(id);
+  }
+
+  add(listed: readonly Listed[]): void {
+    for (const object of listed) {
+      this.listed.push(object);
+      this.byId.set(object.id, object);
+      if (object.category !== "rejected") this.counts.set(object.category, (this.counts.get(object.category) ?? 0) + 1);
+    }
+  }
+
+  async readReport(signal: AbortSignal): Promise<void> {
+    this.report = await runReport(this.jobPath, this.method, signal);
+    this.counts.set("rejected", this.report.counts?.["rejected"] ?? 0);
+  }
+
+  /** Read the models at a level of detail, null for the finest of each; returns the available levels. */
+  readModels(lod: string | null, onBuildings: (buildings: Buildings) => void, signal: AbortSignal): Promise<string[]> {
+    const onMessage = (message: FromLoading): void => {
+      if (message.kind === "frame" && lod === null) this.origin = message.origin;
+      if (message.kind === "buildings") onBuildings(message);
+    };
+    return loadModels(ofRun(`${this.jobPath}/results/cityjson`, this.method), { ...modelUnits(this.report.crs), lod }, onMessage, signal);
+  }
+
+  /** Buildings without a model: only the records have their place. */
+  async failed(signal: AbortSignal): Promise<Feature[]> {
+    const path = ofRun(`${this.jobPath}/buildings?status=failed&limit=10000&crs=native`, this.method);
+    const { features } = await getJson<{ features: Feature[] }>(path, { signal, headers: { Accept: "application/geo+json" } });
+    this.placeBy(features);
+    return features;
+  }
+
+  /** Read the objects that were left out; they are listed by `add`. */
+  async readRejected(signal: AbortSignal): Promise<Feature[]> {
+    const { listedRejected, rejectedObjects } = await import("./rejected_objects");
+    const features = await rejectedObjects(this.jobPath, this.method, signal);
+    for (const object of features.map(listedRejected)) this.rejected.set(object.id, object);
+    this.placeBy(features);
+    return features;
+  }
+
+  /** Take the scene's origin from outlines if there is no model: far from it the figures would be too coarse. */
+  private placeBy(features: readonly Feature[]): void {
+    this.origin ??= cornerOf(features);
+  }
+}
+
+/** A corner of the first outline, in whole units; null without outlines. */
+function cornerOf(features: readonly Feature[]): [number, number, number] | null {
+  for (const { geometry } of features) {
+    const [easting, northing] = ((geometry?.coordinates as unknown[] | undefined)?.flat(3) as number[]) ?? [];
+    if (typeof easting === "number" && typeof northing === "number") return [Math.round(easting), Math.round(northing), 0];
+  }
+  return null;
+}

@@ -1,0 +1,45 @@
+import { el } from "./elements";
+
+/** A control with its label above and a hint below. The control has an id. */
+export function field(label: string, control: HTMLElement, hint?: string): HTMLElement {
+  const hintId = `${control.id}-hint`;
+  if (hint !== undefined) control.setAttribute("aria-describedby", hintId);
+  return el(
+    "div",
+    { class: "field" },
+    el("label", { for: control.id }, label),
+    control,
+    hint === undefined ? null : el("p", { class: "hint", id: hintId }, hint),
+  );
+}
+
+/** A choice of words with their labels; the first is chosen if no other is. */
+export function choice(id: string, options: Record<string, string>, chosen?: string): HTMLSelectElement {
+  return el("select", { id }, ...Object.entries(options).map(([value, label]) => el("option", { value, selected: value === chosen }, label)));
+}
+
+/** A set of checkboxes. */
+export class Boxes {
+  readonly element = el("div", { class: "boxes" });
+  private boxes: HTMLInputElement[] = [];
+
+  /** Offer these words with their labels; the chosen ones are checked. */
+  offer(labels: Readonly<Record<string, string>>, chosen: readonly string[] = []): void {
+    const words = Object.keys(labels);
+    this.boxes = words.map((value) => el("input", { type: "checkbox", value, checked: chosen.includes(value) }));
+    this.element.replaceChildren(...this.boxes.map((box) => el("label", {}, box, ` ${labels[box.value]}`)));
+  }
+
+  get isEmpty(): boolean {
+    return this.boxes.length === 0;
+  }
+
+  get chosen(): string[] {
+    return this.boxes.filter(({ checked }) => checked).map(({ value }) => value);
+  }
+
+  /** Boxes that cannot be set at the moment. */
+  disable(isOff: (value: string) => boolean): void {
+    for (const box of this.boxes) box.disabled = isOff(box.value);
+  }
+}

@@ -1,0 +1,115 @@
+import { getJson } from "../api/requests";
+import type { Feature } from "../api/types";
+import { ringsOf, type Point } from "../models/rings";
+import { el, svg } from "../page/elements";
+import { counted } from "../words/numbers";
+import { CATEGORIES, categoryOf } from "../words/roof_types";
+
+const PAUSE_MS = 3000;
+const PAGE = 1000; // buildings
+const MOST_DRAWN = 5000; // more outlines than that make the page slow; they are only counted
+const MARGIN = 0.03; // of the longer side
+
+type Bounds = [west: number, south: number, east: number, north: number];
+
+interface Page {
+  complete: boolean;
+  numberMatched: number;
+  attempt?: number;
+  features: Feature[];
+}
+
+/** Rings as the path of an SVG, from an origin, with north up. */
+export function pathOf(rings: Point[][], [x0, y0]: Point): string {
+  return rings
+    .map((ring) => `M${ring.map(([x, y]) => `${(x - x0).toFixed(2)} ${(y0 - y).toFixed(2)}`).join("L")}Z`)
+    .join("");
+}
+
+/** Bounds that also hold these rings. */
+export function grown(bounds: Bounds | null, rings: Point[][]): Bounds | null {
+  let found = bounds;
+  for (const [x, y] of rings.flat()) {
+    found =
+      found === null
+        ? [x, y, x, y]
+        : [Math.min(found[0], x), Math.min(found[1], y), Math.max(found[2], x), Math.max(found[3], y)];
+  }
+  return found;
+}
+
+/** The outlines of a running job's buildings, seen from above, as they are modelled. */
+export class BuildingsSoFar {
+  private readonly plan = svg("svg", { role: "img", "aria-label": "Outlines of the buildings so far, seen from above" });
+  private readonly words = el("figcaption");
+  readonly element = el("figure", { class: "so-far", hidden: true }, this.plan, this.words);
+  private attempt = 0;
+  private known = 0;
+  private drawn = 0;
+  private origin: Point | null = null;
+  private bounds: Bounds | null = null;
+  private begun = false;
+
+  constructor(
+    private readonly jobPath: string,
+    private readonly signal: AbortSignal,
+  ) {}
+
+  /** Ask for buildings again and again, until the job is over or the page shows something else. */
+  begin(): void {
+    if (this.begun) return;
+    this.begun = true;
+    void this.follow();
+  }
+
+  private async follow(): Promise<void> {
+    // where the answer is a problem, the events of the job tell it, too
+    while (!(await this.ask().catch(() => false))) {
+      await new Promise((resolve) => setTimeout(resolve, PAUSE_MS));
+      if (this.signal.aborted || !this.element.isConnected) return;
+    }
+  }
+
+  /** Draw what is new; true if the job is over. */
+  private async ask(): Promise<boolean> {
+    const offset = this.known;
+    const path = `${this.jobPath}/buildings?crs=native&limit=${PAGE}&offset=${offset}`;
+    const page = await getJson<Page>(path, { signal: this.signal });
+    if (page.complete) return true;
+    const isAnew = page.attempt !== this.attempt;
+    if (isAnew) this.clear(page.attempt ?? 0);
+    // the job began anew, and so does its list: this page lies somewhere within it
+    if (!isAnew || offset === 0) this.take(page);
+    return false;
+  }
+
+  private clear(attempt: number): void {
+    this.attempt = attempt;
+    this.known = this.drawn = 0;
+    this.origin = this.bounds = null;
+    this.plan.replaceChildren();
+  }
+
+  private take(page: Page): void {
+    for (const feature of page.features) this.draw(feature);
+    this.known += page.features.length;
+    this.element.hidden = this.known === 0;
+    this.words.textContent = `${counted(this.known, "building")} so far`;
+    if (this.bounds === null || this.origin === null) return;
+    const [west, south, east, north] = this.bounds;
+    const margin = MARGIN * Math.max(east - west, north - south);
+    const corner = [west - this.origin[0] - margin, this.origin[1] - north - margin];
+    this.plan.setAttribute("viewBox", [...corner, east - west + 2 * margin, north - south + 2 * margin].join(" "));
+  }
+
+  private draw({ geometry, properties }: Feature): void {
+    const rings = ringsOf(geometry);
+    const first = rings[0]?.[0];
+    if (first === undefined || this.drawn >= MOST_DRAWN) return;
+    this.drawn += 1;
+    this.origin ??= first;
+    this.bounds = grown(this.bounds, rings);
+    const { colour } = CATEGORIES[categoryOf(properties["status"], properties["roof_type"])];
+    this.plan.append(svg("path", { d: pathOf(rings, this.origin), fill: colour, "fill-rule": "evenodd" }));
+  }
+}

@@ -1,0 +1,27 @@
+import { levelWords } from "../models/levels_of_detail";
+import { el } from "../page/elements";
+
+/** Buttons for the levels of detail of the shown models; hidden if there is nothing to choose. */
+export class LevelChoice {
+  readonly element = el("div", { class: "tool-group levels", role: "group", "aria-label": "Level of detail", hidden: true });
+
+  constructor(private readonly onChoice: (lod: string) => void) {}
+
+  /** Set the available levels, coarse to fine; the finest is shown. */
+  offer(lods: readonly string[]): void {
+    this.element.replaceChildren(
+      ...lods.map((lod) =>
+        el("button", { type: "button", value: lod, title: levelWords(lod), onclick: () => this.onChoice(lod) }, `LoD${lod}`),
+      ),
+    );
+    this.element.hidden = lods.length < 2;
+    this.mark(lods[lods.length - 1] ?? "");
+  }
+
+  /** Mark the shown level. */
+  mark(lod: string): void {
+    for (const button of this.element.querySelectorAll("button")) {
+      button.setAttribute("aria-pressed", String(button.value === lod));
+    }
+  }
+}

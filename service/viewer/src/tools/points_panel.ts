@@ -1,0 +1,129 @@
+import { ofRun, request, serviceUrl } from "../api/requests";
+import { originInMetres, type SceneFrame } from "../models/building_mesh";
+import { colourSwatch, el } from "../page/elements";
+import { announce, asProblem } from "../page/notices";
+import { legendLines, POINT_COLOURING_NAMES, POINT_COLOURINGS, type PointColouring } from "../points/points_colouring";
+import { PointsLayer, type Figures } from "../points/points_layer";
+import { factsOf, rootOf, type RawTileset, type TilesetFacts, type Xyz } from "../points/points_tileset";
+import type { ModelScene } from "../scene/scene";
+import { count, counted } from "../words/numbers";
+
+const BUDGET = 3_000_000; // points in a view
+const BUDGET_OF_PHONES = 1_000_000;
+
+/** The points of a job over its models: they are loaded as the view needs them. */
+export class PointsPanel {
+  readonly element: HTMLElement;
+  private readonly choice = el(
+    "select",
+    { id: "point-colouring" },
+    ...POINT_COLOURING_NAMES.map((name) => el("option", { value: name }, POINT_COLOURINGS[name])),
+  );
+  private readonly legend = el("div", { class: "points-legend", role: "group", "aria-label": "Shown points" });
+  private readonly figure = el("span", { class: "points-figure" });
+  private readonly fault = el("div");
+  private readonly layer: PointsLayer;
+  private readonly facts: TilesetFacts;
+
+  /**
+   * Read the octree and draw its points.
+   *
+   * @throws Problem if the service does not give it, Error if it cannot be read.
+   */
+  static async open(scene: ModelScene, jobPath: string, method: string | null, frame: SceneFrame): Promise<PointsPanel> {
+    const get = async (address: string, signal?: AbortSignal): Promise<ArrayBuffer> => {
+      const options: RequestInit = { headers: { Accept: "*/*" }, cache: "default" };
+      if (signal !== undefined) options.signal = signal;
+      return (await request(ofRun(address, method), options)).arrayBuffer();
+    };
+    const address = serviceUrl(`${jobPath}/points/tileset.json`);
+    const tileset = JSON.parse(new TextDecoder().decode(await get(address))) as RawTileset;
+    return new PointsPanel(scene, tileset, address, frame, get);
+  }
+
+  private constructor(
+    private readonly scene: ModelScene,
+    tileset: RawTileset,
+    address: string,
+    private readonly frame: SceneFrame,
+    get: (address: string, signal: AbortSignal) => Promise<ArrayBuffer>,
+  ) {
+    this.facts = factsOf(tileset);
+    const origin = originInMetres(frame);
+    const [east, north, up] = this.facts.originM;
+    const place: Xyz = [east - origin[0], north - origin[1], up - origin[2]];
+    const budget = matchMedia("(pointer: coarse)").matches ? BUDGET_OF_PHONES : BUDGET;
+    this.layer = new PointsLayer(rootOf(tileset, address), place, budget, get, {
+      onArrival: () => scene.request(),
+      onFault: (fault) => this.report(fault),
+      onFrame: (figures) => this.write(figures),
+    });
+    this.choice.addEventListener("change", () => {
+      this.colour();
+      announce(`The points are coloured by ${POINT_COLOURINGS[this.colouring].toLowerCase()}.`);
+    });
+    this.element = el(
+      "section",
+      { class: "stage-card points", "aria-label": "Points" },
+      el("div", { class: "points-head" }, el("label", { for: this.choice.id }, "Points by"), this.choice, this.figure),
+      // on a phone the legend would hide a third of the view
+      el("details", { open: matchMedia("(width > 860px)").matches }, el("summary", {}, "Legend"), this.legend),
+      this.fault,
+    );
+    this.colour();
+    scene.addLayer(this.layer);
+    announce(`${counted(this.facts.nPoints, "point")}: those that the view needs are loaded.`);
+  }
+
+  /** Remove the points. */
+  close(): void {
+    this.scene.removeLayer(this.layer);
+    this.element.remove();
+  }
+
+  private get colouring(): PointColouring {
+    return this.choice.value as PointColouring;
+  }
+
+  private colour(): void {
+    const { material } = this.layer;
+    const [low, high] = this.scene.heights();
+    const base = this.frame.origin[2] * this.frame.verticalUnitM;
+    material.colourBy(this.colouring);
+    material.uniforms["heights"].value = [low, high];
+    const lines = legendLines(this.colouring, this.facts.classes, [low + base, high + base]);
+    this.legend.replaceChildren(
+      ...lines.map(({ colours, label, numbers, count: n }, i) => {
+        const words = [
+          ...colours.map((colour) => colourSwatch(colour)),
+          el("span", { class: "legend-label" }, label),
+          n === null ? null : el("span", { class: "tally" }, count(n)),
+        ];
+        if (numbers.length === 0) return el("div", { class: "legend-row" }, ...words);
+        const box = el("input", { type: "checkbox", id: `points-${i}`, checked: true });
+        box.addEventListener("change", () => {
+          material.show(numbers, box.checked);
+          this.scene.request();
+        });
+        return el("label", { class: "legend-row", for: box.id }, box, ...words);
+      }),
+    );
+    this.scene.request();
+  }
+
+  private write({ points, nodes, kept, missing }: Figures): void {
+    this.figure.textContent = `${count(points)} of ${count(this.facts.nPoints)}${missing > 0 ? " …" : ""}`;
+    Object.assign(this.element.dataset, { points, nodes, kept, missing });
+  }
+
+  private report(fault: unknown): void {
+    const again = el("button", { type: "button", class: "quiet" }, "Try again");
+    again.addEventListener("click", () => {
+      this.fault.replaceChildren();
+      this.layer.retry();
+      this.scene.request();
+    });
+    const words = `Some points could not be read: ${asProblem(fault).message}`;
+    this.fault.replaceChildren(el("div", { class: "notice notice-error", role: "alert" }, el("p", {}, words), again));
+  }
+}

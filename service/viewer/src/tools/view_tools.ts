@@ -1,0 +1,119 @@
+import { getJson, ofRun } from "../api/requests";
+import { originInMetres, type SceneFrame } from "../models/building_mesh";
+import { el } from "../page/elements";
+import { announce, asProblem, problemNotice } from "../page/notices";
+import { factsOf, type RawTileset } from "../points/points_tileset";
+import { groundOf, type TerrainFile } from "../scene/ground";
+import type { ModelScene } from "../scene/scene";
+import { MeasureTool } from "./measure_tool";
+import type { PointsPanel } from "./points_panel";
+import "./view_tools.css";
+
+/** The switches over the 3D view, and the cards that belong to them. */
+export class ViewTools {
+  /** The buttons. */
+  readonly element = el("div", { class: "tool-group switches", role: "group", "aria-label": "Show and measure", hidden: true });
+  /** Lies over the canvas. */
+  readonly cards = el("div", { class: "stage-cards" });
+  private readonly points = el("button", { type: "button", title: "Show the points over the models", "aria-pressed": "false" }, "Points");
+  private readonly fault = el("div", { class: "stage-fault" });
+  private readonly calledOff = new AbortController();
+  private scene: ModelScene | null = null;
+  private measuring: MeasureTool | null = null;
+  private panel: PointsPanel | null = null;
+
+  /** All buttons over the view: these and some more. */
+  bar(...more: HTMLElement[]): HTMLElement {
+    return el("div", { class: "tools" }, this.element, ...more);
+  }
+
+  /** Something else is shown in place of the 3D view, or it is back. */
+  setAway(away: boolean): void {
+    if (away) this.measuring?.end();
+    this.element.classList.toggle("away", away);
+    this.cards.hidden = away;
+  }
+
+  /** Offer what the scene can do. */
+  attach(scene: ModelScene, canvas: HTMLCanvasElement): void {
+    this.scene = scene;
+    this.measuring = new MeasureTool(scene, canvas);
+    const ground = el("button", { type: "button", title: "Show the ground", "aria-pressed": "true" }, "Ground");
+    ground.addEventListener("click", () => {
+      const shown = ground.getAttribute("aria-pressed") !== "true";
+      ground.setAttribute("aria-pressed", String(shown));
+      scene.showGround(shown);
+      announce(shown ? "The ground is shown." : "The ground is hidden.");
+    });
+    this.element.replaceChildren(ground, this.measuring.button);
+    this.element.hidden = false;
+    this.cards.replaceChildren(this.fault, this.measuring.card);
+    canvas.after(this.measuring.cross);
+  }
+
+  /** Offer the points of the job, or of one run of a comparison, and draw their terrain, if it has any. */
+  async offerPoints(jobPath: string, method: string | null, frame: SceneFrame): Promise<void> {
+    await this.tried(async (signal) => {
+      const outputs = await getJson<Record<string, unknown>>(ofRun(`${jobPath}/results`, method), { signal });
+      this.fault.replaceChildren();
+      if (!("tileset" in outputs)) return;
+      this.points.addEventListener("click", () => void this.togglePoints(jobPath, method, frame));
+      this.element.prepend(this.points);
+      await this.tried((again) => this.layTerrain(jobPath, method, frame, again));
+    });
+  }
+
+  /** Draw the terrain of a job with points; runs of earlier versions have none. */
+  private async layTerrain(jobPath: string, method: string | null, frame: SceneFrame, signal: AbortSignal): Promise<void> {
+    const tileset = await getJson<RawTileset>(ofRun(`${jobPath}/points/tileset.json`, method), { signal });
+    const file = factsOf(tileset).terrain;
+    const terrain = file === null ? null : await getJson<TerrainFile>(ofRun(`${jobPath}/points/${file}`, method), { signal });
+    this.fault.replaceChildren();
+    const ground = terrain === null ? null : groundOf(terrain, originInMetres(frame));
+    if (ground !== null && !signal.aborted) this.scene?.layTerrain(ground);
+  }
+
+  /** Do something that may fail, and offer to try it again. */
+  private async tried(step: (signal: AbortSignal) => Promise<void>): Promise<void> {
+    const { signal } = this.calledOff;
+    try {
+      await step(signal);
+    } catch (error) {
+      if (!signal.aborted) this.fault.replaceChildren(problemNotice(asProblem(error), () => void this.tried(step)));
+    }
+  }
+
+  /** End all tools. */
+  leave(): void {
+    this.calledOff.abort();
+    this.measuring?.end();
+    this.panel?.close();
+  }
+
+  private async togglePoints(jobPath: string, method: string | null, frame: SceneFrame): Promise<void> {
+    const { scene } = this;
+    if (scene === null || this.points.getAttribute("aria-busy") === "true") return;
+    if (this.panel !== null) {
+      this.panel.close();
+      this.panel = null;
+      this.points.setAttribute("aria-pressed", "false");
+      announce("The points are hidden.");
+      return;
+    }
+    this.points.setAttribute("aria-busy", "true");
+    this.fault.replaceChildren();
+    try {
+      // the code of the points is loaded only if they are shown
+      const { PointsPanel } = await import("./points_panel");
+      const panel = await PointsPanel.open(scene, jobPath, method, frame);
+      if (this.calledOff.signal.aborted) return panel.close();
+      this.panel = panel;
+      this.cards.append(panel.element);
+      this.points.setAttribute("aria-pressed", "true");
+    } catch (error) {
+      if (!this.calledOff.signal.aborted) this.fault.replaceChildren(problemNotice(asProblem(error)));
+    } finally {
+      this.points.removeAttribute("aria-busy");
+    }
+  }
+}
