@@ -21,6 +21,7 @@ from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.stages.ingested import without_roofs
 from pipeline.settings import RunSettings
+from pipeline.terrain.flight_passes import NO_SLICES, passes_of, slices_of, united_slices
 from pipeline.terrain.settings import StripSettings
 from pipeline.terrain.strip_moves import moves_of, offsets_of, strips_warning, surfaces_warning
 from pipeline.terrain.strip_squares import SQUARE_MM
@@ -220,12 +221,14 @@ class _Strips:
     def __init__(self, points: int) -> None:
         self._every = math.ceil(math.sqrt(max(1, points) / _COMPARED_POINTS))
         self._parts: list[tuple[IntArray, ...]] = []
+        self._slices = NO_SLICES
 
     def add(self, cloud: PointCloud) -> None:
         """Keep the points of the squares."""
         xyz_mm = np.rint(cloud.xyz * MM).astype(np.int64)
         column, row = xyz_mm[:, 0] // SQUARE_MM, xyz_mm[:, 1] // SQUARE_MM
         kept = (column % self._every == 0) & (row % self._every == 0)
+        self._slices = united_slices([self._slices, slices_of(cloud.source_id, cloud.gps_time)])
         columns = (*xyz_mm.T, cloud.return_number, cloud.return_count, cloud.source_id, cloud.gps_time)
         self._parts.append(tuple(np.ascontiguousarray(values[kept]) for values in columns))
 
@@ -235,10 +238,11 @@ class _Strips:
             return ()
         columns = (np.concatenate(parts) for parts in zip(*self._parts, strict=True))
         x, y, z, number, returns, source, time = columns
-        rows = compared_strips((x, y, z), (number, returns), source, time, None)
-        apart = offsets_of([rows], settings)
-        named = strips_warning(apart, moves_of([rows], settings)) if apart else ""
-        return tuple(filter(None, (named, surfaces_warning([rows]))))
+        rows = compared_strips((x, y, z), (number, returns), source, time, None, passes_of(self._slices))
+        differ = rows, self._slices
+        apart = offsets_of(*differ, settings)
+        named = strips_warning(apart, moves_of(*differ, settings)) if apart else ""
+        return tuple(filter(None, (named, surfaces_warning(*differ, settings))))
 
 
 class _Raster:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.terrain.flight_passes import SLICE_S, id_and_slice
+from pipeline.model import IntArray
+from pipeline.terrain.flight_passes import ids_of, passes_of, strip_of
 from pipeline.terrain.flight_strip import Strip
-from pipeline.terrain.survey_strips import NO_ROWS, Rows, counted
+from pipeline.terrain.survey_strips import Rows, counted
 
 FEW_SQUARES = 12
 """Fewest squares that show an offset of two strips."""
@@ -53,55 +54,31 @@ def differences(rows: Rows) -> list[Difference]:
     return found
 
 
-def named_strips(parts: Iterable[Rows], limit_m: float) -> tuple[Sequence[Strip], Rows]:
-    """The strips of some rows, in their order, and the rows of pairs with the places of these in place of numbers.
+def named_strips(rows: Rows, slices: IntArray, limit_m: float) -> tuple[Sequence[Strip], Rows]:
+    """All strips of a survey, in their order, and the rows of pairs with the places of these in place of numbers.
 
-    An id is one strip, unless places show passes of it that differ by more than `limit_m`. Then slices of time that
-    follow one another are a strip, unless they differ so among themselves: then each of them is one.
+    `slices` are those of all inputs. An id is one strip, unless 12 places show that passes of it differ by more than
+    `limit_m`: then each pass is one.
     """
-    rows = counted(np.concatenate([NO_ROWS, *parts]))
+    passes = passes_of(slices)
     pairs = rows[rows[:, 0] < rows[:, 1]]
-    runs = _runs(sorted({*rows[:, :2].ravel().tolist()}))
-    run_of = {number: k for k, run in enumerate(runs) for number in run}
-    torn = {run_of[d.first] for d in differences(pairs) if run_of[d.first] == run_of[d.second] and d.exceeds(limit_m)}
-    strip_of: dict[int, Strip] = {}
-    for k, run in enumerate(runs):
-        for piece in [[number] for number in run] if k in torn else [run]:
-            strip_of |= dict.fromkeys(piece, _strip(piece))
-    names, found = _by_strip(pairs, strip_of)
-    alike = (d for d in differences(found) if names[d.first].source == names[d.second].source)
-    shared = {names[d.first].source for d in alike if d.exceeds(limit_m)}
-    return _by_strip(pairs, {n: one if one.source in shared else Strip(one.source) for n, one in strip_of.items()})
-
-
-def _runs(numbers: Sequence[int]) -> list[list[int]]:
-    """Ascending numbers, divided where one does not follow the one before.
-
-    >>> _runs([3, 4, 7])
-    [[3, 4], [7]]
-    """
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1].append(number)
-        else:
-            runs.append([number])
-    return runs
-
-
-def _strip(slices: Sequence[int]) -> Strip:
-    """The strip of some slices of one id that follow one another."""
-    (source, first), (_, last) = id_and_slice(slices[0]), id_and_slice(slices[-1])
-    return Strip(source, first * SLICE_S, (last + 1) * SLICE_S)
-
-
-def _by_strip(pairs: Rows, strip_of: Mapping[int, Strip]) -> tuple[Sequence[Strip], Rows]:
-    """The strips, and the rows of two of them with their places in place of numbers."""
-    names = sorted({*strip_of.values()})
-    place = {strip: k for k, strip in enumerate(names)}
-    numbers = sorted(strip_of)
-    places = np.array([place[strip_of[number]] for number in numbers], np.int64)
-    found = pairs.copy()
-    for column in (0, 1):
-        found[:, column] = places[np.searchsorted(numbers, pairs[:, column])] if len(pairs) else 0
-    return names, counted(found[found[:, 0] != found[:, 1]])
+    strip = {number: strip_of(number, passes) for number in {*pairs[:, :2].ravel().tolist()}}
+    divided = {
+        strip[found.first].source
+        for found in differences(pairs)
+        if strip[found.first].source == strip[found.second].source and found.exceeds(limit_m)
+    }
+    undivided = (Strip(number) for number in ids_of(slices) if number not in divided)
+    names = sorted([*undivided, *(one for one in passes if one.source in divided)])
+    place = {one: k for k, one in enumerate(names)}
+    found = []
+    for *numbers, cm, squares in pairs.tolist():
+        both = [strip[number] for number in numbers]
+        parts = [one.source in divided for one in both]
+        # of two strips that stay whole counts what was compared by ids, of others what was compared by passes
+        timed = [one.is_timed for one in both]
+        if not all(t >= p for t, p in zip(timed, parts, strict=True)) or any(timed) > any(parts):
+            continue
+        a, b = (place[one if part else Strip(one.source)] for one, part in zip(both, parts, strict=True))
+        found.append((a, b, cm, squares) if a < b else (b, a, -cm, squares))
+    return names, counted(np.array(found, np.int64).reshape(-1, 4))

@@ -6,7 +6,7 @@ Strips that differ by more than houses bear are moved, as whole strips, to their
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -15,15 +15,17 @@ from pipeline.model import FloatArray, IntArray
 from pipeline.terrain.flight_strip import Strip
 from pipeline.terrain.named_strips import FEW_SQUARES, differences, named_strips
 from pipeline.terrain.settings import StripSettings
-from pipeline.terrain.survey_strips import HAS_POINTS, NO_ROWS, Rows, counted
+from pipeline.terrain.survey_strips import UNCLEAR, Rows
 
 _FEW_TO_MOVE = 30
 """Fewest squares by which whole strips are moved: those of one roof may lie apart for a reason of its own."""
 _MOST_NAMED = 5
 """Pairs of strips that a warning names; it counts the others."""
-_LEAST_SHARE = 0.1
-"""Least share of the squares whose points lie on two surfaces from which on these are those of strips: above that of
-trees, wires and glass."""
+_LEAST_SHARE = 0.75
+"""Least share of the squares on one or two surfaces whose points lie on two, from which on these are taken for strips:
+greenhouses, crops and panels on a part of a survey show two surfaces, too."""
+_LEAST_OF_ALL = 0.3
+"""Least share of all squares, with those that show neither: these are rough, or have too few points."""
 _MOST_SPREAD_M = 0.2
 """Largest distance of the quartiles of what lies between two such surfaces: it is alike where strips do not fit."""
 
@@ -55,10 +57,10 @@ class StripOffset:
         return f"strip {self.first} lies {abs(self.offset_m):.2f} m {side} strip {self.second} {seen}"
 
 
-def _all_pairs(parts: Iterable[Rows], settings: StripSettings) -> list[StripOffset]:
-    """All pairs of strips that some square compares."""
-    names, rows = named_strips(parts, min(settings.warn_m, settings.align_m))
-    return [
+def _all_pairs(rows: Rows, slices: IntArray, settings: StripSettings) -> tuple[Sequence[Strip], list[StripOffset]]:
+    """All strips, and all pairs of them that some square compares."""
+    names, rows = named_strips(rows, slices, min(settings.warn_m, settings.align_m))
+    pairs = [
         StripOffset(
             first=names[found.first],
             second=names[found.second],
@@ -69,16 +71,17 @@ def _all_pairs(parts: Iterable[Rows], settings: StripSettings) -> list[StripOffs
         )
         for found in differences(rows)
     ]
+    return names, pairs
 
 
-def offsets_of(parts: Iterable[Rows], settings: StripSettings) -> list[StripOffset]:
+def offsets_of(rows: Rows, slices: IntArray, settings: StripSettings) -> list[StripOffset]:
     """Pairs of strips that differ by more than `warn_m` at a quarter of the squares, the largest offset first.
 
-    `parts` are the rows of all tiles.
+    `rows` are those of all tiles together, `slices` those of all inputs (`slices_of`).
     """
     found = [
         pair
-        for pair in _all_pairs(parts, settings)
+        for pair in _all_pairs(rows, slices, settings)[1]
         if pair.squares >= FEW_SQUARES and max(-pair.low_m, pair.high_m) > settings.warn_m
     ]
     return sorted(found, key=lambda pair: (-max(-pair.low_m, pair.high_m), pair.first, pair.second))
@@ -95,19 +98,21 @@ def strips_warning(apart: Sequence[StripOffset], moves_mm: Mapping[Strip, int]) 
     return f"flight strips do not fit: {named}. They are moved to their common mean: strip {moved}"
 
 
-def surfaces_warning(parts: Iterable[Rows]) -> str:
-    """A sentence on points that lie on two surfaces above one another throughout an area; empty where they do not.
+def surfaces_warning(rows: Rows, slices: IntArray, settings: StripSettings) -> str:
+    """A sentence on points that lie on two surfaces nearly wherever these are smooth; empty where they do not.
 
     Neither their ids nor their GPS times say that two strips saw it.
     """
-    rows = counted(np.concatenate([NO_ROWS, *parts]))
-    alone = rows[(rows[:, 0] == rows[:, 1]) & (rows[:, 2] != HAS_POINTS)]
+    names, _ = _all_pairs(rows, slices, settings)
+    divided = [*{one.source for one in names if one.is_timed}]
+    alone = rows[(rows[:, 0] == rows[:, 1]) & ~np.isin(rows[:, 0], divided)]
     two = alone[alone[:, 2] > 0]
-    alone[:, :2], two[:, :2] = 0, 0
-    squares = int(alone[:, 3].sum())
+    two[:, :2] = 0
+    squares, clear = int(alone[:, 3].sum()), int(alone[alone[:, 2] != UNCLEAR, 3].sum())
     for found in differences(two):
         share = found.squares / squares
-        if found.squares >= _FEW_TO_MOVE and share >= _LEAST_SHARE and found.high_m - found.low_m <= _MOST_SPREAD_M:
+        enough = found.squares >= max(_FEW_TO_MOVE, _LEAST_SHARE * clear) and share >= _LEAST_OF_ALL
+        if enough and found.high_m - found.low_m <= _MOST_SPREAD_M:
             return (
                 f"at {100.0 * share:.0f} % of {squares} places the points lie on two surfaces {found.middle_m:.2f} m "
                 "apart, as where flight strips do not fit, and neither point_source_id nor GPS time says which point "
@@ -116,16 +121,16 @@ def surfaces_warning(parts: Iterable[Rows]) -> str:
     return ""
 
 
-def moves_of(parts: Sequence[Rows], settings: StripSettings) -> dict[Strip, int]:
+def moves_of(rows: Rows, slices: IntArray, settings: StripSettings) -> dict[Strip, int]:
     """By how many millimetres each strip is moved up; empty where all strips fit, or ids separate those that do not.
 
-    Strips that differ by no more than `align_m` keep their places to each other. The others are fitted by least squares
-    over the squares that they share, so that the mean of all places that strips were compared at stays. Strips that GPS
-    times name are listed even where they stay.
+    `rows` and `slices` are as for `offsets_of`. Strips that differ by no more than `align_m` keep their places to each
+    other. The others are fitted by least squares over the squares that they share, so that the mean of all places that
+    strips were compared at stays. Where GPS times name some strips, all are listed, even those that stay.
     """
-    pairs = _all_pairs(parts, settings)
+    names, pairs = _all_pairs(rows, slices, settings)
     apart = [p for p in pairs if abs(p.offset_m) > settings.align_m and p.squares >= _FEW_TO_MOVE]
-    stay = {strip: 0 for p in pairs for strip in (p.first, p.second) if strip.is_timed}
+    stay = dict.fromkeys(names, 0) if any(strip.is_timed for strip in names) else {}
     if not apart:
         return stay
     index = {strip: k for k, strip in enumerate(sorted({strip for p in pairs for strip in (p.first, p.second)}))}

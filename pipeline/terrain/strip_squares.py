@@ -18,8 +18,6 @@ _MAX_TURN = 0.25
 """Largest difference of slope, rise over run, of two planes of one surface."""
 MOST_CM = 1000
 """Larger differences are those of two surfaces."""
-_MOST_PASSES = 32
-"""A square with points of more passes is not compared: its times or ids are not those of passes."""
 
 
 @kernel(inline="always")
@@ -38,82 +36,56 @@ def add_point(sums: FloatArray, x: float, y: float, z: float) -> None:
 
 
 @kernel
-def _passes_in(
-    used: BoolArray, slices: IntArray, members: LabelArray, names: IntArray, firsts: IntArray
-) -> tuple[int, int]:
-    """How many slices and passes the used ones of some points of a square have; more than `_MOST_PASSES` are 0 and 0.
-
-    The slices go into `names` (_MOST_PASSES,), in their order; `firsts` (_MOST_PASSES,) gets the pass of each.
-    """
-    count = 0
-    for i in members:
-        if not used[i]:
-            continue
-        k = 0
-        while k < count and names[k] != slices[i]:
-            k += 1
-        if k == count:
-            if count == _MOST_PASSES:
-                return 0, 0
-            names[count] = slices[i]
-            count += 1
-    if count > 1:
-        names[:count] = np.sort(names[:count])
-    passes = 0
-    for k in range(count):
-        passes += k == 0 or names[k] - names[k - 1] > 1
-        firsts[k] = passes - 1
-    return count, passes
-
-
-@kernel
 def square_sums(
     places: tuple[IntArray, IntArray, IntArray],
     used: BoolArray,
-    slices: IntArray,
+    strips: tuple[LabelArray, int],
     start: LabelArray,
     members: LabelArray,
-) -> tuple[IntArray, FloatArray, IntArray]:
-    """First slice, square and last slice of each pass over a square, (m, 3), by square; sums of its points, (m, 10).
+) -> tuple[LabelArray, FloatArray, IntArray]:
+    """Strip and square of each pair that a used point has, (m, 2), by square, then strip; sums of these, (m, 10).
 
-    `places` are x, y, z (n,) in mm, `slices` (n,) those of `slices_of`; the points of square s are `members` from
-    `start[s]` to `start[s + 1]`. Also the smallest point by x and y of each square and its lowest used one,
-    (squares, 3), the former of all points. Sums are those of `add_point` about the square's corner and lowest point:
-    whole numbers below 2^53.
+    `places` are x, y, z (n,) in mm, `strips` numbers (n,) from 0 and how many there are; the points of square s are
+    `members` from `start[s]` to `start[s + 1]`. Also the smallest point by x and y of each square and its lowest used
+    one, (squares, 3), the former of all points. Sums are those of `add_point` about the square's corner and lowest
+    point: whole numbers below 2^53.
     """
     x, y, z = places
+    strip, strip_count = strips
     squares = len(start) - 1
     corner = np.full((squares, 3), 2**62)
-    names, of_pass = np.empty(_MOST_PASSES, np.int64), np.empty(_MOST_PASSES, np.int64)
-    of, sums = np.empty((squares, 3), np.int64), np.zeros((squares, 10))
+    seen, place = np.full(strip_count, -1, np.int32), np.empty(strip_count, np.int64)
+    names = np.empty(strip_count, np.int32)
+    of, sums = np.empty((squares, 2), np.int32), np.zeros((squares, 10))
     count = 0
     for s in range(squares):
         own = members[start[s] : start[s + 1]]
+        found = 0
         for i in own:
             if x[i] < corner[s, 0] or (x[i] == corner[s, 0] and y[i] < corner[s, 1]):
                 corner[s, 0], corner[s, 1] = x[i], y[i]
-            if used[i]:
-                corner[s, 2] = min(corner[s, 2], z[i])
-        found, passes = _passes_in(used, slices, own, names, of_pass)
-        if count + passes > len(of):
-            grown_of, grown = np.empty((2 * len(of) + passes, 3), np.int64), np.zeros((2 * len(of) + passes, 10))
+            if not used[i]:
+                continue
+            corner[s, 2] = min(corner[s, 2], z[i])
+            if seen[strip[i]] != s:
+                seen[strip[i]] = s
+                names[found] = strip[i]
+                found += 1
+        if count + found > len(of):
+            grown_of, grown = np.empty((2 * len(of) + found, 2), np.int32), np.zeros((2 * len(of) + found, 10))
             grown_of[:count], grown[:count] = of[:count], sums[:count]
             of, sums = grown_of, grown
+        if found > 1:
+            names[:found] = np.sort(names[:found])
         for k in range(found):
-            of[count + of_pass[found - 1 - k], 0] = names[found - 1 - k]
-            of[count + of_pass[k], 1], of[count + of_pass[k], 2] = s, names[k]
-        k = 0
+            of[count, 0], of[count, 1] = names[k], s
+            place[names[k]] = count
+            count += 1
         for i in own:
-            if not used[i] or found == 0:
-                continue
-            if names[k] != slices[i]:
-                k = 0
-                while names[k] != slices[i]:
-                    k += 1
-            dx, dy, dz = float(x[i] % SQUARE_MM), float(y[i] % SQUARE_MM), float(z[i] - corner[s, 2])
-            add_point(sums[count + of_pass[k]], dx, dy, dz)
-        count += passes
-    return of[:count], sums[:count], corner
+            if used[i]:
+                dx, dy, dz = float(x[i] % SQUARE_MM), float(y[i] % SQUARE_MM), float(z[i] - corner[s, 2])
+                add_point(sums[place[strip[i]]], dx, dy, dz)
+    return of[:count].copy(), sums[:count].copy(), corner
 
 
 @kernel

@@ -1,12 +1,14 @@
 """How flight strips of a survey fit each other, by the smooth places that two of them saw.
 
 Squares of the lattice are small enough to be level ground or one roof plane. In each the plane of the last returns of
-one strip is compared with that of another; rough squares, with trees, edges or cars, do not count. Points of one id
-whose GPS times lie far apart are compared, too, as several passes. Counts of whole centimetres add up over tiles and
+one strip is compared with that of another; rough squares, with trees, edges or cars, do not count. First the ids are
+the strips; then the passes of each id, if its GPS times show several. Counts of whole centimetres add up over tiles and
 inputs: the outcome depends on neither tiles, nor workers, nor order.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +16,8 @@ import numpy.typing as npt
 from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray, LabelArray
-from pipeline.terrain.flight_passes import slices_of
+from pipeline.terrain.flight_passes import FIRST_PASS, SLICE_S, numbers_of
+from pipeline.terrain.flight_strip import Strip
 from pipeline.terrain.strip_squares import MOST_CM, SQUARE_MM, above_cm, add_point, plane_of, square_sums
 from pipeline.tiling import Window
 
@@ -28,17 +31,20 @@ edge cuts a square, they are 1.9 m apart at least."""
 _CLEAR = 1.0 / 3.0
 """Least share of the distance of two such surfaces in which no point lies."""
 
+_CROSSED_S = 0.02
+"""An aircraft takes longer to cross a square; times that vary by less say nothing."""
+
 Rows = IntArray
-"""(k, 4) int64: two strips as numbers of `slices_of`, the smaller one first; centimetres of the first over the second;
-squares. Where both numbers are equal, the centimetres are those between two surfaces that one strip saw throughout the
-squares, 0 where it saw one and no other strip saw the square, and `HAS_POINTS` where it has points of this slice."""
-HAS_POINTS = -1
+"""(k, 4) int64: two strips by their numbers (`numbers_of`), the smaller one first; centimetres of the first over the
+second; squares. Where both numbers are equal, the centimetres are those between two surfaces throughout squares that
+this id saw alone: 0 where it saw one, `UNCLEAR` where the points show neither."""
+UNCLEAR = -1
 NO_ROWS: Rows = np.empty((0, 4), np.int64)
 
 
 @kernel
-def _compared(of: IntArray, sums: FloatArray, owned: BoolArray) -> IntArray:
-    """Rows (k, 3) of two passes and their difference in cm, of the squares that are owned, from `square_sums`."""
+def _compared(of: LabelArray, sums: FloatArray, owned: BoolArray) -> IntArray:
+    """Rows (k, 3) of two strips and their difference in cm, of the squares that are owned, from `square_sums`."""
     rows = np.empty((max(1, len(of)), 3), np.int64)
     count = 0
     planes = np.empty((len(of), 5))
@@ -71,7 +77,7 @@ def _surfaces_apart_cm(
     lowest: int,
     middle: tuple[float, float, float, float, float],
 ) -> int:
-    """Centimetres between two smooth surfaces that the used ones of the points of a square lie on; 0 without these.
+    """Centimetres between two smooth surfaces that the used ones of a square's points lie on; `UNCLEAR` without these.
 
     `middle` are slopes and mean place of the plane of all of them, about the corner and the lowest point.
     """
@@ -91,29 +97,31 @@ def _surfaces_apart_cm(
             highest_below = max(highest_below, above)
             add_point(sums[0], dx, dy, dz)
     if min(sums[0, 0], sums[1, 0]) < _FEWEST:
-        return 0
+        return UNCLEAR
     planes = np.empty((2, 5))
     for k in range(2):
         smooth, planes[k, 0], planes[k, 1], planes[k, 2], planes[k, 3], planes[k, 4] = plane_of(sums[k])
         if not smooth:
-            return 0
+            return UNCLEAR
     cm = above_cm(planes[1], planes[0], _MIXED_MM)
-    return cm if 0 < cm <= MOST_CM and lowest_above - highest_below >= 10.0 * _CLEAR * cm else 0
+    return cm if 0 < cm <= MOST_CM and lowest_above - highest_below >= 10.0 * _CLEAR * cm else UNCLEAR
 
 
 @kernel
 def _surfaces(
     places: tuple[IntArray, IntArray, IntArray],
-    used: BoolArray,
+    used: tuple[BoolArray, FloatArray],
     start: LabelArray,
     members: LabelArray,
-    found: tuple[IntArray, FloatArray, IntArray, BoolArray],
+    found: tuple[LabelArray, FloatArray, IntArray, BoolArray],
 ) -> IntArray:
-    """Rows (k, 3) of the squares that one pass saw alone: its first slice twice, and cm between two surfaces.
+    """Rows (k, 3) of the squares that one strip saw alone: its number twice, and cm between two surfaces.
 
-    `found` are the outcomes of `square_sums`, and whether each square is owned; other arguments are as there.
+    A place that was seen within a few seconds was seen by one pass: two surfaces there are not two strips. `used` are
+    which points are used, and their times; `found` the outcomes of `square_sums`, and whether each square is owned.
     """
     of, sums, corner, owned = found
+    last, time = used
     rows = np.empty((len(of), 3), np.int64)
     count = 0
     for k in range(len(of)):
@@ -125,7 +133,12 @@ def _surfaces(
         rows[count, 0], rows[count, 1], rows[count, 2] = of[k, 0], of[k, 0], 0
         if not smooth:
             own = members[start[s] : start[s + 1]]
-            rows[count, 2] = _surfaces_apart_cm(places, used, own, corner[s, 2], (a, b, mx, my, mz))
+            early, late = np.inf, -np.inf
+            for i in own:
+                if last[i]:
+                    early, late = min(early, time[i]), max(late, time[i])
+            if not _CROSSED_S < late - early < SLICE_S:
+                rows[count, 2] = _surfaces_apart_cm(places, last, own, corner[s, 2], (a, b, mx, my, mz))
         count += 1
     return rows[:count].copy()
 
@@ -136,6 +149,7 @@ def compared_strips(
     strip: npt.NDArray[np.uint16],
     gps_time: FloatArray,
     core: Window | None,
+    passes: Sequence[Strip] = (),
 ) -> Rows:
     """Differences of the strips of a tile, over the squares that it owns.
 
@@ -152,6 +166,8 @@ def compared_strips(
     core : Window or None
         A square belongs to the tile whose core holds its smallest point by x and y, whatever the tiles are. None takes
         all squares.
+    passes : sequence of Strip
+        Those of all ids that have several over all inputs (`passes_of`).
     """
     if len(strip) == 0:
         return NO_ROWS
@@ -159,19 +175,27 @@ def compared_strips(
     square, squares = _squares(x, y)
     start, members = counting_sort(square, squares)
     last = returns[0] >= returns[1]
-    of, sums, corner = square_sums(places_mm, last, slices_of(strip, gps_time), start, members)
-    owned = np.ones(squares, np.bool_) if core is None else core.contains(corner[:, 0], corner[:, 1])
-    alone = _surfaces(places_mm, last, start, members, (of, sums, corner, owned))
-    found = np.concatenate((_compared(of, sums, owned), alone))
-    rows = np.column_stack((found, np.ones(len(found), np.int64)))
-    return counted(np.concatenate((rows, _with_points(of[owned[of[:, 1]]]))))
 
+    def by(numbers: IntArray, *, is_alone: bool) -> Rows:
+        # not by np.unique, which loads np.ma
+        names = np.flatnonzero(np.bincount(numbers))
+        place = np.zeros(int(names[-1]) + 1, np.int32)
+        place[names] = np.arange(len(names))
+        of, sums, corner = square_sums(places_mm, last, (place[numbers], len(names)), start, members)
+        owned = np.ones(squares, np.bool_) if core is None else core.contains(corner[:, 0], corner[:, 1])
+        found = _compared(of, sums, owned)
+        if is_alone:
+            alone = _surfaces(places_mm, (last, gps_time), start, members, (of, sums, corner, owned))
+            found = np.concatenate((found, alone))
+        found[:, :2] = names[found[:, :2]]
+        return np.column_stack((found, np.ones(len(found), np.int64)))
 
-def _with_points(of: IntArray) -> Rows:
-    """Rows that say in how many squares each slice has points, from the passes (m, 3) over some squares."""
-    spans = counted(np.column_stack((of[:, 0], of[:, 2], np.full(len(of), HAS_POINTS), np.ones(len(of), np.int64))))
-    whole = [(number, number, HAS_POINTS, n) for k, j, _, n in spans.tolist() for number in range(k, j + 1)]
-    return np.array(whole, np.int64).reshape(-1, 4)
+    rows = by(strip.astype(np.int64), is_alone=True)
+    number = numbers_of(strip, gps_time, passes)
+    if (number != strip).any():
+        timed = by(number, is_alone=False)
+        rows = np.concatenate((rows, timed[timed[:, 1] >= FIRST_PASS]))
+    return counted(rows)
 
 
 def _squares(x_mm: IntArray, y_mm: IntArray) -> tuple[LabelArray, int]:

@@ -184,6 +184,33 @@ def test_an_object_that_passes_of_one_id_keep_from_being_a_building_says_so(tmp_
     assert all(row["reason_detail"].startswith("strips lie 0.80 m apart, at most 0.1; vegetation: ") for row in said)
 
 
+@pytest.mark.parametrize("kind", ["random", "row", "milliseconds"])
+def test_houses_in_strips_with_ids_are_found_whatever_their_gps_times(
+    kind: str, tmp_path: Path, reconstruct: Any
+) -> None:
+    found = houses(per_m2=8.0)
+    random, n = np.random.default_rng(6), len(found.house)
+    strips = random.integers(11, 13, n)
+    passes_ms = 1.6e12 + strips * 6e5 + (found.xyz[:, 0] - 400_000.0) * 200.0
+    times_s = {"random": random.uniform(0.0, 1e5, n), "row": np.arange(n), "milliseconds": passes_ms}[kind]
+    lift_m = (strips == 12) * 0.6
+    summary = reconstruct(write_houses(tmp_path / "t.laz", found, strips=strips, lift_m=lift_m, times_s=times_s))
+    assert summary.statuses == {"ok": 3}
+    assert read_manifest(summary.run_dir).strip_moves_m == {"11": 0.3, "12": -0.3}
+
+
+def test_ids_of_other_strips_do_not_change_what_is_found_in_separated_passes(tmp_path: Path, reconstruct: Any) -> None:
+    found = houses(per_m2=9.0)
+    number = np.random.default_rng(6).integers(0, 3, len(found.house))
+    content = {"lift_m": (number > 0) * 0.3, "times_s": 1000.0 + 500.0 * number}
+    digests = set()
+    # the ids of separated passes count down from 65535
+    for other in (9, 65535):
+        path = write_houses(tmp_path / f"{other}.laz", found, strips=np.array([7, 7, other])[number], **content)
+        digests.add(reconstruct(path).digest)
+    assert len(digests) == 1
+
+
 @pytest.mark.parametrize("lift_m", [0.3, 0.6])
 def test_strips_that_nothing_separates_are_named_as_two_surfaces(
     lift_m: float, tmp_path: Path, reconstruct: Any

@@ -30,6 +30,7 @@ from pipeline.runtime.stages.tile_content import content_of_window
 from pipeline.runtime.stages.window_points import FOLDER, PointState, bucket, bucket_paths
 from pipeline.scene import WindowPoints, lattice_of, usable_as_ground
 from pipeline.spatial_hash import first_of_each
+from pipeline.terrain.flight_strip import Strip
 from pipeline.terrain.lattice import NO_DATA, lowest_per_cell
 from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.scene_settings import ClassesInUse
@@ -51,6 +52,8 @@ class CellsTask:
     """Which of the file's classes are believed."""
     scratch: Scratch
     """Points in, cells out."""
+    passes: tuple[Strip, ...] = ()
+    """Passes of flight strips that are compared with one another, too."""
     memory_bytes: int = 0
     """Estimated peak memory of the process; 0 if unknown."""
 
@@ -79,6 +82,7 @@ def find_all_cells(
     ingested: Sequence[Ingested],
     classes: ClassesInUse,
     tiles: Iterable[Tile],
+    passes: tuple[Strip, ...],
 ) -> dict[Tile, TileCells]:
     """The cells of some tiles with points, the fullest first."""
     grid, points, content = context.plan.grid, points_by_tile(ingested), content_by_tile(ingested)
@@ -87,7 +91,7 @@ def find_all_cells(
     for found in ingested:
         for tile in found.points_by_tile:
             files.setdefault(tile, []).append((found.parts, found.sha256))
-    alike = key_of(grid, settings, classes)
+    alike = key_of(grid, settings, classes, passes)
     tasks = {}
     for tile in sorted(tiles, key=lambda tile: (-points[tile], tile)):
         seen = content_of_window(content, grid, grid.window(tile), tile)
@@ -97,6 +101,7 @@ def find_all_cells(
             grid=grid,
             classes=classes,
             scratch=context.scratch,
+            passes=passes,
             memory_bytes=points_bytes(points[tile], max(points[other] for other in grid.tiles_over(grid.window(tile)))),
         )
     clear_tiles(context.scratch, FOLDER, tasks)
@@ -131,7 +136,7 @@ def find_cells(task: CellsTask, settings: OutlierSettings) -> TileCells:
     around = _around(task, core.grown(max(SQUARE_MM, math.ceil(settings.support_m * MM))))
     x, y, z = (np.concatenate([columns[axis] for columns in (own, *around)]) for axis in range(3))
     number, time, source, returns = (np.concatenate([columns[k] for columns in (own, *around)]) for k in (3, 4, 5, 7))
-    strips = compared_strips((x, y, z), (number, returns), source, time, core)
+    strips = compared_strips((x, y, z), (number, returns), source, time, core, task.passes)
     task.scratch.check_cancelled()
     n = len(own[0])
     kept = dense_enough(x, y, z, settings)[:n]

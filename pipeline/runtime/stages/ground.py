@@ -31,6 +31,7 @@ from pipeline.runtime.stages.tile_content import ZoneSums, content_of_window, zo
 from pipeline.runtime.stages.window_points import FOLDER as CELLS
 from pipeline.scene import lattice_of
 from pipeline.settings import RunSettings
+from pipeline.terrain.flight_strip import Strip
 from pipeline.terrain.ground import ground_on
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 from pipeline.terrain.roofs_alone import SUPPORT_CELLS, roofs_alone
@@ -118,8 +119,9 @@ def cells_of_blocks(
     ingested: Sequence[Ingested],
     footprints: GivenFootprints | None,
     only: Collection[Tile] | None = None,
+    passes: tuple[Strip, ...] = (),
 ) -> BlockCells:
-    """The cells of all tiles, or of some and of what their splits see.
+    """The cells of all tiles, or of some and of what their splits see; `passes` as for `find_all_cells`.
 
     Raises InputError if the points of a tile do not fit into a worker, now that they are counted.
     """
@@ -143,7 +145,7 @@ def cells_of_blocks(
         for name, tiles in blocks.items()
     }
     wanted = {tile for tiles in seen.values() for tile in tiles}
-    cells = find_all_cells(context, scene.outliers, ingested, classes, wanted)
+    cells = find_all_cells(context, scene.outliers, ingested, classes, wanted, passes)
     return BlockCells(
         blocks=blocks, seen=seen, drawn=drawn, cells=cells, reach_mm=reach_mm, classes=classes, outlines=outlines
     )

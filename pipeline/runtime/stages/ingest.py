@@ -36,6 +36,7 @@ from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.cleanup import clear_points
 from pipeline.runtime.stages.ingested import Ingested, of_file, points_by_tile, spread_m
 from pipeline.runtime.stages.tile_content import ZoneSums, zone_sums
+from pipeline.terrain.flight_passes import NO_SLICES, slices_of, united_slices
 from pipeline.terrain.flight_strip import Strip, ids_of_timed
 from pipeline.tiling import MM, Tile, TileGrid
 
@@ -70,7 +71,8 @@ class IngestTask:
     limits: IsolationLimits | None = None
     """Limits of the child process that reads it; None reads it in the process that runs the task."""
     moves_mm: tuple[tuple[Strip, int], ...] = ()
-    """Flight strips that are moved, and by how much up; those named by GPS times get ids of their own, too."""
+    """Flight strips that are moved, and by how much up; those named by GPS times get ids of their own, too. With
+    these, all strips of the survey."""
 
     @property
     def supervises(self) -> bool:
@@ -279,10 +281,14 @@ def _ingested(task: IngestTask) -> Ingested:
     first: tuple[int, int] | None = None
     multiple = False
     own_ids = ids_of_timed(strip for strip, _ in task.moves_mm)
+    slices = NO_SLICES
     for cloud in source.chunks(_CHUNK_POINTS, task.share):
         task.scratch.check_cancelled()
         records = to_records(cloud)
+        slices = united_slices([slices, slices_of(cloud.source_id, cloud.gps_time)])
         for strip, move_mm in task.moves_mm:
+            if not (move_mm or strip.is_timed):
+                continue
             held = strip.holds(cloud.source_id, cloud.gps_time)
             records["z"][held] += move_mm
             records["source"][held] = own_ids.get(strip, strip.source)
@@ -316,6 +322,7 @@ def _ingested(task: IngestTask) -> Ingested:
         moments=tuple(float(v) for v in moments),
         first_mm=first or (0, 0),
         multiple_returns=multiple,
+        slices=slices.tobytes(),
         sha256=sha256,
     )
 

@@ -14,9 +14,10 @@ import numpy as np
 
 from pipeline.io import SourceInfo
 from pipeline.io.source import Findings
-from pipeline.model import FloatArray
+from pipeline.model import FloatArray, IntArray
 from pipeline.runtime.stages.tile_content import ZoneSums, zone_sums_of
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, VEGETATION_CLASSES
+from pipeline.terrain.flight_passes import united_slices
 from pipeline.terrain.scene_settings import ClassesInUse
 from pipeline.tiling import MM, Tile
 
@@ -54,6 +55,8 @@ class Ingested:
     """That first point."""
     multiple_returns: bool
     """Whether any kept pulse has more than one return."""
+    slices: bytes
+    """When each flight strip saw kept points: the bytes of `slices_of`, int64."""
     sha256: str
     """Digest of the file, empty for its shares but the first; of the points in the window where only its nodes were
     fetched."""
@@ -96,6 +99,7 @@ def _together(info: SourceInfo, shares: Sequence[Ingested]) -> Ingested:
         moments=tuple(sum((_moments_about(share, first_mm) for share in shares), np.zeros(6)).tolist()),
         first_mm=first_mm,
         multiple_returns=any(share.multiple_returns for share in shares),
+        slices=slices_in(shares).tobytes(),
         sha256=shares[0].sha256,
     )
 
@@ -116,6 +120,11 @@ def content_by_tile(ingested: Sequence[Ingested]) -> dict[Tile, ZoneSums]:
             sums = zone_sums_of(stored)
             content[tile] = content[tile] + sums if tile in content else sums
     return content
+
+
+def slices_in(ingested: Sequence[Ingested]) -> IntArray:
+    """When each flight strip saw points of all inputs, as `slices_of`."""
+    return united_slices(np.frombuffer(found.slices, np.int64) for found in ingested)
 
 
 def classes_in_use(ingested: Sequence[Ingested], *, trust: bool) -> tuple[ClassesInUse, str]:

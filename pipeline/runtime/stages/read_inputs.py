@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from pipeline.model import IntArray
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.outcomes import (
     DamagedError,
@@ -21,8 +22,9 @@ from pipeline.runtime.scratch.outcomes import (
 from pipeline.runtime.stages.given_footprints import GivenFootprints
 from pipeline.runtime.stages.ground import BlockCells, cells_of_blocks
 from pipeline.runtime.stages.ingest import ingest, tasks_of
-from pipeline.runtime.stages.ingested import Ingested
+from pipeline.runtime.stages.ingested import Ingested, slices_in
 from pipeline.settings import RunSettings
+from pipeline.terrain.flight_passes import passes_of
 from pipeline.terrain.flight_strip import Strip
 from pipeline.terrain.strip_moves import moves_of, offsets_of, strips_warning, surfaces_warning
 from pipeline.terrain.survey_strips import NO_ROWS, Rows, counted, rows_of
@@ -55,21 +57,24 @@ def read_inputs(
     key = key_of([place.name for place in tasks_of(context, paths)], general.classes, scene.outliers)
     place = Place(_STRIPS, "rows", key)
     found: Inputs | None = None
-    rows = _stored(context, place)
-    if rows is None:
+    differ = _stored(context, place)
+    if differ is None:
         found = _read(context, settings, paths, {}, footprints)
         rows = counted(np.concatenate([NO_ROWS, *(rows_of(cells.strips) for cells in found.cells.cells.values())]))
-    moves_mm = moves_of([rows], scene.strips)
-    apart = offsets_of([rows], scene.strips)
+        differ = rows, slices_in(found.ingested)
+    moves_mm = moves_of(*differ, scene.strips)
+    apart = offsets_of(*differ, scene.strips)
     if apart:
         context.progress.warn("cells", strips_warning(apart, moves_mm))
-    if doubled := surfaces_warning([rows]):
+    if doubled := surfaces_warning(*differ, scene.strips):
         context.progress.warn("cells", doubled)
     if found is not None and not moves_mm:
         return found
     if found is not None:
         drop_outcomes(context.scratch, _STRIPS, [])
-        work = OutcomeTask(function=whole, task=rows, place=place, scratch=context.scratch, brief=whole, stage="cells")
+        work = OutcomeTask(
+            function=whole, task=differ, place=place, scratch=context.scratch, brief=whole, stage="cells"
+        )
         run_and_store(work)
     return _read(context, settings, paths, moves_mm, footprints)
 
@@ -83,16 +88,18 @@ def _read(
 ) -> Inputs:
     """Read all inputs with some strips moved up and separated."""
     ingested = ingest(context, paths, moves_mm)
-    cells = cells_of_blocks(context, settings, ingested, footprints)
+    # once they are moved and separated, passes fit
+    passes = () if moves_mm else passes_of(slices_in(ingested))
+    cells = cells_of_blocks(context, settings, ingested, footprints, passes=passes)
     return Inputs(ingested=ingested, cells=cells, moves_mm=moves_mm)
 
 
-def _stored(context: RunContext, place: Place) -> Rows | None:
+def _stored(context: RunContext, place: Place) -> tuple[Rows, IntArray] | None:
     """How the strips of these inputs differ, if an earlier run moved them; None if it is not stored, or damaged."""
     if not context.scratch.has(place.name):
         return None
     try:
-        rows: Rows = brief_of(context.scratch, place)
+        differ: tuple[Rows, IntArray] = brief_of(context.scratch, place)
     except DamagedError:
         return None
-    return rows
+    return differ
