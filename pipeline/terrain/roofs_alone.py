@@ -2,7 +2,8 @@
 
 The ground filter believes in the lowest points that it sees. Where these are eaves, a roof would lie on itself, so such
 cells are kept from it. Where the points were clipped with a margin, the ground is at the rim of what is left, a wall's
-height below the roofs: a roof falls to its eaves by its slope, and to the ground by a step.
+height below the roofs: a roof falls to its eaves by its slope, and to the ground by a step. How high a step must be
+depends on the slope of the roof itself, so that steep eaves are no ground and the ground beside low sheds is.
 """
 
 from __future__ import annotations
@@ -36,8 +37,11 @@ _LEVEL = 2
 """Cells of the rim this near to the foot of a step lie below it, too, if they are level with it."""
 _STEP = 3
 """Cells this far apart are compared, since points leave gaps."""
-_STEP_MM, _STEEP_MM = 600, 1800
-"""A step is higher than the sum of the first and, for each metre between cells, the second: steeper than 60 degrees."""
+_LEAST_MM, _SPARE_MM, _UNSURE = 1800, 600, 1.2
+"""A step is higher than the first, and by the second higher than the roof's slope, times the third, explains."""
+_STEEP, _FEWEST, _UNKNOWN_STEEP = 0.8, 12, 2.0
+"""The roof is as steep as the first share of its cells at most. Fewer cells than the second do not tell: then it is as
+steep as the third."""
 _LEVEL_MM = 1000
 """Differs so much at most from the foot of a step."""
 _PIECE = 64
@@ -84,21 +88,25 @@ def roofs_alone(
     if not any(bare):
         return alone
     rim = near & (lowest != NO_DATA) & _grown(~inside, 1)
-    below = _below_steps(lowest)
-    rims, feet = _sums(rim), _sums(rim & below)
-    bare = [found and not _has_ground(piece.part, rims, feet) for found, piece in zip(bare, pieces, strict=True)]
-    for found, (part, cells) in zip(bare, pieces, strict=True):
-        if found:
+    rims = _sums(rim)
+    for k, (part, cells) in enumerate(pieces):
+        if bare[k]:
+            reach = next((reach for reach in _RIMS if _count(rims, part, reach)), _OVERHANG)
+            seen = part_around(part, reach, occupied.shape)
+            below = _below_steps(lowest, part, cells, reach)
+            rim_cells = np.count_nonzero(rim[seen])
+            if rim_cells and 2 * np.count_nonzero(rim[seen] & below) >= rim_cells:
+                bare[k] = False
+                continue
             wide = part_around(part, _OVERHANG, occupied.shape)
             own = np.zeros_like(alone[wide])
-            within = tuple(slice(a.start - b.start, a.stop - b.start) for a, b in zip(part, wide, strict=True))
-            own[within] = cells
-            alone[wide] |= _grown(own, _OVERHANG)
+            own[_within(part, wide)] = cells
+            # beside a footprint lie eaves, and the ground of a yard
+            alone[wide] |= _grown(own, _OVERHANG) & (inside[wide] | ~below[_within(wide, seen)])
     for found, (part, cells) in zip(bare, pieces, strict=True):
         if not found:
             alone[part] &= ~cells
-    # beside a footprint lie eaves, and the ground of a yard
-    return alone & (inside | ~below)
+    return alone
 
 
 def _pieces(outline: Polygon | MultiPolygon, corner: tuple[int, int], shape: tuple[int, ...]) -> Iterator[_Piece]:
@@ -136,28 +144,57 @@ def _is_unsurrounded(part: Part, outside: Counts, beside: Counts, held: Counts) 
     return _count(beside, part, reach) < _SEEN * _count(held, part, reach)
 
 
-def _has_ground(part: Part, rims: Counts, feet: Counts) -> bool:
-    """Whether most of the rim around a part lies below steps; by `_sums`."""
-    for reach in _RIMS:
-        if (cells := _count(rims, part, reach)) > 0:
-            return 2 * _count(feet, part, reach) >= cells
-    return False
-
-
-def _below_steps(lowest: Elevations) -> BoolArray:
-    """Cells beside, and level with, one that lies a step below a cell near it."""
-    known = lowest != NO_DATA
-    z = np.where(known, lowest, 0)
+def _below_steps(lowest: Elevations, part: Part, cells: BoolArray, reach: int) -> BoolArray:
+    """Cells in and so far around a piece that lie beside, and level with, one a step below a cell near it."""
+    steep = _UNSURE * _steepness(lowest, part, cells)
+    window = part_around(part, reach + _STEP + _LEVEL, lowest.shape)
+    known = lowest[window] != NO_DATA
+    z = np.where(known, lowest[window], 0)
     foot = np.zeros_like(known)
     for rows, columns in _offsets(_STEP):
-        least = _STEP_MM + round(_STEEP_MM * float(np.hypot(rows, columns)))
+        # the lowest points of cells may lie a cell farther apart than their centres
+        least = max(_LEAST_MM, _SPARE_MM + round(steep * CELL_MM * (1.0 + float(np.hypot(rows, columns)))))
         here, there = _shifted(known.shape, rows, columns)
         foot[here] |= known[here] & known[there] & (z[there] - z[here] > least)
-    below: BoolArray = foot.copy()
+    below = foot.copy()
     for rows, columns in _offsets(_LEVEL):
         here, there = _shifted(known.shape, rows, columns)
         below[here] |= known[here] & foot[there] & (np.abs(z[there] - z[here]) <= _LEVEL_MM)
-    return below
+    found: BoolArray = below[_within(part_around(part, reach, lowest.shape), window)]
+    return found
+
+
+def _steepness(lowest: Elevations, part: Part, cells: BoolArray) -> float:
+    """Rise per metre of the roof on a piece.
+
+    Along each axis, the smaller of the rises to both sides counts, which leaves out steps. Cells of which one side is
+    unknown count where few others are left.
+    """
+    window = part_around(part, 2, lowest.shape)
+    z = np.where(lowest[window] != NO_DATA, lowest[window], np.nan)
+    rises = []
+    for rows, columns in ((1, 0), (0, 1)):
+        sides = []
+        for sign in (-1, 1):
+            side = np.full(z.shape, np.nan)
+            for cell in (2, 1):
+                here, there = _shifted(z.shape, sign * cell * rows, sign * cell * columns)
+                rise = np.abs(z[there] - z[here]) / (cell * CELL_MM)
+                side[here] = np.where(np.isnan(rise), side[here], rise)
+            sides.append(side)
+        rises.append(sides)
+    for smaller in (np.minimum, np.fmin):
+        found = np.hypot(*(smaller(*sides) for sides in rises))[_within(part, window)][cells]
+        found = found[~np.isnan(found)]
+        if len(found) >= _FEWEST:
+            return float(np.quantile(found, _STEEP))
+    return _UNKNOWN_STEEP
+
+
+def _within(part: Part, wide: Part) -> Part:
+    """A part of the window, in a wider one."""
+    down, across = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(part, wide, strict=True))
+    return down, across
 
 
 def _offsets(reach: int) -> list[tuple[int, int]]:

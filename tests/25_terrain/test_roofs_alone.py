@@ -1,5 +1,7 @@
 """Verdicts on roofs alone: the same in every window; strays and wide halls."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import shapely
@@ -63,6 +65,43 @@ def test_a_hall_wider_than_the_squares_looked_at_is_alone_as_a_whole() -> None:
     lowest = np.where(occupied, 9000, NO_DATA).astype(np.int32)
     found = roofs_alone(lowest, occupied, (0, 0), [shapely.box(70.0, 60.0, 330.0, 340.0)])
     assert found[occupied].all()
+
+
+def clipped_house(rise: float, eaves_m: float, margin_m: float, density: float, seed: int) -> tuple[Elevations, Any]:
+    """The lowest points of a gabled house of 10 m by 8 m on level ground, clipped with a margin; its outline."""
+    random = np.random.default_rng(seed)
+    x, y = random.uniform(0.0, 40.0, (2, round(density * 40**2)))
+    east, north = 20.0 + random.random(2)
+    u, v = np.abs(x - east), np.abs(y - north)
+    z = np.where((u < 5.0) & (v < 4.0), eaves_m + rise * (4.0 - v), 0.0) + random.normal(0.0, 0.02, len(x))
+    kept = (u < 5.0 + margin_m) & (v < 4.0 + margin_m)
+    lowest = np.full((40, 40), np.iinfo(np.int32).max, np.int32)
+    np.minimum.at(lowest, (y[kept].astype(int), x[kept].astype(int)), np.round(z[kept] * 1000).astype(np.int32))
+    lowest[lowest == np.iinfo(np.int32).max] = NO_DATA
+    return lowest, shapely.box(east - 5.0, north - 4.0, east + 5.0, north + 4.0)
+
+
+@pytest.mark.parametrize("density", [1.0, 2.0, 3.0, 6.0])
+@pytest.mark.parametrize("rise", [1.0, 1.73, 2.2, 2.75])
+def test_steep_eaves_are_not_ground(rise: float, density: float) -> None:
+    alone = 0
+    for seed in range(20):
+        lowest, outline = clipped_house(rise, 3.0, 0.0, density, seed)
+        alone += int(roofs_alone(lowest, lowest != NO_DATA, (0, 0), [outline]).any())
+    assert alone >= 19
+
+
+@pytest.mark.parametrize("density", [2.0, 6.0, 12.0])
+@pytest.mark.parametrize("margin_m", [1.0, 2.0])
+@pytest.mark.parametrize(("rise", "eaves_m"), [(0.0, 2.2), (0.5, 2.2), (1.0, 3.0), (1.73, 5.0)])
+def test_ground_beside_low_and_steep_roofs_stays_ground(
+    rise: float, eaves_m: float, margin_m: float, density: float
+) -> None:
+    alone = 0
+    for seed in range(20):
+        lowest, outline = clipped_house(rise, eaves_m, margin_m, density, seed)
+        alone += int(roofs_alone(lowest, lowest != NO_DATA, (0, 0), [outline]).any())
+    assert alone <= 1
 
 
 def test_without_footprints_nothing_is_a_roof_alone() -> None:

@@ -33,6 +33,16 @@ def flat(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.full(len(x), 6.0)
 
 
+def steep(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Eaves 3 m up, 65 degrees steep."""
+    return 3.0 + 2.14 * (4.0 - np.abs(y))
+
+
+def shed(x: FloatArray, y: FloatArray) -> FloatArray:
+    """2.2 m up."""
+    return np.full(len(x), 2.2)
+
+
 def box(place: tuple[float, float], grow_m: float = 0.0) -> Any:
     """The outline of a house of 12 m by 8 m, turned by 20 degrees."""
     own = shapely.box(-6.0 - grow_m, -4.0 - grow_m, 6.0 + grow_m, 4.0 + grow_m)
@@ -106,6 +116,32 @@ def test_ground_in_the_margin_of_a_clip_is_used(
     place = (45.0, 45.0)
     xyz = clipped(town({place: gable}), box(place, margin_m))
     file, outlines = written(tmp_path, xyz, {"A": box(place, margin_m if buffered else 0.0)})
+    found = modelled(reconstruct, file, outlines, tmp_path / "run")
+    assert (found["A"]["status"], found["A"]["ground_source"]) == ("ok", "terrain")
+    assert found["A"]["ground_z"] == pytest.approx(100.0, abs=0.2)
+    assert found[""]["warnings"] == []
+
+
+@pytest.mark.parametrize("density", [2.0, 6.0])
+def test_steep_roofs_do_not_stand_on_their_eaves(density: float, tmp_path: Path, reconstruct: Any) -> None:
+    places = {"A": (25.0, 25.0), "B": (90.0, 25.0), "C": (25.0, 90.0), "D": (90.0, 90.0)}
+    outlines = {name: box(place) for name, place in places.items()}
+    xyz = clipped(town(dict.fromkeys(places.values(), steep), density), *outlines.values())
+    file, given = written(tmp_path, xyz, outlines)
+    found = modelled(reconstruct, file, given, tmp_path / "run")
+    for name in places:
+        assert found[name]["ground_source"] == "assumed"
+        assert found[name]["ground_z"] == pytest.approx(100.5, abs=0.6)
+
+
+@pytest.mark.parametrize("margin_m", [1.0, 2.0])
+@pytest.mark.parametrize("density", [2.0, 6.0])
+def test_low_sheds_stand_on_the_ground_in_their_margin(
+    density: float, margin_m: float, tmp_path: Path, reconstruct: Any
+) -> None:
+    place = (45.0, 45.0)
+    xyz = clipped(town({place: shed}, density), box(place, margin_m))
+    file, outlines = written(tmp_path, xyz, {"A": box(place)})
     found = modelled(reconstruct, file, outlines, tmp_path / "run")
     assert (found["A"]["status"], found["A"]["ground_source"]) == ("ok", "terrain")
     assert found["A"]["ground_z"] == pytest.approx(100.0, abs=0.2)

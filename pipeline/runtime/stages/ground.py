@@ -40,8 +40,8 @@ from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 _ABOUT_ROOFS_ALONE = (
-    "no points lie around given footprints with points on {} m2: the points there are roof, not ground, and a floor "
-    "without terrain beside it is assumed"
+    "no points lie around given footprints with points on {} m2: the points there count as roof, not ground, and a "
+    "floor without terrain beside it is assumed"
 )
 _ROOFS_MM = SUPPORT_CELLS * CELL_MM
 """How far beyond the filter's reach given footprints are judged."""
