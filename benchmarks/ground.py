@@ -1,11 +1,11 @@
 """Ground filters on the ISPRS samples and on scenes with exact ground: type I, type II, total error, kappa, speed.
 
     python -m benchmarks.ground [--data ../shared/data] [--filter morphological | MODULE:FUNCTION] [--only samp quarry]
-                                [--densities 0.2 1 5] [--draw 0] [--out DIR] [--kept-aside]
+                                [--densities 0.2 1 5] [--draw 0] [--kept-aside]
 
 A filter is the name of one in the settings, all other settings default, or a function of this environment that takes
 x, y, z (n,) int64 in mm, `usable` (n,) bool and the window (column0, row0, columns, rows) and gives (n,) bool. Judged
-are all points, as the benchmark of Sithole and Vosselman (2003) does. `--out` writes a map of the errors of each scene.
+are all points, as the benchmark of Sithole and Vosselman (2003) does.
 """
 
 from __future__ import annotations
@@ -176,32 +176,6 @@ def table(rows: Sequence[Figures], mean: str) -> str:
     return "\n".join(lines)
 
 
-def error_map(scene: Scene, found: Bools, path: Path) -> None:
-    """Draw relief of the lowest points with both kinds of error."""
-    from matplotlib.figure import Figure
-
-    x, y, z = scene.x_mm / 1000, scene.y_mm / 1000, scene.z_mm / 1000
-    width, depth = float(np.ptp(x)), float(np.ptp(y))
-    figure = Figure(figsize=(20, 2.0 + 9.0 * depth / width), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    size = 12000.0 / len(x) * 4
-    low, high = np.percentile(z, [1, 99])
-    shown = left.scatter(x, y, c=z, s=size, cmap="terrain", vmin=low, vmax=high)
-    figure.colorbar(shown, ax=left, shrink=0.6)
-    left.set_title(f"{scene.name}: elevation")
-    for mask, colour, label in (
-        (scene.is_ground & found, "#d8d8d8", "ground"),
-        (~scene.is_ground & ~found, "#9ab0c8", "object"),
-        (scene.is_ground & ~found, "red", "type I: ground missed"),
-        (~scene.is_ground & found, "blue", "type II: object taken"),
-    ):
-        right.scatter(x[mask], y[mask], c=colour, s=size, label=f"{label} {int(mask.sum())}")
-    right.legend(loc="upper right")
-    for axes in (left, right):
-        axes.set_aspect("equal")
-    figure.savefig(path, dpi=70)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -210,7 +184,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", nargs="*", default=())
     parser.add_argument("--densities", type=float, nargs="*", default=DENSITIES)
     parser.add_argument("--draw", type=int, default=0)
-    parser.add_argument("--out", type=Path)
     parser.add_argument("--kept-aside", action="store_true", help="the samples that no setting was chosen on")
     given = parser.parse_args(arguments)
     ground_filter = filter_of(given.filter)
@@ -219,13 +192,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         (list(drawn_scenes(given.densities, given.draw)), "mean of drawn scenes"),
     ):
         wanted = [scene for scene in scenes if not given.only or any(part in scene.name for part in given.only)]
-        if not wanted:
-            continue
-        print(table(measured(wanted, ground_filter), mean), end="\n\n", flush=True)
-        if given.out is not None:
-            given.out.mkdir(parents=True, exist_ok=True)
-            for scene in wanted:
-                error_map(scene, labels_of(scene, ground_filter), given.out / f"{scene.name.replace(' ', '_')}.png")
+        if wanted:
+            print(table(measured(wanted, ground_filter), mean), end="\n\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -120,22 +120,7 @@ def without_buildings(las: laspy.LasData) -> laspy.LasData:
 
 
 def write_changed(tiles: Sequence[Path], folder: Path, change: Change) -> tuple[Path, ...]:
-    """Write point files that were changed, under their own names.
-
-    Parameters
-    ----------
-    tiles : sequence of Path
-        LAS or LAZ files, each read as a whole.
-    folder : Path
-        Where the changed ones go; made where it is not there.
-    change : callable
-        From the points of a file to those that are written.
-
-    Returns
-    -------
-    tuple of Path
-        The new files, in the order of the tiles.
-    """
+    """Change LAS or LAZ files, each read as a whole; the new files have their names, in their order, in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for tile in tiles:

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from benchmarks.candidates import candidates_of
+from benchmarks.candidates import found_scene
 from benchmarks.entries import markdown_table
 from pipeline.io import ReadOptions, open_source
 from pipeline.io.footprints import read_footprints
@@ -81,7 +81,7 @@ def relations(candidate: IntArray, house: IntArray) -> Relations:
 def points_of_candidates(tiles: Sequence[str], crs: str | None, split: str) -> tuple[IntArray, IntArray]:
     """Points (n, 3) of all candidates in mm, and the candidate of each."""
     settings = RunSettings.from_mapping({"classes": "ignore", "units": {"split": split}})
-    found = list(candidates_of(tiles, crs, settings))
+    found = found_scene(tiles, crs, settings)
     points = [np.rint(1000 * (one.points + np.array(one.origin))).astype(np.int64) for one in found]
     return np.concatenate(points), np.repeat(np.arange(len(found)), [len(own) for own in points])
 
