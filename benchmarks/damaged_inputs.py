@@ -42,8 +42,8 @@ def table_of(outcomes: Sequence[Outcome]) -> str:
     return markdown_table(["kind", "files", *OUTCOMES, "slowest, s"], rows)
 
 
-def parsed(words: Sequence[str] | None) -> argparse.Namespace:
-    """The options."""
+def main(words: Sequence[str] | None = None) -> int:
+    """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--per-kind", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)
@@ -54,12 +54,7 @@ def parsed(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--keep", type=Path, help="Folder for the files of all that went wrong.")
     parser.add_argument("--shown", type=int, default=20, help="Faults of each kind that are printed.")
     parser.add_argument("--verbose", action="store_true", help="Print a line per case.")
-    return parser.parse_args(words)
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Run and print."""
-    arguments = parsed(words)
+    arguments = parser.parse_args(words)
     numbers = arguments.numbers or range(arguments.per_kind)
     cases = [Case(kind=kind, number=number, seed=arguments.seed) for kind in arguments.kinds for number in numbers]
     limits = Limits(time_s=arguments.time_limit)

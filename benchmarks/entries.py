@@ -174,20 +174,6 @@ def run_settings(entry: Entry) -> RunSettings:
     return RunSettings.from_mapping({"classes": entry.classes})
 
 
-def run_request(entry: Entry, place: Workplace, out: Path) -> RunRequest:
-    """What is asked of a run on an entry, serially and in this process, so that seconds are of the method alone."""
-    return RunRequest(
-        inputs=tiles_of(entry, place),
-        out=str(out),
-        settings=run_settings(entry),
-        footprints=None if entry.footprints is None else str(entry.footprints),
-        crs=entry.crs,
-        resources=SERIAL,
-        meshes="none",
-        overwrite=True,
-    )
-
-
 def measure_entry(entry: Entry, variants: Sequence[Variant], place: Workplace) -> None:
     """Simulate, run and evaluate what is not there yet."""
     unmeasured = [variant for variant in variants if not place.is_measured(variant, entry)]
@@ -195,7 +181,15 @@ def measure_entry(entry: Entry, variants: Sequence[Variant], place: Workplace) -
     if to_run:
         folder = place.root / "scratch" / f"{entry.name}-{os.getpid()}"  # another program may be at the same entry
         folder.mkdir(parents=True, exist_ok=True)
-        request = run_request(entry, place, folder)
+        request = RunRequest(
+            inputs=tiles_of(entry, place),
+            out=str(folder),
+            settings=run_settings(entry),
+            footprints=None if entry.footprints is None else str(entry.footprints),
+            crs=entry.crs,
+            resources=SERIAL,
+            meshes="none",
+        )
         ways = [run_variant(request.settings, variant, str(place.run(variant, entry))) for variant in to_run]
         for variant in to_run:  # of the measures nothing may be left that is of an earlier run
             shutil.rmtree(place.report(variant, entry), ignore_errors=True)
@@ -249,21 +243,9 @@ def _with_ground(evaluation: Evaluation, other: Evaluation | None) -> Evaluation
 
 
 def measure_all(wanted: Iterable[tuple[Entry, Sequence[Variant]]], place: Workplace, jobs: int) -> list[str]:
-    """Measure many entries, some at a time; tell each on the terminal as it is done.
+    """Measure many entries in `jobs` processes (0: in this one); returns what went wrong, a line per entry.
 
-    Parameters
-    ----------
-    wanted : iterable of (Entry, sequence of Variant)
-        Entries with the methods to be measured on each; the largest first, so that no long one is left for the end.
-    place : Workplace
-        Where everything goes.
-    jobs : int
-        Processes; 0 measures in this one.
-
-    Returns
-    -------
-    list of str
-        What went wrong, an entry each: the others are measured all the same.
+    The largest entries come first, so that no long one is left for the end.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     todo = [(entry, ways) for entry, ways in wanted if any(not place.is_measured(variant, entry) for variant in ways)]

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.entries import markdown_table
 from benchmarks.ground_scenes import KINDS
 from pipeline.io import open_source
 from pipeline.scene import GROUND_CLASS
@@ -163,17 +164,15 @@ def measured(scenes: Sequence[Scene], ground_filter: GroundFilter) -> list[Figur
 
 def table(rows: Sequence[Figures], mean: str) -> str:
     """Rows and their mean as a Markdown table."""
-    lines = ["| scene | type I | type II | total | kappa | points | points/s |", "|---|--:|--:|--:|--:|--:|--:|"]
-    lines += [
-        f"| {row.name} | {row.type_1:.2f} | {row.type_2:.2f} | {row.total:.2f} | {row.kappa:.1f} | {row.points} |"
-        f" {row.points / max(row.seconds, 1e-9):.2g} |"
+    names = ("type_1", "type_2", "total", "kappa")
+    lines = [
+        [row.name, *(f"{getattr(row, name):.2f}" for name in names), str(row.points), f"{row.points / row.seconds:.2g}"]
         for row in rows
     ]
-    means = [statistics.fmean(getattr(row, name) for row in rows) for name in ("type_1", "type_2", "total", "kappa")]
-    speed = sum(row.points for row in rows) / max(sum(row.seconds for row in rows), 1e-9)
-    one, two, total, kappa = means
-    lines.append(f"| {mean} | {one:.2f} | {two:.2f} | {total:.2f} | {kappa:.1f} | | {speed:.2g} |")
-    return "\n".join(lines)
+    means = [f"{statistics.fmean(getattr(row, name) for row in rows):.2f}" for name in names]
+    speed = sum(row.points for row in rows) / sum(row.seconds for row in rows)
+    lines.append([mean, *means, "", f"{speed:.2g}"])
+    return markdown_table(["scene", "type I", "type II", "total", "kappa", "points", "points/s"], lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

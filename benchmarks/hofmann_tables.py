@@ -13,8 +13,6 @@ buildings correct, passable and false by roof type, on draws of `hofmann310`. Wr
   this the method would be blamed for the error of the GPS. The paper judged clusters, which a common shift of all
   points of a building does not affect.
 - Counts are means of the draws, shares and 95 % bootstrap intervals are over the buildings of all draws together.
-
-The last part tests whether the figures show the pattern of the paper, sentence by sentence.
 """
 
 from __future__ import annotations
@@ -29,21 +27,13 @@ from types import MappingProxyType
 import numpy as np
 
 from benchmarks.entries import Workplace, all_variants, fill_page, hofmann_entries, markdown_table, measure_all
-from pipeline.model import BoolArray, FloatArray, RoofType
-from pipeline.ruler.evaluation.bootstrap import Estimate, Sums, bootstrap, share
+from pipeline.model import BoolArray, RoofType
+from pipeline.ruler.evaluation.bootstrap import Estimate, bootstrap, share
 from pipeline.runtime.compare import Variant
 
 OUTCOMES = ("correct", "passable", "false")
 KINDS = tuple(kind.value for kind in (RoofType.FLAT, RoofType.PENT, RoofType.GABLE, RoofType.HIP, RoofType.COMBINATION))
 ALL = "all"
-TWO_D, THREE_D = "parameter-space-2d", "parameter-space-3d"
-FAR_BETTER = 0.15
-"""Difference of shares that counts as far better; the paper's is .27."""
-ABOUT_NONE = 0.10
-"""Share that counts as about none; the paper's is 0 of 18."""
-RELIABLE = 0.90
-"""Share from which a roof type counts as reliably found; of the paper's three flat roofs two were, and one."""
-
 
 PAPER: Mapping[str, Mapping[str, tuple[int, int, int]]] = MappingProxyType(
     {
@@ -113,21 +103,6 @@ class Outcomes:
         return bootstrap({"correct": right, "n": np.ones(len(right))}, share("correct", "n"))
 
 
-def difference(first: Outcomes, second: Outcomes, kind: str, *, good_only: bool = False) -> Estimate:
-    """Share correct of the first less that of the second, of the same buildings, which are drawn in pairs."""
-    mask = first.mask(kind, good_only=good_only)
-    columns = {
-        "first": first.is_outcome("correct")[mask].astype(np.float64),
-        "second": second.is_outcome("correct")[mask].astype(np.float64),
-        "n": np.ones(int(mask.sum())),
-    }
-
-    def statistic(sums: Sums) -> FloatArray:
-        return np.asarray((sums["first"] - sums["second"]) / sums["n"], np.float64)
-
-    return bootstrap(columns, statistic)
-
-
 def read_outcomes(variant: Variant, place: Workplace, split: str, draws: int) -> Outcomes | None:
     """The outcomes of a method; None where a draw was not measured."""
     entries = list(hofmann_entries(split, draws))
@@ -172,62 +147,10 @@ def _count(value: float) -> str:
     return f"{value:.1f}".removesuffix(".0")
 
 
-def reported_share(estimate: Estimate, sign: str = "") -> str:
+def reported_share(estimate: Estimate) -> str:
     """A share in percent with its interval."""
     value, low, high = (100.0 * end for end in (estimate.value, estimate.low, estimate.high))
-    return f"{value:{sign}.0f} ({low:{sign}.0f} to {high:{sign}.0f})"
-
-
-def pattern(flat: Outcomes, full: Outcomes) -> list[tuple[str, bool, str]]:
-    """The paper's pattern on the figures of a 2D and a 3D method: sentence, whether it shows, the figures."""
-    gables, pents, whole = (difference(full, flat, kind) for kind in ("gable", "pent", ALL))
-    hips = full.correct("hip", good_only=False)
-    flats = {"2D": flat.correct("flat", good_only=False), "3D": full.correct("flat", good_only=False)}
-    good, everything = full.correct(ALL, good_only=True), full.correct(ALL, good_only=False)
-
-    def beside(kind: str, gain: Estimate) -> str:
-        two, three = flat.correct(kind, good_only=False), full.correct(kind, good_only=False)
-        return f"2D {reported_share(two)}, 3D {reported_share(three)}, difference {reported_share(gain, '+')}"
-
-    return [
-        (
-            f"gables: 3D far better than 2D (by {100 * FAR_BETTER:.0f} points or more; paper 29 to 56 %)",
-            gables.value >= FAR_BETTER and gables.low > 0.0,
-            beside("gable", gables),
-        ),
-        (
-            f"hips: about none in 3D ({100 * ABOUT_NONE:.0f} % or fewer; paper 0 of 18)",
-            hips.value <= ABOUT_NONE,
-            f"3D {reported_share(hips)}, 2D {reported_share(flat.correct('hip', good_only=False))}",
-        ),
-        ("pent: worse in 3D than in 2D (paper 65 to 35 %)", pents.value < 0.0, beside("pent", pents)),
-        (
-            f"flat: by accident (in neither space {100 * RELIABLE:.0f} %; paper 2 and 1 of 3)",
-            all(one.value < RELIABLE for one in flats.values()),
-            ", ".join(f"{name} {reported_share(one)}" for name, one in flats.items()),
-        ),
-        ("all: 3D better than 2D (paper 30 to 49 %)", whole.low > 0.0, beside(ALL, whole)),
-        (
-            "3D: better where nothing makes it hard (paper 49 to 63 %)",
-            good.value > everything.value,
-            f"all {reported_share(everything)}, good {reported_share(good)}",
-        ),
-    ]
-
-
-def pattern_table(found: Mapping[str, Outcomes]) -> str:
-    """The pattern of every pair of a 2D and a 3D method of one preset; empty where there is no pair."""
-    parts = []
-    for label, outcomes in found.items():
-        other = label.replace(TWO_D, THREE_D, 1)
-        if label.startswith(TWO_D) and other in found:
-            rows = [
-                (sentence, "yes" if shows else "no", reported)
-                for sentence, shows, reported in pattern(outcomes, found[other])
-            ]
-            header = ["the paper's pattern", "shows?", f"percent correct: {label} and {other}"]
-            parts.append(markdown_table(header, rows))
-    return "\n".join(parts)
+    return f"{value:.0f} ({low:.0f} to {high:.0f})"
 
 
 def document(found: Mapping[str, Outcomes], split: str, draws: int) -> str:
@@ -240,8 +163,6 @@ def document(found: Mapping[str, Outcomes], split: str, draws: int) -> str:
             counts_table(found, printed, good_only=good_only),
             interval_table(found, good_only=good_only),
         ]
-    parts.append("### Does the pattern of the paper show?\n")
-    parts.append(pattern_table(found) or "Not both parameter spaces were measured.\n")
     return "\n".join(parts) + "\n"
 
 

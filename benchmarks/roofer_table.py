@@ -16,10 +16,8 @@ compared with the outlines of its own class 6, and has no figures of roofer.
   if GABLEWORK_VAL3DITY names that program.
 - Scores are over all points of class 6 inside the outlines, against the highest roof there; a point without a roof is a
   miss. Top-visible points have no other one of the same building more than 1.1 m higher within 0.5 m in plan.
-- Buildings that differ are those of a serial run and one of two workers, by all columns that `gablework digest` counts.
 - Thinned surveys keep the points whose hash of their place is small, of all classes alike (`thinned_surveys.py`), so
   that class 6 inside the outlines has the stated density; the score is over the points of the whole survey.
-- Less input: class 6 made class 1, or no footprints given, or both.
 
 Writes DIR/roofer_table_<survey>.md and the same figures as .json.
 """
@@ -34,7 +32,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -43,9 +41,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks.entries import Entry, Workplace, fill_page, markdown_table, run_settings
-from benchmarks.run_scores import RunScore, differing_buildings, score_run
+from benchmarks.run_scores import RunScore, score_run
 from benchmarks.survey_runs import Seconds, candidates_of, run_survey
-from benchmarks.thinned_surveys import Change, roof_density, thinned, without_buildings, write_changed
+from benchmarks.thinned_surveys import roof_density, thinned, write_changed
 from pipeline.io import ReadOptions
 from pipeline.model import FloatArray
 from pipeline.reconstruct import reconstruct_building
@@ -53,9 +51,8 @@ from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.reference_points import read_points_reference
 from pipeline.runtime.compare import Variant, settings_of
 
-PARTS = ("times", "seconds", "differences", "thinned", "less-input")
+PARTS = ("times", "seconds", "thinned")
 """What can be left out."""
-NO_CLASS_6, NO_FOOTPRINTS, NEITHER = "no-class-6", "no-footprints", "neither"
 
 
 def surveys(data: Path) -> dict[str, Entry]:
@@ -101,35 +98,22 @@ class Figures:
     """Processor time of a building."""
     median_ms: float = math.nan
     """Its median."""
-    differing: tuple[str, ...] | None = None
-    """Buildings that two runs made differently."""
     thinned: Mapping[str, RunScore] = dataclasses.field(default_factory=dict)
     """By the density."""
-    less_input: Mapping[str, RunScore] = dataclasses.field(default_factory=dict)
-    """By the input that was left out."""
 
 
-def poorer_surveys(entry: Entry, reference: Reference, place: Workplace, skip: Collection[str]) -> dict[str, Entry]:
-    """The thinned surveys, by their density, and those with less input, by what is left out. Writes their files."""
-    changes: dict[str, Change] = {}
-    if "thinned" not in skip:
-        found = roof_density(reference).per_m2
-        changes |= {f"{wanted:g}": thinned(wanted / found) for wanted in THINNED if wanted < found}
-    if "less-input" not in skip:
-        changes[NO_CLASS_6] = without_buildings
-    poorer = {}
-    for name, change in changes.items():
-        tiles = write_changed(entry.tiles, place.root / "surveys" / entry.name / name, change)
-        poorer[name] = dataclasses.replace(entry, name=f"{entry.name}-{name}", tiles=tiles)
-    if "less-input" not in skip and entry.footprints is not None:
-        poorer[NO_FOOTPRINTS] = dataclasses.replace(entry, name=f"{entry.name}-{NO_FOOTPRINTS}", footprints=None)
-        poorer[NEITHER] = dataclasses.replace(poorer[NO_CLASS_6], name=f"{entry.name}-{NEITHER}", footprints=None)
-    return poorer
+def thinned_surveys(entry: Entry, reference: Reference, place: Workplace) -> dict[str, Entry]:
+    """The thinned surveys, by their density. Writes their files."""
+    found, surveys = roof_density(reference).per_m2, {}
+    for name, wanted in ((f"{wanted:g}", wanted) for wanted in THINNED if wanted < found):
+        tiles = write_changed(entry.tiles, place.root / "surveys" / entry.name / name, thinned(wanted / found))
+        surveys[name] = dataclasses.replace(entry, name=f"{entry.name}-{name}", tiles=tiles)
+    return surveys
 
 
 def measure(
     entry: Entry,
-    poorer: Mapping[str, Entry],
+    sparser: Mapping[str, Entry],
     variant: Variant,
     reference: Reference,
     place: Workplace,
@@ -140,27 +124,20 @@ def measure(
     out, skip = place.run(variant, entry), arguments.skip
     first = run_survey(entry, variant, out)
     reported(variant, entry, first)
-    warm = differing = None
+    warm = None
     if "seconds" not in skip:
         runs = [run_survey(entry, variant, out) for _ in range(arguments.repeat)]
         warm = min(runs, key=lambda run: run.processor)
         reported(variant, entry, warm)
-    if "differences" not in skip:
-        other = out.with_name("two_workers")
-        reported(variant, entry, run_survey(entry, variant, other, workers=2))
-        differing = tuple(sorted(differing_buildings(out, other)))
     whole = score_run(out, reference, val3dity)
     scores = {}
-    for name, survey in poorer.items():
+    for name, survey in sparser.items():
         reported(variant, survey, run_survey(survey, variant, place.run(variant, survey)))
         scores[name] = score_run(place.run(variant, survey), reference, val3dity)
-    less = {name: score for name, score in scores.items() if name in LESS_INPUT}
     return Figures(
         whole=whole,
         warm=warm,
-        differing=differing,
-        thinned={name: score for name, score in scores.items() if name not in less},
-        less_input=less,
+        thinned=scores,
     )
 
 
@@ -209,18 +186,14 @@ def _within(score: RunScore) -> str:
     return number(score.within)
 
 
-def _both_within(score: RunScore) -> str:
-    return f"{number(score.within)} / {number(score.within_top)}"
-
-
 def _judged(own: int, other: int | None, whole: int) -> str:
     """How many are valid by the own checker and by val3dity."""
     return f"{own} / {'not run' if other is None else other} of {whole}"
 
 
 def _valid_elsewhere(found: Figures) -> str:
-    """Models of the poorer surveys that are valid."""
-    scores = [*found.thinned.values(), *found.less_input.values()]
+    """Models of the thinned surveys that are valid."""
+    scores = list(found.thinned.values())
     if not scores:
         return ""
     others = [score.models_val3dity for score in scores if score.models_val3dity is not None]
@@ -228,10 +201,9 @@ def _valid_elsewhere(found: Figures) -> str:
     return _judged(own, sum(others) if len(others) == len(scores) else None, whole)
 
 
-def _poorer(name: str, cell: Callable[[RunScore], str], found: Figures) -> str:
-    """A figure of a poorer survey; empty where there is none."""
-    scores = {**found.thinned, **found.less_input}
-    return cell(scores[name]) if name in scores else ""
+def _thinned(name: str, cell: Callable[[RunScore], str], found: Figures) -> str:
+    """A figure of a thinned survey; empty where there is none."""
+    return cell(found.thinned[name]) if name in found.thinned else ""
 
 
 THINNED: Mapping[float, tuple[str, str]] = {
@@ -241,30 +213,18 @@ THINNED: Mapping[float, tuple[str, str]] = {
     0.5: ("0", ""),
 }
 """By class-6 points per square metre: what roofer delivers, and the share of points within 0.2 m of it."""
-LESS_INPUT: Mapping[str, str] = {NO_CLASS_6: "no class 6", NO_FOOTPRINTS: "no footprints", NEITHER: "neither"}
-"""The input that is left out, and what the table calls it."""
 
 
 def _thinned_rows() -> Iterator[Row]:
     for per_m2, (delivered, within) in THINNED.items():
         name, head = f"{per_m2:g}", f"{per_m2:g} class-6 points per m2"
-        yield Row(label=f"{head}: LoD2.2", roofer=delivered, cell=partial(_poorer, name, _lod2))
-        yield Row(label=f"{head}: reasons of the others", cell=partial(_poorer, name, _reasons))
-        yield Row(label=f"{head}: within 0.2 m of the full cloud", roofer=within, cell=partial(_poorer, name, _within))
-
-
-def _less_input_rows() -> Iterator[Row]:
-    for name, label in LESS_INPUT.items():
-        yield Row(label=f"{label}: LoD2.2", roofer="0", cell=partial(_poorer, name, _lod2))
-        yield Row(label=f"{label}: within 0.2 m, all / top-visible", cell=partial(_poorer, name, _both_within))
+        yield Row(label=f"{head}: LoD2.2", roofer=delivered, cell=partial(_thinned, name, _lod2))
+        yield Row(label=f"{head}: reasons of the others", cell=partial(_thinned, name, _reasons))
+        yield Row(label=f"{head}: within 0.2 m of the full cloud", roofer=within, cell=partial(_thinned, name, _within))
 
 
 def _valid(found: Figures) -> str:
     return _judged(found.whole.valid, found.whole.val3dity, found.whole.lod2)
-
-
-def _differing(found: Figures) -> str:
-    return "" if found.differing is None else str(len(found.differing))
 
 
 ROWS: tuple[Row, ...] = (
@@ -287,24 +247,14 @@ ROWS: tuple[Row, ...] = (
         roofer=".754",
         cell=lambda found: number(found.whole.rmse_median_m),
     ),
-    Row(label="buildings that differ between runs", roofer="2 to 5", cell=_differing),
     *_thinned_rows(),
-    *_less_input_rows(),
-    Row(label="models of these poorer surveys that are valid, own checker / val3dity", cell=_valid_elsewhere),
+    Row(label="models of these thinned surveys that are valid, own checker / val3dity", cell=_valid_elsewhere),
 )
 """The table, line by line."""
 
 
 def roofer_table(found: Mapping[str, Figures], *, with_roofer: bool) -> str:
-    """The figures of all methods as Markdown.
-
-    Parameters
-    ----------
-    found : mapping
-        By the label of the method.
-    with_roofer : bool
-        Whether the survey is the one of roofer's figures.
-    """
+    """The figures of all methods, by label, as Markdown; `with_roofer` on the survey of roofer's figures."""
     lines = []
     for row in ROWS:
         cells = [row.cell(figures) for figures in found.values()]
@@ -335,8 +285,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"{platform.machine()}, load {os.getloadavg()[0]:.1f} before.\n"
     )
     print(head, flush=True)
-    poorer = poorer_surveys(entry, reference, place, arguments.skip)
-    found = {variant.label: measure(entry, poorer, variant, reference, place, arguments) for variant in variants}
+    sparser = {} if "thinned" in arguments.skip else thinned_surveys(entry, reference, place)
+    found = {variant.label: measure(entry, sparser, variant, reference, place, arguments) for variant in variants}
     if "times" not in arguments.skip:
         for label, took_s in building_times(entry, variants, arguments.repeat).items():
             mean, median = (1e3 * float(of(took_s)) for of in (np.mean, np.median))

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-import statistics
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -35,9 +34,6 @@ from benchmarks.entries import (
 from pipeline.model import Status
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.runtime.compare import Variant
-
-CUBES = 20
-"""Draws of the cube: it is one building."""
 
 QUALITY = "faces.quality_10m2"
 """Measure of the tables of the sweep: TP / (TP + FP + FN)."""
@@ -66,9 +62,7 @@ def suites(split: str) -> Iterator[Entry]:
     yield Entry(name="city", scene=SimulatedScene(suite="city", seed=seed_of(split, 0)))
     yield from sweep_entries(split)
     yield from (dataclasses.replace(entry, has_page=True) for entry in hofmann_entries(split, 1))
-    for draw in range(CUBES):
-        scene = SimulatedScene(suite="cube", seed=seed_of(split, draw))
-        yield Entry(name=f"cube-{draw:02d}", scene=scene, has_page=False)
+    yield Entry(name="cube", scene=SimulatedScene(suite="cube", seed=seed_of(split, 0)))
 
 
 def real_tiles(data: Path) -> Iterator[Entry]:
@@ -108,38 +102,14 @@ def statuses(manifest: Mapping[str, Any]) -> str:
 
 
 def methods_table(entries: Sequence[Entry], variants: Sequence[Variant], place: Workplace) -> str:
-    """One line per entry and method; the cubes, one building each, are one entry: their means."""
+    """One line per entry and method, without those of the sweep."""
     lines = []
-    cubes = [entry for entry in entries if entry.name.startswith("cube-")]
-    for entry in entries:
-        if entry not in cubes and not entry.name.startswith("sweep-"):
-            for variant in variants:
-                if place.is_measured(variant, entry):
-                    rows = place.table(variant, entry, "measures")
-                    shown = [cell(rows, name) for name, _ in SHOWN]
-                    lines.append([entry.name, variant.label, statuses(place.manifest(variant, entry)), *shown])
-    for variant in variants:
-        measured = [entry for entry in cubes if place.is_measured(variant, entry)]
-        if measured:
-            tables = [place.table(variant, entry, "measures") for entry in measured]
-            facts = [place.manifest(variant, entry) for entry in measured]
-            lines.append([f"cube, {len(measured)} draws", variant.label, statuses(_summed(facts)), *_means(tables)])
+    for entry in (one for one in entries if not one.name.startswith("sweep-")):
+        for variant in (one for one in variants if place.is_measured(one, entry)):
+            rows = place.table(variant, entry, "measures")
+            shown = [cell(rows, name) for name, _ in SHOWN]
+            lines.append([entry.name, variant.label, statuses(place.manifest(variant, entry)), *shown])
     return markdown_table(["entry", "method", "ok/doubtful/block/failed", *(head for _, head in SHOWN)], lines)
-
-
-def _summed(manifests: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What `statuses` looks at, of several runs together."""
-    return {"counts": {status: sum(one["counts"].get(status, 0) for one in manifests) for status in Status}}
-
-
-def _means(tables: Sequence[Sequence[Mapping[str, Any]]]) -> list[str]:
-    """The shown measures as means over several entries, of those that have a figure."""
-    cells = []
-    for name, _ in SHOWN:
-        rows = [row for table in tables for row in table if row["name"] == name and row["subset"] == "all"]
-        values = [row["value"] for row in rows if row["value"] is not None]
-        cells.append(figure({**rows[0], "value": statistics.fmean(values)}) if values else "")
-    return cells
 
 
 def sweep_table(qualities: Mapping[tuple[float, float], float]) -> str:

@@ -1,4 +1,4 @@
-"""What a run delivered, how near it is to the measured roofs, and which buildings two runs make differently."""
+"""What a run delivered, and how near it is to the measured roofs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.residuals import building_residuals
 from pipeline.ruler.evaluation.validity import validity
-from pipeline.runtime.digest import NOT_CONTENT
 
 LOD2 = "2.2"
 """The level of detail that counts as delivered."""
@@ -63,25 +62,9 @@ class RunScore:
 
 
 def score_run(run: Path, reference: Reference, val3dity: str | None = None) -> RunScore:
-    """Hold a run directory against the roof points of a reference.
+    """Hold a run directory against the roof points of a reference; `val3dity` is the program, if it is there.
 
     All points of class 6 inside the outlines count, those at the end of the data too.
-
-    Parameters
-    ----------
-    run : Path
-        The run directory.
-    reference : Reference
-        With points.
-    val3dity : str, optional
-        The program.
-
-    Raises
-    ------
-    RunError
-        The run cannot be read.
-    RuntimeError
-        val3dity does not answer.
     """
     found = read_models(run)
     lod2 = {model.building_id for model in found.models if _is_lod2(model)}
@@ -126,21 +109,9 @@ def _median(values: list[float]) -> float:
 
 
 def val3dity_report(file: Path, program: str, *options: str) -> dict[str, Any]:
-    """val3dity's report of a file, with its own tolerances; its exit code says nothing about validity.
+    """val3dity's report of a file of CityJSON or CityJSONSeq; RuntimeError if there is none.
 
-    Parameters
-    ----------
-    file : Path
-        CityJSON or CityJSONSeq.
-    program : str
-        val3dity, 2.5 or later: older ones do not read CityJSONSeq.
-    options : str
-        More options of the program.
-
-    Raises
-    ------
-    RuntimeError
-        There is no report.
+    Its exit code says nothing about validity. Versions before 2.5 do not read CityJSONSeq.
     """
     with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
         place = Path(folder, "report.json")
@@ -162,23 +133,3 @@ def valid_by_val3dity(run: Path, program: str) -> set[str]:
             raise RuntimeError(f"val3dity on {file}: {report['dataset_errors']}")
         valid |= {feature["id"] for feature in report["features"] if feature["validity"]}
     return valid
-
-
-def differing_buildings(one: Path, other: Path) -> set[str]:
-    """The buildings that two runs made differently, or that only one of them has, by their ids.
-
-    What counts is what `gablework digest` counts: all columns of the records and the planes but those that may differ
-    between tilings.
-    """
-    first, second = _contents(one), _contents(other)
-    return {name for name in first.keys() | second.keys() if first.get(name) != second.get(name)}
-
-
-def _contents(run: Path) -> dict[str, list[str]]:
-    """Each building's rows as texts that tell every bit of a number."""
-    rows: dict[str, list[str]] = {}
-    for table in ("buildings", "planes"):
-        for row in read_table(str(run), table).to_pylist():
-            reported = sorted((name, value) for name, value in row.items() if name not in NOT_CONTENT)
-            rows.setdefault(row["building_id"], []).append(f"{table} {reported!r}")
-    return rows

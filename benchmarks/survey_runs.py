@@ -29,36 +29,15 @@ class Seconds:
     """Wall-clock time."""
 
 
-def run_survey(entry: Entry, variant: Variant, out: Path, *, workers: int = 0) -> Seconds:
-    """Run the command line on a survey, in a process of its own; nothing else may be started meanwhile.
+def run_survey(entry: Entry, variant: Variant, out: Path) -> Seconds:
+    """Run the command line on a survey in a process of its own, with `out` overwritten; RuntimeError if it fails.
 
-    Parameters
-    ----------
-    entry : Entry
-        Tiles, CRS, footprints, classes.
-    variant : Variant
-        Method and preset.
-    out : Path
-        The run directory; overwritten.
-    workers : int
-        Of the run.
-
-    Raises
-    ------
-    RuntimeError
-        The run ended with a fault.
+    Nothing else may be started meanwhile: its processor seconds are those of all child processes.
     """
-    command = [
-        os.environ.get("GABLEWORK_PYTHON", sys.executable),
-        "-m",
-        "service.cli",
-        "reconstruct",
-        *map(str, entry.tiles),
-        "--out",
-        str(out),
-    ]
+    python = os.environ.get("GABLEWORK_PYTHON", sys.executable)
+    command = [python, "-m", "service.cli", "reconstruct", *map(str, entry.tiles), "--out", str(out)]
     command += ["--method", variant.method, "--preset", variant.preset, "--classes", entry.classes]
-    command += ["--workers", str(workers), "--meshes", "none", "--overwrite", "--quiet"]
+    command += ["--workers", "0", "--meshes", "none", "--overwrite", "--quiet"]
     command += [] if entry.crs is None else ["--crs", entry.crs]
     command += [] if entry.footprints is None else ["--footprints", str(entry.footprints)]
     paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]  # the code that this file belongs to

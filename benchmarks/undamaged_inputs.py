@@ -126,14 +126,7 @@ KINDS: tuple[Kind, ...] = (
     ),
     Kind(
         name="shapefile",
-        files=(
-            "footprints.shp",
-            "footprints.shp",
-            "footprints.dbf",
-            "footprints.shx",
-            "footprints.prj",
-            "footprints.cpg",
-        ),
+        files=tuple(f"footprints.{ending}" for ending in ("shp", "shp", "dbf", "shx", "prj", "cpg")),
         arguments=_run("tile.laz", "--footprints", "footprints.shp"),
     ),
     Kind(

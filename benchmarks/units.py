@@ -97,7 +97,7 @@ def houses_of_city(truth: Path, xyz_mm: IntArray) -> IntArray:
 
 
 def _keys(xyz_mm: IntArray) -> npt.NDArray[np.void]:
-    """One sortable value a point."""
+    """One sortable value per point."""
     return np.ascontiguousarray(xyz_mm).view([("x", "<i8"), ("y", "<i8"), ("z", "<i8")]).ravel()
 
 
@@ -111,11 +111,6 @@ def houses_of_footprints(path: str, tile: str, crs: str | None, xyz_mm: IntArray
         near = np.flatnonzero((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))
         house[near[shapely.contains_xy(polygon, x[near], y[near])]] = number
     return house
-
-
-def row_of(name: str, way: str, found: Relations) -> list[str]:
-    """A row of the table."""
-    return [name, way, *(str(value) for value in dataclasses.astuple(found))]
 
 
 def main() -> None:
@@ -142,12 +137,12 @@ def main() -> None:
             for way, split in WAYS:
                 points, candidate = points_of_candidates(tiles, None, split)
                 found = relations(candidate, houses_of_city(made.truth, points))
-                rows.append(row_of(f"{density:g} pts/m2", way, found))
+                rows.append([f"{density:g} pts/m2", way, *map(str, dataclasses.astuple(found))])
     else:
         for way, split in WAYS:
             points, candidate = points_of_candidates(arguments.tiles, arguments.crs, split)
             house = houses_of_footprints(arguments.footprints, arguments.tiles[0], arguments.crs, points)
-            rows.append(row_of("footprints", way, relations(candidate, house)))
+            rows.append(["footprints", way, *map(str, dataclasses.astuple(relations(candidate, house)))])
     print(markdown_table(["scene", "units", *(field.name for field in dataclasses.fields(Relations))], rows))
 
 

@@ -34,7 +34,7 @@ from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reading.wireframes import read_wireframes
 from pipeline.runtime.classify import ClassifyRequest, classify
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.resources import Resources
+from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
 from pipeline.scene import BUILDING_CLASS
 from pipeline.settings import RunSettings
@@ -52,7 +52,6 @@ TALLINN = "more/building3d"
 TALLINN_CRS = "EPSG:3301"
 TOLERANCES = ("0_3m", "0_5m", "1m")
 """Tolerances of edges and corners, as in the names of the measures."""
-SERIAL = Resources(workers=0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

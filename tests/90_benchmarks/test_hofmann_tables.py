@@ -10,10 +10,7 @@ from benchmarks.hofmann_tables import (
     PAPER,
     Outcomes,
     counts_table,
-    difference,
     document,
-    pattern,
-    pattern_table,
 )
 
 Counts = dict[str, tuple[int, int, int]]
@@ -35,40 +32,6 @@ def outcomes_of(counts: Counts, good: Counts | None = None, draws: int = 1) -> O
             outcomes += [outcome] * number
             is_good += [place < (good or PAPER_GOOD)[kind][k] for place in range(number)]
     return Outcomes(draws=draws, kind=tuple(kinds), good=np.array(is_good), outcome=tuple(outcomes))
-
-
-def test_the_papers_own_tables_show_the_papers_pattern() -> None:
-    rows = pattern(outcomes_of(PAPER_2D), outcomes_of(PAPER_3D))
-    assert [shows for _, shows, _ in rows] == [True] * 6
-
-
-def test_the_pattern_turned_round_does_not_show() -> None:
-    shows = {sentence.split(":")[0]: yes for sentence, yes, _ in pattern(outcomes_of(PAPER_3D), outcomes_of(PAPER_2D))}
-    del shows["3D"]  # which of the buildings were good in 2D the paper does not tell
-    assert shows == {"gables": False, "hips": False, "pent": False, "flat": True, "all": False}
-
-
-def test_a_method_that_finds_all_shows_no_pattern() -> None:
-    perfect = outcomes_of({kind: (sum(PAPER_3D[kind]), 0, 0) for kind in KINDS})
-    assert [shows for _, shows, _ in pattern(perfect, perfect)] == [False] * 6
-
-
-def test_a_pair_is_two_and_three_dimensions_of_one_preset() -> None:
-    one, other = outcomes_of(PAPER_2D), outcomes_of(PAPER_3D)
-    both = {"parameter-space-2d": one, "parameter-space-3d": other}
-    assert pattern_table(both).count("the paper's pattern") == 1
-    assert pattern_table({"parameter-space-2d-faithful": one, "parameter-space-3d": other, "kmeans": one}) == ""
-
-
-def test_a_difference_is_that_of_the_shares_with_an_interval_about_it() -> None:
-    two, three = outcomes_of(PAPER_2D), outcomes_of(PAPER_3D)
-    gain = difference(three, two, "gable")
-    assert gain.value == pytest.approx((135 - 70) / 239)
-    assert gain.low < gain.value < gain.high
-    back = difference(two, three, "gable")
-    assert (back.value, back.low, back.high) == pytest.approx((-gain.value, -gain.high, -gain.low))
-    same = difference(two, two, ALL)
-    assert (same.value, same.low, same.high) == (0.0, 0.0, 0.0)
 
 
 def test_counts_are_means_of_the_draws() -> None:
@@ -93,4 +56,3 @@ def test_the_document_holds_both_subsets() -> None:
     reported = document({"parameter-space-2d": outcomes_of(PAPER_2D)}, "dev", 1)
     assert "### All 310 buildings" in reported
     assert "### The 197 without difficulties" in reported
-    assert "Not both parameter spaces were measured" in reported

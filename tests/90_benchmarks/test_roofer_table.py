@@ -1,4 +1,4 @@
-"""The table beside roofer: how surveys are thinned, what differs between runs, who is valid, and the table itself."""
+"""The table beside roofer: how surveys are thinned, who is valid, and the table itself."""
 
 import json
 import math
@@ -7,8 +7,6 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import shapely
 from hypothesis import given
@@ -16,9 +14,9 @@ from hypothesis import strategies as st
 
 from benchmarks.entries import Entry, run_settings
 from benchmarks.roofer_table import Figures, main, roofer_table, surveys
-from benchmarks.run_scores import RunScore, differing_buildings, valid_by_val3dity
+from benchmarks.run_scores import RunScore, valid_by_val3dity
 from benchmarks.survey_runs import Seconds, candidates_of, run_survey
-from benchmarks.thinned_surveys import kept, place_hash, thinned, without_buildings, write_changed
+from benchmarks.thinned_surveys import kept, place_hash, thinned, write_changed
 from pipeline.export.geoparquet import read_table
 from pipeline.runtime.compare import Variant
 
@@ -108,46 +106,6 @@ def test_a_thinned_file_has_the_same_points_with_all_that_is_reported_of_them(tm
         np.testing.assert_array_equal(np.asarray(thin[name]), np.asarray(whole[name])[stays])
 
 
-def test_without_buildings_only_class_6_is_another_one(tmp_path) -> None:
-    survey(tmp_path / "a.laz")
-    (written,) = write_changed([tmp_path / "a.laz"], tmp_path / "bare", without_buildings)
-    whole, bare = laspy.read(tmp_path / "a.laz"), laspy.read(written)
-    before, after = np.asarray(whole.classification), np.asarray(bare.classification)
-    np.testing.assert_array_equal(after, np.where(before == 6, 1, before))
-    for name in set(whole.point_format.dimension_names) - {"classification"}:
-        np.testing.assert_array_equal(np.asarray(bare[name]), np.asarray(whole[name]))
-
-
-# ---------------------------------------------------------------------------------------------------------- two runs
-
-
-def tables(run: Path, buildings: dict[str, list[object]], planes: dict[str, list[object]]) -> Path:
-    """The tables of a run, made by hand."""
-    for name, columns in (("buildings", buildings), ("planes", planes)):
-        folder = run / name / "tile=x0_y0"
-        folder.mkdir(parents=True)
-        pq.write_table(pa.table(columns), folder / "part-0.parquet")
-    return run
-
-
-def test_buildings_differ_by_any_content_and_where_one_is_missing(tmp_path) -> None:
-    names = ["a", "b", "c", "d"]
-    buildings = {"building_id": names, "rmse_m": [0.1, math.nan, 0.3, 0.4], "input_hash": ["1", "2", "3", "4"]}
-    planes = {"building_id": ["a", "a", "b"], "plane_id": [0, 1, 0], "area_m2": [10.0, 20.0, 30.0]}
-    one = tables(tmp_path / "one", buildings, planes)
-    assert differing_buildings(one, one) == set()
-    other = tables(
-        tmp_path / "other",
-        {
-            "building_id": ["e", "c", "b", "a"],
-            "rmse_m": [0.1, math.nextafter(0.3, 1.0), math.nan, 0.1],
-            "input_hash": ["9", "9", "9", "9"],
-        },
-        {"building_id": ["b", "a", "a"], "plane_id": [0, 1, 0], "area_m2": [30.0, 20.5, 10.0]},
-    )
-    assert differing_buildings(one, other) == differing_buildings(other, one) == {"a", "c", "d", "e"}
-
-
 # ---------------------------------------------------------------------------------------------------------- val3dity
 
 PROGRAM = """
@@ -195,9 +153,7 @@ def test_only_what_was_measured_has_a_line_and_roofer_stands_beside_delft_alone(
         warm=Seconds(processor=2.52, clock=3.0),
         mean_ms=4.0,
         median_ms=2.0,
-        differing=(),
         thinned={"2": score()},
-        less_input={"neither": score()},
     )
     text = roofer_table({"arrangement": found, "kmeans": Figures(whole=whole)}, with_roofer=True)
     heads, *lines = text.splitlines()
@@ -205,10 +161,8 @@ def test_only_what_was_measured_has_a_line_and_roofer_stands_beside_delft_alone(
     for line in (
         "| CPU seconds in all, warm |  | 2.5 |  |",
         "| reconstruction of a building, ms, mean / median |  | 4.0 / 2.0 |  |",
-        "| buildings that differ between runs | 2 to 5 | 0 |  |",
         "| 2 class-6 points per m2: within 0.2 m of the full cloud | .53 | 0.750 |  |",
         "| 2 class-6 points per m2: reasons of the others |  | 1 no_plane |  |",
-        "| neither: within 0.2 m, all / top-visible |  | 0.750 / 0.500 |  |",
     ):
         assert line in lines
 
@@ -241,10 +195,8 @@ def test_the_table_of_a_small_survey_is_written_with_all_parts(shared_data: Path
     text = (tmp_path / "roofer_table_hdf_870000.md").read_text(encoding="utf-8")
     assert text in capsys.readouterr().out
     figures = json.loads((tmp_path / "roofer_table_hdf_870000.json").read_text(encoding="utf-8"))["fuzzy-sart"]
-    assert figures["differing"] == []
     assert figures["whole"]["valid"] == figures["whole"]["lod2"] > 0
     assert figures["warm"] is None
     assert figures["median_ms"] > 0.0
     assert list(figures["thinned"]) == ["4", "2", "1", "0.5"]
-    assert list(figures["less_input"]) == ["no-class-6"]
     assert figures["thinned"]["0.5"]["within"] < figures["thinned"]["4"]["within"] <= figures["whole"]["within"] + 0.02
