@@ -54,7 +54,6 @@ REAL: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Files below the data folder, and options."""
 
-
 JUDGED = {
     "models": "faults of models",
     "schema": "of documents",
