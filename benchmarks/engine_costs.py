@@ -31,8 +31,6 @@ from pipeline.runtime.cluster.dask_executor import Cluster, DaskExecutor
 from pipeline.runtime.monitoring.events import Watch
 
 _WAIT_S = 120.0
-_ODD = 0x9E3779B97F4A7C15
-"""Spreads small numbers over 64 bits (the golden ratio)."""
 _WARM_TASKS = 200
 
 

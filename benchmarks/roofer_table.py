@@ -46,7 +46,7 @@ from benchmarks.survey_runs import Seconds, candidates_of, run_survey
 from benchmarks.thinned_surveys import roof_density, thinned, write_changed
 from pipeline.io import ReadOptions
 from pipeline.model import FloatArray
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.reference_points import read_points_reference
 from pipeline.runtime.compare import Variant, settings_of

@@ -34,7 +34,10 @@ IMPORT = "import pipeline.runtime.run"
 BUILDINGS = """
 import time
 from benchmarks.candidates import found_scene
-from pipeline.reconstruct import reconstruct_building
+try:
+    from pipeline.recipe import reconstruct_building
+except ImportError:  # earlier versions
+    from pipeline.reconstruct import reconstruct_building
 from pipeline.settings import RunSettings
 
 settings = RunSettings()

@@ -19,7 +19,7 @@ STAGES = (
         f"pipeline.runtime.stages.{name}"
         for name in ("ingest", "ground", "split_window", "join", "model_batch", "publish")
     ),
-    "pipeline.reconstruct",
+    "pipeline.recipe",
 )
 """The modules of all tasks."""
 NAME = "gablework-work"
