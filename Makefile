@@ -154,12 +154,8 @@ serve: $(VENV)/.run-stamp viewer
 
 ruler: $(VENV)/.warm-stamp
 	@mkdir -p $(RULER)
-	$(BIN)/python benchmarks/ruler.py --out $(RULER) --data $(DATA)
-	$(BIN)/python benchmarks/hofmann_tables.py --out $(RULER)
-	$(BIN)/python benchmarks/sweep_limits.py --out $(RULER)
-	$(BIN)/python benchmarks/method_times.py --out $(RULER) --data $(DATA)
-	$(BIN)/python benchmarks/hofmann_statistics.py > $(RULER)/hofmann_statistics.md
-	$(BIN)/python benchmarks/simulated_against_real.py --data $(DATA) > $(RULER)/simulated_against_real.md
+	$(BIN)/python -m benchmarks.ruler --out $(RULER) --data $(DATA)
+	$(BIN)/python -m benchmarks.hofmann_tables --out $(RULER)
 
 docs: $(VENV)/.run-stamp
 	$(BIN)/python docs/generate.py

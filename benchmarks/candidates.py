@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.io import ReadOptions
@@ -20,53 +19,24 @@ from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.read_inputs import read_inputs
-from pipeline.runtime.stages.sites import RejectedSite, found_sites
+from pipeline.runtime.stages.sites import found_sites
 from pipeline.runtime.stages.split import split
 from pipeline.settings import RunSettings
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FoundScene:
-    """What ingest, split and join make of point files."""
-
-    candidates: tuple[Candidate, ...]
-    """Largest first."""
-    rejected: tuple[RejectedSite, ...]
-    """Objects that were judged to be no building."""
-    small_fragments: int
-    """Surfaces below the size of an object."""
-    points: int
-    """Points without duplicates."""
-    seconds: Mapping[str, float]
-    """Wall-clock time by stage: ingest, split, join, outline."""
-
-
 def found_scene(
     tiles: Sequence[str], crs: str | None, settings: RunSettings, footprints: str | None = None
-) -> FoundScene:
-    """The stages of point files up to the join, serially in this process, with given footprints if there are any."""
+) -> tuple[Candidate, ...]:
+    """The candidates of point files, largest first, with given footprints if there are any."""
     plan = make_plan(tiles, ReadOptions(crs=crs), settings)
     given = footprints_of_run(footprints, plan, settings.footprints)
-    progress = Progress(ignore)
     with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
         scratch = Scratch(str(Path(folder, "scratch")))
         scratch.create()
-        context = RunContext(plan=plan, progress=progress, executor=SerialExecutor(), scratch=scratch)
+        context = RunContext(plan=plan, progress=Progress(ignore), executor=SerialExecutor(), scratch=scratch)
         inputs = read_inputs(context, settings, tiles, given)
-        ingested, ground = inputs.ingested, find_ground(context, settings, inputs.cells)
-        splits = split(context, settings, ingested, ground, given)
+        ground = find_ground(context, settings, inputs.cells)
+        splits = split(context, settings, inputs.ingested, ground, given)
         roof = settings.building.roof
-        joined = join(context, settings.scene, roof, splits, given)
-        found = found_sites(joined.each(scratch))
-        return FoundScene(
-            candidates=tuple(gather(scratch, plan.grid, site, plan.gps_kind, roof)[0] for site in found.candidates),
-            rejected=found.rejected,
-            small_fragments=joined.small_fragments,
-            points=sum(found.points for found in splits.figures),
-            seconds=progress.timings,
-        )
-
-
-def candidates_of(tiles: Sequence[str], crs: str | None, settings: RunSettings) -> Iterator[Candidate]:
-    """The candidates of point files, as a run finds them, largest first."""
-    yield from found_scene(tiles, crs, settings).candidates
+        found = found_sites(join(context, settings.scene, roof, splits, given).each(scratch))
+        return tuple(gather(scratch, plan.grid, site, plan.gps_kind, roof)[0] for site in found.candidates)

@@ -27,6 +27,7 @@ import laspy
 import numpy as np
 
 from benchmarks.city_tiles import main as make_tiles
+from benchmarks.entries import markdown_table
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
@@ -61,9 +62,6 @@ class Again:
         share = 100.0 * self.modelled / max(1, self.buildings)
         stages = [f"{self.done[name]} of {self.total[name]}" for name in STAGES if name != "reconstruct"]
         return [self.what, *stages, f"{self.modelled} of {self.buildings} ({share:.2f} %)", f"{self.seconds:.1f}"]
-
-
-HEADER = ("change", "files read", "tiles split", "tiles published", "buildings modelled", "seconds")
 
 
 def one_building(las: laspy.LasData) -> None:
@@ -154,8 +152,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for path, content in before.items():
             path.write_bytes(content)
         measured("undone", tiles, given.out, given.workers)
-    table = [HEADER, ["---"] * len(HEADER), *(row.cells for row in rows)]
-    print("\n".join("| " + " | ".join(line) + " |" for line in table))
+    heads = ["change", "files read", "tiles split", "tiles published", "buildings modelled", "seconds"]
+    print(markdown_table(heads, [row.cells for row in rows]))
     (given.out / "changed_tiles.json").write_text(json.dumps([dataclasses.asdict(row) for row in rows], indent=1))
     return 0
 

@@ -1,14 +1,13 @@
 """The engine at the scale of a city: efficiency, memory, the cost of the driver and of killed workers.
 
     python -m benchmarks.city_scale --out DIR [--tiles 400] [--tile-size 0] [--workers 2]
-                                    [--mode traced|plain|apart] [--kill-every 30] [--label NAME] [--keep]
+                                    [--mode traced|plain] [--kill-every 30] [--label NAME] [--keep]
 
 makes the city of `city_tiles.py` in DIR/city<tiles> (minutes), runs the pipeline over it in processes of their own,
 watches them from outside, and writes DIR/<label>.md (tables), DIR/<label>.json and DIR/<label>.trace.json (one row per
 task; `scaling_simulation.py` reads it). `traced` is the run of `gablework reconstruct` with an executor that records
-the cost of each task; `plain` is the command itself, watched only from outside; `apart` is `traced` with the scheduler
-and the workers (`gablework worker`) as separate processes, which measures driver and scheduler separately. With
-`--kill-every S` a worker's process is killed every S seconds, in turns, as soon as the run has its workers.
+the cost of each task; `plain` is the command itself, watched only from outside. With `--kill-every S` a worker's
+process is killed every S seconds, in turns, as soon as the run has its workers.
 
 Efficiency is the CPU time of all task bodies, their child processes included, over wall-clock time times workers. On a
 machine that others use too, it comes out too small: the wall-clock time grows, the CPU time does not. Two more figures
@@ -24,46 +23,25 @@ import itertools
 import json
 import os
 import shutil
-import socket
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.city_tiles import SUFFIX, make_city, square_of
 from benchmarks.entries import markdown_table
-from benchmarks.process_watch import DRIVER, NANNY, SCHEDULER, Watcher
+from benchmarks.process_watch import DRIVER, Watcher
 from benchmarks.traced_run import folder_bytes
 from pipeline.model import Status
 
 REQUIRED, WANTED = 0.80, 0.90
-_SCHEDULER_WAIT_S = 300.0
 RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state")
 
 
-def free_port() -> int:
-    """A free port."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
-
-
-def wait_for_listener(port: int, log: Path) -> None:
-    """Return once a process listens on a port of this machine."""
-    end = time.monotonic() + _SCHEDULER_WAIT_S
-    while True:
-        with socket.socket() as asking:
-            if asking.connect_ex(("127.0.0.1", port)) == 0:
-                return
-        if time.monotonic() > end:
-            raise SystemExit(f"the scheduler did not come: see {log}")
-        time.sleep(0.1)
-
-
-def command_of(arguments: argparse.Namespace, tiles: Path, run_dir: Path, scheduler: str | None) -> list[str]:
+def command_of(arguments: argparse.Namespace, tiles: Path, run_dir: Path) -> list[str]:
     """What is started."""
     if arguments.mode == "plain":
         command = [sys.executable, "-m", "service.cli", "reconstruct", str(tiles), "--out", str(run_dir), "--overwrite"]
@@ -76,48 +54,20 @@ def command_of(arguments: argparse.Namespace, tiles: Path, run_dir: Path, schedu
     trace = run_dir.parent / f"{arguments.label}.trace.json"
     command = [sys.executable, "-m", "benchmarks.traced_run", str(tiles), "--out", str(run_dir), "--trace", str(trace)]
     command += ["--workers", str(arguments.workers), "--tile-size", str(arguments.tile_size)]
-    return command if scheduler is None else [*command, "--scheduler", scheduler]
-
-
-@contextlib.contextmanager
-def cluster_apart(workers: int, log: Path) -> Iterator[tuple[str, dict[int, str]]]:
-    """A scheduler and workers as processes of their own: the address, and the role of each by its id."""
-    address = f"tcp://127.0.0.1:{free_port()}"
-    dask = Path(sys.executable).parent / "dask"
-    with log.open("wb") as out, contextlib.ExitStack() as stack:
-
-        def started(command: Sequence[str]) -> int:
-            process = subprocess.Popen(command, stdout=out, stderr=out)
-            stack.callback(process.wait)
-            stack.callback(process.terminate)
-            return process.pid
-
-        port = address.rsplit(":", 1)[1]
-        roles = {
-            started(
-                [str(dask), "scheduler", "--host", "127.0.0.1", "--port", port, "--dashboard-address", "127.0.0.1:0"]
-            ): SCHEDULER
-        }
-        for _ in range(workers):
-            roles[started([sys.executable, "-m", "service.cli", "worker", "--scheduler", address])] = NANNY
-        wait_for_listener(int(port), log)
-        yield address, roles
+    return command
 
 
 def watched_run(arguments: argparse.Namespace, tiles: Path, run_dir: Path) -> dict[str, Any]:
     """Run once and tell what was seen from outside."""
     log = run_dir.parent / f"{arguments.label}.log"
     with contextlib.ExitStack() as stack:
-        scheduler, roots = None, dict[int, str]()
-        if arguments.mode == "apart":
-            scheduler, roots = stack.enter_context(cluster_apart(arguments.workers, log.with_suffix(".cluster.log")))
         out = stack.enter_context(log.open("wb"))
         load_before = os.getloadavg()[0]
         began = time.perf_counter()
-        process = subprocess.Popen(command_of(arguments, tiles, run_dir, scheduler), stdout=out, stderr=out)
+        process = subprocess.Popen(command_of(arguments, tiles, run_dir), stdout=out, stderr=out)
         # it is written when the workers are there: one that dies before ends the run
         begun = run_dir / "run.json"
-        watcher = stack.enter_context(Watcher({process.pid: DRIVER, **roots}, arguments.kill_every, begun.exists))
+        watcher = stack.enter_context(Watcher({process.pid: DRIVER}, arguments.kill_every, begun.exists))
         code = process.wait()
         wall_s = time.perf_counter() - began
     if code:
@@ -191,18 +141,6 @@ def stage_table(rows: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def sizes_reported(trace: Mapping[str, Any]) -> str:
-    """Bytes of tasks and results as they travel."""
-    kept: dict[str, dict[str, list[int]]] = {}
-    for size in trace["sizes"]:
-        kept.setdefault(size["stage"], {}).setdefault(size["what"], []).append(size["bytes"])
-    rows = [
-        [stage, *(f"{statistics.fmean(found[what]):.0f}" if what in found else "" for what in ("task", "result"))]
-        for stage, found in kept.items()
-    ]
-    return markdown_table(["stage", "bytes per task", "bytes per result"], rows)
-
-
 def report(seen: Mapping[str, Any], trace: Mapping[str, Any] | None, run_dir: Path, workers: int) -> tuple[str, Any]:
     """The tables, and the same as figures."""
     manifest = json.loads((run_dir / "run.json").read_text(encoding="utf-8"))
@@ -249,7 +187,7 @@ def report(seen: Mapping[str, Any], trace: Mapping[str, Any] | None, run_dir: Pa
             f"CPU of task bodies {cpu_s:.1f} s.  \n"
             f"Scratch {figures['scratch_bytes_a_point']:.1f} bytes per point at most."
         )
-        lines += ["", reported, "", stage_table(figures["stages"]), sizes_reported(trace)]
+        lines += ["", reported, "", stage_table(figures["stages"])]
     lines += [
         "",
         markdown_table(
@@ -276,7 +214,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--tile-size", type=float, default=0.0, help="of gablework's lattice; 0 leaves it the choice")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--mode", choices=("traced", "plain", "apart"), default="traced")
+    parser.add_argument("--mode", choices=("traced", "plain"), default="traced")
     parser.add_argument("--kill-every", type=float, default=0.0, metavar="S")
     parser.add_argument("--label", default="run")
     parser.add_argument("--keep", action="store_true", help="leave the run directory")

@@ -120,17 +120,7 @@ def _record(block: ScanBlock, header: laspy.LasHeader) -> laspy.ScaleAwarePointR
 
 
 def make_city(city: CityTiles, out: Path, processes: int) -> list[MadeTile]:
-    """Write all tiles, one row at a time per process.
-
-    Parameters
-    ----------
-    city : CityTiles
-        What is made.
-    out : Path
-        Folder; made where it is missing.
-    processes : int
-        How many rows at once.
-    """
+    """Write all tiles into a folder, as many rows at once as there are processes."""
     out.mkdir(parents=True, exist_ok=True)
     fresh = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, mp_context=fresh) as pool:

@@ -77,6 +77,26 @@ ODD_VALUES: tuple[Any, ...] = (
 )
 
 
+ODD_TOKENS = (
+    *(
+        "true",
+        "-1",
+        "1e308",
+        "nan",
+        "inf",
+        "2026-01-01",
+        '""',
+        '"\\u0000"',
+        "[]",
+        "{}",
+        "[[[]]]",
+        '"' + "x" * 70_000 + '"',
+    ),
+    *("9" * DIGITS, "[1, 'a', {}]", "07:32:00", "'''\n'''", '"../../../x"', '"C:\\\\x"', "{ file = 1, id = [] }"),
+)
+"""Values of TOML of other types."""
+
+
 def _place(draw: random.Random, length: int) -> int:
     """A place in a file, half of the time near its start."""
     return draw.randrange(min(length, HEAD_BYTES) if draw.random() < 0.5 else length)
@@ -267,29 +287,7 @@ def odd_value(draw: random.Random, data: bytes) -> bytes:
 def odd_token(draw: random.Random, data: bytes) -> bytes:
     """TOML with a value of another type, or a key under another name."""
     places = [found.span(1) for found in re.finditer(rb"= *([^\n]+)\n", data)]
-    values = (
-        "true",
-        "-1",
-        "1e308",
-        "nan",
-        "inf",
-        "2026-01-01",
-        '""',
-        '"\\u0000"',
-        "[]",
-        "{}",
-        "[[[]]]",
-        '"' + "x" * 70_000 + '"',
-    )
-    values += (
-        "9" * DIGITS,
-        "[1, 'a', {}]",
-        "07:32:00",
-        "'''\n'''",
-        '"../../../x"',
-        '"C:\\\\x"',
-        "{ file = 1, id = [] }",
-    )
+    values: tuple[str, ...] = ODD_TOKENS
     if draw.random() < 0.3:
         places, values = (
             [found.span() for found in re.finditer(rb"[a-z_]+(?= *=)", data)],
@@ -364,17 +362,7 @@ BINARY: tuple[Damage, ...] = (
     *(flipped_bits, other_bytes, overwritten_run, truncated, inserted_block, removed_block, swapped_blocks),
     extreme_number,
 )
-LAS: tuple[Damage, ...] = (
-    *BINARY,
-    las_field,
-    las_field,
-    las_field,
-    las_record,
-    las_record,
-    las_record,
-    las_crs,
-    las_crs,
-)
+LAS: tuple[Damage, ...] = (*BINARY, *[las_field] * 3, *[las_record] * 3, *[las_crs] * 2)
 TEXT: tuple[Damage, ...] = (*BINARY, *[odd_number, odd_text] * 3, *[moved_lines, deep_nesting] * 2)
 JSON: tuple[Damage, ...] = (*TEXT, *[odd_value] * 8)
 TOML: tuple[Damage, ...] = (*TEXT, *[odd_token] * 10)

@@ -1,7 +1,6 @@
-"""What becomes of damaged inputs: 500 damaged copies of each of eleven kinds, run by the command line or a service.
+"""What becomes of damaged inputs: 500 damaged copies of each of eleven kinds, run by the command line.
 
     python -m benchmarks.damaged_inputs [--per-kind 500] [--seed 1] [--kinds las laz ...] [--processes 2] [--keep DIR]
-    python -m benchmarks.damaged_inputs --rest http://127.0.0.1:8000 [--key KEY] ...
 
 Each copy is damaged by a seed of its own (`damage.py`), so the same call damages the same bytes; `--numbers 7 12` runs
 single ones. Each run is a process of its own (`damaged_runs.py`), forked from one that has loaded the modules, with
@@ -23,7 +22,7 @@ import argparse
 import faulthandler
 import sys
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.damaged_runs import GOOD, OUTCOMES, Case, Limits, Outcome, run_cases
@@ -43,8 +42,8 @@ def table_of(outcomes: Sequence[Outcome]) -> str:
     return markdown_table(["kind", "files", *OUTCOMES, "slowest, s"], rows)
 
 
-def parsed(words: Sequence[str] | None) -> argparse.Namespace:
-    """The options."""
+def main(words: Sequence[str] | None = None) -> int:
+    """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--per-kind", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)
@@ -55,27 +54,13 @@ def parsed(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--keep", type=Path, help="Folder for the files of all that went wrong.")
     parser.add_argument("--shown", type=int, default=20, help="Faults of each kind that are printed.")
     parser.add_argument("--verbose", action="store_true", help="Print a line per case.")
-    parser.add_argument("--rest", metavar="URL", help="A running service that gets the files in place of the command.")
-    parser.add_argument("--key", help="Its key, if it wants one.")
-    return parser.parse_args(words)
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Run and print."""
-    arguments = parsed(words)
+    arguments = parser.parse_args(words)
     numbers = arguments.numbers or range(arguments.per_kind)
     cases = [Case(kind=kind, number=number, seed=arguments.seed) for kind in arguments.kinds for number in numbers]
     limits = Limits(time_s=arguments.time_limit)
-    found: Iterable[Outcome]
     faulthandler.enable()
-    if arguments.rest is not None:
-        from benchmarks.damaged_uploads import send_cases
-
-        found = send_cases(arguments.rest, arguments.key, cases, arguments.processes, limits.time_s)
-    else:
-        found = run_cases(cases, arguments.keep, limits, arguments.processes)
     outcomes, shown = [], Counter[str]()
-    for outcome in found:
+    for outcome in run_cases(cases, arguments.keep, limits, arguments.processes):
         outcomes.append(outcome)
         name = outcome.case.kind.name
         if arguments.verbose or (outcome.result not in GOOD and shown[name] < arguments.shown):

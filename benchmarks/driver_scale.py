@@ -116,16 +116,8 @@ class Recorder(LocalExecutor):
 class Copier(SerialExecutor):
     """Gives each task the brief of the one that it copies.
 
-    Parameters
-    ----------
-    briefs : mapping
-        Of the small city.
-    first : int
-        Its first column of tiles.
-    stride, copies : int
-        Columns from one copy to the next, and number of copies.
-    block : int
-        Tiles across a block of the ground.
+    `briefs` are those of the small city, whose first column of tiles is `first`; its copies lie `stride` columns apart.
+    A block of the ground is `block` tiles across.
     """
 
     def __init__(

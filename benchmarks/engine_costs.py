@@ -14,6 +14,7 @@ import argparse
 import asyncio
 import contextlib
 import json
+import socket
 import subprocess
 import sys
 import time
@@ -24,16 +25,32 @@ from unittest import mock
 
 import psutil
 
-from benchmarks.city_scale import free_port, wait_for_listener
 from benchmarks.entries import markdown_table
 from pipeline.runtime.cluster import dispatch
 from pipeline.runtime.cluster.dask_executor import Cluster, DaskExecutor
 from pipeline.runtime.monitoring.events import Watch
 
 _WAIT_S = 120.0
-_ODD = 0x9E3779B97F4A7C15
-"""Spreads small numbers over 64 bits (the golden ratio)."""
 _WARM_TASKS = 200
+
+
+def free_port() -> int:
+    """A free port."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+def wait_for_listener(port: int, log: Path) -> None:
+    """Return once a process listens on a port of this machine."""
+    end = time.monotonic() + _WAIT_S
+    while True:
+        with socket.socket() as asking:
+            if asking.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        if time.monotonic() > end:
+            raise SystemExit(f"the scheduler did not come: see {log}")
+        time.sleep(0.1)
 
 
 def nothing(size_bytes: int) -> bytes:
@@ -117,18 +134,14 @@ def cost_of_tasks(count: int, tasks: int, size_bytes: int, log: Path) -> dict[st
 
 def tables(costs: dict[str, Any]) -> str:
     """What was measured, as tables."""
-    parts = [
-        markdown_table(
-            ["workers", "bytes per result", "scheduler, ms per task", "driver, ms per task", "tasks per second"],
-            [
-                [str(row["workers"]), str(row["result_bytes"])]
-                + [f"{1e3 * row[name]:.2f}" for name in ("scheduler_s", "driver_s")]
-                + [f"{row['tasks_a_second']:.0f}"]
-                for row in costs["tasks"]
-            ],
-        )
+    heads = ["workers", "bytes per result", "scheduler, ms per task", "driver, ms per task", "tasks per second"]
+    rows = [
+        [str(row["workers"]), str(row["result_bytes"])]
+        + [f"{1e3 * row[name]:.2f}" for name in ("scheduler_s", "driver_s")]
+        + [f"{row['tasks_a_second']:.0f}"]
+        for row in costs["tasks"]
     ]
-    return "\n".join(parts)
+    return markdown_table(heads, rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

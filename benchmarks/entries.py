@@ -1,8 +1,8 @@
 """The measured entries: scenes and tiles, each modelled by several methods and compared with its reference.
 
-The parts that the programs of this folder share: `ruler.py`, `hofmann_tables.py`, `sweep_limits.py`, `method_times.py`.
-All work in one folder, where each finds the results of the others; existing results are not computed again
-if the settings are the same (delete DIR after a change of the code).
+`ruler.py`, `hofmann_tables.py` and `roofer_table.py` share these parts. All work in one folder, where each finds the
+results of the others; existing results are not computed again if the settings are the same (delete DIR after a change
+of the code).
 
     DIR/scenes/<entry>/           the simulated scene and its truth, made once for all methods
     DIR/<label>/<entry>/run/      the run directory of a method (label: METHOD, or METHOD-PRESET)
@@ -18,8 +18,9 @@ import dataclasses
 import json
 import multiprocessing
 import os
+import re
 import shutil
-import time
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -44,11 +45,11 @@ from pipeline.runtime.compare import Variant, run_variant, settings_of
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run_variants
-from pipeline.runtime.stages.model_batch import load
 from pipeline.settings import RunSettings
 
 GROUND = "ground."
 """Beginning of the names of the measures that are of the scene, not of a method."""
+_PART = re.compile(r"(<!-- begin (\S+) -->\n).*?(<!-- end \2 -->)", re.DOTALL)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -173,57 +174,29 @@ def run_settings(entry: Entry) -> RunSettings:
     return RunSettings.from_mapping({"classes": entry.classes})
 
 
-def run_request(entry: Entry, place: Workplace, out: Path) -> RunRequest:
-    """What is asked of a run on an entry, serially and in this process, so that seconds are of the method alone."""
-    return RunRequest(
-        inputs=tiles_of(entry, place),
-        out=str(out),
-        settings=run_settings(entry),
-        footprints=None if entry.footprints is None else str(entry.footprints),
-        crs=entry.crs,
-        resources=SERIAL,
-        meshes="none",
-        overwrite=True,
-    )
-
-
-def measure_entry(entry: Entry, variants: Sequence[Variant], place: Workplace) -> list[tuple[str, float]]:
-    """Simulate, run and evaluate what is not there yet.
-
-    Returns
-    -------
-    list of (str, float)
-        What was done, with its wall-clock seconds; empty where all was there.
-    """
+def measure_entry(entry: Entry, variants: Sequence[Variant], place: Workplace) -> None:
+    """Simulate, run and evaluate what is not there yet."""
     unmeasured = [variant for variant in variants if not place.is_measured(variant, entry)]
-    if not unmeasured:
-        return []
-    laps: list[tuple[str, float]] = []
-    began = time.perf_counter()
-
-    def lap(name: str) -> None:
-        nonlocal began
-        now = time.perf_counter()
-        laps.append((name, now - began))
-        began = now
-
-    tiles_of(entry, place)
-    lap("scene")
     to_run = [variant for variant in unmeasured if not place.is_run(variant, entry)]
     if to_run:
         folder = place.root / "scratch" / f"{entry.name}-{os.getpid()}"  # another program may be at the same entry
         folder.mkdir(parents=True, exist_ok=True)
-        request = run_request(entry, place, folder)
+        request = RunRequest(
+            inputs=tiles_of(entry, place),
+            out=str(folder),
+            settings=run_settings(entry),
+            footprints=None if entry.footprints is None else str(entry.footprints),
+            crs=entry.crs,
+            resources=SERIAL,
+            meshes="none",
+        )
         ways = [run_variant(request.settings, variant, str(place.run(variant, entry))) for variant in to_run]
         for variant in to_run:  # of the measures nothing may be left that is of an earlier run
             shutil.rmtree(place.report(variant, entry), ignore_errors=True)
-        load()  # also where one variant is left: its seconds are not those of kernels that are loaded
         run_variants(request, ways)
         shutil.rmtree(folder)
-        lap("runs")
-    _evaluate(entry, unmeasured, place)
-    lap("measures")
-    return laps
+    if unmeasured:
+        _evaluate(entry, unmeasured, place)
 
 
 def _evaluate(entry: Entry, variants: Sequence[Variant], place: Workplace) -> None:
@@ -270,46 +243,54 @@ def _with_ground(evaluation: Evaluation, other: Evaluation | None) -> Evaluation
 
 
 def measure_all(wanted: Iterable[tuple[Entry, Sequence[Variant]]], place: Workplace, jobs: int) -> list[str]:
-    """Measure many entries, some at a time; tell each on the terminal as it is done.
+    """Measure many entries in `jobs` processes (0: in this one); returns what went wrong, a line per entry.
 
-    Parameters
-    ----------
-    wanted : iterable of (Entry, sequence of Variant)
-        Entries with the methods to be measured on each; the largest first, so that no long one is left for the end.
-    place : Workplace
-        Where everything goes.
-    jobs : int
-        Processes; 0 measures in this one.
-
-    Returns
-    -------
-    list of str
-        What went wrong, an entry each: the others are measured all the same.
+    The largest entries come first, so that no long one is left for the end.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     todo = [(entry, ways) for entry, ways in wanted if any(not place.is_measured(variant, entry) for variant in ways)]
     faults: list[str] = []
     if jobs == 0:
         for entry, ways in todo:
-            _tell(entry, measure_entry(entry, ways, place))
+            measure_entry(entry, ways, place)
+            print(f"{entry.name} is measured", flush=True)
         return faults
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
         running = {pool.submit(measure_entry, entry, ways, place): entry for entry, ways in todo}
         for done in as_completed(running):
-            error = done.exception()
-            if error is None:
-                _tell(running[done], done.result())
-            else:
-                faults.append(f"{running[done].name}: {type(error).__name__}: {error}")
-                print(faults[-1], flush=True)
+            error, name = done.exception(), running[done].name
+            if error is not None:
+                faults.append(f"{name}: {type(error).__name__}: {error}")
+            print(f"{name} is measured" if error is None else faults[-1], flush=True)
     return faults
-
-
-def _tell(entry: Entry, laps: Sequence[tuple[str, float]]) -> None:
-    print(f"{entry.name}: " + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in laps), flush=True)
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def filled(page: str, out: Path) -> tuple[str, list[str]]:
+    """A page whose text between `<!-- begin NAME -->` and `<!-- end NAME -->` is that of OUT/NAME.
+
+    Also the names of parts without a file: they stay as they are.
+    """
+    missing = []
+
+    def part(found: re.Match[str]) -> str:
+        path = out / found[2]
+        if not path.exists():
+            missing.append(found[2])
+            return found[0]
+        return f"{found[1]}\n{path.read_text(encoding='utf-8').strip()}\n\n{found[3]}"
+
+    return _PART.sub(part, page), missing
+
+
+def fill_page(page: Path, out: Path) -> None:
+    """Put measured tables into a page of results. Prose is left alone: read it again when the figures change."""
+    text, missing = filled(page.read_text(encoding="utf-8"), out)
+    page.write_text(text, encoding="utf-8")
+    for name in missing:
+        print(f"{out / name} is not there: its part stays as it is", file=sys.stderr)

@@ -1,11 +1,11 @@
 """Ground filters on the ISPRS samples and on scenes with exact ground: type I, type II, total error, kappa, speed.
 
     python -m benchmarks.ground [--data ../shared/data] [--filter morphological | MODULE:FUNCTION] [--only samp quarry]
-                                [--densities 0.2 1 5] [--draw 0] [--out DIR] [--kept-aside]
+                                [--densities 0.2 1 5] [--draw 0] [--kept-aside]
 
 A filter is the name of one in the settings, all other settings default, or a function of this environment that takes
 x, y, z (n,) int64 in mm, `usable` (n,) bool and the window (column0, row0, columns, rows) and gives (n,) bool. Judged
-are all points, as the benchmark of Sithole and Vosselman (2003) does. `--out` writes a map of the errors of each scene.
+are all points, as the benchmark of Sithole and Vosselman (2003) does.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.entries import markdown_table
 from benchmarks.ground_scenes import KINDS
 from pipeline.io import open_source
 from pipeline.scene import GROUND_CLASS
@@ -163,43 +164,15 @@ def measured(scenes: Sequence[Scene], ground_filter: GroundFilter) -> list[Figur
 
 def table(rows: Sequence[Figures], mean: str) -> str:
     """Rows and their mean as a Markdown table."""
-    lines = ["| scene | type I | type II | total | kappa | points | points/s |", "|---|--:|--:|--:|--:|--:|--:|"]
-    lines += [
-        f"| {row.name} | {row.type_1:.2f} | {row.type_2:.2f} | {row.total:.2f} | {row.kappa:.1f} | {row.points} |"
-        f" {row.points / max(row.seconds, 1e-9):.2g} |"
+    names = ("type_1", "type_2", "total", "kappa")
+    lines = [
+        [row.name, *(f"{getattr(row, name):.2f}" for name in names), str(row.points), f"{row.points / row.seconds:.2g}"]
         for row in rows
     ]
-    means = [statistics.fmean(getattr(row, name) for row in rows) for name in ("type_1", "type_2", "total", "kappa")]
-    speed = sum(row.points for row in rows) / max(sum(row.seconds for row in rows), 1e-9)
-    one, two, total, kappa = means
-    lines.append(f"| {mean} | {one:.2f} | {two:.2f} | {total:.2f} | {kappa:.1f} | | {speed:.2g} |")
-    return "\n".join(lines)
-
-
-def error_map(scene: Scene, found: Bools, path: Path) -> None:
-    """Draw relief of the lowest points with both kinds of error."""
-    from matplotlib.figure import Figure
-
-    x, y, z = scene.x_mm / 1000, scene.y_mm / 1000, scene.z_mm / 1000
-    width, depth = float(np.ptp(x)), float(np.ptp(y))
-    figure = Figure(figsize=(20, 2.0 + 9.0 * depth / width), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    size = 12000.0 / len(x) * 4
-    low, high = np.percentile(z, [1, 99])
-    shown = left.scatter(x, y, c=z, s=size, cmap="terrain", vmin=low, vmax=high)
-    figure.colorbar(shown, ax=left, shrink=0.6)
-    left.set_title(f"{scene.name}: elevation")
-    for mask, colour, label in (
-        (scene.is_ground & found, "#d8d8d8", "ground"),
-        (~scene.is_ground & ~found, "#9ab0c8", "object"),
-        (scene.is_ground & ~found, "red", "type I: ground missed"),
-        (~scene.is_ground & found, "blue", "type II: object taken"),
-    ):
-        right.scatter(x[mask], y[mask], c=colour, s=size, label=f"{label} {int(mask.sum())}")
-    right.legend(loc="upper right")
-    for axes in (left, right):
-        axes.set_aspect("equal")
-    figure.savefig(path, dpi=70)
+    means = [f"{statistics.fmean(getattr(row, name) for row in rows):.2f}" for name in names]
+    speed = sum(row.points for row in rows) / sum(row.seconds for row in rows)
+    lines.append([mean, *means, "", f"{speed:.2g}"])
+    return markdown_table(["scene", "type I", "type II", "total", "kappa", "points", "points/s"], lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -210,7 +183,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", nargs="*", default=())
     parser.add_argument("--densities", type=float, nargs="*", default=DENSITIES)
     parser.add_argument("--draw", type=int, default=0)
-    parser.add_argument("--out", type=Path)
     parser.add_argument("--kept-aside", action="store_true", help="the samples that no setting was chosen on")
     given = parser.parse_args(arguments)
     ground_filter = filter_of(given.filter)
@@ -219,13 +191,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         (list(drawn_scenes(given.densities, given.draw)), "mean of drawn scenes"),
     ):
         wanted = [scene for scene in scenes if not given.only or any(part in scene.name for part in given.only)]
-        if not wanted:
-            continue
-        print(table(measured(wanted, ground_filter), mean), end="\n\n", flush=True)
-        if given.out is not None:
-            given.out.mkdir(parents=True, exist_ok=True)
-            for scene in wanted:
-                error_map(scene, labels_of(scene, ground_filter), given.out / f"{scene.name.replace(' ', '_')}.png")
+        if wanted:
+            print(table(measured(wanted, ground_filter), mean), end="\n\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -33,8 +33,7 @@ def _noisy(random: np.random.Generator, x: Floats, y: Floats, z: Floats, ground:
 
 
 def _hill(x: Floats, y: Floats, at: tuple[float, float], height: float, radius: float) -> Floats:
-    hill: Floats = height * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2.0 * radius * radius))
-    return hill
+    return height * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2.0 * radius * radius))
 
 
 def _turned(x: Floats, y: Floats, at: tuple[float, float], turn_deg: float) -> tuple[Floats, Floats]:
@@ -44,8 +43,7 @@ def _turned(x: Floats, y: Floats, at: tuple[float, float], turn_deg: float) -> t
 
 def _box(x: Floats, y: Floats, at: tuple[float, float], size: tuple[float, float], turn_deg: float) -> Mask:
     u, v = _turned(x, y, at, turn_deg)
-    inside: Mask = (np.abs(u) < size[0] / 2) & (np.abs(v) < size[1] / 2)
-    return inside
+    return (np.abs(u) < size[0] / 2) & (np.abs(v) < size[1] / 2)
 
 
 def _trees(
@@ -140,8 +138,7 @@ def houses_on_a_slope(random: np.random.Generator, density: float) -> Drawn:
     x, y = _places(random, density)
 
     def terrain(px: Floats, py: Floats) -> Floats:
-        slope: Floats = math.tan(math.radians(25.0)) * px + 1.5 * np.sin(px / 25.0) * np.cos(py / 30.0)
-        return slope
+        return math.tan(math.radians(25.0)) * px + 1.5 * np.sin(px / 25.0) * np.cos(py / 30.0)
 
     z, ground = _village(random, x, y, terrain, 32.0)
     z, ground = _trees(random, x, y, z, ground, 0.15, 0.6)
@@ -168,8 +165,7 @@ def embankments(random: np.random.Generator, density: float) -> Drawn:
         dam = 6.0 - np.clip((np.abs(px - 80.0 - 0.1 * py) - 7.0) / 1.5, 0.0, 6.0)
         rails = 3.0 - np.clip((np.abs(py - 250.0) - 4.0) / 1.5, 0.0, 3.0)
         cutting = -5.0 + np.clip((np.abs(px - 240.0 + 0.2 * py) - 6.0) / 1.5, 0.0, 5.0)
-        whole: Floats = np.maximum(dam, rails) + cutting
-        return whole
+        return np.maximum(dam, rails) + cutting
 
     z, ground = terrain(x, y), np.ones(len(x), np.bool_)
     for at in ((150.0, 60.0), (170.0, 90.0), (150.0, 130.0), (20.0, 60.0), (20.0, 120.0), (290.0, 200.0)):
@@ -204,8 +200,7 @@ def low_outliers(random: np.random.Generator, density: float) -> Drawn:
     x, y = _places(random, density)
 
     def terrain(px: Floats, py: Floats) -> Floats:
-        soft: Floats = 4.0 * np.sin(px / 50.0) * np.cos(py / 45.0)
-        return soft
+        return 4.0 * np.sin(px / 50.0) * np.cos(py / 45.0)
 
     z, ground = _village(random, x, y, terrain, 30.0)
     low = ground & (random.random(len(x)) < 0.003)
@@ -223,8 +218,7 @@ def terraces(random: np.random.Generator, density: float) -> Drawn:
 
     def terrain(px: Floats, py: Floats) -> Floats:
         along = px + 6.0 * np.sin(py / 35.0)
-        steps: Floats = 2.5 * np.floor(along / 12.0) + 0.1 * along
-        return steps
+        return 2.5 * np.floor(along / 12.0) + 0.1 * along
 
     z, ground = terrain(x, y), np.ones(len(x), np.bool_)
     for at in random.uniform(20, SIDE_M - 20, (14, 2)).tolist():
@@ -238,8 +232,7 @@ def gaps(random: np.random.Generator, density: float) -> Drawn:
     x, y = _places(random, density)
 
     def terrain(px: Floats, py: Floats) -> Floats:
-        hills: Floats = 12.0 * np.sin(px / 45.0) * np.cos(py / 40.0)
-        return hills
+        return 12.0 * np.sin(px / 45.0) * np.cos(py / 40.0)
 
     z, ground = _village(random, x, y, terrain, 34.0)
     gone = (np.hypot(x - 90, y - 80) < 30) | (np.abs(x - 200 - 0.3 * y) < 18) | (np.hypot(x - 60, y - 260) < 20)
@@ -273,8 +266,7 @@ def deep_cutting(random: np.random.Generator, density: float) -> Drawn:
     def terrain(px: Floats, py: Floats) -> Floats:
         off = px - 160.0 - 25.0 * np.sin(py / 110.0)
         depth = np.where(off < 0.0, np.where(off > -7.0, 8.0, 0.0), np.clip(8.0 - (off - 7.0) * 1.2, 0.0, 8.0))
-        whole: Floats = 0.03 * px - depth
-        return whole
+        return 0.03 * px - depth
 
     z, ground = terrain(x, y), np.ones(len(x), np.bool_)
     for at in ((60.0, 60.0), (60.0, 100.0), (90.0, 200.0), (250.0, 60.0), (240.0, 250.0), (280.0, 150.0)):
@@ -321,8 +313,7 @@ def dyke(random: np.random.Generator, density: float) -> Drawn:
         crest = np.clip(8.0 - (off - 3.0) / 3.0, 0.0, 8.0)
         berm = np.where(off < 36.0, np.maximum(crest, 2.0), crest)
         ditch = np.where((px % 40.0 < 3.0) & (py > 150.0), -1.5, 0.0)
-        whole: Floats = berm + ditch
-        return whole
+        return berm + ditch
 
     z, ground = terrain(x, y), np.ones(len(x), np.bool_)
     for cx, cy in ((60.0, 200.0), (180.0, 230.0), (260.0, 190.0)):

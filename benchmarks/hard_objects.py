@@ -2,9 +2,9 @@
 
     python -m benchmarks.hard_objects --out DIR [--split dev|test] [--draws 3]
 
-`bridges_and_vans` has no building: a bridge becomes one if candidates cover a fifth of its deck, a vehicle if they
-cover half of it. `wide_halls` has eight halls across the edge of the data: one is found if candidates cover half of
-what lies within the data. Candidates have the outlines of their models; nothing is modelled.
+`bridges_and_vans` has no building: a bridge becomes one if models cover a fifth of its deck, a vehicle if they cover
+half of it. `wide_halls` has eight halls across the edge of the data: one is found if models cover half of what lies
+within the data.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from benchmarks.candidates import found_scene
 from benchmarks.entries import markdown_table
-from benchmarks.scene_scores import outlined_models
+from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.simulation.bridges_and_vans import BRIDGES
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.ruler.simulation.scene import Scene
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.suites import suite_named
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.run import run
 from pipeline.settings import RunSettings
 
 DECK_SHARE = 0.2
@@ -32,21 +33,21 @@ DECK_SHARE = 0.2
 FOUND_SHARE = 0.5
 
 
-def covered(suite: str, split: str, draw: int, out: Path) -> tuple[Scene, list[shapely.Polygon], list[float]]:
-    """A scene, its objects within the data (boxes, else halls), and the share of each that candidates cover."""
+def covered(suite: str, split: str, draw: int, out: Path) -> list[float]:
+    """The share that models cover of each object within the data (boxes, else halls) of a scene."""
     plan, seed = suite_named(suite), seed_of(split, draw)
     scene, folder = plan.make(seed, plan.size_m), out / suite / f"{split}{draw}"
     if not (folder / "truth" / "scene.json").exists():
         simulate(suite, folder, seed)
+    tile, run_dir = str(folder / f"{suite}.laz"), str(folder / "run")
     settings = RunSettings.from_mapping({"classes": "ignore"})
-    found = found_scene([str(folder / f"{suite}.laz")], None, settings)
-    models = outlined_models(found.candidates, settings.building.roof)
-    outlines = shapely.union_all([model.footprint for model in models])
+    run(RunRequest(inputs=(tile,), out=run_dir, settings=settings, resources=SERIAL, meshes="none", overwrite=True))
+    outlines = shapely.union_all([model.footprint for model in read_models(run_dir).models])
     halls = [one.footprint for one in scene.buildings if one.building_id.startswith("hall")]
     local = [shapely.Polygon(box.corners) for box in scene.boxes] or halls
     inside = [shapely.intersection(one, shapely.box(*scene.extent)) for one in local]
     moved = [shapely.transform(one, lambda xy: xy + scene.origin[:2]) for one in inside]
-    return scene, moved, [shapely.intersection(one, outlines).area / one.area for one in moved]
+    return [shapely.intersection(one, outlines).area / one.area for one in moved]
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -60,10 +61,10 @@ def main(words: Sequence[str] | None = None) -> int:
     vans: list[float] = []
     halls: list[float] = []
     for draw in range(arguments.draws):
-        _, _, shares = covered("bridges_and_vans", arguments.split, draw, arguments.out)
+        shares = covered("bridges_and_vans", arguments.split, draw, arguments.out)
         bridges += shares[:BRIDGES]
         vans += shares[BRIDGES:]
-        halls += covered("wide_halls", arguments.split, draw, arguments.out)[2]
+        halls += covered("wide_halls", arguments.split, draw, arguments.out)
     rows = [
         [name, str(len(shares)), f"{np.mean(np.array(shares) >= least):.1%}"]
         for name, shares, least in (

@@ -22,9 +22,9 @@ from pipeline.runtime.cluster import worker_setup
 from pipeline.runtime.isolation import child_main, fork_server
 
 LOOK_S = 0.25
-DRIVER, SCHEDULER, NANNY, WORKER, CHILD, OTHER = "driver", "scheduler", "nanny", "worker", "child", "other"
+DRIVER, WORKER, CHILD, OTHER = "driver", "worker", "child", "other"
 FORKING = "process server"
-ROLES = (DRIVER, SCHEDULER, NANNY, FORKING, WORKER, CHILD, OTHER)
+ROLES = (DRIVER, FORKING, WORKER, CHILD, OTHER)
 _NAMES = {child_main.NAME: CHILD, fork_server.NAME: FORKING, worker_setup.NAME: WORKER}
 
 
@@ -54,16 +54,9 @@ def role_of(name: str, command: Sequence[str], roots: dict[int, str], pid: int) 
 
 
 class Watcher:
-    """Looks at some processes and all below them; a context manager.
+    """Looks at some processes, given with their roles, and all below them; a context manager.
 
-    Parameters
-    ----------
-    roots : dict
-        Role of each process that is looked at, by its id.
-    kill_every_s : float
-        A worker is killed so often, in turns; 0 kills none.
-    may_kill : callable
-        From when on.
+    Every `kill_every_s` seconds (0: never) a worker is killed, in turns, as soon as `may_kill` says so.
     """
 
     def __init__(

@@ -1,28 +1,25 @@
-"""The methods beside roofer 1.1.0-beta.1 on real points: `python benchmarks/roofer_table.py --out DIR`.
+"""The methods beside roofer 1.1.0-beta.1 on real points: `python -m benchmarks.roofer_table --out DIR`.
 
-    [--data ../shared/data] [--survey delft] [--methods METHOD[:PRESET] ...] [--skip PART ...] [--cold] [--repeat 3]
+    [--data ../shared/data] [--survey delft] [--methods METHOD[:PRESET] ...] [--skip PART ...] [--repeat 3]
+    [--page FILE]
 
 roofer's figures were measured once on `delft_west` and `delft_east` with the given footprints and the file's classes;
 its times were those of another machine and are left out. The methods are run here. A survey without given footprints is
 compared with the outlines of its own class 6, and has no figures of roofer.
 
 - Processor seconds are those of a whole run of the command line, serial, in a separate process, including its children:
-  the minimum of `--repeat` runs after one that compiled what was missing. `--cold` measures one run with empty caches
-  of kernels and bytecode as well. GABLEWORK_PYTHON names the interpreter of another environment, such as one without
-  the tools of the tests, which some libraries load where they find them.
+  the minimum of `--repeat` runs after one that compiled what was missing. GABLEWORK_PYTHON names the interpreter of
+  another environment, such as one without the tools of the tests, which some libraries load where they find them.
 - Milliseconds per building are processor time of `reconstruct_building` in this process, for the candidates that the
   stages of a run find; the minimum of `--repeat` times of each building counts.
 - Delivered buildings are ok and LoD2.2; valid ones have solids that keep all rules, by our own checker, and by val3dity
   if GABLEWORK_VAL3DITY names that program.
 - Scores are over all points of class 6 inside the outlines, against the highest roof there; a point without a roof is a
   miss. Top-visible points have no other one of the same building more than 1.1 m higher within 0.5 m in plan.
-- Buildings that differ are those of a serial run and one of two workers, by all columns that `gablework digest` counts.
 - Thinned surveys keep the points whose hash of their place is small, of all classes alike (`thinned_surveys.py`), so
   that class 6 inside the outlines has the stated density; the score is over the points of the whole survey.
-- Less input: class 6 made class 1, or no footprints given, or both. A building's loss is the share of its points within
-  0.2 m that it has less than with the full input.
 
-Writes DIR/roofer_table_<survey>.md and the same figures, with those of each building, as .json.
+Writes DIR/roofer_table_<survey>.md and the same figures as .json.
 """
 
 from __future__ import annotations
@@ -34,7 +31,8 @@ import math
 import os
 import platform
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -42,19 +40,19 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from benchmarks.entries import Entry, Workplace, markdown_table, run_settings
-from benchmarks.method_times import Times, clock
-from benchmarks.run_scores import RunScore, ScoreLoss, differing_buildings, score_loss, score_run
-from benchmarks.survey_runs import Seconds, candidates_of, cold_run, run_survey
-from benchmarks.thinned_surveys import Change, roof_density, thinned, without_buildings, write_changed
+from benchmarks.entries import Entry, Workplace, fill_page, markdown_table, run_settings
+from benchmarks.run_scores import RunScore, score_run
+from benchmarks.survey_runs import Seconds, candidates_of, run_survey
+from benchmarks.thinned_surveys import roof_density, thinned, write_changed
 from pipeline.io import ReadOptions
+from pipeline.model import FloatArray
+from pipeline.recipe import reconstruct_building
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.reference_points import read_points_reference
-from pipeline.runtime.compare import Variant
+from pipeline.runtime.compare import Variant, settings_of
 
-PARTS = ("times", "seconds", "differences", "thinned", "less-input")
+PARTS = ("times", "seconds", "thinned")
 """What can be left out."""
-NO_CLASS_6, NO_FOOTPRINTS, NEITHER = "no-class-6", "no-footprints", "neither"
 
 
 def surveys(data: Path) -> dict[str, Entry]:
@@ -71,11 +69,21 @@ def surveys(data: Path) -> dict[str, Entry]:
 # --------------------------------------------------------------------------------------------------------- measuring
 
 
-def building_times(entry: Entry, variants: Sequence[Variant], repeat: int) -> dict[str, Times]:
-    """What each method takes for the candidates of a survey, in this process, by label."""
-    found = candidates_of(entry, run_settings(entry))
-    measured = [candidate for candidate in found if len(candidate.points)]
-    return clock(measured, variants, entry, repeat)
+def building_times(entry: Entry, variants: Sequence[Variant], repeat: int) -> dict[str, FloatArray]:
+    """Processor seconds per building (n,) of each method, by label: the shortest of `repeat` times after one more.
+
+    The methods take turns candidate by candidate, so other work on the machine slows all alike.
+    """
+    candidates = [candidate for candidate in candidates_of(entry, run_settings(entry)) if len(candidate.points)]
+    ways = {one: settings_of(run_settings(entry), one).building for one in variants}
+    took_s = {one: np.empty((repeat + 1, len(candidates))) for one in variants}
+    for turn in range(repeat + 1):
+        for number, candidate in enumerate(candidates):
+            for one in variants:
+                began = time.process_time()
+                reconstruct_building(candidate, one.method, ways[one])
+                took_s[one][turn, number] = time.process_time() - began
+    return {one.label: times[1:].min(axis=0) for one, times in took_s.items()}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,43 +94,26 @@ class Figures:
     """The survey as it is."""
     warm: Seconds | None = None
     """The cheapest of several runs that found all caches filled."""
-    cold: Seconds | None = None
-    """A run without caches."""
     mean_ms: float = math.nan
     """Processor time of a building."""
     median_ms: float = math.nan
     """Its median."""
-    differing: tuple[str, ...] | None = None
-    """Buildings that two runs made differently."""
     thinned: Mapping[str, RunScore] = dataclasses.field(default_factory=dict)
     """By the density."""
-    less_input: Mapping[str, RunScore] = dataclasses.field(default_factory=dict)
-    """By the input that was left out."""
-    losses: Mapping[str, ScoreLoss] = dataclasses.field(default_factory=dict)
-    """The same, building by building against `whole`."""
 
 
-def poorer_surveys(entry: Entry, reference: Reference, place: Workplace, skip: Collection[str]) -> dict[str, Entry]:
-    """The thinned surveys, by their density, and those that tell less, by what they do not tell. Writes their files."""
-    changes: dict[str, Change] = {}
-    if "thinned" not in skip:
-        found = roof_density(reference).per_m2
-        changes |= {f"{wanted:g}": thinned(wanted / found) for wanted in THINNED if wanted < found}
-    if "less-input" not in skip:
-        changes[NO_CLASS_6] = without_buildings
-    poorer = {}
-    for name, change in changes.items():
-        tiles = write_changed(entry.tiles, place.root / "surveys" / entry.name / name, change)
-        poorer[name] = dataclasses.replace(entry, name=f"{entry.name}-{name}", tiles=tiles)
-    if "less-input" not in skip and entry.footprints is not None:
-        poorer[NO_FOOTPRINTS] = dataclasses.replace(entry, name=f"{entry.name}-{NO_FOOTPRINTS}", footprints=None)
-        poorer[NEITHER] = dataclasses.replace(poorer[NO_CLASS_6], name=f"{entry.name}-{NEITHER}", footprints=None)
-    return poorer
+def thinned_surveys(entry: Entry, reference: Reference, place: Workplace) -> dict[str, Entry]:
+    """The thinned surveys, by their density. Writes their files."""
+    found, surveys = roof_density(reference).per_m2, {}
+    for name, wanted in ((f"{wanted:g}", wanted) for wanted in THINNED if wanted < found):
+        tiles = write_changed(entry.tiles, place.root / "surveys" / entry.name / name, thinned(wanted / found))
+        surveys[name] = dataclasses.replace(entry, name=f"{entry.name}-{name}", tiles=tiles)
+    return surveys
 
 
 def measure(
     entry: Entry,
-    poorer: Mapping[str, Entry],
+    sparser: Mapping[str, Entry],
     variant: Variant,
     reference: Reference,
     place: Workplace,
@@ -133,31 +124,20 @@ def measure(
     out, skip = place.run(variant, entry), arguments.skip
     first = run_survey(entry, variant, out)
     reported(variant, entry, first)
-    warm = cold = differing = None
+    warm = None
     if "seconds" not in skip:
         runs = [run_survey(entry, variant, out) for _ in range(arguments.repeat)]
         warm = min(runs, key=lambda run: run.processor)
         reported(variant, entry, warm)
-    if "differences" not in skip:
-        other = out.with_name("two_workers")
-        reported(variant, entry, run_survey(entry, variant, other, workers=2))
-        differing = tuple(sorted(differing_buildings(out, other)))
-    if arguments.cold:
-        cold = cold_run(entry, variant, out.with_name("cold"))
     whole = score_run(out, reference, val3dity)
     scores = {}
-    for name, survey in poorer.items():
+    for name, survey in sparser.items():
         reported(variant, survey, run_survey(survey, variant, place.run(variant, survey)))
         scores[name] = score_run(place.run(variant, survey), reference, val3dity)
-    less = {name: score for name, score in scores.items() if name in TOLD_LESS}
     return Figures(
         whole=whole,
         warm=warm,
-        cold=cold,
-        differing=differing,
-        thinned={name: score for name, score in scores.items() if name not in less},
-        less_input=less,
-        losses={name: score_loss(whole, score) for name, score in less.items()},
+        thinned=scores,
     )
 
 
@@ -177,10 +157,6 @@ class Row:
     """What is measured."""
     roofer: str = ""
     """roofer's figure on `delft`."""
-    required: str = ""
-    """What the default method has to reach there."""
-    stretch: str = ""
-    """What it should reach."""
     cell: Callable[[Figures], str]
     """A method's figure; empty where it was left out."""
 
@@ -210,18 +186,14 @@ def _within(score: RunScore) -> str:
     return number(score.within)
 
 
-def _both_within(score: RunScore) -> str:
-    return f"{number(score.within)} / {number(score.within_top)}"
-
-
 def _judged(own: int, other: int | None, whole: int) -> str:
     """How many are valid by the own checker and by val3dity."""
     return f"{own} / {'not run' if other is None else other} of {whole}"
 
 
 def _valid_elsewhere(found: Figures) -> str:
-    """Models of the poorer surveys that are valid."""
-    scores = [*found.thinned.values(), *found.less_input.values()]
+    """Models of the thinned surveys that are valid."""
+    scores = list(found.thinned.values())
     if not scores:
         return ""
     others = [score.models_val3dity for score in scores if score.models_val3dity is not None]
@@ -229,114 +201,45 @@ def _valid_elsewhere(found: Figures) -> str:
     return _judged(own, sum(others) if len(others) == len(scores) else None, whole)
 
 
-def _poorer(name: str, cell: Callable[[RunScore], str], found: Figures) -> str:
-    """A figure of a poorer survey; empty where there is none."""
-    scores = {**found.thinned, **found.less_input}
-    return cell(scores[name]) if name in scores else ""
+def _thinned(name: str, cell: Callable[[RunScore], str], found: Figures) -> str:
+    """A figure of a thinned survey; empty where there is none."""
+    return cell(found.thinned[name]) if name in found.thinned else ""
 
 
-def _loss(name: str, cell: Callable[[ScoreLoss], str], found: Figures) -> str:
-    """A figure of what a poorer survey loses; empty where there is none."""
-    return cell(found.losses[name]) if name in found.losses else ""
-
-
-def _buildings_that_lose_little(loss: ScoreLoss) -> str:
-    return f"{loss.within_5_points} / {loss.within_2_points} of {loss.buildings}"
-
-
-def _points_lost(loss: ScoreLoss) -> str:
-    return f"{number(100.0 * loss.mean, 1)} / {number(100.0 * loss.median, 1)}"
-
-
-THINNED: Mapping[float, tuple[tuple[str, str, str], tuple[str, str, str]]] = {
-    4.0: (("157", "157", "160"), (".75", ".78", ".81")),
-    2.0: (("136", "150", "160"), (".53", ".70", ".75")),
-    1.0: (("63", "130", "155"), (".34", ".55", ".62")),
-    0.5: (("0", "80", "140"), ("", ".40", ".50")),
+THINNED: Mapping[float, tuple[str, str]] = {
+    4.0: ("157", ".75"),
+    2.0: ("136", ".53"),
+    1.0: ("63", ".34"),
+    0.5: ("0", ""),
 }
-"""By class-6 points per square metre: roofer, required and stretch of what is delivered, and of points within 0.2 m."""
-TOLD_LESS: Mapping[str, str] = {NO_CLASS_6: "no class 6", NO_FOOTPRINTS: "no footprints", NEITHER: "neither"}
-"""The input that is left out, and what the table calls it."""
-
-
-def _row(label: str, printed: tuple[str, str, str], cell: Callable[[Figures], str]) -> Row:
-    """A row with roofer's figure, what is required and the stretch."""
-    return Row(label=label, roofer=printed[0], required=printed[1], stretch=printed[2], cell=cell)
+"""By class-6 points per square metre: what roofer delivers, and the share of points within 0.2 m of it."""
 
 
 def _thinned_rows() -> Iterator[Row]:
-    for density, (delivered, _) in THINNED.items():
-        yield _row(f"{density:g} class-6 points per m2: LoD2.2", delivered, partial(_poorer, f"{density:g}", _lod2))
-        yield Row(
-            label=f"{density:g} class-6 points per m2: reasons of the others",
-            cell=partial(_poorer, f"{density:g}", _reasons),
-        )
-    for density, (_, within) in THINNED.items():
-        label = f"{density:g} class-6 points per m2: within 0.2 m of the full cloud"
-        yield _row(label, within, partial(_poorer, f"{density:g}", _within))
+    for per_m2, (delivered, within) in THINNED.items():
+        name, head = f"{per_m2:g}", f"{per_m2:g} class-6 points per m2"
+        yield Row(label=f"{head}: LoD2.2", roofer=delivered, cell=partial(_thinned, name, _lod2))
+        yield Row(label=f"{head}: reasons of the others", cell=partial(_thinned, name, _reasons))
+        yield Row(label=f"{head}: within 0.2 m of the full cloud", roofer=within, cell=partial(_thinned, name, _within))
 
 
-def _less_input_rows() -> Iterator[Row]:
-    for name, label in TOLD_LESS.items():
-        yield Row(label=f"{label}: LoD2.2", roofer="0", cell=partial(_poorer, name, _lod2))
-        yield Row(label=f"{label}: within 0.2 m, all / top-visible", cell=partial(_poorer, name, _both_within))
-        yield Row(
-            label=f"{label}: buildings that lose at most 5 / 2 points",
-            cell=partial(_loss, name, _buildings_that_lose_little),
-        )
-        yield Row(
-            label=f"{label}: points that a building loses, mean / median",
-            required="5",
-            stretch="2",
-            cell=partial(_loss, name, _points_lost),
-        )
+def _valid(found: Figures) -> str:
+    return _judged(found.whole.valid, found.whole.val3dity, found.whole.lod2)
 
 
 ROWS: tuple[Row, ...] = (
-    # roofer's times, these and those of a building, were another machine's: they have no place beside ours
+    # roofer's times were those of another machine
     Row(label="CPU seconds in all, warm", cell=lambda found: _seconds(found.warm)),
-    Row(label="the same, cold", cell=lambda found: _seconds(found.cold)),
-    Row(
-        label="reconstruction of a building, ms, mean / median",
-        required="10 / 5",
-        stretch="3 / 1.5",
-        cell=_milliseconds,
-    ),
-    Row(label="LoD2.2", roofer="160 of 160", required="158", stretch="160", cell=lambda found: _lod2(found.whole)),
-    Row(
-        label="valid of these, own checker / val3dity",
-        roofer="160 of 160",
-        required="158",
-        stretch="160",
-        cell=lambda found: _judged(found.whole.valid, found.whole.val3dity, found.whole.lod2),
-    ),
-    Row(
-        label="within 0.2 m of all class-6 points",
-        roofer=".814",
-        required=".83",
-        stretch=".85; .86",
-        cell=lambda found: number(found.whole.within),
-    ),
-    Row(
-        label="at this many roof faces",
-        roofer="588",
-        required="620",
-        stretch="675; 735",
-        cell=lambda found: str(found.whole.roof_faces),
-    ),
+    Row(label="reconstruction of a building, ms, mean / median", cell=_milliseconds),
+    Row(label="LoD2.2", roofer="160 of 160", cell=lambda found: _lod2(found.whole)),
+    Row(label="valid of these, own checker / val3dity", roofer="160 of 160", cell=_valid),
+    Row(label="within 0.2 m of all class-6 points", roofer=".814", cell=lambda found: _within(found.whole)),
+    Row(label="at this many roof faces", roofer="588", cell=lambda found: str(found.whole.roof_faces)),
     Row(label="points with a roof", cell=lambda found: number(found.whole.coverage)),
-    Row(
-        label="top-visible points within 0.2 m",
-        roofer=".894",
-        required=".91",
-        stretch=".93",
-        cell=lambda found: number(found.whole.within_top),
-    ),
+    Row(label="top-visible points within 0.2 m", roofer=".894", cell=lambda found: number(found.whole.within_top)),
     Row(
         label="top-visible points, median RMSE of a building, m",
         roofer=".367",
-        required=".33",
-        stretch=".30",
         cell=lambda found: number(found.whole.rmse_top_median_m),
     ),
     Row(
@@ -344,36 +247,20 @@ ROWS: tuple[Row, ...] = (
         roofer=".754",
         cell=lambda found: number(found.whole.rmse_median_m),
     ),
-    Row(
-        label="buildings that differ between runs",
-        roofer="2 to 5",
-        required="0",
-        stretch="0",
-        cell=lambda found: "" if found.differing is None else str(len(found.differing)),
-    ),
     *_thinned_rows(),
-    *_less_input_rows(),
-    Row(label="models of these poorer surveys that are valid, own checker / val3dity", cell=_valid_elsewhere),
+    Row(label="models of these thinned surveys that are valid, own checker / val3dity", cell=_valid_elsewhere),
 )
 """The table, line by line."""
 
 
 def roofer_table(found: Mapping[str, Figures], *, with_roofer: bool) -> str:
-    """The figures of all methods as Markdown.
-
-    Parameters
-    ----------
-    found : mapping
-        By the label of the method.
-    with_roofer : bool
-        Whether the survey is the one that roofer's figures, and the demands beside them, are of.
-    """
+    """The figures of all methods, by label, as Markdown; `with_roofer` on the survey of roofer's figures."""
     lines = []
     for row in ROWS:
         cells = [row.cell(figures) for figures in found.values()]
         if any(cells):
-            lines.append([row.label, *([row.roofer, row.required, row.stretch] if with_roofer else []), *cells])
-    heads = ["", *(["roofer 1.1.0-beta.1", "required", "stretch"] if with_roofer else []), *found]
+            lines.append([row.label, *([row.roofer] if with_roofer else []), *cells])
+    heads = ["", *(["roofer 1.1.0-beta.1"] if with_roofer else []), *found]
     return markdown_table(heads, lines)
 
 
@@ -385,8 +272,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--survey", choices=tuple(surveys(Path())), default="delft")
     parser.add_argument("--methods", nargs="+", metavar="METHOD[:PRESET]", default=["fuzzy-sart"])
     parser.add_argument("--skip", nargs="+", choices=PARTS, default=[], help="parts that are left out")
-    parser.add_argument("--cold", action="store_true", help="one run without caches too")
     parser.add_argument("--repeat", type=int, default=3, help="times over; the shortest time counts")
+    parser.add_argument("--page", type=Path, help="fill in this page of results")
     arguments = parser.parse_args(argv)
     entry, place = surveys(arguments.data)[arguments.survey], Workplace(root=arguments.out)
     variants = [Variant.parse(text) for text in arguments.methods]
@@ -398,14 +285,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"{platform.machine()}, load {os.getloadavg()[0]:.1f} before.\n"
     )
     print(head, flush=True)
-    poorer = poorer_surveys(entry, reference, place, arguments.skip)
-    found = {variant.label: measure(entry, poorer, variant, reference, place, arguments) for variant in variants}
+    sparser = {} if "thinned" in arguments.skip else thinned_surveys(entry, reference, place)
+    found = {variant.label: measure(entry, sparser, variant, reference, place, arguments) for variant in variants}
     if "times" not in arguments.skip:
-        for label, times in building_times(entry, variants, arguments.repeat).items():
-            together = 1e3 * (times.segmentation_s + times.solids_s)
-            found[label] = dataclasses.replace(
-                found[label], mean_ms=float(together.mean()), median_ms=float(np.median(together))
-            )
+        for label, took_s in building_times(entry, variants, arguments.repeat).items():
+            mean, median = (1e3 * float(of(took_s)) for of in (np.mean, np.median))
+            found[label] = dataclasses.replace(found[label], mean_ms=mean, median_ms=median)
     text = f"{head}\n{roofer_table(found, with_roofer=entry.name == 'delft')}"
     print(text)
     place.root.mkdir(parents=True, exist_ok=True)
@@ -413,6 +298,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     target.with_suffix(".md").write_text(text, encoding="utf-8")
     figures = {label: dataclasses.asdict(one) for label, one in found.items()}
     target.with_suffix(".json").write_text(json.dumps(figures, indent=1), encoding="utf-8")
+    if arguments.page is not None:
+        fill_page(arguments.page, place.root)
     return 0
 
 

@@ -1,12 +1,13 @@
 """Measures all methods on every suite and every real tile.
 
-    python benchmarks/ruler.py --out DIR [--data ../shared/data] [--split test] [--only hofmann310 delft] [--jobs 2]
-                               [--methods METHOD[:PRESET] ...] [--no-pages]
+    python -m benchmarks.ruler --out DIR [--data ../shared/data] [--split test] [--only hofmann310 delft] [--jobs 2]
+                               [--methods METHOD[:PRESET] ...] [--no-pages] [--page FILE]
 
 The default is every method with its default settings. An entry of the table below is simulated once (suites), its
 candidates are found once, each method models them, and each run is measured; `benchmarks/entries.py` describes the
-folders. DIR/methods.md then holds one line per entry and method, DIR/sweep.md one table per method: the roof faces of
-at least 10 m2 by density and noise. Existing results are not computed again: delete them to repeat them.
+folders. DIR/methods.md then holds one line per entry and method, without those of the sweep; DIR/sweep.md has one table
+per method: the quality of the roof faces of at least 10 m2 by density and noise. Existing results are not computed
+again: delete them to repeat them.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-import statistics
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -25,6 +25,7 @@ from benchmarks.entries import (
     SimulatedScene,
     Workplace,
     all_variants,
+    fill_page,
     hofmann_entries,
     markdown_table,
     measure_all,
@@ -34,9 +35,8 @@ from pipeline.model import Status
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.runtime.compare import Variant
 
-CUBES = 20
-"""Draws of the cube: it is one building."""
-
+QUALITY = "faces.quality_10m2"
+"""Measure of the tables of the sweep: TP / (TP + FP + FN)."""
 SHOWN = (
     ("delivery.lod2", "delivered"),
     ("detection.area_completeness_without_ring", "area compl."),
@@ -62,9 +62,7 @@ def suites(split: str) -> Iterator[Entry]:
     yield Entry(name="city", scene=SimulatedScene(suite="city", seed=seed_of(split, 0)))
     yield from sweep_entries(split)
     yield from (dataclasses.replace(entry, has_page=True) for entry in hofmann_entries(split, 1))
-    for draw in range(CUBES):
-        scene = SimulatedScene(suite="cube", seed=seed_of(split, draw))
-        yield Entry(name=f"cube-{draw:02d}", scene=scene, has_page=False)
+    yield Entry(name="cube", scene=SimulatedScene(suite="cube", seed=seed_of(split, 0)))
 
 
 def real_tiles(data: Path) -> Iterator[Entry]:
@@ -99,50 +97,19 @@ def cell(rows: Sequence[Mapping[str, Any]], name: str) -> str:
 
 
 def statuses(manifest: Mapping[str, Any]) -> str:
-    """Candidates by status; how long they take is the business of `method_times.py`."""
+    """Candidates by status."""
     return "/".join(str(manifest["counts"].get(status, 0)) for status in Status)
 
 
-def _reading_order(entry: Entry) -> tuple[bool, bool, float, float]:
-    """Suites before real tiles, the cells of the sweep together and from sparse to dense."""
-    cell_of = None if entry.scene is None else entry.scene.cell
-    density, noise = (0.0, 0.0) if cell_of is None else (cell_of.density_per_m2, cell_of.noise_m)
-    return entry.scene is None, cell_of is not None, density, noise
-
-
 def methods_table(entries: Sequence[Entry], variants: Sequence[Variant], place: Workplace) -> str:
-    """One line an entry and method; the cubes, one building each, are one entry: their means."""
+    """One line per entry and method, without those of the sweep."""
     lines = []
-    cubes = [entry for entry in entries if entry.name.startswith("cube-")]
-    for entry in entries:
-        if entry not in cubes:
-            for variant in variants:
-                if place.is_measured(variant, entry):
-                    rows = place.table(variant, entry, "measures")
-                    shown = [cell(rows, name) for name, _ in SHOWN]
-                    lines.append([entry.name, variant.label, statuses(place.manifest(variant, entry)), *shown])
-    for variant in variants:
-        measured = [entry for entry in cubes if place.is_measured(variant, entry)]
-        if measured:
-            tables = [place.table(variant, entry, "measures") for entry in measured]
-            facts = [place.manifest(variant, entry) for entry in measured]
-            lines.append([f"cube, {len(measured)} draws", variant.label, statuses(_summed(facts)), *_means(tables)])
+    for entry in (one for one in entries if not one.name.startswith("sweep-")):
+        for variant in (one for one in variants if place.is_measured(one, entry)):
+            rows = place.table(variant, entry, "measures")
+            shown = [cell(rows, name) for name, _ in SHOWN]
+            lines.append([entry.name, variant.label, statuses(place.manifest(variant, entry)), *shown])
     return markdown_table(["entry", "method", "ok/doubtful/block/failed", *(head for _, head in SHOWN)], lines)
-
-
-def _summed(manifests: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What `statuses` looks at, of several runs together."""
-    return {"counts": {status: sum(one["counts"].get(status, 0) for one in manifests) for status in Status}}
-
-
-def _means(tables: Sequence[Sequence[Mapping[str, Any]]]) -> list[str]:
-    """The shown measures as means over several entries, of those that have a figure."""
-    cells = []
-    for name, _ in SHOWN:
-        rows = [row for table in tables for row in table if row["name"] == name and row["subset"] == "all"]
-        values = [row["value"] for row in rows if row["value"] is not None]
-        cells.append(figure({**rows[0], "value": statistics.fmean(values)}) if values else "")
-    return cells
 
 
 def sweep_table(qualities: Mapping[tuple[float, float], float]) -> str:
@@ -158,16 +125,14 @@ def sweep_table(qualities: Mapping[tuple[float, float], float]) -> str:
     return markdown_table(["pulses per m2", *(f"{noise:g} m of noise" for noise in noises)], lines)
 
 
-def sweep_qualities(
-    variant: Variant, place: Workplace, entries: Sequence[Entry], name: str = "faces.quality_10m2"
-) -> dict[tuple[float, float], float]:
-    """A measure of the cells of the sweep that were measured, by density and noise; 0 where it is undefined."""
+def sweep_qualities(variant: Variant, place: Workplace, entries: Sequence[Entry]) -> dict[tuple[float, float], float]:
+    """The quality of the cells of the sweep that were measured, by density and noise; 0 where it is undefined."""
     found = {}
     for entry in entries:
         if entry.scene is not None and entry.scene.cell is not None and place.is_measured(variant, entry):
             cell_of = entry.scene.cell
             rows = place.table(variant, entry, "measures")
-            value = next(row["value"] for row in rows if row["name"] == name and row["subset"] == "all")
+            value = next(row["value"] for row in rows if row["name"] == QUALITY and row["subset"] == "all")
             found[cell_of.density_per_m2, cell_of.noise_m] = 0.0 if value is None else float(value)
     return found
 
@@ -187,6 +152,7 @@ def main() -> int:
     parser.add_argument("--methods", nargs="*", metavar="METHOD[:PRESET]", help="default: all methods")
     parser.add_argument("--jobs", type=int, default=2, help="entries at a time")
     parser.add_argument("--no-pages", action="store_true", help="tables only")
+    parser.add_argument("--page", type=Path, help="fill in this page of results")
     arguments = parser.parse_args()
     variants, place = parsed_variants(arguments.methods), Workplace(root=arguments.out)
     entries = [
@@ -196,12 +162,14 @@ def main() -> int:
         if entry.name.startswith(tuple(arguments.only))
     ]
     faults = measure_all([(entry, variants) for entry in entries], place, arguments.jobs)
-    overview = methods_table(sorted(entries, key=_reading_order), variants, place)
+    overview = methods_table(sorted(entries, key=lambda entry: entry.scene is None), variants, place)
     (place.root / "methods.md").write_text(overview, encoding="utf-8")
     swept = {variant.label: sweep_qualities(variant, place, entries) for variant in variants}
     tables = [f"## {label}\n\n{sweep_table(qualities)}" for label, qualities in swept.items() if qualities]
     (place.root / "sweep.md").write_text("\n".join(tables), encoding="utf-8")
     print(overview, *tables, sep="\n")
+    if arguments.page is not None:
+        fill_page(arguments.page, place.root)
     print("\n".join(faults), file=sys.stderr)
     return int(bool(faults))
 

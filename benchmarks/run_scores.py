@@ -1,4 +1,4 @@
-"""What a run delivered, how near it is to the measured roofs, and which buildings two runs make differently."""
+"""What a run delivered, and how near it is to the measured roofs."""
 
 from __future__ import annotations
 
@@ -18,26 +18,11 @@ from pipeline.export.geoparquet import read_table
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.residuals import BuildingResiduals, building_residuals
+from pipeline.ruler.evaluation.residuals import building_residuals
 from pipeline.ruler.evaluation.validity import validity
-from pipeline.runtime.digest import NOT_CONTENT
 
 LOD2 = "2.2"
 """The level of detail that counts as delivered."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class BuildingScore:
-    """One reference building: how near the models are to its roof points."""
-
-    points: int
-    """Roof points inside its outline."""
-    within: float
-    """Share of them within 0.2 m of a roof; without a roof is a miss; nan without points."""
-    within_top: float
-    """The same of the top-visible ones."""
-    rmse_top_m: float
-    """Root mean square distance of the top-visible ones that a roof covers; nan without any."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,36 +59,20 @@ class RunScore:
     """Median over the buildings of the root mean square distance of the covered points."""
     rmse_top_median_m: float
     """The same of the top-visible ones."""
-    buildings: Mapping[str, BuildingScore]
-    """By the name of the reference building."""
 
 
 def score_run(run: Path, reference: Reference, val3dity: str | None = None) -> RunScore:
-    """Hold a run directory against the roof points of a reference.
+    """Hold a run directory against the roof points of a reference; `val3dity` is the program, if it is there.
 
     All points of class 6 inside the outlines count, those at the end of the data too.
-
-    Parameters
-    ----------
-    run : Path
-        The run directory.
-    reference : Reference
-        With points.
-    val3dity : str, optional
-        The program.
-
-    Raises
-    ------
-    RunError
-        The run cannot be read.
-    RuntimeError
-        val3dity does not answer.
     """
     found = read_models(run)
     lod2 = {model.building_id for model in found.models if _is_lod2(model)}
     valid = {row.building_id for row in validity(found) if row.is_valid}
     by_val3dity = None if val3dity is None else valid_by_val3dity(run, val3dity)
     rows = building_residuals(found.models, reference)
+    all_points, top_visible = [row.all_points for row in rows], [row.top_visible for row in rows]
+    points = sum(one.n_points for one in all_points)
     reasons = collections.Counter(read_table(str(run), "buildings").column("reason").to_pylist())
     return RunScore(
         candidates=len(found.models) + len(found.failed),
@@ -117,27 +86,17 @@ def score_run(run: Path, reference: Reference, val3dity: str | None = None) -> R
         if by_val3dity is None
         else sum(model.building_id in by_val3dity for model in found.models),
         roof_faces=sum(len(model.surfaces) for model in found.models),
-        points=sum(row.all_points.n_points for row in rows),
-        coverage=_ratio(sum(row.all_points.n_covered for row in rows), sum(row.all_points.n_points for row in rows)),
-        within=_ratio(sum(row.all_points.n_within for row in rows), sum(row.all_points.n_points for row in rows)),
-        within_top=_ratio(sum(row.top_visible.n_within for row in rows), sum(row.top_visible.n_points for row in rows)),
-        rmse_median_m=_median([row.all_points.rmse_m for row in rows]),
-        rmse_top_median_m=_median([row.top_visible.rmse_m for row in rows]),
-        buildings={row.building_id: _building(row) for row in rows},
+        points=points,
+        coverage=_ratio(sum(one.n_covered for one in all_points), points),
+        within=_ratio(sum(one.n_within for one in all_points), points),
+        within_top=_ratio(sum(one.n_within for one in top_visible), sum(one.n_points for one in top_visible)),
+        rmse_median_m=_median([one.rmse_m for one in all_points]),
+        rmse_top_median_m=_median([one.rmse_m for one in top_visible]),
     )
 
 
 def _is_lod2(model: RoofModel) -> bool:
     return model.status.has_roof and model.lod == LOD2
-
-
-def _building(row: BuildingResiduals) -> BuildingScore:
-    return BuildingScore(
-        points=row.all_points.n_points,
-        within=row.all_points.share_within,
-        within_top=row.top_visible.share_within,
-        rmse_top_m=row.top_visible.rmse_m,
-    )
 
 
 def _ratio(part: int, whole: int) -> float:
@@ -149,99 +108,28 @@ def _median(values: list[float]) -> float:
     return float(np.median(known)) if known else math.nan
 
 
-def valid_by_val3dity(run: Path, program: str) -> set[str]:
-    """The buildings of a run that val3dity finds valid, by their ids.
+def val3dity_report(file: Path, program: str, *options: str) -> dict[str, Any]:
+    """val3dity's report of a file of CityJSON or CityJSONSeq; RuntimeError if there is none.
 
-    Its exit code says nothing about validity, so its report is read.
-
-    Parameters
-    ----------
-    run : Path
-        A run directory; its CityJSONSeq is judged, with val3dity's own tolerances.
-    program : str
-        val3dity, 2.5 or later: older ones know no CityJSONSeq.
-
-    Raises
-    ------
-    RuntimeError
-        A file has no report, or faults as a whole.
+    Its exit code says nothing about validity. Versions before 2.5 do not read CityJSONSeq.
     """
+    with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
+        place = Path(folder, "report.json")
+        done = subprocess.run(
+            [program, str(file), "--report", str(place), *options], capture_output=True, text=True, check=False
+        )
+        if not place.exists():
+            raise RuntimeError(f"{program} gives no report of {file}: {(done.stdout + done.stderr)[-300:]}")
+        found: dict[str, Any] = json.loads(place.read_text(encoding="utf-8"))
+        return found
+
+
+def valid_by_val3dity(run: Path, program: str) -> set[str]:
+    """The ids of the buildings whose CityJSONSeq val3dity finds valid; RuntimeError if it cannot judge a file."""
     valid: set[str] = set()
     for file in sorted(run.glob("cityjson/*/*.city.jsonl")):
-        with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
-            report = Path(folder, "report.json")
-            reported = subprocess.run(
-                [program, str(file), "--report", str(report)], capture_output=True, text=True, check=False
-            )
-            if not report.exists():
-                raise RuntimeError(f"{program} gives no report of {file}: {(reported.stdout + reported.stderr)[-300:]}")
-            valid |= valid_features(json.loads(report.read_text(encoding="utf-8")))
+        report = val3dity_report(file, program)
+        if report["dataset_errors"]:
+            raise RuntimeError(f"val3dity on {file}: {report['dataset_errors']}")
+        valid |= {feature["id"] for feature in report["features"] if feature["validity"]}
     return valid
-
-
-def valid_features(report: Mapping[str, Any]) -> set[str]:
-    """The ids of the valid features of a report of val3dity.
-
-    Raises
-    ------
-    RuntimeError
-        The report has faults of the file as a whole: none of its features was judged.
-    """
-    if report["dataset_errors"]:
-        raise RuntimeError(f"val3dity on {report['input_file']}: {report['dataset_errors']}")
-    return {feature["id"] for feature in report["features"] if feature["validity"]}
-
-
-def differing_buildings(one: Path, other: Path) -> set[str]:
-    """The buildings that two runs made differently, or that only one of them has, by their ids.
-
-    What counts is what `gablework digest` counts: all columns of the records and the planes but those that may differ
-    between tilings.
-    """
-    first, second = _contents(one), _contents(other)
-    return {name for name in first.keys() | second.keys() if first.get(name) != second.get(name)}
-
-
-def _contents(run: Path) -> dict[str, list[str]]:
-    """Each building's rows as texts that tell every bit of a number."""
-    rows: dict[str, list[str]] = {}
-    for table in ("buildings", "planes"):
-        for row in read_table(str(run), table).to_pylist():
-            reported = sorted((name, value) for name, value in row.items() if name not in NOT_CONTENT)
-            rows.setdefault(row["building_id"], []).append(f"{table} {reported!r}")
-    return rows
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ScoreLoss:
-    """How much less of the roofs a run meets than another one with more input, building by building."""
-
-    buildings: int
-    """Reference buildings with roof points."""
-    within_5_points: int
-    """Those whose share of points within 0.2 m is at most 0.05 less; better ones too."""
-    within_2_points: int
-    """Those where it is at most 0.02 less."""
-    mean: float
-    """Mean loss of a building's share, points within 0.2 m; negative where the run is better; nan without buildings."""
-    median: float
-    """Median loss."""
-
-
-def score_loss(more_input: RunScore, less_input: RunScore) -> ScoreLoss:
-    """Compare two runs on the same reference building by building."""
-    lost = np.array(
-        [
-            one.within - less_input.buildings[name].within
-            for name, one in more_input.buildings.items()
-            if one.points and not math.isnan(one.within)
-        ]
-    )
-    rounding = 1e-9
-    return ScoreLoss(
-        buildings=len(lost),
-        within_5_points=int((lost <= 0.05 + rounding).sum()),
-        within_2_points=int((lost <= 0.02 + rounding).sum()),
-        mean=float(lost.mean()) if len(lost) else math.nan,
-        median=float(np.median(lost)) if len(lost) else math.nan,
-    )

@@ -3,15 +3,13 @@
     python -m benchmarks.scaling_simulation --traces DIR/run.trace.json [more] --costs DIR/engine_costs.json
                                             --driver DIR/driver_scale.json --out DIR
                                             [--buildings 20000 1000000 10000000] [--workers 1 2 8 32 100 300 1000]
-                                            [--storage-mb-s 0] [--tile-size 500] [--figure FILE.png]
 
 The traces come from `city_scale.py`, the costs from `engine_costs.py` and `driver_scale.py`. A stage's tasks draw their
 CPU times from those of the first trace; larger runs have fewer and larger ones, as many as the driver of a large run
 had. The simulation keeps the engine's order (largest first), its window of messages in flight, how many tasks travel
-together, its barriers between stages and what the driver does alone between them. Driver, scheduler and storage each
-serve one request after the other. A task costs the driver what it cost in that stage of a large run, a message what one
-with a task that does nothing costs driver and scheduler. A byte of a result passes through both, and a byte of scratch
-takes its share of the bandwidth; `--storage-mb-s 0` means no limit. Nothing is assumed.
+together, its barriers between stages and what the driver does alone between them. Driver and scheduler each serve
+one request after the other. A task costs the driver what it cost in that stage of a large run, a message what one with
+a task that does nothing costs driver and scheduler. A byte of a result passes through both. Storage has no limit.
 
 Every trace is also replayed: its own tasks with their measured wall-clock times on the same number of workers. The
 reported error is the difference between the simulated and the measured wall-clock time.
@@ -24,9 +22,8 @@ import dataclasses
 import heapq
 import itertools
 import json
-import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,16 +33,12 @@ from benchmarks.city_scale import is_mark
 from benchmarks.entries import markdown_table
 from pipeline.model import FloatArray
 from pipeline.runtime.cluster.dispatch import _SHARES, _TOGETHER_S, TASKS_PER_THREAD
-from pipeline.runtime.scratch.folder import POINT
 
 _SEED = 20
-_HALO_M = 41.5
-"""Halo of a split; `SceneSettings.split_support_m`."""
 STAGES = ("ingest", "cells", "ground", "split", "join", "outline", "reconstruct", "publish", "digest")
 _HASH_BYTES = 32
 _FILES_PER_LOOK = 32
 """Files at which one task looks; `pipeline.runtime.looking`."""
-REQUIRED = 0.80
 _LARGE = 5_000_000
 """Cities with more buildings are simulated with the larger numbers of workers only: a minute each."""
 _LARGE_WORKERS = 100
@@ -68,8 +61,6 @@ class Stage:
     """What a message costs the scheduler."""
     result_bytes: float = 0.0
     """Bytes of a task's result."""
-    stored_bytes: float = 0.0
-    """What a task reads and writes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,8 +73,6 @@ class Machine:
     """What a byte of a result costs scheduler and driver, each."""
     worker_s: float = 0.0
     """Between two tasks of one worker."""
-    storage_bytes_s: float = math.inf
-    """Bandwidth of the storage that all share."""
     tasks_a_thread: int = TASKS_PER_THREAD
     """The window of messages in flight."""
     together_s: float = _TOGETHER_S
@@ -134,8 +123,7 @@ def run_stage(stage: Stage, machine: Machine, began_s: float) -> tuple[float, fl
     count = len(stage.durations_s)
     until = np.concatenate(([0.0], np.cumsum(stage.durations_s)))
     short = int(machine.together_s * count / max(float(until[-1]), 1e-9)) if count else 1
-    driver, scheduler, storage = _Server(now_s), _Server(now_s), _Server(now_s)
-    storing_s = 0.0 if math.isinf(machine.storage_bytes_s) else stage.stored_bytes / machine.storage_bytes_s
+    driver, scheduler = _Server(now_s), _Server(now_s)
     carrying_s = machine.byte_s * stage.result_bytes
     events: list[tuple[float, int, int, tuple[int, int]]] = []
     ready: deque[tuple[int, int]] = deque()
@@ -157,8 +145,7 @@ def run_stage(stage: Stage, machine: Machine, began_s: float) -> tuple[float, fl
 
     def start(tasks: tuple[int, int]) -> None:
         first, last = tasks
-        read_s = storage.serve(now_s, storing_s * (last - first)) if storing_s else now_s
-        tell(read_s + float(until[last] - until[first]) + machine.worker_s * (last - first), _DONE, tasks)
+        tell(now_s + float(until[last] - until[first]) + machine.worker_s * (last - first), _DONE, tasks)
 
     for _ in range(machine.tasks_a_thread * max(2, machine.workers)):
         send()
@@ -261,8 +248,6 @@ class Engine:
     """Number of buildings in the trace."""
     files: float
     """Files per building."""
-    points: int
-    """Points in the trace."""
     look_s: float
     """Seconds of a look at a file."""
     tasks: Mapping[str, float]
@@ -285,13 +270,9 @@ class Engine:
     """By stage."""
     start_s: float
     """From the start of the workers to the first task."""
-    tile_m: float
-    """Side of a tile."""
 
 
-def measured_engine(
-    trace: Mapping[str, Any], costs: Mapping[str, Any], driver: Mapping[str, Any], tile_m: float
-) -> Engine:
+def measured_engine(trace: Mapping[str, Any], costs: Mapping[str, Any], driver: Mapping[str, Any]) -> Engine:
     """The engine as a trace, the costs of messages and the driver of a large run have it."""
     small = [row for row in costs["tasks"] if row["result_bytes"] < 100_000]
     large = max(costs["tasks"], key=lambda row: row["result_bytes"])
@@ -304,7 +285,6 @@ def measured_engine(
         times=own_times(trace, "cpu_s"),
         buildings=counts["candidates"],
         files=row["files"] / row["buildings"],
-        points=counts["points"],
         look_s=driver["look_s"],
         tasks={stage: row["tasks"][stage] / row["buildings"] for stage in STAGES},
         before_s={stage: row["before_s"][stage] / row["buildings"] for stage in STAGES},
@@ -323,28 +303,12 @@ def measured_engine(
             for stage in STAGES
         },
         start_s=2.0,
-        tile_m=tile_m,
     )
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Change:
-    """What is done otherwise; as the engine is by default."""
-
-    drivers: int = 1
-    """Runs side by side, each with a scheduler and a share of the workers."""
-    tasks_a_thread: int = TASKS_PER_THREAD
-    """Window of messages in flight."""
-    together_s: float = _TOGETHER_S
-    """Tasks that take so long together travel in one message."""
 
 
 def city_stages(engine: Engine, buildings: int, seed: int = _SEED) -> list[Stage]:
     """The stages of a run over a city of so many buildings."""
     random = np.random.default_rng(seed)
-    points = engine.points / engine.buildings
-    window = (1.0 + 2.0 * _HALO_M / engine.tile_m) ** 2
-    factor = {"ingest": 1.15, "cells": 1.0, "split": window + 0.3, "reconstruct": 1.5}
     files = engine.files * buildings
     looks = max(1, round(files / _FILES_PER_LOOK))
     costs = {"driver_s": engine.message_s, "scheduler_s": engine.scheduler_s}
@@ -365,7 +329,6 @@ def city_stages(engine: Engine, buildings: int, seed: int = _SEED) -> list[Stage
                 durations_s=durations,
                 task_s=engine.task_s[name],
                 result_bytes=engine.result_bytes[name],
-                stored_bytes=POINT.itemsize * points * buildings * factor.get(name, 0.0) / len(durations),
                 **costs,
             )
         )
@@ -373,72 +336,25 @@ def city_stages(engine: Engine, buildings: int, seed: int = _SEED) -> list[Stage
     return [*stages, last, Stage(name="end", before_s=engine.after_s * buildings, durations_s=np.empty(0))]
 
 
-def city_run(engine: Engine, buildings: int, workers: int, change: Change, storage_bytes_s: float) -> Outcome:
-    """A run over a city; of several drivers one is simulated, with its share of all."""
-    share = change.drivers
-    machine = Machine(
-        workers=max(1, workers // share),
-        byte_s=engine.byte_s,
-        worker_s=0.002,
-        storage_bytes_s=storage_bytes_s / share,
-        tasks_a_thread=change.tasks_a_thread,
-        together_s=change.together_s,
-    )
-    return simulate(city_stages(engine, max(1, buildings // share)), machine)
+def city_run(engine: Engine, buildings: int, workers: int) -> Outcome:
+    """A run over a city."""
+    return simulate(city_stages(engine, buildings), Machine(workers=workers, byte_s=engine.byte_s, worker_s=0.002))
 
 
-CHANGES: Mapping[str, Change] = {
-    "as it is": Change(),
-    "window twice as large": Change(tasks_a_thread=2 * TASKS_PER_THREAD),
-    "each task travels alone": Change(together_s=0.0),
-    "four runs side by side": Change(drivers=4),
-}
-"""What moves the point where it stops scaling."""
-
-
-def curves(engine: Engine, wanted: argparse.Namespace) -> dict[int, list[Outcome]]:
-    """Cities on more and more workers."""
-    storage = wanted.storage_mb_s * 1e6 if wanted.storage_mb_s else math.inf
+def curves(engine: Engine, sizes: Sequence[int], workers: Sequence[int]) -> dict[int, list[Outcome]]:
+    """Cities of some numbers of buildings on more and more workers."""
     return {
         buildings: [
-            city_run(engine, buildings, count, Change(), storage)
-            for count in wanted.workers
-            if buildings < _LARGE or count >= _LARGE_WORKERS
+            city_run(engine, buildings, count) for count in workers if buildings < _LARGE or count >= _LARGE_WORKERS
         ]
-        for buildings in wanted.buildings
+        for buildings in sizes
     }
-
-
-def max_workers(run_with: Callable[[int], Outcome], least: float, limit: int) -> int:
-    """The largest number of workers, up to a limit, at which the efficiency is still as large as wanted; by halves."""
-    low, high = 0, limit
-    while high - low > max(1, low // 20):
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if run_with(middle).efficiency >= least else (low, middle - 1)
-    return low
 
 
 def outcome_cells(found: Outcome) -> list[str]:
     """Wall, efficiency, and how busy driver and scheduler were."""
     shares = found.efficiency, found.driver_s / found.wall_s, found.scheduler_s / found.wall_s
     return [f"{found.wall_s / 60:.1f}", *(f"{share:.2f}" for share in shares)]
-
-
-def changes_table(engine: Engine, buildings: int, workers: int, storage_bytes_s: float) -> str:
-    """What each change gives."""
-    rows = []
-    for label, change in CHANGES.items():
-        found = city_run(engine, buildings, workers, change, storage_bytes_s)
-
-        def run_with(count: int, change: Change = change) -> Outcome:
-            return city_run(engine, buildings, max(count, change.drivers), change, storage_bytes_s)
-
-        most = str(max_workers(run_with, REQUIRED, 1000))
-        rows.append([label, *outcome_cells(found), most])
-    return markdown_table(
-        ["change", "wall, min", "efficiency", "driver at work", "scheduler at work", "workers at which it is 0.8"],
-        rows,
-    )
 
 
 def curve_table(buildings: int, found: Sequence[Outcome]) -> str:
@@ -453,57 +369,13 @@ def curve_table(buildings: int, found: Sequence[Outcome]) -> str:
     return markdown_table([*heads, "stages that take most"], rows)
 
 
-def tables(
-    engine: Engine,
-    wanted: argparse.Namespace,
-    replays: Sequence[tuple[str, int, float, float]],
-    found: Mapping[int, Sequence[Outcome]],
-) -> str:
+def tables(replays: Sequence[tuple[str, int, float, float]], found: Mapping[int, Sequence[Outcome]]) -> str:
     """The whole report."""
-    storage = wanted.storage_mb_s * 1e6 if wanted.storage_mb_s else math.inf
     rows = [[name, str(n), f"{a:.1f}", f"{b:.1f}", f"{100 * (a / b - 1):+.1f} %"] for name, n, a, b in replays]
     parts = ["## Replayed\n", markdown_table(["trace", "workers", "simulated, s", "measured, s", "error"], rows)]
     for buildings, outcomes in found.items():
         parts += [f"\n## {buildings} buildings\n", curve_table(buildings, outcomes)]
-    middle, most = wanted.buildings[len(wanted.buildings) // 2], wanted.workers[-1]
-    parts.append(f"\n## What moves it: {middle} buildings, {most} workers\n")
-    parts.append(changes_table(engine, middle, most, storage))
-    parts.append(f"\n## A limit of the storage: {middle} buildings, {most} workers\n")
-    rows = []
-    for mb_s in (math.inf, 10_000.0, 3_000.0, 1_000.0, 300.0):
-        limited = city_run(engine, middle, most, Change(), mb_s * 1e6)
-        rows.append(["none" if math.isinf(mb_s) else f"{mb_s:g}", *outcome_cells(limited)[:2]])
-    parts.append(markdown_table(["MB per second", "wall, min", "efficiency"], rows))
     return "\n".join(parts)
-
-
-def draw(found: Mapping[int, Sequence[Outcome]], path: Path) -> None:
-    """Efficiency by workers."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axis = plt.subplots(figsize=(6.4, 3.8), dpi=120)
-    for buildings, outcomes in found.items():
-        axis.plot(
-            [one.workers for one in outcomes],
-            [one.efficiency for one in outcomes],
-            marker="o",
-            markersize=3,
-            label=f"{buildings:,} buildings",
-        )
-    axis.axhline(REQUIRED, color="0.6", linewidth=0.8)
-    axis.set_xscale("log")
-    axis.set_ylim(0.0, 1.0)
-    axis.set_xlabel("workers")
-    axis.set_ylabel("efficiency (simulated)")
-    axis.legend(fontsize=7)
-    axis.grid(visible=True, alpha=0.3)
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    plt.close(figure)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -515,21 +387,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--buildings", type=int, nargs="+", default=[20_000, 1_000_000, 10_000_000])
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 8, 32, 100, 300, 1000])
-    parser.add_argument("--storage-mb-s", type=float, default=0.0)
-    parser.add_argument("--tile-size", type=float, default=500.0, help="of the first trace's lattice")
-    parser.add_argument("--figure", type=Path)
     wanted = parser.parse_args(arguments)
     traces = {path.name.split(".")[0]: json.loads(path.read_text(encoding="utf-8")) for path in wanted.traces}
     replays = [(name, trace["workers"], *replayed(trace)) for name, trace in traces.items()]
     costs = json.loads(wanted.costs.read_text(encoding="utf-8"))
     driver = json.loads(wanted.driver.read_text(encoding="utf-8"))
-    engine = measured_engine(next(iter(traces.values())), costs, driver, wanted.tile_size)
-    found = curves(engine, wanted)
-    text = tables(engine, wanted, replays, found)
+    engine = measured_engine(next(iter(traces.values())), costs, driver)
+    text = tables(replays, curves(engine, wanted.buildings, wanted.workers))
     wanted.out.mkdir(parents=True, exist_ok=True)
     (wanted.out / "scaling.md").write_text(text + "\n", encoding="utf-8")
-    if wanted.figure is not None:
-        draw(found, wanted.figure)
     print(text)
     return 0
 

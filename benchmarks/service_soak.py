@@ -1,4 +1,4 @@
-"""Many clients for minutes while parts of the service fail: what is lost or doubled, and how long a status call takes.
+"""Many clients for minutes, also while parts of the service fail: what is lost or doubled, how long a call takes.
 
     python -m benchmarks.service_soak [--minutes 10] [--pollers 500] [--uploads 50] [--kill-driver-every 20]
         [--fill-disk] [--lock-database] [--state DIR] [--tile FILE] [--megabytes 20]
@@ -10,7 +10,8 @@ of one once a second. Jobs model a small window of the tile, so that the service
 `--kill-driver-every` sends SIGKILL to the driver. `--lock-database` holds an exclusive lock for the first 10 s of each
 minute, and `--fill-disk` writes to the last byte of the disk that `--state` lies on for 10 s from the middle of each
 minute: put it on a small file system of its own. When the time is over, all jobs must end, each exactly once. Every
-refusal must be a problem document that says when to come again.
+refusal must be a problem document that says when to come again, and the API process must stay below 250 MiB. Without
+any of the three options it measures load alone.
 """
 
 from __future__ import annotations
@@ -42,8 +43,13 @@ import laspy
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 
-from benchmarks.service_load import PAUSE_S, TILE, Poller, cpu_s, peak_mib, serving
+from benchmarks.service_process import Poller, cpu_s, peak_mib, serving
 
+TILE = Path(__file__).resolve().parents[2] / "shared" / "data" / "ahn3" / "delft_east.laz"
+MAX_API_MIB = 250.0
+"""Limit of the API process."""
+PAUSE_S = 1.0
+"""Seconds that a poller waits between two calls."""
 POINTS_IN_WINDOW = 8_000
 FAULT_S = 10.0
 """How long the database is locked and the disk is full, in each minute."""
@@ -322,7 +328,7 @@ def ended(url: str, jobs: list[str]) -> tuple[Counter[str], list[str]]:
 
 
 def main() -> int:
-    """Load a service and let it fail; 1 where something is lost, doubled or refused without a reason."""
+    """Load a service and let it fail; 1 if something is lost, doubled, too large or refused without a reason."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--pollers", type=int, default=500)
@@ -345,6 +351,8 @@ def main() -> int:
             _, peak = peak_mib(pid)
             ends, faults = ended(url, uploading.jobs)
             faults += uploading.faults + polling.faults
+    if peak > MAX_API_MIB:
+        faults.append(f"the API process took {peak:.0f} MiB, {MAX_API_MIB:.0f} are allowed")
     cuts = statistics.quantiles(polling.calls_s, n=100)
     spread = (cuts[49], cuts[94], cuts[98], max(polling.calls_s))
     figures = {

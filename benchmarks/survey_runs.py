@@ -7,9 +7,7 @@ import os
 import resource
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.candidates import found_scene
@@ -31,44 +29,19 @@ class Seconds:
     """Wall-clock time."""
 
 
-def run_survey(
-    entry: Entry, variant: Variant, out: Path, *, workers: int = 0, environment: Mapping[str, str] | None = None
-) -> Seconds:
-    """Run the command line on a survey, in a process of its own; nothing else may be started meanwhile.
+def run_survey(entry: Entry, variant: Variant, out: Path) -> Seconds:
+    """Run the command line on a survey in a process of its own, with `out` overwritten; RuntimeError if it fails.
 
-    Parameters
-    ----------
-    entry : Entry
-        Tiles, CRS, footprints, classes.
-    variant : Variant
-        Method and preset.
-    out : Path
-        The run directory; overwritten.
-    workers : int
-        Of the run.
-    environment : mapping, optional
-        Variables beside those of this process.
-
-    Raises
-    ------
-    RuntimeError
-        The run ended with a fault.
+    Nothing else may be started meanwhile: its processor seconds are those of all child processes.
     """
-    command = [
-        os.environ.get("GABLEWORK_PYTHON", sys.executable),
-        "-m",
-        "service.cli",
-        "reconstruct",
-        *map(str, entry.tiles),
-        "--out",
-        str(out),
-    ]
+    python = os.environ.get("GABLEWORK_PYTHON", sys.executable)
+    command = [python, "-m", "service.cli", "reconstruct", *map(str, entry.tiles), "--out", str(out)]
     command += ["--method", variant.method, "--preset", variant.preset, "--classes", entry.classes]
-    command += ["--workers", str(workers), "--meshes", "none", "--overwrite", "--quiet"]
+    command += ["--workers", "0", "--meshes", "none", "--overwrite", "--quiet"]
     command += [] if entry.crs is None else ["--crs", entry.crs]
     command += [] if entry.footprints is None else ["--footprints", str(entry.footprints)]
     paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]  # the code that this file belongs to
-    variables = {**os.environ, **(environment or {}), "PYTHONPATH": os.pathsep.join(paths)}
+    variables = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     variables.pop("PYTHONDONTWRITEBYTECODE", None)  # a second run finds what the first compiled
     before, began = _processor_s(), time.perf_counter()
     reported = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
@@ -86,14 +59,7 @@ def _processor_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def cold_run(entry: Entry, variant: Variant, out: Path) -> Seconds:
-    """A run that finds neither compiled kernels nor bytecode."""
-    with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
-        empty = {"NUMBA_CACHE_DIR": f"{folder}/kernels", "PYTHONPYCACHEPREFIX": f"{folder}/bytecode"}
-        return run_survey(entry, variant, out, environment=empty)
-
-
 def candidates_of(entry: Entry, settings: RunSettings) -> list[Candidate]:
     """The candidates of a survey as a run finds them, with the given footprints where there are any."""
     footprints = None if entry.footprints is None else str(entry.footprints)
-    return list(found_scene([str(tile) for tile in entry.tiles], entry.crs, settings, footprints).candidates)
+    return list(found_scene([str(tile) for tile in entry.tiles], entry.crs, settings, footprints))

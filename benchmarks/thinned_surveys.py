@@ -1,4 +1,4 @@
-"""Point files like those of a poorer survey: fewer points, or no buildings among the classes.
+"""Point files like those of a sparser survey.
 
 A point stays if the hash of its place in whole millimetres is below the wanted share. The choice does not depend on
 order, files or a random generator, and every denser survey contains the points of a sparser one. All classes
@@ -19,10 +19,6 @@ import shapely
 
 from pipeline.model import BoolArray, IntArray
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.scene import BUILDING_CLASS
-
-UNCLASSIFIED = 1
-"""What a building point becomes when the buildings are left out."""
 
 _ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 _MIXERS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
@@ -57,18 +53,8 @@ def roof_density(reference: Reference) -> RoofDensity:
 def place_hash(xyz_mm: IntArray) -> npt.NDArray[np.uint64]:
     """A number between 0 and 2^64 for each place, evenly spread and unrelated between neighbours.
 
-    The coordinates are weighted by odd numbers and mixed by the finaliser of SplitMix64 (Steele, Lea and Flood 2014,
-    Fast splittable pseudorandom number generators), axis after axis.
-
-    Parameters
-    ----------
-    xyz_mm : (n, 3) int64
-        Places, whole millimetres.
-
-    Returns
-    -------
-    (n,) uint64
-        The same for the same place, whatever stands beside it.
+    The coordinates (n, 3) in whole millimetres are weighted by odd numbers and mixed by the finaliser of SplitMix64
+    (Steele, Lea and Flood 2014, Fast splittable pseudorandom number generators), axis after axis.
     """
     mixed = np.zeros(len(xyz_mm), np.uint64)
     for axis, weight in enumerate(_ODD):
@@ -80,20 +66,7 @@ def place_hash(xyz_mm: IntArray) -> npt.NDArray[np.uint64]:
 
 
 def kept(xyz_mm: IntArray, share: float) -> BoolArray:
-    """Which points of a survey stay.
-
-    Parameters
-    ----------
-    xyz_mm : (n, 3) int64
-        Places, whole millimetres.
-    share : float
-        About this share of them stays; all from 1 on.
-
-    Returns
-    -------
-    (n,) bool
-        True where a point stays.
-    """
+    """Which points (n, 3) of a survey, in whole millimetres, stay: about this share of them, all from 1 on."""
     if share >= 1.0:
         return np.ones(len(xyz_mm), np.bool_)
     below: BoolArray = place_hash(xyz_mm) < np.uint64(int(share * 2.0**64))
@@ -111,31 +84,8 @@ def thinned(share: float) -> Change:
     return change
 
 
-def without_buildings(las: laspy.LasData) -> laspy.LasData:
-    """The change that hides the buildings: class 6 becomes 1, all else stays."""
-    classes = np.array(las.classification)
-    classes[classes == BUILDING_CLASS] = UNCLASSIFIED
-    las.classification = classes
-    return las
-
-
 def write_changed(tiles: Sequence[Path], folder: Path, change: Change) -> tuple[Path, ...]:
-    """Write point files that were changed, under their own names.
-
-    Parameters
-    ----------
-    tiles : sequence of Path
-        LAS or LAZ files, each read as a whole.
-    folder : Path
-        Where the changed ones go; made where it is not there.
-    change : callable
-        From the points of a file to those that are written.
-
-    Returns
-    -------
-    tuple of Path
-        The new files, in the order of the tiles.
-    """
+    """Change LAS or LAZ files, each read as a whole; the new files have their names, in their order, in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for tile in tiles:

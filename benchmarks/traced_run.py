@@ -1,7 +1,6 @@
 """One run of the pipeline that records every task; `city_scale.py` starts it as a separate process.
 
-    python -m benchmarks.traced_run INPUT --out RUN --trace trace.json [--workers 2] [--scheduler ADDRESS]
-                                    [--tile-size M]
+    python -m benchmarks.traced_run INPUT --out RUN --trace trace.json [--workers 2] [--tile-size M]
 
 It calls the function of `gablework reconstruct` with an executor that passes tasks on and stores the measurements of
 `Measured`. For every eighth task it also takes the sizes of task and result.
@@ -38,13 +37,7 @@ SCRATCH_AFTER = ("split", "reconstruct", "publish")
 
 
 class TracingExecutor:
-    """Hands tasks on to an executor and keeps what each took.
-
-    Parameters
-    ----------
-    inner : Executor
-        Does the work.
-    """
+    """Hands tasks on to an executor, which does the work, and keeps what each took."""
 
     def __init__(self, inner: Executor) -> None:
         self._inner = inner
@@ -148,7 +141,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--trace", type=Path, required=True)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--scheduler")
     parser.add_argument("--tile-size", type=float, default=0.0)
     wanted = parser.parse_args(arguments)
     settings = RunSettings.from_mapping({"tile_size_m": wanted.tile_size} if wanted.tile_size else {})
@@ -156,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         inputs=(wanted.input,),
         out=str(wanted.out),
         settings=settings,
-        resources=Resources(workers=wanted.workers, scheduler=wanted.scheduler),
+        resources=Resources(workers=wanted.workers),
         overwrite=True,
     )
     diary = Diary(wanted.out / "scratch")

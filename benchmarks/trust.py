@@ -1,6 +1,7 @@
 """Which models of a run are wrong, and whether their status says so: the suite `trust`, held against its truth.
 
     python -m benchmarks.trust --out DIR [--split dev|test] [--draws 3] [--kinds houses glass] [--jobs 2] [--feet]
+    python -m benchmarks.trust --runs RUN ...
 
 Makes the scenes of the suite below DIR/SPLITn, models each with default settings, its classes ignored and, where they
 were written, trusted, and judges every model. A model is wrong if it is not of a building: true buildings lie under
@@ -14,6 +15,9 @@ judged in metres.
 
 DIR/SPLIT.parquet has a row per model: scene, survey, classes, the judgement, and the columns of the record.
 DIR/SPLIT_rejected.parquet has the rejected objects, DIR/SPLIT.json and DIR/SPLIT.md the tables.
+
+`--runs` has no truth: of finished runs it counts the models that lie on their points, at least 90 % of their roof
+returns within 0.2 m (`share_within_0_2m`), and those of them that are not `ok`, by reason.
 """
 
 from __future__ import annotations
@@ -29,25 +33,32 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import laspy
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pyproj
 import shapely
+from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from benchmarks.entries import markdown_table
-from benchmarks.trust_feet import FOOT_M, write_in_feet
 from benchmarks.trust_judge import Truth, top_of
 from pipeline.export.geoparquet import read_table
+from pipeline.model import Status
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.trust import CELLS, KINDS, TrustCell
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.resources import Resources
+from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
 from pipeline.settings import RunSettings
 
 TOLERANCE_M, SPARSE_TOLERANCE_M, SPARSE_PER_M2 = 0.2, 0.4, 2.0
-OK = "ok"
+FOOT_M = 0.3048
+"""The international foot."""
+FITTED_SHARE = 0.9
+"""Share of the roof returns within 0.2 m from which on a model lies on its points."""
 SURVEYS_IN_FEET = ("d4_five", "d6_last")
 
 
@@ -133,6 +144,37 @@ def _with_columns(
     return pa.table([*columns, *records.columns], names=[*(field.name for field in fields), *records.column_names])
 
 
+def crs_in_feet(crs: pyproj.CRS) -> pyproj.CRS:
+    """A compound CRS in metres with feet on all axes, so that a place has the same coordinates over `FOOT_M`."""
+    changed = crs.to_json_dict()
+    changed.pop("id", None)
+    for part in changed["components"]:
+        part.pop("id", None)
+        part["name"] += " (ft)"
+        for axis in part["coordinate_system"]["axis"]:
+            axis["unit"] = {"type": "LinearUnit", "name": "foot", "conversion_factor": FOOT_M}
+    return pyproj.CRS.from_json_dict(changed)
+
+
+def write_in_feet(metres: Path, feet: Path) -> None:
+    """Write a copy of a LAZ file whose coordinates are in feet, to 0.001 ft, and whose compound CRS says so."""
+    las = laspy.read(metres)
+    header = laspy.LasHeader(version=las.header.version, point_format=las.header.point_format)
+    header.scales = np.full(3, 0.001)
+    header.offsets = np.floor(las.header.offsets / FOOT_M)
+    header.global_encoding.gps_time_type = las.header.global_encoding.gps_time_type
+    header.global_encoding.wkt = True
+    crs = las.header.parse_crs()
+    assert crs is not None
+    header.vlrs.append(WktCoordinateSystemVlr(crs_in_feet(crs).to_wkt("WKT1_GDAL")))
+    copy = laspy.LasData(header)
+    for name in set(las.point_format.dimension_names) - {"X", "Y", "Z"}:
+        copy[name] = las[name]
+    for axis in "xyz":
+        setattr(copy, axis, np.asarray(las[axis]) / FOOT_M)
+    copy.write(feet)
+
+
 def run_cell(task: tuple[TrustCell, Path, int, bool]) -> list[Judged]:
     """Model a scene with its classes ignored, and trusted if it has any, and judge both; the last says: in feet."""
     cell, place, draw, in_feet = task
@@ -146,10 +188,14 @@ def run_cell(task: tuple[TrustCell, Path, int, bool]) -> list[Judged]:
         settings = RunSettings.from_mapping({"classes": classes})
         run(
             RunRequest(
-                inputs=(str(laz),), out=str(out), settings=settings, resources=Resources(workers=0),
-                meshes="none", overwrite=True,
+                inputs=(str(laz),),
+                out=str(out),
+                settings=settings,
+                resources=SERIAL,
+                meshes="none",
+                overwrite=True,
             )
-        )  # fmt: skip
+        )
         found.append(judge_run(out, place / "truth", cell, classes, draw, in_feet=in_feet))
     return found
 
@@ -171,6 +217,16 @@ def run_split(
         return [one for some in pool.map(run_cell, tasks) for one in some]
 
 
+def fitted_row(name: str, records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The row of a run with these records in the table of `--runs`."""
+    models = [record for record in records if record["status"] != Status.FAILED]
+    fitted = [model for model in models if (model["share_within_0_2m"] or 0.0) >= FITTED_SHARE]
+    others = collections.Counter(model["reason"] for model in fitted if model["status"] != Status.OK)
+    reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(others.items()))
+    share = f"{_ratio(others.total(), len(fitted)):.1%}" if fitted else ""
+    return [name, str(len(models)), str(len(fitted)), str(others.total()), share, reasons]
+
+
 # ----------------------------------------------------------------------------------------------------------- tables
 
 
@@ -189,12 +245,12 @@ class Counts:
     @property
     def wrong_ok(self) -> float:
         """Share of the wrong models that are `ok`; nan without any."""
-        return _ratio(self.wrong.get(OK, 0), sum(self.wrong.values()))
+        return _ratio(self.wrong.get(Status.OK, 0), sum(self.wrong.values()))
 
     @property
     def right_not_ok(self) -> float:
         """Share of the right models that are not `ok`; nan without any."""
-        return _ratio(sum(self.right.values()) - self.right.get(OK, 0), sum(self.right.values()))
+        return _ratio(sum(self.right.values()) - self.right.get(Status.OK, 0), sum(self.right.values()))
 
 
 def _ratio(part: int, whole: int) -> float:
@@ -221,7 +277,10 @@ def counted(runs: Iterable[Judged]) -> Counts:
 
 def table(groups: Mapping[str, Counts]) -> str:
     """A row per group."""
-    statuses = sorted({status for one in groups.values() for status in (*one.right, *one.wrong)} | {OK}, key=_order)
+    statuses = sorted(
+        {status for one in groups.values() for status in (*one.right, *one.wrong)} | {str(Status.OK)},
+        key=lambda one: (one != Status.OK, one),
+    )
     heads = [*(f"right, {status}" for status in statuses), *(f"wrong, {status}" for status in statuses)]
     rows = []
     for name, one in groups.items():
@@ -231,10 +290,6 @@ def table(groups: Mapping[str, Counts]) -> str:
         rows.append([name, *map(str, counts), *("" if s != s else f"{s:.1%}" for s in shares), *map(str, others)])
     shares = ["wrong that are ok", "right that are not ok"]
     return markdown_table(["", *heads, *shares, "buildings", "without a model", "rejected buildings"], rows)
-
-
-def _order(status: str) -> tuple[bool, str]:
-    return status != OK, status
 
 
 def grouped(runs: Sequence[Judged]) -> dict[str, dict[str, Counts]]:
@@ -278,13 +333,22 @@ def write(runs: Sequence[Judged], out: Path, name: str) -> str:
 def main(words: Sequence[str] | None = None) -> int:
     """Make, model, judge, write and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--runs", nargs="+", type=Path, help="finished runs without truth")
     parser.add_argument("--split", choices=("dev", "test"), default="dev")
     parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--kinds", nargs="*", choices=tuple(KINDS), default=tuple(KINDS))
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--feet", action="store_true", help="model copies of some surveys that are in feet")
     given = parser.parse_args(words)
+    if given.runs:
+        columns = ["status", "reason", "share_within_0_2m"]
+        records = {run.name: read_table(str(run), "buildings").select(columns).to_pylist() for run in given.runs}
+        heads = ["run", "models", "on their points", "of these not ok", "share", "reasons"]
+        print(markdown_table(heads, [fitted_row(*item) for item in records.items()]))
+        return 0
+    if given.out is None:
+        parser.error("give --out or --runs")
     given.out.mkdir(parents=True, exist_ok=True)
     runs = run_split(given.split, given.draws, given.kinds, given.out, given.jobs, in_feet=given.feet)
     print(write(runs, given.out, f"{given.split}_feet" if given.feet else given.split))

@@ -94,8 +94,6 @@ class Kind:
     """The files of which one is damaged."""
     arguments: tuple[str, ...]
     """The command that reads it; `{file}` is the damaged file, `{out}` the run directory."""
-    rest: str = ""
-    """The input of the process `reconstruct` that takes it; empty where the service takes none."""
 
 
 def _run(points: str, *more: str) -> tuple[str, ...]:
@@ -104,49 +102,37 @@ def _run(points: str, *more: str) -> tuple[str, ...]:
 
 
 KINDS: tuple[Kind, ...] = (
-    Kind(name="las", files=("tile.las",), arguments=_run("tile.las"), rest="tiles"),
-    Kind(name="laz", files=("tile.laz", "old.laz"), arguments=_run("{file}"), rest="tiles"),
+    Kind(name="las", files=("tile.las",), arguments=_run("tile.las")),
+    Kind(name="laz", files=("tile.laz", "old.laz"), arguments=_run("{file}")),
     Kind(
         name="copc",
         files=("tile.copc.laz",),
         arguments=_run("tile.copc.laz", "--bbox", "400000", "5650000", "400039", "5650029"),
-        rest="tiles",
     ),
     Kind(
         name="ply",
         files=("tile.ply", "text.ply"),
         arguments=_run("{file}", "--crs", CRS),
-        rest="tiles",
     ),
     Kind(
         name="geojson",
         files=("footprints.geojson",),
         arguments=_run("tile.laz", "--footprints", "footprints.geojson"),
-        rest="footprints",
     ),
     Kind(
         name="geopackage",
         files=("footprints.gpkg",),
         arguments=_run("tile.laz", "--footprints", "footprints.gpkg"),
-        rest="footprints",
     ),
     Kind(
         name="shapefile",
-        files=(
-            "footprints.shp",
-            "footprints.shp",
-            "footprints.dbf",
-            "footprints.shx",
-            "footprints.prj",
-            "footprints.cpg",
-        ),
+        files=tuple(f"footprints.{ending}" for ending in ("shp", "shp", "dbf", "shx", "prj", "cpg")),
         arguments=_run("tile.laz", "--footprints", "footprints.shp"),
     ),
     Kind(
         name="geoparquet",
         files=("footprints.parquet",),
         arguments=_run("tile.laz", "--footprints", "footprints.parquet"),
-        rest="footprints",
     ),
     Kind(
         name="overrides",
@@ -157,7 +143,6 @@ KINDS: tuple[Kind, ...] = (
         name="guides",
         files=("guides.geojson", "guides.gpkg"),
         arguments=_run("tile.laz", "--guides", "{file}"),
-        rest="guides",
     ),
     Kind(name="batch", files=("batch.toml",), arguments=("batch", "run", "batch.toml", "--quiet", "--json")),
 )

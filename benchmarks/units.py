@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from benchmarks.candidates import candidates_of
+from benchmarks.candidates import found_scene
 from benchmarks.entries import markdown_table
 from pipeline.io import ReadOptions, open_source
 from pipeline.io.footprints import read_footprints
@@ -81,7 +81,7 @@ def relations(candidate: IntArray, house: IntArray) -> Relations:
 def points_of_candidates(tiles: Sequence[str], crs: str | None, split: str) -> tuple[IntArray, IntArray]:
     """Points (n, 3) of all candidates in mm, and the candidate of each."""
     settings = RunSettings.from_mapping({"classes": "ignore", "units": {"split": split}})
-    found = list(candidates_of(tiles, crs, settings))
+    found = found_scene(tiles, crs, settings)
     points = [np.rint(1000 * (one.points + np.array(one.origin))).astype(np.int64) for one in found]
     return np.concatenate(points), np.repeat(np.arange(len(found)), [len(own) for own in points])
 
@@ -97,7 +97,7 @@ def houses_of_city(truth: Path, xyz_mm: IntArray) -> IntArray:
 
 
 def _keys(xyz_mm: IntArray) -> npt.NDArray[np.void]:
-    """One sortable value a point."""
+    """One sortable value per point."""
     return np.ascontiguousarray(xyz_mm).view([("x", "<i8"), ("y", "<i8"), ("z", "<i8")]).ravel()
 
 
@@ -111,11 +111,6 @@ def houses_of_footprints(path: str, tile: str, crs: str | None, xyz_mm: IntArray
         near = np.flatnonzero((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))
         house[near[shapely.contains_xy(polygon, x[near], y[near])]] = number
     return house
-
-
-def row_of(name: str, way: str, found: Relations) -> list[str]:
-    """A row of the table."""
-    return [name, way, *(str(value) for value in dataclasses.astuple(found))]
 
 
 def main() -> None:
@@ -142,12 +137,12 @@ def main() -> None:
             for way, split in WAYS:
                 points, candidate = points_of_candidates(tiles, None, split)
                 found = relations(candidate, houses_of_city(made.truth, points))
-                rows.append(row_of(f"{density:g} pts/m2", way, found))
+                rows.append([f"{density:g} pts/m2", way, *map(str, dataclasses.astuple(found))])
     else:
         for way, split in WAYS:
             points, candidate = points_of_candidates(arguments.tiles, arguments.crs, split)
             house = houses_of_footprints(arguments.footprints, arguments.tiles[0], arguments.crs, points)
-            rows.append(row_of("footprints", way, relations(candidate, house)))
+            rows.append(["footprints", way, *map(str, dataclasses.astuple(relations(candidate, house)))])
     print(markdown_table(["scene", "units", *(field.name for field in dataclasses.fields(Relations))], rows))
 
 

@@ -24,10 +24,8 @@ import laspy
 import numpy as np
 import shapely
 
-from benchmarks.entries import markdown_table
+from benchmarks.entries import fill_page, markdown_table
 from benchmarks.ground import DATA, measured, product_filter, samples
-from benchmarks.results_page import filled
-from benchmarks.scenes import DELFT_CRS, SCENES
 from benchmarks.thinned_surveys import thinned, write_changed
 from pipeline.export.geoparquet import read_table
 from pipeline.model import BoolArray, Status
@@ -36,7 +34,7 @@ from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reading.wireframes import read_wireframes
 from pipeline.runtime.classify import ClassifyRequest, classify
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.resources import Resources
+from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
 from pipeline.scene import BUILDING_CLASS
 from pipeline.settings import RunSettings
@@ -44,6 +42,9 @@ from pipeline.terrain.settings import GroundSettings
 
 PARTS = ("ground", "classes", "forest", "wireframes")
 IGN_CRS = "EPSG:2154"
+DELFT_CRS = "EPSG:7415"
+UNJUDGED = {"hdf": (870210.0, 6617086.0, 870234.0, 6617109.0)}
+"""x_min, y_min, x_max, y_max of a building that the file of a tile leaves unclassified."""
 THINNED_PER_M2 = (0.3, 0.5)
 SPARSE = "more/ign/sparse_0382_6565.laz"
 FOREST = "more/ign/forest_0906_6665.laz"
@@ -51,7 +52,6 @@ TALLINN = "more/building3d"
 TALLINN_CRS = "EPSG:3301"
 TOLERANCES = ("0_3m", "0_5m", "1m")
 """Tolerances of edges and corners, as in the names of the measures."""
-SERIAL = Resources(workers=0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -101,7 +101,7 @@ def half_of(las: laspy.LasData, *, eastern: bool) -> laspy.LasData:
 
 def judged_points(name: str, las: laspy.LasData) -> BoolArray:
     """The points to compare: all except those in a building that the file leaves unclassified."""
-    place = next((scene.unjudged for scene in SCENES if scene.name == name), None)
+    place = UNJUDGED.get(name)
     if place is None:
         return np.ones(len(las.x), np.bool_)
     inside: BoolArray = shapely.contains_xy(shapely.box(*place), np.asarray(las.x), np.asarray(las.y))
@@ -253,7 +253,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         (given.out / name).write_text(text, encoding="utf-8")
         print(f"{name}\n\n{text}", flush=True)
     if given.page is not None:
-        given.page.write_text(filled(given.page.read_text(encoding="utf-8"), given.out)[0], encoding="utf-8")
+        fill_page(given.page, given.out)
     return 0
 
 

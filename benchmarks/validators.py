@@ -20,15 +20,14 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jsonschema_rs  # schemathesis brings it: the library of the tests takes minutes for a town
 
-from benchmarks.entries import markdown_table
-from benchmarks.results_page import filled
+from benchmarks.entries import fill_page, markdown_table
+from benchmarks.run_scores import val3dity_report
 from pipeline.ruler.simulation.suites import SUITES
 
 SIMULATED = [name for name in SUITES if name not in {"sweep", "trust"}]
@@ -55,7 +54,6 @@ REAL: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Files below the data folder, and options."""
 
-
 JUDGED = {
     "models": "faults of models",
     "schema": "of documents",
@@ -63,15 +61,8 @@ JUDGED = {
     "finely": "of terrain, 0.5 mm",
 }
 """What is judged, and how it is called in the table."""
-COUNTED = {
-    "buildings": "buildings",
-    "solids": "solids",
-    "triangles": "triangles",
-    "surfaces": "surfaces",
-    "files": "files",
-    "documents": "documents",
-}
-"""What is counted, likewise."""
+COUNTED = ("buildings", "solids", "triangles", "surfaces", "files", "documents")
+"""What is counted: fields of `Figures`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -121,9 +112,7 @@ def main() -> int:
         print(name, found[name], flush=True)
     (arguments.out / "validators.md").write_text(table(found), encoding="utf-8")
     if arguments.page is not None:
-        arguments.page.write_text(
-            filled(arguments.page.read_text(encoding="utf-8"), arguments.out)[0], encoding="utf-8"
-        )
+        fill_page(arguments.page, arguments.out)
     return int(bool(failed) or any(faults for figures in found.values() for faults in figures.invalid.values()))
 
 
@@ -181,13 +170,13 @@ def judged(folder: Path, val3dity: str, check: Callable[[Mapping[str, Any]], lis
                     counts["triangles"] += sum(len(g["boundaries"]) for g in thing.get("geometry", ())) * (
                         thing["type"] == "TINRelief"
                     )
-            report = reported(file, val3dity)
+            report = val3dity_report(file, val3dity)
             counts[kind] += sum(kept["total"] for kept in report["primitives_overview"]) if kind != "files" else 1
             for judged_as, fault in faults_of(report):
                 faults[judged_as][fault] += 1
             if kind == "terrain":
                 faults["finely"].update(
-                    fault for _, fault in faults_of(reported(file, val3dity, "--snap_tol", "0.0005"))
+                    fault for _, fault in faults_of(val3dity_report(file, val3dity, "--snap_tol", "0.0005"))
                 )
     return Figures(
         buildings=counts["buildings"],
@@ -204,19 +193,6 @@ def read(file: Path) -> Iterator[dict[str, Any]]:
     """The objects of a file: its lines, or the one that it is."""
     text = file.read_text(encoding="utf-8")
     return map(json.loads, text.splitlines() if file.suffix == ".jsonl" else [text])
-
-
-def reported(file: Path, val3dity: str, *options: str) -> dict[str, Any]:
-    """val3dity's report of a file; its exit code says nothing about validity."""
-    with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
-        place = Path(folder, "report.json")
-        done = subprocess.run(
-            [val3dity, str(file), "--report", str(place), *options], capture_output=True, text=True, check=False
-        )
-        if not place.exists():
-            raise RuntimeError(f"{val3dity} gives no report of {file}: {(done.stdout + done.stderr)[-300:]}")
-        found: dict[str, Any] = json.loads(place.read_text(encoding="utf-8"))
-        return found
 
 
 def faults_of(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -249,7 +225,7 @@ def table(found: Mapping[str, Figures]) -> str:
         rows.setdefault(row, []).append(figures)
     lines = [[name, *_summed(parts)] for name, parts in rows.items()]
     lines.append(["**all**", *_summed(list(found.values()))])
-    return markdown_table(["data", *COUNTED.values(), *JUDGED.values()], lines)
+    return markdown_table(["data", *COUNTED, *JUDGED.values()], lines)
 
 
 def _summed(parts: Sequence[Figures]) -> list[str]:

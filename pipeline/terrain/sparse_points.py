@@ -2,8 +2,8 @@
 
 Where one or two points lie on a square metre, or fewer, no surface shows by itself where a roof ends and a tree begins.
 Several weak signs do so together: pulses that go on, how much of what stands around is on the point's level, how far
-candidates are and how much of the surroundings they hold. A logistic regression weighs them, and
-`benchmarks/sparse_points.py` fits the weights and shows how they do on places that they were not fitted on.
+candidates are and how much of the surroundings they hold. A logistic regression weighs them. The weights were fitted at
+commit 01fb6cec by `benchmarks/sparse_points.py`, which also scored them on places that they were not fitted on.
 
 All counts are whole numbers, and each point's terms are computed alone: the chance does not depend on tiles or order.
 """

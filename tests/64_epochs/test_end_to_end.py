@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import shapely
+from two_epochs import TwoEpochs, Work, two_epochs
 
-from benchmarks.two_epochs import TwoEpochs, Work, two_epochs
 from pipeline.ruler.epochs.diff import DiffRequest, diff
 from pipeline.ruler.simulation.als import scan
 from pipeline.ruler.simulation.suburb import suburb

@@ -10,7 +10,6 @@ import shapely
 
 from benchmarks.calibration_data import Candidates, is_building, points_of
 from benchmarks.detection_confidence import Weights, calibration_error, fitted, kinds_of
-from benchmarks.well_fitted import row_of
 from pipeline.model import FloatArray
 
 TRUE = Weights(per_log_flatness=4.0, at_flatness_1=-14.0, most=0.97, per_log_rough=-0.7, at_no_rough=-1.5)
@@ -114,14 +113,3 @@ def test_points_of_an_outline_are_those_of_all_its_files(tmp_path: Path) -> None
     found = look(shapely.box(7.5, -1.0, 12.5, 1.0))
     assert found[:, 0].tolist() == [8.0, 9.0, 10.0, 11.0, 12.0]
     assert (found[:, 3:] == [6.0, 0.0, 1.0]).all()
-
-
-def test_models_on_their_points_that_are_not_ok_are_counted_by_reason() -> None:
-    records = [
-        {"status": "ok", "reason": None, "share_within_0_2m": 0.95, "detection_confidence": 0.9},
-        {"status": "doubtful", "reason": "uncertain", "share_within_0_2m": 0.91, "detection_confidence": 0.3},
-        {"status": "doubtful", "reason": "poor_fit", "share_within_0_2m": 0.5, "detection_confidence": 0.3},
-        {"status": "fallback", "reason": "no_plane", "share_within_0_2m": 0.6, "detection_confidence": None},
-        {"status": "failed", "reason": "no_footprint", "share_within_0_2m": None, "detection_confidence": None},
-    ]
-    assert row_of("run", records) == ["run", "4", "2", "1", "50.0%", "1 uncertain", "25.0%"]

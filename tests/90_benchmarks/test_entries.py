@@ -1,29 +1,24 @@
-"""What the benchmarks measure, what they find there already, and how they clock."""
+"""What the benchmarks measure, what they find there already, and how they fill in pages."""
 
 import dataclasses
 import json
-import time
 from pathlib import Path
 
-import numpy as np
 import pytest
-from method_by_hand import MethodByHand
 
 from benchmarks.entries import (
     Entry,
     SimulatedScene,
     Workplace,
     all_variants,
+    filled,
     hofmann_entries,
     measure_all,
     run_settings,
     sweep_entries,
 )
-from benchmarks.method_times import ClockedSettings
 from benchmarks.ruler import cell, methods_table
-from pipeline.methods import METHODS, ReconstructSettings
-from pipeline.model import Candidate, PreparedCloud, Segmentation
-from pipeline.prepared_cloud import prepare_cloud
+from pipeline.methods import METHODS
 from pipeline.ruler.simulation.sweep import CELLS
 from pipeline.runtime.compare import Variant, settings_of
 
@@ -62,27 +57,15 @@ def test_a_run_counts_where_it_is_whole_and_by_the_same_settings(tmp_path, statu
     assert place.is_measured(FUZZY, entry) == there
 
 
-def test_the_clock_stands_within_the_segmentation_and_changes_nothing() -> None:
-    settings_type = METHODS["fuzzy-sart"].settings_type
-    answer = Segmentation(planes=(), labels=np.zeros(0, np.int32))
-
-    def segment(cloud: PreparedCloud, settings: object) -> Segmentation:
-        assert isinstance(settings, settings_type)
-        until = time.process_time() + 0.02
-        while time.process_time() < until:
-            pass
-        return answer
-
-    method = MethodByHand(name="busy", segment=segment, settings_type=settings_type)
-    candidate = Candidate(
-        building_id="a", origin=(0.0, 0.0, 0.0), points=np.zeros((0, 3)), ground=np.zeros((0, 3)), ground_z_m=0.0
+def test_parts_of_a_page_that_are_there_are_replaced_and_others_stay(tmp_path) -> None:
+    page = (
+        "# A\n<!-- begin one.md -->\nold\n<!-- end one.md -->\nprose\n<!-- begin two.md -->\nold\n<!-- end two.md -->\n"
     )
-    clocked = ClockedSettings()
-    assert isinstance(clocked, ReconstructSettings)
-    assert clocked.segmentation(method)(prepare_cloud(candidate)) is answer
-    assert clocked.segmentation(method)(prepare_cloud(candidate)) is answer
-    assert len(clocked.clocked) == 2
-    assert all(seconds >= 0.02 for seconds in clocked.clocked)
+    (tmp_path / "one.md").write_text("| entry |\n| --- |\n| city |\n")
+    new, missing = filled(page, tmp_path)
+    assert missing == ["two.md"]
+    assert new == page.replace("old", "\n| entry |\n| --- |\n| city |\n", 1)
+    assert filled(new, tmp_path)[0] == new
 
 
 @pytest.mark.slow

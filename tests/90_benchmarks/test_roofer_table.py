@@ -1,33 +1,22 @@
-"""The table beside roofer: how surveys are thinned, what differs between runs, who is valid, and the table itself."""
+"""The table beside roofer: how surveys are thinned, who is valid, and the table itself."""
 
 import json
 import math
-import re
 import sys
 from pathlib import Path
 
 import laspy
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.entries import Entry, run_settings
-from benchmarks.results_page import PAGE
 from benchmarks.roofer_table import Figures, main, roofer_table, surveys
-from benchmarks.run_scores import (
-    BuildingScore,
-    RunScore,
-    differing_buildings,
-    score_loss,
-    valid_by_val3dity,
-    valid_features,
-)
+from benchmarks.run_scores import RunScore, valid_by_val3dity
 from benchmarks.survey_runs import Seconds, candidates_of, run_survey
-from benchmarks.thinned_surveys import kept, place_hash, thinned, without_buildings, write_changed
+from benchmarks.thinned_surveys import kept, place_hash, thinned, write_changed
 from pipeline.export.geoparquet import read_table
 from pipeline.runtime.compare import Variant
 
@@ -52,12 +41,7 @@ def survey(path: Path, n: int = 4000) -> np.ndarray:
     return np.rint(np.asarray(las.xyz) * 1e3).astype(np.int64)
 
 
-def score(**shares: float) -> RunScore:
-    """A score of which only the buildings' shares within 0.2 m matter; nan is one without points."""
-    buildings = {
-        name: BuildingScore(points=0 if math.isnan(share) else 10, within=share, within_top=share, rmse_top_m=0.1)
-        for name, share in shares.items()
-    }
+def score(within: float = 0.75) -> RunScore:
     return RunScore(
         candidates=5,
         lod2=4,
@@ -70,11 +54,10 @@ def score(**shares: float) -> RunScore:
         roof_faces=7,
         points=40,
         coverage=1.0,
-        within=0.75,
+        within=within,
         within_top=0.5,
         rmse_median_m=0.7,
         rmse_top_median_m=0.25,
-        buildings=buildings,
     )
 
 
@@ -123,80 +106,19 @@ def test_a_thinned_file_has_the_same_points_with_all_that_is_reported_of_them(tm
         np.testing.assert_array_equal(np.asarray(thin[name]), np.asarray(whole[name])[stays])
 
 
-def test_without_buildings_only_class_6_is_another_one(tmp_path) -> None:
-    survey(tmp_path / "a.laz")
-    (written,) = write_changed([tmp_path / "a.laz"], tmp_path / "bare", without_buildings)
-    whole, bare = laspy.read(tmp_path / "a.laz"), laspy.read(written)
-    before, after = np.asarray(whole.classification), np.asarray(bare.classification)
-    np.testing.assert_array_equal(after, np.where(before == 6, 1, before))
-    for name in set(whole.point_format.dimension_names) - {"classification"}:
-        np.testing.assert_array_equal(np.asarray(bare[name]), np.asarray(whole[name]))
-
-
-# ---------------------------------------------------------------------------------------------------------- two runs
-
-
-def tables(run: Path, buildings: dict[str, list[object]], planes: dict[str, list[object]]) -> Path:
-    """The tables of a run, made by hand."""
-    for name, columns in (("buildings", buildings), ("planes", planes)):
-        folder = run / name / "tile=x0_y0"
-        folder.mkdir(parents=True)
-        pq.write_table(pa.table(columns), folder / "part-0.parquet")
-    return run
-
-
-def test_buildings_differ_by_any_content_and_where_one_is_missing(tmp_path) -> None:
-    names = ["a", "b", "c", "d"]
-    buildings = {"building_id": names, "rmse_m": [0.1, math.nan, 0.3, 0.4], "input_hash": ["1", "2", "3", "4"]}
-    planes = {"building_id": ["a", "a", "b"], "plane_id": [0, 1, 0], "area_m2": [10.0, 20.0, 30.0]}
-    one = tables(tmp_path / "one", buildings, planes)
-    assert differing_buildings(one, one) == set()
-    other = tables(
-        tmp_path / "other",
-        {
-            "building_id": ["e", "c", "b", "a"],
-            "rmse_m": [0.1, math.nextafter(0.3, 1.0), math.nan, 0.1],
-            "input_hash": ["9", "9", "9", "9"],
-        },
-        {"building_id": ["b", "a", "a"], "plane_id": [0, 1, 0], "area_m2": [30.0, 20.5, 10.0]},
-    )
-    assert differing_buildings(one, other) == differing_buildings(other, one) == {"a", "c", "d", "e"}
-
-
-def test_a_loss_is_counted_building_by_building_without_those_that_have_no_points() -> None:
-    before, after = score(a=0.90, b=0.80, c=0.70, d=0.5, e=math.nan), score(a=0.88, b=0.75, c=0.60, d=0.6, e=math.nan)
-    loss = score_loss(before, after)
-    assert (loss.buildings, loss.within_5_points, loss.within_2_points) == (4, 3, 2)
-    assert loss.mean == pytest.approx((0.02 + 0.05 + 0.10 - 0.10) / 4)
-    assert loss.median == pytest.approx(0.035)
-
-
 # ---------------------------------------------------------------------------------------------------------- val3dity
 
-REPORT = {
-    "input_file": "part-0.city.jsonl",
-    "dataset_errors": [],
-    "features": [
-        {"id": "a", "type": "Building", "validity": True, "errors": []},
-        {"id": "b", "type": "Building", "validity": False, "errors": [{"code": 204}]},
-    ],
-}
 PROGRAM = """
 import json, pathlib, sys
 cityjson, option, report = sys.argv[1:]
 assert option == "--report"
 lines = pathlib.Path(cityjson).read_text().splitlines()
+faults = [{"code": 901}] if lines == ["broken"] else []
 features = [{"id": line, "validity": line != "wrong", "errors": []} for line in lines]
 if features:
-    pathlib.Path(report).write_text(json.dumps({"dataset_errors": [], "features": features}))
+    pathlib.Path(report).write_text(json.dumps({"dataset_errors": faults, "features": features}))
 print("nothing to read")
 """
-
-
-def test_the_report_of_val3dity_says_the_valid_features() -> None:
-    assert valid_features(REPORT) == {"a"}
-    with pytest.raises(RuntimeError, match="901"):
-        valid_features({**REPORT, "dataset_errors": [{"code": 901}]})
 
 
 def test_all_files_of_a_run_are_given_to_val3dity_and_a_missing_report_is_a_fault(tmp_path) -> None:
@@ -207,6 +129,9 @@ def test_all_files_of_a_run_are_given_to_val3dity_and_a_missing_report_is_a_faul
         (tmp_path / "cityjson" / tile).mkdir(parents=True)
         (tmp_path / "cityjson" / tile / "part-0.city.jsonl").write_text(lines)
     assert valid_by_val3dity(tmp_path, str(program)) == {"one", "two"}
+    (tmp_path / "cityjson" / "tile=x0_y1" / "part-0.city.jsonl").write_text("broken")
+    with pytest.raises(RuntimeError, match="901"):
+        valid_by_val3dity(tmp_path, str(program))
     (tmp_path / "cityjson" / "tile=x0_y1" / "part-0.city.jsonl").write_text("")
     with pytest.raises(RuntimeError, match="nothing to read"):
         valid_by_val3dity(tmp_path, str(program))
@@ -216,7 +141,7 @@ def test_all_files_of_a_run_are_given_to_val3dity_and_a_missing_report_is_a_faul
 
 
 def test_only_what_was_measured_has_a_line_and_roofer_stands_beside_delft_alone() -> None:
-    whole = score(a=0.5)
+    whole = score()
     bare = roofer_table({"kmeans": Figures(whole=whole)}, with_roofer=False)
     assert "roofer" not in bare
     assert "| LoD2.2 | 4 of 5 |" in bare
@@ -228,30 +153,18 @@ def test_only_what_was_measured_has_a_line_and_roofer_stands_beside_delft_alone(
         warm=Seconds(processor=2.52, clock=3.0),
         mean_ms=4.0,
         median_ms=2.0,
-        differing=(),
-        thinned={"2": score(a=0.4)},
-        less_input={"neither": score(a=0.4)},
-        losses={"neither": score_loss(whole, score(a=0.4))},
+        thinned={"2": score()},
     )
     text = roofer_table({"arrangement": found, "kmeans": Figures(whole=whole)}, with_roofer=True)
     heads, *lines = text.splitlines()
-    assert heads == "|  | roofer 1.1.0-beta.1 | required | stretch | arrangement | kmeans |"
+    assert heads == "|  | roofer 1.1.0-beta.1 | arrangement | kmeans |"
     for line in (
-        "| CPU seconds in all, warm |  |  |  | 2.5 |  |",
-        "| reconstruction of a building, ms, mean / median |  | 10 / 5 | 3 / 1.5 | 4.0 / 2.0 |  |",
-        "| buildings that differ between runs | 2 to 5 | 0 | 0 | 0 |  |",
-        "| 2 class-6 points per m2: within 0.2 m of the full cloud | .53 | .70 | .75 | 0.750 |  |",
-        "| 2 class-6 points per m2: reasons of the others |  |  |  | 1 no_plane |  |",
-        "| neither: buildings that lose at most 5 / 2 points |  |  |  | 0 / 0 of 1 |  |",
-        "| neither: points that a building loses, mean / median |  | 5 | 2 | 10.0 / 10.0 |  |",
+        "| CPU seconds in all, warm |  | 2.5 |  |",
+        "| reconstruction of a building, ms, mean / median |  | 4.0 / 2.0 |  |",
+        "| 2 class-6 points per m2: within 0.2 m of the full cloud | .53 | 0.750 |  |",
+        "| 2 class-6 points per m2: reasons of the others |  | 1 no_plane |  |",
     ):
         assert line in lines
-
-
-def test_the_page_has_a_part_for_the_table_of_every_survey() -> None:
-    page = PAGE.with_name("roofer.md").read_text(encoding="utf-8")
-    wanted = [f"roofer_table_{name}.md" for name in surveys(Path())]
-    assert re.findall(r"<!-- begin (\S+) -->", page) == re.findall(r"<!-- end (\S+) -->", page) == wanted
 
 
 def test_a_run_that_fails_is_reported_with_its_message(tmp_path) -> None:
@@ -282,10 +195,8 @@ def test_the_table_of_a_small_survey_is_written_with_all_parts(shared_data: Path
     text = (tmp_path / "roofer_table_hdf_870000.md").read_text(encoding="utf-8")
     assert text in capsys.readouterr().out
     figures = json.loads((tmp_path / "roofer_table_hdf_870000.json").read_text(encoding="utf-8"))["fuzzy-sart"]
-    assert figures["differing"] == []
     assert figures["whole"]["valid"] == figures["whole"]["lod2"] > 0
     assert figures["warm"] is None
     assert figures["median_ms"] > 0.0
     assert list(figures["thinned"]) == ["4", "2", "1", "0.5"]
-    assert list(figures["less_input"]) == ["no-class-6"]
     assert figures["thinned"]["0.5"]["within"] < figures["thinned"]["4"]["within"] <= figures["whole"]["within"] + 0.02

@@ -1,20 +1,17 @@
 """The simulation of the task graph: limits that can be reckoned by hand, and traces that it gives again."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
 
 from benchmarks.scaling_simulation import (
     STAGES,
-    Change,
     Engine,
     Machine,
     Stage,
     city_run,
     city_stages,
-    max_workers,
     replayed,
     run_stage,
     simulate,
@@ -45,9 +42,8 @@ def test_the_longest_first_is_kept() -> None:
         (stage(2000, 0.01, driver_s=0.01), Machine(workers=1000), 20.0, 20.0),
         (stage(2000, 0.01, scheduler_s=0.02), Machine(workers=1000), 40.0, 0.0),
         (stage(500, 0.01, result_bytes=1e6), Machine(workers=100, byte_s=2e-8), 10.0, 10.0),
-        (stage(1000, 0.01, stored_bytes=1e8), Machine(workers=500, storage_bytes_s=1e9), 100.0, 0.0),
     ],
-    ids=["driver of few", "driver of many", "scheduler", "bytes of results", "shared storage"],
+    ids=["driver of few", "driver of many", "scheduler", "bytes of results"],
 )
 def test_the_scarcest_part_bounds_the_rate(tasks: Stage, machine: Machine, wall_s: float, driver_s: float) -> None:
     found = simulate([tasks], dataclasses.replace(machine, together_s=0.0))
@@ -84,7 +80,6 @@ def engine() -> Engine:
         times={name: rng.uniform(0.5, 1.5, 60) for name in STAGES},
         buildings=2000,
         files=0.03,
-        points=8_000_000,
         look_s=0.01,
         tasks=dict.fromkeys(STAGES, 0.02),
         before_s=dict.fromkeys(STAGES, 2e-6),
@@ -96,7 +91,6 @@ def engine() -> Engine:
         byte_s=1e-9,
         result_bytes=dict.fromkeys(STAGES, 1000.0),
         start_s=1.0,
-        tile_m=500.0,
     )
 
 
@@ -114,23 +108,10 @@ def test_every_file_is_looked_at_and_every_building_hashed() -> None:
     assert digest.durations_s.tolist() == [20_000 * 1e-7]
 
 
-def test_efficiency_falls_with_workers_and_less_where_the_driver_does_less() -> None:
-    plain = [city_run(engine(), 50_000, n, Change(), math.inf).efficiency for n in (2, 50, 500)]
-    alone = [city_run(engine(), 50_000, n, Change(together_s=0.0), math.inf).efficiency for n in (2, 50, 500)]
-    several = [city_run(engine(), 50_000, n, Change(drivers=4), math.inf).efficiency for n in (50, 500)]
-    assert plain == sorted(plain, reverse=True)
-    assert plain[2] >= alone[2]
-    assert several[1] > plain[2]
-    assert all(0.0 < value <= 1.0 for value in (*plain, *alone, *several))
-
-
-def test_the_largest_number_of_workers_is_found_by_halves() -> None:
-    outcome = city_run(engine(), 2000, 1, Change(), math.inf)
-
-    def run_with(workers: int) -> object:
-        return dataclasses.replace(outcome, workers=workers, wall_s=1.0, busy_s=workers * (1.0 - workers / 1000))
-
-    assert max_workers(run_with, 0.8, 1000) == pytest.approx(200, rel=0.06)
+def test_efficiency_falls_with_workers() -> None:
+    found = [city_run(engine(), 50_000, n).efficiency for n in (2, 50, 500)]
+    assert found == sorted(found, reverse=True)
+    assert all(0.0 < value <= 1.0 for value in found)
 
 
 def test_a_trace_is_given_again() -> None:

@@ -11,7 +11,7 @@ import pytest
 import shapely
 from roofs_by_hand import ORIGIN, flat, gable, model, rectangle, surface
 
-from benchmarks.trust import Judged, counted, run_cell, table, write
+from benchmarks.trust import Judged, counted, fitted_row, run_cell, table, write
 from benchmarks.trust_judge import Judgement, Truth, top_of
 from pipeline.model import RoofType
 from pipeline.ruler.evaluation.models import RoofModel
@@ -152,6 +152,17 @@ def test_models_are_counted_by_any_status_and_failures_are_not_models() -> None:
     cells = dict(zip(heads.split(" | "), row.split(" | "), strict=True))
     assert (cells["right, ok"], cells["wrong, doubtful"], cells["wrong that are ok"]) == ("4", "2", "50.0%")
     assert np.isnan(counted([]).wrong_ok)
+
+
+def test_models_on_their_points_that_are_not_ok_are_counted_by_reason() -> None:
+    records = [
+        {"status": "ok", "reason": None, "share_within_0_2m": 0.95},
+        {"status": "doubtful", "reason": "uncertain", "share_within_0_2m": 0.91},
+        {"status": "doubtful", "reason": "poor_fit", "share_within_0_2m": 0.5},
+        {"status": "fallback", "reason": "no_plane", "share_within_0_2m": 0.6},
+        {"status": "failed", "reason": "no_footprint", "share_within_0_2m": None},
+    ]
+    assert fitted_row("run", records) == ["run", "4", "2", "1", "50.0%", "1 uncertain"]
 
 
 @pytest.mark.slow

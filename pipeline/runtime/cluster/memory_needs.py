@@ -18,7 +18,7 @@ DECLARED_FROM_BYTES = 2**29
 BUILDING_BASE_BYTES = 280 * 2**20
 """Memory of a process that models buildings, before the first one."""
 BUILDING_BYTES_PER_POINT = 2_000
-"""Peak above it, in bytes per point. Measured by `benchmarks/giant_memory.py`: 390 to 430 for flat halls, up to 490 for
+"""Peak above it, in bytes per point. Measured at commit 3d991134: 390 to 430 for flat halls, up to 490 for
 saw-tooth roofs, 580 to 1,070 for roofs full of things. It depends on the number of faces, which is unknown before, so
 this is twice the maximum; the limit of a building's process bounds it."""
 WINDOW_BASE_BYTES = 300 * 2**20
