@@ -44,9 +44,10 @@ from pipeline.cli.options import (
     VerticalUnit,
     WithPoints,
     Workers,
+    tls_files,
 )
 from pipeline.console import Console, ExitCode
-from pipeline.runtime.isolation.preloading import start_early
+from pipeline.runtime.isolation.preloading import has_idle_child, start_early
 
 if TYPE_CHECKING:
     from pipeline.runtime.run import RunSummary
@@ -102,7 +103,6 @@ def reconstruct(
 ) -> None:
     """Reconstruct buildings from tiles into a run directory."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.runtime.cluster.tls import given_tls
         from pipeline.runtime.compiling import compile_for, kernel_groups
         from pipeline.runtime.request import RunRequest
         from pipeline.runtime.resources import Resources
@@ -126,7 +126,7 @@ def reconstruct(
             resources=Resources(
                 workers=workers,
                 scheduler=scheduler,
-                tls=given_tls(tls_ca, tls_cert, tls_key),
+                tls=tls_files(tls_ca, tls_cert, tls_key),
                 performance_report=performance_report,
                 scratch=scratch,
                 isolate=isolate,
@@ -180,7 +180,6 @@ def rerun(
 ) -> None:
     """Model single buildings of a run again, after other overrides; all others stay untouched."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.runtime.cluster.tls import given_tls
         from pipeline.runtime.compiling import compile_for, kernel_groups
         from pipeline.runtime.earlier import earlier_run, request_of
         from pipeline.runtime.rerun import RerunRequest
@@ -194,7 +193,7 @@ def rerun(
             resources=Resources(
                 workers=workers,
                 scheduler=scheduler,
-                tls=given_tls(tls_ca, tls_cert, tls_key),
+                tls=tls_files(tls_ca, tls_cert, tls_key),
                 isolate=isolate,
                 input_timeout_s=input_timeout,
                 building_timeout_s=building_timeout,
@@ -258,7 +257,6 @@ def compare(
         from pipeline.ruler.evaluation.files import EvaluationRequest
         from pipeline.ruler.report.compare_files import compare_files, comparison_facts
         from pipeline.ruler.report.evaluation_page import headline
-        from pipeline.runtime.cluster.tls import given_tls
         from pipeline.runtime.compare import CompareRequest, own_tables, parse_variants
         from pipeline.runtime.compiling import compile_for, kernel_groups
         from pipeline.runtime.request import RunRequest
@@ -285,7 +283,7 @@ def compare(
                 resources=Resources(
                     workers=workers,
                     scheduler=scheduler,
-                    tls=given_tls(tls_ca, tls_cert, tls_key),
+                    tls=tls_files(tls_ca, tls_cert, tls_key),
                     isolate=isolate,
                     input_timeout_s=input_timeout,
                     building_timeout_s=building_timeout,
@@ -353,7 +351,7 @@ def replay(
     with Console(as_json=as_json) as console:
         from pipeline import __version__
         from pipeline.io.remote_file import on_this_machine
-        from pipeline.runtime.isolation.isolated_items import IsolationLimits
+        from pipeline.runtime.isolation.limits import IsolationLimits
         from pipeline.runtime.isolation.replay_bundle import read_bundle
         from pipeline.runtime.replay import replay as replay_building
         from pipeline.runtime.replay import replay_row, write_replay
@@ -394,8 +392,6 @@ def _run_settings(path: str | None, **overrides: str | None) -> RunSettings:
 
 def _statistics_of(run_dir: str) -> dict[str, Any]:
     """The figures of a run, read by a child of the run if there is one: it has loaded Arrow, which takes longer."""
-    from pipeline.runtime.isolation.child_pool import has_idle_child
-
     if has_idle_child():
         from pipeline.runtime.cluster.local_executor import LocalExecutor
         from pipeline.runtime.cluster.serial_executor import run_alone

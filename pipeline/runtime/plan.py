@@ -24,13 +24,14 @@ from pipeline.io.crs import with_one_vertical
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.io.records import Share
 from pipeline.io.source import IMPOSSIBLE_DENSITY
-from pipeline.runtime.cluster.memory_needs import WINDOW_BASE_BYTES
 from pipeline.runtime.scratch.folder import POINT
 from pipeline.settings import RunSettings
 from pipeline.terrain.scene_settings import APRON_M, ClassesInUse
 from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
+WINDOW_BASE_BYTES = 300 * 2**20
+"""Memory of a worker, before the first split."""
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
 _ONE_CRS = (
     "Run inputs of different CRS apart, or give --crs if one header is wrong, with its vertical part (such as "

@@ -10,6 +10,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,8 +22,6 @@ from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
 from pipeline.io import SourceInfo, SpatialReference, Storage, is_url, shown, storage_at
 from pipeline.methods import ReconstructSettings, method_named
 from pipeline.runtime.cluster.serial_executor import Executor, run_alone
-from pipeline.runtime.cluster.worker_fork_server import start_early
-from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.manifest import (
     NAME,
@@ -41,10 +40,10 @@ from pipeline.runtime.overrides.overrides_file import Override, read_overrides
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
 from pipeline.runtime.run_context import RunContext, run_context
+from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import check_scratch, run_scratch
 from pipeline.runtime.scratch.outcomes import Place
-from pipeline.runtime.scratch.work_folder import is_known, locked_work
 from pipeline.runtime.stages.apply_overrides import about_no_effect, apply_overrides
 from pipeline.runtime.stages.batch_figures import Counted
 from pipeline.runtime.stages.cleanup import OVERRIDDEN, publishing, tidy
@@ -66,7 +65,8 @@ from pipeline.settings import RunSettings
 from pipeline.terrain.flight_strip import Strip
 from pipeline.tiling import MM
 
-if TYPE_CHECKING:  # loads kernels, which few drivers need
+if TYPE_CHECKING:
+    from pipeline.runtime.expected import Expected
     from pipeline.runtime.stages.terrain import TerrainOutcome
 
 FOOTPRINTS = "footprints.json"
@@ -217,6 +217,8 @@ def run_variants(
     for variant in variants:
         storage_at(variant.out)  # refuses a URL of no storage before anything is read
     if resources.workers and resources.scheduler is None and executor is None:
+        from pipeline.runtime.cluster.worker_fork_server import start_early
+
         start_early()
     progress = Progress(on_event)
     progress.tell("run", "plan", f"run into {request.out}")
@@ -242,8 +244,8 @@ def run_variants(
                 plan,
                 progress,
                 resources,
-                run_scratch(request.out, resources.scratch) if work is None else locked_work(work),
-                expected(plan, None if footprints is None else len(footprints.polygons)),
+                _scratch_of(request),
+                functools.partial(_expected, plan, None if footprints is None else len(footprints.polygons)),
                 loads=loads_of("reconstruct", footprints=footprints is not None, method=settings.general.method),
                 executor=executor,
                 cancelled=cancelled,
@@ -277,6 +279,22 @@ def run_variants(
     seconds = time.perf_counter() - began
     progress.tell("finished", "", f"{outcomes[0].summary.counts['candidates']} candidates in {seconds:.1f} s")
     return outcomes
+
+
+def _scratch_of(request: RunRequest) -> AbstractContextManager[Scratch]:
+    """The scratch of a run: its work folder, if it has one."""
+    if request.work is None:
+        return run_scratch(request.out, request.resources.scratch)
+    from pipeline.runtime.scratch.work_folder import locked_work
+
+    return locked_work(request.work)
+
+
+def _expected(plan: Plan, footprints: int | None) -> Expected:
+    """The cost of the run, with so many footprints."""
+    from pipeline.runtime.expected import expected
+
+    return expected(plan, footprints)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -617,6 +635,8 @@ def _is_of_work(run_dir: str, work: str) -> bool:
     try:
         known = read_manifest(run_dir).request.get("work")
     except RunError:
+        from pipeline.runtime.scratch.work_folder import is_known
+
         # missing or damaged
         return is_known(work, publishing(run_dir))
     return known == str(Path(work).resolve())

@@ -22,7 +22,7 @@ from processes import LONG_S, wait_for
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
-from pipeline.runtime.isolation.isolated_items import MIN_MEMORY_BYTES
+from pipeline.runtime.isolation.limits import MIN_MEMORY_BYTES
 from service import supervisor as supervisor_module
 from service.cli import app
 from service.connections import listen

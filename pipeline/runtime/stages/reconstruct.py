@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.model import Status
-from pipeline.runtime.monitoring.tracing import Part, slow_building_s
+from pipeline.runtime.monitoring.traces import Part, slow_building_s
 from pipeline.runtime.overrides.overrides_file import own_modelling
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch

@@ -16,7 +16,7 @@ from pipeline.export.coordinates import SpatialReference, one_unit
 from pipeline.export.terrain import FOLDER, in_crs, terrain_lines, terrain_obj, terrain_path
 from pipeline.io import storage_at
 from pipeline.model import BuildingResult, FaceKind
-from pipeline.runtime.cluster.memory_needs import WINDOW_BASE_BYTES
+from pipeline.runtime.plan import WINDOW_BASE_BYTES
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
