@@ -13,10 +13,10 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 import small_buildings as small
+from command_line import app
 from small_runs import TREE, content, moved, street
 from typer.testing import CliRunner
 
-from pipeline.cli.app import app
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import RecordContext
