@@ -97,7 +97,7 @@ def replay(
     """Model one quarantined building again, from its bundle alone."""
     with Console(as_json=as_json) as console:
         from pipeline import __version__
-        from pipeline.io.remote_file import on_this_machine
+        from pipeline.io.places import on_this_machine
         from pipeline.runtime.isolation.limits import IsolationLimits
         from pipeline.runtime.isolation.replay_bundle import read_bundle
         from pipeline.runtime.replay import replay as replay_building

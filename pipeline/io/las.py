@@ -32,10 +32,9 @@ from pipeline.io.laz_chunks import (
     read_chunk_table,
 )
 from pipeline.io.laz_decoder import DECODING_ERRORS, decoding
-from pipeline.io.readable import Readable
+from pipeline.io.readable import Readable, bytes_of
 from pipeline.io.reading import moved
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Share, Window
-from pipeline.io.remote_file import bytes_of
 from pipeline.io.strays import Bounds, header_box_problem, typical_bounds
 from pipeline.model import FloatArray
 

@@ -6,15 +6,14 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.io import ReadOptions, SpatialReference, find_inputs, is_url, open_source, sha256_of, shown
-from pipeline.io.footprints import read_area
+from pipeline.io.places import on_this_machine
 from pipeline.io.reading import one_input, set_input_timeout
-from pipeline.io.remote_file import on_this_machine
-from pipeline.io.tile_index import TileIndex
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.looking import look_at_all
 from pipeline.runtime.manifest import InputFile
@@ -24,6 +23,9 @@ from pipeline.runtime.plan import Plan, check_places, make_plan, without_far_fil
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.scratch.location import SCRATCH
 from pipeline.settings import RunSettings
+
+if TYPE_CHECKING:
+    from pipeline.io.tile_index import TileIndex
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -124,6 +126,8 @@ def plan_inputs(
 
 def _area(path: str, reference: SpatialReference) -> Polygon | MultiPolygon:
     """The area of interest, read within the time limit of an input."""
+    from pipeline.io.footprints import read_area
+
     with one_input(shown(path)):
         return read_area(path, reference)
 

@@ -12,7 +12,7 @@ from object_store import SECRET
 from pipeline.errors import EmptyInputError, InputError, RunError, UnreadableInputError
 from pipeline.export import tile as tile_files
 from pipeline.io import storage_at
-from pipeline.io.remote_file import on_this_machine
+from pipeline.io.places import on_this_machine
 from pipeline.io.retries import persistently
 from pipeline.io.urls import filesystem_of
 from pipeline.report.statistics import run_statistics

@@ -20,9 +20,9 @@ import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, UnreadableInputError
 from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
+from pipeline.io.places import file_at
 from pipeline.io.reading import heard_by, moved, one_input, stalled
 from pipeline.io.records import Share
-from pipeline.io.remote_file import RemoteFile, file_at
 from pipeline.io.storage import sha256_of
 from pipeline.io.strays import MOST_STRAYS
 from pipeline.model import IntArray, PointCloud, Reason
@@ -233,6 +233,8 @@ def _ingest_here(task: IngestTask) -> Ingested:
         return _ingested(task)
     if task.known is not None and is_fetched_by_nodes(task.known, task.options):
         return dataclasses.replace(_ingested(task), path=shown(task.path))
+    from pipeline.io.remote_file import RemoteFile
+
     file = RemoteFile(task.path)
     copy = task.scratch.path("fetched", uuid4().hex, f"points{file.suffix}")
     try:

@@ -19,7 +19,7 @@ from pipeline.export.coordinates import one_unit
 from pipeline.export.geoparquet import read_table
 from pipeline.io import arrow_at, is_url, place_below, storage_at
 from pipeline.io.crs import resolve_reference
-from pipeline.io.remote_file import file_at
+from pipeline.io.places import file_at
 from pipeline.model import FaceKind, RoofType, Solid, SolidFace, Status
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel, RoofSurface
 from pipeline.ruler.evaluation.reading.cityjson import features
