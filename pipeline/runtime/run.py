@@ -36,7 +36,6 @@ from pipeline.runtime.manifest import (
 from pipeline.runtime.monitoring.events import Listener, ignore, never
 from pipeline.runtime.monitoring.measurement import peak_of_process
 from pipeline.runtime.monitoring.progress import Progress
-from pipeline.runtime.overrides.overrides_file import Override, read_overrides
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
 from pipeline.runtime.run_context import RunContext, run_context
@@ -44,14 +43,11 @@ from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import check_scratch, run_scratch
 from pipeline.runtime.scratch.outcomes import Place
-from pipeline.runtime.stages.apply_overrides import about_no_effect, apply_overrides
 from pipeline.runtime.stages.batch_figures import Counted
 from pipeline.runtime.stages.cleanup import OVERRIDDEN, publishing, tidy
 from pipeline.runtime.stages.content_digest import STAGE as DIGEST
 from pipeline.runtime.stages.content_digest import content_digest
 from pipeline.runtime.stages.counts import about_emptiness, run_counts
-from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints_of_run
-from pipeline.runtime.stages.given_guides import GivenGuides, given_guides
 from pipeline.runtime.stages.ground import Ground, find_ground
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.join import join
@@ -67,6 +63,9 @@ from pipeline.tiling import MM
 
 if TYPE_CHECKING:
     from pipeline.runtime.expected import Expected
+    from pipeline.runtime.overrides.overrides_file import Override
+    from pipeline.runtime.stages.given_footprints import GivenFootprints
+    from pipeline.runtime.stages.given_guides import GivenGuides
     from pipeline.runtime.stages.terrain import TerrainOutcome
 
 FOOTPRINTS = "footprints.json"
@@ -223,7 +222,7 @@ def run_variants(
     progress = Progress(on_event)
     progress.tell("run", "plan", f"run into {request.out}")
     plan, paths = plan_inputs(request, progress, cancelled, executor)
-    footprints = footprints_of_run(request.footprints, plan, request.settings.footprints, request.footprints_layer)
+    footprints = _given_footprints(request, plan)
     for warning in () if footprints is None else footprints.warnings:
         progress.warn("plan", warning)
     guides = None
@@ -231,7 +230,7 @@ def run_variants(
         guides = _given_guides(request, plan, variants)
         for warning in guides.warnings:
             progress.warn("plan", warning)
-    overrides = () if request.overrides is None else read_overrides(request.overrides, plan.reference, settings)
+    overrides = _given_overrides(request, plan, settings)
     runs = [_VariantRun.of(variant, request, plan, progress, started_at) for variant in variants]
     progress.timings["plan"] = time.perf_counter() - began
     with contextlib.ExitStack() as locks:
@@ -321,6 +320,25 @@ def _find_candidates(
     return _Candidates(ingested=inputs.ingested, moves_mm=inputs.moves_mm, ground=ground, splits=splits, joined=joined)
 
 
+def _given_footprints(request: RunRequest, plan: Plan) -> GivenFootprints | None:
+    """The footprints of a run; None without a file, a layer or a column of them."""
+    named = (request.footprints, request.footprints_layer)
+    if named == (None, None) and not request.settings.footprints.columns:
+        return None
+    from pipeline.runtime.stages.given_footprints import footprints_of_run
+
+    return footprints_of_run(request.footprints, plan, request.settings.footprints, request.footprints_layer)
+
+
+def _given_overrides(request: RunRequest, plan: Plan, settings: RunSettings) -> Sequence[Override]:
+    """The overrides of a run."""
+    if request.overrides is None:
+        return ()
+    from pipeline.runtime.overrides.overrides_file import read_overrides
+
+    return read_overrides(request.overrides, plan.reference, settings)
+
+
 def _override(
     context: RunContext,
     settings: RunSettings,
@@ -329,6 +347,8 @@ def _override(
     runs: Sequence[_VariantRun],
 ) -> _Candidates:
     """The candidates after the overrides; the outcome of each entry goes into the run directories."""
+    from pipeline.runtime.stages.apply_overrides import about_no_effect, apply_overrides
+
     context.check(listed.place.folder for listed in (*found.joined.groups, *found.joined.rejected))
     applied = apply_overrides(context, settings, found.joined, overrides, found.ingested, found.ground)
     for entry in applied.outcomes:
@@ -345,6 +365,8 @@ def _override(
 
 def _given_guides(request: RunRequest, plan: Plan, variants: Sequence[RunVariant]) -> GivenGuides:
     """The guides of a run; raises InputError if they cannot be used, also by a method that takes none."""
+    from pipeline.runtime.stages.given_guides import given_guides
+
     settings = [variant.settings_in(request.settings) for variant in variants]
     for one in settings:
         if not one.building.arranges(method_named(one.general.method)):

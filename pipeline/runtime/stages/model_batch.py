@@ -23,7 +23,6 @@ from pipeline.model import BuildingResult, Candidate, Guide, Reason, Status
 from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX, IsolationLimits, Loss
 from pipeline.runtime.monitoring.logs import LOG
 from pipeline.runtime.monitoring.tallies import TALLIES
-from pipeline.runtime.overrides.overrides_file import OwnModelling
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import DamagedError, Place, key_of, result_of
 from pipeline.runtime.stages.batch_figures import LOST, REJECTED, BatchFigures, Modelled
@@ -33,6 +32,7 @@ from pipeline.tiling import TileGrid
 
 if TYPE_CHECKING:
     from pipeline.runtime.isolation.replay_bundle import Bundle, Incident
+    from pipeline.runtime.overrides.overrides_file import OwnModelling
 
 _BUNDLE_TIMEOUT_S = 60.0
 _NO_BUNDLE = "there is no bundle, since its points cannot be put together"
