@@ -21,8 +21,7 @@ from pathlib import Path
 import shapely
 
 from pipeline.errors import RunError
-from pipeline.export.point_files import FOLDER as POINTS_FOLDER
-from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
+from pipeline.export.folders import POINTS_FOLDER, TERRAIN_FOLDER
 from pipeline.export.tile_update import updated_tile
 from pipeline.io import LocalStorage
 from pipeline.model import Reason, Status

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING
 from pipeline import __version__
 from pipeline.errors import InputError, RunCancelledError, RunError
 from pipeline.export.coordinates import one_unit
-from pipeline.export.point_files import FOLDER as POINTS_FOLDER
-from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
+from pipeline.export.folders import POINTS_FOLDER, TERRAIN_FOLDER
 from pipeline.io import SourceInfo, SpatialReference, Storage, is_url, shown, storage_at
 from pipeline.methods import ReconstructSettings, method_named
 from pipeline.runtime.cluster.serial_executor import Executor, run_alone
