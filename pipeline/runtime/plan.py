@@ -45,6 +45,8 @@ _POINTS_PER_SHARE = 2_000_000
 """Points of a file that a task of ingest takes: some seconds of work."""
 _MOST_SHARES = 128
 """Tasks of ingest per file: each leaves a file in every tile that it meets."""
+MANY_FILES = 256
+"""From so many files on tasks look at them: two seconds of work, more than the start of a process takes."""
 _ASKED_AT_ONCE = 8
 """Remote files whose headers are read at once: a header takes some ten requests of tens of milliseconds each."""
 _BYTES_PER_POINT = 220

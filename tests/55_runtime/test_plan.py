@@ -108,7 +108,7 @@ def test_a_file_whose_points_lie_over_millions_of_tiles_is_refused_unless_a_regi
 @pytest.fixture
 def many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """More inputs than this process looks at itself."""
-    monkeypatch.setattr(looking, "_MANY", 5)
+    monkeypatch.setattr(looking, "MANY_FILES", 5)
     monkeypatch.setattr(looking, "_FILES_PER_TASK", 3)
     return [_file(tmp_path / f"{number}.laz", "EPSG:25832") for number in range(8)]
 

@@ -19,6 +19,7 @@ STAGES = (
         f"pipeline.runtime.stages.{name}"
         for name in ("ingest", "ground", "split_window", "join", "model_batch", "publish")
     ),
+    "pipeline.strip_alignment",
     "pipeline.reconstruct",
 )
 """The modules of all tasks."""

@@ -20,6 +20,7 @@ _STAGES = (
     "pipeline.runtime.stages.ingest",
     "pipeline.runtime.stages.ground",
     "pipeline.runtime.stages.split_window",
+    "pipeline.strip_alignment",
 )
 _LOADS = {
     "reconstruct": ("pipeline.runtime.stages.publish", "pipeline.export.tile", "pipeline.runtime.digest"),
