@@ -31,7 +31,8 @@ from pipeline.ruler.simulation.scene import Scene
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.suites import suite_named
 from pipeline.ruler.simulation.survey_files import write_points
-from pipeline.runtime.manifest import NAME, RunStatus, read_manifest
+from pipeline.runtime.manifest import NAME, RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import run

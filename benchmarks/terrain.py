@@ -21,7 +21,7 @@ import shapely
 
 from pipeline.export.terrain import read_terrain
 from pipeline.model import FloatArray
-from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run

@@ -32,7 +32,8 @@ from pipeline.export.qml import STYLES
 from pipeline.export.terrain import terrain_path
 from pipeline.io import LocalStorage, SpatialReference, arrow_at, is_url, storage_at
 from pipeline.io.crs_units import unit_name
-from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
+from pipeline.runtime.manifest import RunManifest, RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.monitoring.events import Event, Listener, ignore
 
 ROWS = 8192

@@ -22,16 +22,7 @@ from pipeline.io import SourceInfo, SpatialReference, Storage, is_url, shown, st
 from pipeline.methods import ReconstructSettings, method_named
 from pipeline.runtime.cluster.serial_executor import Executor, run_alone
 from pipeline.runtime.isolation.preloading import loads_of
-from pipeline.runtime.manifest import (
-    NAME,
-    PAGE,
-    InputFile,
-    PointFileFacts,
-    RunManifest,
-    RunStatus,
-    read_manifest,
-    write_manifest,
-)
+from pipeline.runtime.manifest import NAME, PAGE, InputFile, PointFileFacts, RunManifest, RunStatus, write_manifest
 from pipeline.runtime.monitoring.events import Listener, ignore, never
 from pipeline.runtime.monitoring.measurement import peak_of_process
 from pipeline.runtime.monitoring.progress import Progress
@@ -653,6 +644,8 @@ def put_json(run_dir: str | Path, name: str, content: object) -> None:
 
 def _is_of_work(run_dir: str, work: str) -> bool:
     """Whether a run directory was written from this work folder, which then knows what is there."""
+    from pipeline.runtime.manifest_reading import read_manifest
+
     try:
         known = read_manifest(run_dir).request.get("work")
     except RunError:

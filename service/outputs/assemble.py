@@ -154,7 +154,8 @@ def _manifest(run_dir: Path) -> Mapping[str, Any]:
         The run did not end, or does not exist.
     """
     from pipeline.errors import RunError
-    from pipeline.runtime.manifest import NAME, RunStatus, read_manifest
+    from pipeline.runtime.manifest import NAME, RunStatus
+    from pipeline.runtime.manifest_reading import read_manifest
 
     status = read_manifest(run_dir).status
     if status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:

@@ -20,7 +20,8 @@ from pipeline.ruler.evaluation.reading import read_models
 from pipeline.runtime.classify import ClassifyRequest, classify
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.isolation.replay_bundle import read_bundle
-from pipeline.runtime.manifest import RunStatus, read_manifest
+from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL, Resources

@@ -22,15 +22,8 @@ from pipeline.errors import RunError
 from pipeline.model import Reason, Status
 from pipeline.report import class_map, run_page
 from pipeline.report.run_page import write_run_page
-from pipeline.runtime.manifest import (
-    PAGE,
-    InputFile,
-    RunManifest,
-    RunStatus,
-    SlowBuilding,
-    read_manifest,
-    write_manifest,
-)
+from pipeline.runtime.manifest import PAGE, InputFile, RunManifest, RunStatus, SlowBuilding, write_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 
 
 def change(run: Path, **values: Any) -> RunManifest:
