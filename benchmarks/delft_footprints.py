@@ -28,7 +28,7 @@ from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, Status
 from pipeline.quality.residuals import vertical_residuals
 from pipeline.quality.validity import check_solid
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 
 TOLERANCE_M = 0.2
 GROUND_REACH_M = 8.0

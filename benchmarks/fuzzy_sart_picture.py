@@ -22,7 +22,7 @@ from pipeline.geometry import facet_normals
 from pipeline.methods import ReconstructSettings
 from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import FaceKind, FloatArray, LabelArray, Solid
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.report.perspective import View, ViewedFace, draw_view
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
 

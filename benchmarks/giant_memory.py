@@ -53,7 +53,7 @@ def peak() -> int:
 
 def model(kind: str, count: int, method: str, answers: Connection) -> None:
     """Model one giant and tell what it took."""
-    from pipeline.reconstruct import reconstruct_building
+    from pipeline.recipe import reconstruct_building
     from pipeline.runtime.stages.model_batch import load
 
     load(*METHODS)

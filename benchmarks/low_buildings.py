@@ -25,7 +25,7 @@ from benchmarks.entries import markdown_table
 from pipeline.model import BuildingResult, Status
 from pipeline.quality.residuals import vertical_residuals
 from pipeline.quality.validity import check_solid
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.reference_truth import read_truth_reference
 from pipeline.ruler.simulation.dataset import Output, simulate

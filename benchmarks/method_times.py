@@ -31,7 +31,7 @@ from benchmarks.candidates import candidates_of
 from benchmarks.entries import Entry, Workplace, all_variants, hofmann_entries, markdown_table, run_settings, tiles_of
 from pipeline.methods import Method, ReconstructSettings
 from pipeline.model import Candidate, FloatArray, PreparedCloud, Segmentation, Status
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.runtime.compare import Variant, settings_of
 
 

@@ -25,7 +25,7 @@ from pipeline.methods.parameter_space import facets_of, roof_clusters_3d
 from pipeline.methods.settings import ParameterSpace3dSettings
 from pipeline.model import Candidate, FaceKind, FloatArray, LabelArray
 from pipeline.prepared_cloud import prepare_cloud
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 
 COLOURS = np.array(["#c0392b", "#2471a3", "#229954", "#b7950b", "#7d3c98", "#ca6f1e"])
 OTHER = "#b8bcc0"

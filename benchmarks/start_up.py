@@ -68,7 +68,7 @@ IMPORT = "import pipeline.runtime.run"
 BUILDINGS = """
 import time
 from benchmarks.candidates import found_scene
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.settings import RunSettings
 
 settings = RunSettings()

@@ -31,7 +31,7 @@ from pipeline.methods.kmeans import BuildingTop, building_top, planes_of, sides_
 from pipeline.methods.settings import KMeansSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, LabelArray, Plane, RoofType
 from pipeline.prepared_cloud import prepare_cloud
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.report.perspective import VIEW_SUN, View, ViewedFace, draw_view, projected
 from pipeline.report.pictures import png_of
 from pipeline.roof.primitives import GableFit, fit_gable

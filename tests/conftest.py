@@ -121,9 +121,9 @@ def computed_once() -> Generator[None]:
     The ground of the few scenes that most runs of the tests are of takes a third of such a run, and the command line's
     options are built anew by each call. The tests of both call the functions themselves.
     """
-    import pipeline.terrain.ground as ground
+    import pipeline.terrain.morphological as morphological
 
-    filtered = ground.morphological_ground
+    filtered = morphological.morphological_ground
     command = functools.cache(typer.testing._get_command)
     masks: dict[object, tuple[BoolArray, BoolArray]] = {}
 
@@ -138,7 +138,7 @@ def computed_once() -> Generator[None]:
         return ground.copy(), steady.copy()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ground, "morphological_ground", kept)
+        patch.setattr(morphological, "morphological_ground", kept)
         patch.setattr(typer.testing, "_get_command", command)
         yield
 

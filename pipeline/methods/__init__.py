@@ -7,17 +7,10 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import SettingsError
-from pipeline.methods.settings import (
-    FuzzySartSettings,
-    KMeansSettings,
-    ParameterSpace2dSettings,
-    ParameterSpace3dSettings,
-    RoofFaceSettings,
-)
 from pipeline.parameters import Parameters
 from pipeline.quality.settings import SupportSettings
+from pipeline.registry import loaded
 from pipeline.roof.settings import ArrangementSettings, GuideSettings, RoofSettings, RoofTypeSettings
-from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
 
 if TYPE_CHECKING:
     from pipeline.model import PreparedCloud, Segmentation
@@ -32,22 +25,32 @@ PRESETS = ("robust", "faithful")
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A segmentation method."""
+    """A segmentation method, which loads when it is used."""
 
     name: str
     """As on the command line and in the records."""
-    settings_type: type[Parameters]
-    """Its settings class."""
-    segment: Callable[[PreparedCloud, Any], Segmentation]
-    """From a prepared cloud and an instance of `settings_type` to planes and labels."""
-    faithful: Parameters | None = None
-    """The settings that keep to the paper's words, None for a method of our own; the defaults of `settings_type` are
-    those that measured better."""
+    recipe: str
+    """Its module and function, as "module:function"; see `segment`."""
+    settings: str
+    """Its settings class, as "module:class". The defaults are those that measured better."""
+    follows_paper: bool = True
+    """Whether its settings class has `faithful` ones, which keep to the paper's words; else it is a method of ours."""
+
+    @property
+    def settings_type(self) -> type[Parameters]:
+        """Its settings class."""
+        kind: type[Parameters] = loaded(self.settings)
+        return kind
+
+    def segment(self, cloud: PreparedCloud, settings: Parameters) -> Segmentation:
+        """From a prepared cloud and an instance of `settings_type` to planes and labels."""
+        found: Segmentation = loaded(self.recipe)(cloud, settings)
+        return found
 
     @property
     def presets(self) -> tuple[str, ...]:
         """Names of the presets that it has."""
-        return PRESETS[: 1 if self.faithful is None else 2]
+        return PRESETS if self.follows_paper else PRESETS[:1]
 
     def preset(self, name: str) -> Parameters:
         """The settings ``robust``, the defaults, or ``faithful``, the paper to the letter as far as it is printed.
@@ -59,55 +62,31 @@ class Method:
         """
         if name not in PRESETS:
             raise SettingsError([f"preset is {name!r}: use one of {', '.join(PRESETS)}"])
-        if name == "robust":
-            return self.settings_type()
-        if self.faithful is None:
+        if name not in self.presets:
             raise SettingsError([f"preset is {name!r}, and {self.name} follows no paper: use {self.presets[0]}"])
-        return self.faithful
+        kind: Any = self.settings_type
+        settings: Parameters = kind() if name == "robust" else kind.faithful()
+        return settings
 
 
-def _arrangement(cloud: PreparedCloud, settings: AdaptivePlaneSettings) -> Segmentation:
-    from pipeline.methods import arrangement
-
-    return arrangement.segment(cloud, settings)
-
-
-def _fuzzy_sart(cloud: PreparedCloud, settings: FuzzySartSettings) -> Segmentation:
-    from pipeline.methods import fuzzy_sart
-
-    return fuzzy_sart.segment(cloud, settings)
-
-
-def _parameter_space_2d(cloud: PreparedCloud, settings: ParameterSpace2dSettings) -> Segmentation:
-    from pipeline.methods import parameter_space
-
-    return parameter_space.segment_2d(cloud, settings)
-
-
-def _parameter_space_3d(cloud: PreparedCloud, settings: ParameterSpace3dSettings) -> Segmentation:
-    from pipeline.methods import parameter_space
-
-    return parameter_space.segment_3d(cloud, settings)
-
-
-def _kmeans(cloud: PreparedCloud, settings: KMeansSettings) -> Segmentation:
-    from pipeline.methods import kmeans
-
-    return kmeans.segment(cloud, settings)
-
-
+_SETTINGS = "pipeline.methods.settings:"
 METHODS: Mapping[str, Method] = {
     method.name: method
     for method in (
-        Method("arrangement", AdaptivePlaneSettings, _arrangement),
-        Method("fuzzy-sart", FuzzySartSettings, _fuzzy_sart, FuzzySartSettings.faithful()),
         Method(
-            "parameter-space-2d", ParameterSpace2dSettings, _parameter_space_2d, ParameterSpace2dSettings.faithful()
+            "arrangement",
+            "pipeline.methods.arrangement:segment",
+            "pipeline.segmentation.plane_settings:AdaptivePlaneSettings",
+            follows_paper=False,
+        ),
+        Method("fuzzy-sart", "pipeline.methods.fuzzy_sart:segment", f"{_SETTINGS}FuzzySartSettings"),
+        Method(
+            "parameter-space-2d", "pipeline.methods.parameter_space:segment_2d", f"{_SETTINGS}ParameterSpace2dSettings"
         ),
         Method(
-            "parameter-space-3d", ParameterSpace3dSettings, _parameter_space_3d, ParameterSpace3dSettings.faithful()
+            "parameter-space-3d", "pipeline.methods.parameter_space:segment_3d", f"{_SETTINGS}ParameterSpace3dSettings"
         ),
-        Method("kmeans", KMeansSettings, _kmeans, KMeansSettings.faithful()),
+        Method("kmeans", "pipeline.methods.kmeans:segment", f"{_SETTINGS}KMeansSettings"),
     )
 }
 """All methods by name. A recipe and its kernels load when a building is first segmented by it."""
@@ -186,11 +165,10 @@ class ReconstructSettings:
         Examples
         --------
         >>> kmeans = method_named("kmeans")
-        >>> ReconstructSettings().arranges(kmeans), ReconstructSettings(method=kmeans.faithful).arranges(kmeans)
-        (True, False)
+        >>> [ReconstructSettings(method=kmeans.preset(name)).arranges(kmeans) for name in PRESETS]
+        [True, False]
         """
-        settings = self._of(method)
-        return not isinstance(settings, RoofFaceSettings) or settings.faces == "arranged"
+        return getattr(self._of(method), "faces", "arranged") == "arranged"
 
     def _of(self, method: Method) -> Parameters:
         """The settings of a method, its defaults where there are none."""

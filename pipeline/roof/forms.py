@@ -6,7 +6,6 @@ A form is a function that draws the faces when it is called: a later one costs n
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from collections.abc import Iterator, Sequence
 from functools import partial
 
@@ -16,21 +15,16 @@ from shapely import MultiPolygon
 from pipeline.errors import BuildingError
 from pipeline.model import Decision, DecisionKind, Outcome, Plane
 from pipeline.roof.footprint import simpler_outlines
-from pipeline.roof.guides import guide_steps, guided_outline
-from pipeline.roof.named_form import ARRANGEMENT, TEMPLATES, NamedForm
+from pipeline.roof.named_form import ARRANGEMENT, MOST_TEMPLATE_POINTS, SIMPLER, TEMPLATES, NamedForm, RankedFaces
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.plan import RoofPlan, RoofPoints, arranged_faces, drawn_outline, partition_roof, plan_forms
+from pipeline.roof.plan import RoofPoints, arranged_faces, drawn_outline, partition_roof
 from pipeline.roof.settings import ArrangementSettings, RoofSettings
-from pipeline.roof.templates.fitting import MAX_POINTS, RankedFaces, Templates, fit_templates, margin_of_templates
-from pipeline.roof.voids import without_voids
 
 FaceForm = NamedForm[RoofPartition | RankedFaces]
 """Draws roof faces, over the planes of the segmentation or over planes of their own."""
 
 UNDRAWABLE = (BuildingError, shapely.errors.GEOSException)
 """Raised by a form that cannot be drawn."""
-
-_SIMPLER = "within a simpler outline"
 
 _WIDER_CLEARANCES = (2.5, 4.0)
 """Times the usual distances between an arrangement's vertices. Not settings: tried only where the usual distances made
@@ -52,8 +46,12 @@ def arranged_forms(
     """
     outline_mm = drawn_outline(roof, settings)
     if roof.footprint_mm is not None:
+        from pipeline.roof.voids import without_voids
+
         outline_mm = without_voids(outline_mm, roof.points, roof.spacing_m, settings)
-    else:
+    elif roof.guides:
+        from pipeline.roof.guides import guide_steps, guided_outline
+
         with guide_steps():
             outline_mm = guided_outline(outline_mm, roof.guides, roof.xy_mm, roof.guide_distance_m)
     first, last = _competing_forms(roof, planes, outline_mm, settings, costs, decisions)
@@ -64,31 +62,25 @@ def arranged_forms(
         yield NamedForm(ARRANGEMENT, wider, f"vertices {clearance:g} times as far apart")
     if roof.footprint_mm is not None:
         for simpler in simpler_outlines(outline_mm):
-            yield from _competing_forms(roof, planes, simpler, settings, costs, decisions, _SIMPLER)[0]
+            yield from _competing_forms(roof, planes, simpler, settings, costs, decisions, SIMPLER)[0]
     try:
         plan = partition_roof(roof, planes, settings)
     except BuildingError:
         if not last:
             raise
     else:
+        from pipeline.roof.traced_forms import traced_forms
+
         yield from traced_forms(plan, roof, settings)
     yield from last
 
 
-def traced_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> Iterator[FaceForm]:
-    """The traced faces; behind them the same within simpler outlines, where the outline is given."""
-    yield from plan_forms(plan, roof, settings)
-    if roof.footprint_mm is not None:
-        for simpler in simpler_outlines(plan.outline_mm):
-            simpler_plan = dataclasses.replace(plan, outline_mm=simpler)
-            for form in plan_forms(simpler_plan, roof, settings):
-                yield dataclasses.replace(form, detail=f"{form.detail}, {_SIMPLER}")
-
-
 def template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSettings) -> Iterator[FaceForm]:
     """The templates alone, where no planes were found; raises `lack` where there are no templates either."""
-    if len(roof.points) > MAX_POINTS:
+    if len(roof.points) > MOST_TEMPLATE_POINTS:
         raise lack
+    from pipeline.roof.templates.fitting import fit_templates
+
     try:
         outline_mm = drawn_outline(roof, settings)
         templates = fit_templates(roof.points, outline_mm)
@@ -98,7 +90,7 @@ def template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSettings
     if roof.footprint_mm is not None:
         for simpler in simpler_outlines(outline_mm):
             with contextlib.suppress(*UNDRAWABLE):
-                yield NamedForm(TEMPLATES, fit_templates(roof.points, simpler).faces, _SIMPLER)
+                yield NamedForm(TEMPLATES, fit_templates(roof.points, simpler).faces, SIMPLER)
 
 
 def _competing_forms(
@@ -112,15 +104,16 @@ def _competing_forms(
 ) -> tuple[tuple[FaceForm, ...], tuple[FaceForm, ...]]:
     """The arrangement within an outline and, where points are few, the templates: what goes first, what last."""
     arranged = partial(arranged_faces, roof, planes, outline_mm, costs)
-    if roof.spacing_m < settings.templates_spacing_m or len(roof.points) > MAX_POINTS:
-        return (NamedForm(ARRANGEMENT, arranged, within),), ()
-    templates: Templates | None = None
+    alone = (NamedForm(ARRANGEMENT, arranged, within),), ()
+    if roof.spacing_m < settings.templates_spacing_m or len(roof.points) > MOST_TEMPLATE_POINTS:
+        return alone
+    from pipeline.roof.templates.fitting import fit_templates, margin_of_templates
+
     try:
         templates = fit_templates(roof.points, outline_mm)
     except UNDRAWABLE as error:
         decisions.append(undrawable(TEMPLATES, error))
-    if templates is None:
-        return (NamedForm(ARRANGEMENT, arranged, within),), ()
+        return alone
     try:
         drawn = arranged()
     except UNDRAWABLE as error:

@@ -22,24 +22,12 @@ from pipeline.roof.footprint import polygons_of
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.simplification import without_idle_vertices
-from pipeline.roof.solid import SolidPart, solid_parts
+from pipeline.roof.solid import LodParts, SolidPart, solid_parts
 
 XY = tuple[int, int]
 
 _MAX_FORMS = 8
 """Most ways to draw the levels of a part: bounds the work. Then the part becomes one level."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LodParts:
-    """A building at one level of detail."""
-
-    lod: str
-    """1.2, 1.3 or 2.2."""
-    parts: list[SolidPart]
-    """Its separate parts."""
-    planes: list[Plane]
-    """The planes that the labels of the parts' faces number."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

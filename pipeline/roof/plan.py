@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
-from functools import partial
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -17,6 +17,7 @@ from pipeline.geometry import spacing_over_area_m
 from pipeline.kernels.bounds import bounds_of
 from pipeline.model import (
     BoolArray,
+    Candidate,
     Decision,
     FloatArray,
     Guide,
@@ -29,16 +30,10 @@ from pipeline.model import (
 )
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides
-from pipeline.roof.borders import straighten_borders
 from pipeline.roof.eaves import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
-from pipeline.roof.enclosed_planes import with_enclosed_planes
-from pipeline.roof.facades import FacadePoints, Walls, walls_beneath
-from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, outline, polygons_of
-from pipeline.roof.guided_faces import guided_faces
-from pipeline.roof.guides import guide_steps, inner_pieces
+from pipeline.roof.footprint import footprint_in_mm, in_footprint, outline
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels, nearest_points
-from pipeline.roof.named_form import TRACED, NamedForm
 from pipeline.roof.partition import (
     OUTSIDE,
     MinAreas,
@@ -47,8 +42,10 @@ from pipeline.roof.partition import (
     march,
 )
 from pipeline.roof.settings import ArrangementSettings, RoofSettings
-from pipeline.roof.simplification import simplify_partition, unite_close_vertices
 from pipeline.tin.delaunay import triangulate
+
+if TYPE_CHECKING:
+    from pipeline.roof.facades import FacadePoints, Walls
 
 _PITCH_SPACINGS = 1.2
 """Pitch of the samples in empty places, in point spacings: about as dense as the points."""
@@ -129,12 +126,15 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
         spacing_m=min(max(spacing_over_area_m(points), 0.1), 3.0),
         footprint_mm=footprint,
         outline_mm=None if candidate.outline is None else footprint_in_mm(candidate.outline),
-        facades=FacadePoints.of(
-            candidate.beside, candidate.beside_later, points, candidate.ground, candidate.ground_z_m
-        )
-        if settings.at_walls or settings.finds_walls
-        else None,
+        facades=_facades(candidate, points) if settings.at_walls or settings.finds_walls else None,
     )
+
+
+def _facades(candidate: Candidate, points: FloatArray) -> FacadePoints:
+    """The points that show the walls beneath a roof with some points (n, 3)."""
+    from pipeline.roof.facades import FacadePoints
+
+    return FacadePoints.of(candidate.beside, candidate.beside_later, points, candidate.ground, candidate.ground_z_m)
 
 
 @kernel
@@ -238,6 +238,8 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
         edge_points = EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m)
         drawn = straighten(around, roof.spacing_m, settings, edge_points)
         if roof.facades is not None and settings.at_walls:
+            from pipeline.roof.facades import walls_beneath
+
             reach_m = 1e-3 * mixed_pulse_reach_mm(around, edge_points)
             drawn = walls_beneath(drawn, roof.facades, reach_m, settings.usual_overhang_m).outline_mm
     return RoofPlan(planes=tuple(planes), faces=faces, outline_mm=drawn, raw=partition)
@@ -263,6 +265,8 @@ def walls_of(footprint: Polygon | MultiPolygon, roof: RoofPoints, settings: Roof
     """The walls beneath a footprint at the eaves, local metres; None where they are not asked for."""
     if roof.facades is None or roof.footprint_mm is not None or not settings.finds_walls:
         return None
+    from pipeline.roof.facades import walls_beneath
+
     eaves_mm = footprint_in_mm(footprint)
     reach_mm = mixed_pulse_reach_mm(eaves_mm, EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m))
     return walls_beneath(eaves_mm, roof.facades, 1e-3 * reach_mm, settings.usual_overhang_m, settings.min_overhang_m)
@@ -303,82 +307,16 @@ def arranged_faces(
     free = arranged(NO_GUIDES)
     if not roof.guides:
         return free
+    from pipeline.roof.enclosed_planes import with_enclosed_planes
+    from pipeline.roof.guided_faces import guided_faces
+    from pipeline.roof.guides import guide_steps, inner_pieces
+
     with guide_steps():
         pieces, may_step = inner_pieces(roof.guides, outline_mm)
         guides = Guides(pieces, roof.guide_distance_m)
         coefficients, labels = with_enclosed_planes(roof.points, labels, coefficients, pieces, outline_mm, costs)
         beside_m = max(guides.distance_m, roof.spacing_m)
         return guided_faces(arranged, free, roof.points, guides, may_step, beside_m, costs.residual_cap_m)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PlanForm:
-    """One way to draw the final plan: the forms are tried one after another until the solid is valid."""
-
-    straight: bool = False
-    """Whether borders are straightened."""
-    simplification: float
-    """Times the simplification of the settings."""
-    shrink_mm: float
-    """By how much the footprint is drawn back, so that it passes by vertices that it touched."""
-    unite_mm: float
-    """Clipped vertices closer than this are one."""
-
-    @property
-    def words(self) -> str:
-        """How it differs from others."""
-        drawn_back = f", drawn back {self.shrink_mm:g} mm" if self.shrink_mm else ""
-        borders = "straight borders" if self.straight else f"borders simplified {self.simplification:g} times"
-        return f"{borders}{drawn_back}, vertices within {self.unite_mm:g} mm united"
-
-
-FORMS = (
-    PlanForm(straight=True, simplification=1.0, shrink_mm=0.0, unite_mm=10.0),
-    PlanForm(straight=True, simplification=1.0, shrink_mm=7.0, unite_mm=2.5),
-    PlanForm(simplification=1.0, shrink_mm=0.0, unite_mm=10.0),
-    PlanForm(simplification=1.0, shrink_mm=0.0, unite_mm=2.5),
-    PlanForm(simplification=1.0, shrink_mm=7.0, unite_mm=2.5),
-    PlanForm(simplification=0.4, shrink_mm=16.0, unite_mm=2.5),
-    PlanForm(simplification=0.1, shrink_mm=29.0, unite_mm=2.5),
-    PlanForm(simplification=0.0, shrink_mm=0.0, unite_mm=0.0),
-)
-"""From the one that is wanted to the one that is most likely to succeed."""
-
-RAW_FORMS = (
-    PlanForm(simplification=0.5, shrink_mm=0.0, unite_mm=0.0),
-    PlanForm(simplification=0.1, shrink_mm=0.0, unite_mm=0.0),
-    PlanForm(simplification=0.0, shrink_mm=0.0, unite_mm=0.0),
-)
-"""The same for faces up to the raw outline."""
-
-
-def plan_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> Iterator[NamedForm[RoofPartition]]:
-    """Ways to draw the final plan, the best first; each raises `no_partition` where it cannot be drawn."""
-    clipped = plan.raw is None or settings.straight_eaves
-    if clipped:
-        for form in FORMS:
-            yield NamedForm(TRACED, partial(draw_clipped, plan, roof, settings, form), form.words)
-    if plan.raw is not None:
-        for form in RAW_FORMS if clipped else (FORMS[0], *RAW_FORMS):
-            tolerance = form.simplification * settings.simplification_spacings * roof.spacing_m
-            raw = partial(simplify_partition, plan.raw, tolerance)
-            yield NamedForm(TRACED, raw, f"up to the raw outline, {form.words}")
-
-
-def draw_clipped(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings, form: PlanForm) -> RoofPartition:
-    """Clip the faces of `partition_roof` by the outline and simplify the borders between them, in integer millimetres.
-
-    Raises BuildingError `no_partition` where this form cannot be drawn.
-    """
-    outline_mm = plan.outline_mm
-    if form.shrink_mm > 0.0:
-        drawn_back = shapely.set_precision(shapely.buffer(outline_mm, -form.shrink_mm, join_style="mitre"), 1.0)
-        outline_mm = MultiPolygon(polygons_of(drawn_back))
-    partition = clip_partition(plan.faces, outline_mm, min_face_area(roof, settings))
-    if form.straight and settings.straight_borders:
-        partition = straighten_borders(partition, plan.planes, roof.spacing_m, settings)
-    tolerance = form.simplification * settings.simplification_spacings * roof.spacing_m
-    return unite_close_vertices(simplify_partition(partition, tolerance, outline_too=False), form.unite_mm)
 
 
 def min_face_area(roof: RoofPoints, settings: RoofSettings) -> float:

@@ -34,6 +34,18 @@ class SolidPart:
     """Its floor in plan, local metres."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LodParts:
+    """A building at one level of detail."""
+
+    lod: str
+    """1.2, 1.3 or 2.2."""
+    parts: list[SolidPart]
+    """Its separate parts."""
+    planes: list[Plane]
+    """The planes that the labels of the parts' faces number."""
+
+
 def solid_parts(partition: RoofPartition, planes: Sequence[Plane], ground_z_m: float) -> list[SolidPart]:
     """Extrude a partition to one closed solid for every connected part, in the order of each part's first polygon.
 

@@ -17,8 +17,9 @@ from pipeline.errors import BuildingError
 from pipeline.model import Candidate, LabelArray, Plane
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.footprint import polygons_of
-from pipeline.roof.plan import FORMS, draw_clipped, partition_roof, roof_points
+from pipeline.roof.plan import partition_roof, roof_points
 from pipeline.roof.settings import RoofSettings
+from pipeline.roof.traced_forms import FORMS, draw_clipped
 
 
 def unit_outlines(candidate: Candidate, units: LabelArray, settings: RoofSettings) -> list[MultiPolygon | None]:

@@ -26,6 +26,7 @@ from pipeline.io.records import Share
 from pipeline.io.source import IMPOSSIBLE_DENSITY
 from pipeline.runtime.scratch.folder import POINT
 from pipeline.settings import RunSettings
+from pipeline.terrain.filter_settings import FILTERS
 from pipeline.terrain.scene_settings import APRON_M, ClassesInUse
 from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
@@ -53,8 +54,6 @@ _BYTES_PER_POINT = 220
 """Bytes per point of the window: measured peak of a split above the size of its process, at 3 and 5 million points."""
 _BYTES_PER_JUDGED_POINT = 140
 """The same of the search for duplicates and outliers, where several files share a tile; 80 with one."""
-_BYTES_PER_CELL = {"morphological": 150, "hierarchical": 210}
-"""The same per cell of 1 m of each ground filter: 144 and 207 measured, all cells filled."""
 _BLOCK_M = 1000.0
 """About the side of a block of the ground stage. Wider ones look at fewer cells twice, and need more memory."""
 LARGEST_TASK_BYTES = _POINTS_PER_WINDOW * _BYTES_PER_POINT
@@ -256,7 +255,7 @@ def _block_bytes(grid: TileGrid, sources: Sequence[SourceInfo], settings: RunSet
     widths = [min(tiles_per_block(grid.size_mm) * size_m, high[axis] - low[axis] + size_m) for axis in (0, 1)]
     beyond_m = 2.0 * (APRON_M + settings.scene.ground_support_m(ClassesInUse()))
     cells = (widths[0] + beyond_m) * (widths[1] + beyond_m)
-    return int(cells * _BYTES_PER_CELL[settings.scene.ground.filter])
+    return int(cells * FILTERS[settings.scene.ground.filter].bytes_per_cell)
 
 
 def looked_at(paths: Sequence[str], options: ReadOptions) -> tuple[SourceInfo, ...]:
@@ -379,7 +378,7 @@ def points_bytes(points: int, beside: int) -> int:
 def ground_bytes(window: Window, settings: GroundSettings) -> int:
     """Estimated peak memory of a process that finds the ground of a window."""
     cells = (window.x1_mm - window.x0_mm) * (window.y1_mm - window.y0_mm) // MM**2
-    return WINDOW_BASE_BYTES + cells * _BYTES_PER_CELL[settings.filter]
+    return WINDOW_BASE_BYTES + cells * FILTERS[settings.filter].bytes_per_cell
 
 
 def tiles_per_block(size_mm: int) -> int:

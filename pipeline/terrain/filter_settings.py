@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from typing import NamedTuple
 
+from pipeline.model import BoolArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.support import (
     CLUMP_CELLS,
@@ -15,6 +17,36 @@ from pipeline.terrain.support import (
     embankments_support_m,
     wide_support_m,
 )
+
+
+class GroundFilter(NamedTuple):
+    """A filter that tells the cells of ground from those of objects."""
+
+    find: str
+    """Its function, as "module:name": from the lowest points of cells (rows, columns), the column and row of the first
+    cell, the settings, and the part where terrain is needed to a `FoundGround`."""
+    bytes_per_cell: int
+    """Peak memory per cell of 1 m, all cells filled."""
+    widens_on_slopes: bool
+    """Whether points of steep terrain are ground farther from it (`tolerance_slope`)."""
+
+
+FILTERS = {
+    "morphological": GroundFilter("pipeline.terrain.morphological:found_ground", 150, True),
+    "hierarchical": GroundFilter("pipeline.terrain.hierarchical_filter:found_ground", 210, False),
+}
+"""The ground filters by name: 144 and 207 bytes per cell were measured."""
+
+
+class FoundGround(NamedTuple):
+    """The cells that hold ground, (rows, columns) each."""
+
+    near: BoolArray
+    """Those through which small squares draw the terrain."""
+    wide: BoolArray
+    """Those for squares beyond `NEAR_CELLS`."""
+    beside: tuple[int, float] = (0, 0.0)
+    """For ground at brows and crests: half side of the squares beside a cell, and a step in mm; 0 leaves them out."""
 
 
 class MorphologicalFilterSettings(Parameters):

@@ -14,9 +14,9 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
-from pipeline.terrain.hierarchical_filter import hierarchical_ground
+from pipeline.registry import loaded
+from pipeline.terrain.filter_settings import FILTERS, FoundGround
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, Part, lowest_per_cell, part_around, without_pits
-from pipeline.terrain.morphological import morphological_ground
 from pipeline.terrain.planar_fitting import MIN_CELLS, plane_around, plane_sums, sum_within
 from pipeline.terrain.rejoining import FEWEST_SIDES, meeting_sides
 from pipeline.terrain.settings import GroundSettings
@@ -226,19 +226,14 @@ def ground_on(
         down, across = (slice(0, rows), slice(0, columns)) if wanted is None else wanted
         south, west = seen[0].start, seen[1].start
         drawn = (slice(down.start - south, down.stop - south), slice(across.start - west, across.stop - west))
-        is_ground = steady = part != NO_DATA
-        beside = (0, 0.0)
-        if not trusted:
-            pit_depth_mm = round(settings.pit_depth_m * 1000)
-            part = without_pits(part, pit_depth_mm)
-            place = (column0 + west, row0 + south)
-            if settings.filter == "hierarchical":
-                is_ground = steady = hierarchical_ground(part, place, settings, pit_depth_mm)
-            else:
-                is_ground, steady = morphological_ground(part, place, settings, (drawn, settings.reach_m))
-                beside = (settings.rejoin_m, settings.rejoin_step_m * 1000.0)
-        elevation[seen] = _terrain(part, (is_ground, steady), settings.reach_m, settings.max_slope, drawn, beside)
-        measured[seen] = is_ground
+        if trusted:
+            found = FoundGround(part != NO_DATA, part != NO_DATA)
+        else:
+            part = without_pits(part, round(settings.pit_depth_m * 1000))
+            found = loaded(FILTERS[settings.filter].find)(part, (column0 + west, row0 + south), settings, drawn)
+        grounds = (found.near, found.wide)
+        elevation[seen] = _terrain(part, grounds, settings.reach_m, settings.max_slope, drawn, found.beside)
+        measured[seen] = found.near
     return elevation, measured
 
 
@@ -296,7 +291,7 @@ def ground_points(
     lowest points, and steep ground rises far above them within a cell. Returns and outliers do not matter here; points
     without terrain are not ground.
     """
-    rise = 0.0 if settings.filter == "hierarchical" else settings.tolerance_slope
+    rise = settings.tolerance_slope if FILTERS[settings.filter].widens_on_slopes else 0.0
     found: BoolArray = _near_terrain(
         x_mm,
         y_mm,

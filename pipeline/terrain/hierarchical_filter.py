@@ -14,9 +14,10 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray
-from pipeline.terrain.filter_settings import HierarchicalFilterSettings
-from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, without_pits
+from pipeline.terrain.filter_settings import FoundGround, HierarchicalFilterSettings
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, Part, without_pits
 from pipeline.terrain.planar_fitting import join_planes
+from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.support import PIT_CELLS
 from pipeline.terrain.tin_densification import join_facets
 
@@ -133,6 +134,12 @@ def _without_clumps(lowest: Elevations, size: int, column0: int, row0: int, dept
             if near <= _CLUMP_MATES:
                 out[r, c] = NO_DATA
     return out
+
+
+def found_ground(lowest: Elevations, corner: tuple[int, int], settings: GroundSettings, _: Part) -> FoundGround:
+    """The cells that hold ground; see `hierarchical_ground`."""
+    ground = hierarchical_ground(lowest, corner, settings, round(settings.pit_depth_m * 1000))
+    return FoundGround(ground, ground)
 
 
 def hierarchical_ground(

@@ -18,11 +18,12 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, LabelArray
 from pipeline.terrain.between_walls import between_walls
 from pipeline.terrain.embankments import embankments
-from pipeline.terrain.filter_settings import MorphologicalFilterSettings
+from pipeline.terrain.filter_settings import FoundGround, MorphologicalFilterSettings
 from pipeline.terrain.lattice import NO_DATA, Elevations, Part, part_around
 from pipeline.terrain.openings import cut_off
 from pipeline.terrain.planar_fitting import leaning_planes
 from pipeline.terrain.rejoining import rejoined
+from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS
 from pipeline.terrain.wide_objects import wide_objects, with_corners
 
@@ -266,6 +267,12 @@ def regrown(
                 out[r, c] = level >= _FEWEST_BESIDE and level >= share * beside
         ground = out
     return ground
+
+
+def found_ground(lowest: Elevations, corner: tuple[int, int], settings: GroundSettings, wanted: Part) -> FoundGround:
+    """The cells that hold ground; see `morphological_ground`."""
+    ground, steady = morphological_ground(lowest, corner, settings, (wanted, settings.reach_m))
+    return FoundGround(ground, steady, (settings.rejoin_m, settings.rejoin_step_m * 1000.0))
 
 
 def morphological_ground(

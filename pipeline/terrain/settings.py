@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipeline.parameters import Parameters, parameter
-from pipeline.terrain.filter_settings import HierarchicalFilterSettings, MorphologicalFilterSettings
+from pipeline.terrain.filter_settings import FILTERS, HierarchicalFilterSettings, MorphologicalFilterSettings
 from pipeline.terrain.support import GLASS_M, NEAR_CELLS, PLANARITY_SCALES
 
 _MAX_SUPPORT_M = 500
@@ -39,7 +39,7 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
     filter: str = parameter(
         "morphological",
         "Separates ground from objects: openings of growing size, or TIN densification with planar fitting.",
-        choices=("morphological", "hierarchical"),
+        choices=tuple(FILTERS),
     )
 
     pit_depth_m: float = parameter(

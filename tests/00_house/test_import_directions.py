@@ -42,7 +42,7 @@ def test_the_sources_keep_all_contracts(copied_house: Path) -> None:
         ("pipeline/terrain/ground.py", "import pipeline.roof", "Layers of the pipeline"),
         ("pipeline/tin/delaunay.py", "import pipeline.io", "The science knows no files"),
         ("pipeline/segmentation/fuzzy_sart.py", "import dask", "The science knows no files"),
-        ("pipeline/reconstruct.py", "import pandas", "The science knows no files"),
+        ("pipeline/recipe.py", "import pandas", "The science knows no files"),
         (
             "pipeline/segmentation/fuzzy_sart.py",
             "import pipeline.segmentation.plane_refinement",

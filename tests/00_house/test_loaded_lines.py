@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from plain_houses import houses, write_houses
 
-MOST_LINES = 49_600
+MOST_LINES = 42_400
 """Lines of the loaded modules of `pipeline` and `service`, whole files. Lower it whenever the number falls."""
 NAMED = 25
 """Largest modules that the failure names."""
@@ -43,7 +43,7 @@ def test_a_default_run_loads_no_more_lines_than_it_may(tmp_path: Path) -> None:
     lines = loaded_lines(*words)
     if "pipeline.compiler.warm_up" in lines:  # the first run of a checkout compiles kernels
         lines = loaded_lines(*words)
-    assert {"pipeline.runtime.run", "pipeline.reconstruct", "pipeline.export.tile"} <= set(lines)
+    assert {"pipeline.runtime.run", "pipeline.recipe", "pipeline.export.tile"} <= set(lines)
     largest = sorted(lines, key=lambda name: -lines[name])[:NAMED]
     table = "\n".join(f"{lines[name]:6d} {name}" for name in largest)
     total = sum(lines.values())

@@ -19,7 +19,7 @@ def modules_after(statement: str) -> set[str]:
 @pytest.mark.parametrize(
     ("modules", "unused"),
     [
-        ("pipeline.reconstruct", HEAVY),
+        ("pipeline.recipe", HEAVY),
         ("service.cli", HEAVY | SCIENCE),
         ("service.client", HEAVY | SCIENCE | {"pydantic", "starlette", "sqlalchemy"}),
         ("pipeline.settings", HEAVY | SCIENCE),

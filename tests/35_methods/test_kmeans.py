@@ -21,7 +21,7 @@ from pipeline.methods.settings import KMeansSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, Reason, RoofType, Segmentation, Status
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.validity import check_solid
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 
 PAGE = Path(__file__).parents[2] / "docs" / "methods" / "kmeans.md"
 FAITHFUL = KMeansSettings.faithful()

@@ -253,8 +253,8 @@ def test_the_faithful_settings_hold_the_papers_figures() -> None:
     assert (deep.max_o_deviation_m, deep.ground_below_deg, deep.wall_above_deg) == (1.3, 4.0, 76.0)
     for settings in (flat, deep):
         assert (settings.ground_clusters, settings.point_groups, settings.type_from) == ("keep", "membership", "tree")
-    assert METHODS["parameter-space-2d"].faithful == flat
-    assert METHODS["parameter-space-3d"].faithful == deep
+    assert METHODS["parameter-space-2d"].preset("faithful") == flat
+    assert METHODS["parameter-space-3d"].preset("faithful") == deep
 
 
 def test_contradicting_settings_of_all_stages_are_named_at_once() -> None:

@@ -11,10 +11,10 @@ from pipeline.errors import SettingsError
 from pipeline.methods import METHODS, ReconstructSettings, method_named
 from pipeline.methods.settings import RoofFaceSettings
 from pipeline.model import BuildingResult, Candidate, RoofType, Status
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.settings import RunSettings
 
-OF_PAPERS = [name for name, entry in METHODS.items() if entry.faithful is not None]
+OF_PAPERS = [name for name, entry in METHODS.items() if entry.follows_paper]
 OUTLINE = shapely.box(0.0, 0.0, 12.0, 8.0)
 
 

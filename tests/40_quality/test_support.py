@@ -14,7 +14,7 @@ from pipeline.model import DecisionKind, Outcome, Reason, Status
 from pipeline.quality.detection import confidence_of
 from pipeline.quality.settings import SupportSettings
 from pipeline.quality.support import Support, doubt_of, noise_limits
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.settings import RunSettings
 
 GOOD = Support(share_on_roof=0.95, scatter_m=0.04, unseen_share=0.02, returns_per_face=40.0)

@@ -12,9 +12,10 @@ from candidates_by_hand import candidate
 from pipeline.model import Candidate, FloatArray, LabelArray, Plane, Solid
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.plan import RoofPlan, RoofPoints, partition_roof, plan_forms, roof_points
+from pipeline.roof.plan import RoofPlan, RoofPoints, partition_roof, roof_points
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.solid import SolidPart, solid_parts
+from pipeline.roof.traced_forms import plan_forms
 
 FLOOR_M = 0.0
 

@@ -10,7 +10,7 @@ from candidates_by_hand import candidate
 
 from pipeline.model import FloatArray
 from pipeline.prepared_cloud import prepare_cloud
-from pipeline.reconstruct import ReconstructSettings, reconstruct_building
+from pipeline.recipe import ReconstructSettings, reconstruct_building
 from pipeline.roof.block import block_plane
 from pipeline.roof.facades import Eave, FacadePoints, eave_of, mean_overhang, walls_beneath
 from pipeline.roof.plan import partition_roof, roof_points

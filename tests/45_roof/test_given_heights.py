@@ -15,7 +15,7 @@ from pipeline.errors import BuildingError
 from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, GivenHeights, GroundSource, HeightSource, Reason, Status
 from pipeline.quality.validity import check_solid
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.roof.given_heights import given_block, given_heights
 from pipeline.roof.settings import FootprintSettings
 

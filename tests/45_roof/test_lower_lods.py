@@ -11,10 +11,10 @@ from shapely import Polygon
 
 from pipeline.model import FaceKind, FloatArray, Plane, Solid
 from pipeline.quality.validity import check_solid
-from pipeline.roof.lower_lods import LodParts, level_forms, lower_lods
+from pipeline.roof.lower_lods import level_forms, lower_lods
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.simplification import without_idle_vertices
-from pipeline.roof.solid import solid_parts
+from pipeline.roof.solid import LodParts, solid_parts
 
 ExactRoofs = Callable[..., Any]
 Volume = Callable[[Solid], float]

@@ -11,7 +11,7 @@ from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, IntArray, Plane, PreparedCloud
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.residuals import vertical_residuals
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.roof.plan import RoofPoints, roof_points
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.shaded_points import with_shaded_points

@@ -1,7 +1,7 @@
 """What a result says about the way to it: figures with their limits, and the forms that were tried."""
 
 import dataclasses
-import operator
+import importlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,8 +10,6 @@ import pytest
 import shapely
 from candidates_by_hand import candidate
 
-import pipeline
-from pipeline import reconstruct
 from pipeline.errors import BuildingError
 from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.model import (
@@ -28,10 +26,12 @@ from pipeline.model import (
     Segmentation,
     Status,
 )
-from pipeline.reconstruct import reconstruct_building
+from pipeline.quality.validity import check_solid
+from pipeline.recipe import reconstruct_building
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints
 from pipeline.roof.settings import RoofSettings
+from pipeline.roof.unsupported_faces import level_unsupported_faces
 
 
 def gable(n: int = 960, seed: int = 0) -> Candidate:
@@ -111,7 +111,7 @@ def test_where_points_are_few_both_forms_have_the_margin_of_their_competition() 
 
 
 def test_a_form_that_is_beaten_later_is_listed_with_what_it_explains(monkeypatch: pytest.MonkeyPatch) -> None:
-    usual, calls = reconstruct.level_unsupported_faces, iter(range(100))
+    usual, calls = level_unsupported_faces, iter(range(100))
 
     def level(
         drawn: RoofPartition, roof: RoofPoints, planes: Sequence[Plane], ground_z_m: float, settings: RoofSettings
@@ -121,7 +121,7 @@ def test_a_form_that_is_beaten_later_is_listed_with_what_it_explains(monkeypatch
         flat = Plane(a=0.0, b=0.0, c=6.4, n_points=1, rmse_m=0.0)
         return RoofPartition(polygons=drawn.polygons, labels=drawn.labels * 0 + len(planes)), [*planes, flat]
 
-    monkeypatch.setattr(reconstruct, "level_unsupported_faces", level)
+    monkeypatch.setattr("pipeline.building.drawing.level_unsupported_faces", level)
     result = reconstruct_building(gable(), "arrangement", ReconstructSettings())
     first, second = forms(result)
     assert (first.outcome, first.levelled_share, first.detail) == (Outcome.OUTDONE, 1.0, "2 faces made level")
@@ -131,11 +131,12 @@ def test_a_form_that_is_beaten_later_is_listed_with_what_it_explains(monkeypatch
 
 
 def test_invalid_solids_are_listed_with_their_codes_and_the_block_behind_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    usual, judged = reconstruct.check_solid, iter([(306,)] * 3)
-    monkeypatch.setattr(reconstruct, "check_solid", lambda solid: next(judged, None) or usual(solid))
-    monkeypatch.setattr(reconstruct, "traced_forms", lambda *_: iter(()))
+    usual, judged = check_solid, iter([(306,)] * 3)
+    for name in ("form_search", "drawing", "record"):
+        monkeypatch.setattr(f"pipeline.building.{name}.check_solid", lambda solid: next(judged, None) or usual(solid))
+    monkeypatch.setattr("pipeline.roof.traced_forms.traced_forms", lambda *_: iter(()))
     given = gable()
-    monkeypatch.setattr(reconstruct, "lower_lods", lambda *_: [])
+    monkeypatch.setattr("pipeline.roof.lower_lods.lower_lods", lambda *_: [])
     result = reconstruct_building(given, "arrangement", ReconstructSettings())
     codes = [entry.validity_codes for entry in forms(result)[:3]]
     assert outcomes(result)[:3] == [("arrangement", "invalid")] * 3
@@ -146,7 +147,7 @@ def test_invalid_solids_are_listed_with_their_codes_and_the_block_behind_them(mo
 def test_a_model_that_is_not_delivered_is_withdrawn_and_the_block_is_chosen() -> None:
     settings = ReconstructSettings(lods=("1.2", "2.2"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reconstruct, "lower_lods", lambda *_: [])
+        patch.setattr("pipeline.roof.lower_lods.lower_lods", lambda *_: [])
         result = reconstruct_building(gable(), "arrangement", settings)
     assert result.status is Status.FALLBACK
     assert outcomes(result) == [("arrangement", "withdrawn"), ("block", "chosen")]
@@ -165,12 +166,12 @@ def test_every_level_of_detail_that_was_asked_for_is_listed() -> None:
 
 
 GUIDED = {
-    "roof.forms.guided_outline": lambda _, guides, *__: guides,
-    "roof.plan.inner_pieces": lambda guides, *_: guides,
-    "roof.plan.with_enclosed_planes": lambda *_: True,
+    "roof.guides.guided_outline": lambda _, guides, *__: guides,
+    "roof.guides.inner_pieces": lambda guides, *_: guides,
+    "roof.enclosed_planes.with_enclosed_planes": lambda *_: True,
     "roof.plan.arrange": lambda *given: len(given[-1].pieces),
     "roof.guided_faces.misfits_of": lambda *_: True,
-    "reconstruct.followed": lambda guides, *_: guides,
+    "roof.guides.followed": lambda guides, *_: guides,
 }
 """The steps that need guides, and whether they get any."""
 
@@ -185,7 +186,8 @@ def test_a_building_whose_guides_fail_in_any_step_is_modelled_without_them_and_s
     eave = Guide(kind=GuideKind.EAVE, line=shapely.LineString([(0.0, -0.1), (12.0, -0.1)]))
     guided = dataclasses.replace(free, guides=(ridge, eave))
     known = reconstruct_building(free, "arrangement", ReconstructSettings())
-    usual = operator.attrgetter(step)(pipeline)
+    module, _, name = step.rpartition(".")
+    usual = getattr(importlib.import_module(f"pipeline.{module}"), name)
 
     def failing(*given: Any) -> Any:
         if GUIDED[step](*given):
@@ -204,7 +206,7 @@ def test_a_building_whose_guides_fail_in_any_step_is_modelled_without_them_and_s
 
 def test_a_building_that_fails_without_its_guides_too_keeps_its_own_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     ridge = Guide(kind=GuideKind.RIDGE, line=shapely.LineString([(1.0, 4.0), (11.0, 4.0)]))
-    monkeypatch.setattr(reconstruct, "model_quality", lambda *_, **__: 1 // 0)
+    monkeypatch.setattr("pipeline.building.record.model_quality", lambda *_, **__: 1 // 0)
     result = reconstruct_building(dataclasses.replace(gable(), guides=(ridge,)), "arrangement", ReconstructSettings())
     assert (result.status, result.reason) == (Status.FAILED, Reason.INTERNAL_ERROR)
     assert "ZeroDivisionError" in result.reason_detail

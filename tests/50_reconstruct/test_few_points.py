@@ -11,7 +11,7 @@ import shapely
 from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, Reason, RoofType, Status
 from pipeline.quality.validity import check_solid
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.roof.settings import RoofSettings
 
 HOUSE = shapely.box(0.0, 0.0, 12.0, 8.0)

@@ -8,7 +8,7 @@ from shapely import Polygon
 
 from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, FloatArray, Status
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 
 
 def house(density: float, rng: np.random.Generator) -> FloatArray:

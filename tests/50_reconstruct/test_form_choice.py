@@ -7,14 +7,15 @@ import pytest
 import shapely
 from candidates_by_hand import candidate
 
-from pipeline import reconstruct
 from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, Plane, Reason, Status
-from pipeline.reconstruct import reconstruct_building
+from pipeline.quality.validity import check_solid
+from pipeline.recipe import reconstruct_building
 from pipeline.roof import block
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints
 from pipeline.roof.settings import RoofSettings
+from pipeline.roof.unsupported_faces import level_unsupported_faces
 
 
 def gable(seed: int = 0) -> Candidate:
@@ -28,7 +29,7 @@ def gable(seed: int = 0) -> Candidate:
 def levelled_at_first(monkeypatch: pytest.MonkeyPatch, forms: int) -> list[int]:
     """Makes all faces of so many first forms level; the list holds an entry for every form that was drawn."""
     drawn_forms: list[int] = []
-    usual = reconstruct.level_unsupported_faces
+    usual = level_unsupported_faces
 
     def level(
         drawn: RoofPartition, roof: RoofPoints, planes: Sequence[Plane], ground_z_m: float, settings: RoofSettings
@@ -39,7 +40,7 @@ def levelled_at_first(monkeypatch: pytest.MonkeyPatch, forms: int) -> list[int]:
         flat = Plane(a=0.0, b=0.0, c=6.4, n_points=1, rmse_m=0.0)
         return RoofPartition(polygons=drawn.polygons, labels=drawn.labels * 0 + len(planes)), [*planes, flat]
 
-    monkeypatch.setattr(reconstruct, "level_unsupported_faces", level)
+    monkeypatch.setattr("pipeline.building.drawing.level_unsupported_faces", level)
     return drawn_forms
 
 
@@ -63,10 +64,11 @@ def test_a_block_that_cannot_be_drawn_gives_way_to_the_next(monkeypatch: pytest.
         raise shapely.errors.GEOSException("on purpose")
 
     monkeypatch.setattr(block, "_opened", opened)
-    monkeypatch.setattr(reconstruct, "arranged_forms", lambda *_: iter(()))
+    monkeypatch.setattr("pipeline.recipe.arranged_forms", lambda *_: iter(()))
     judged = iter([(306,)])
-    usual = reconstruct.check_solid
-    monkeypatch.setattr(reconstruct, "check_solid", lambda solid: next(judged, None) or usual(solid))
+    usual = check_solid
+    for name in ("form_search", "drawing", "record"):
+        monkeypatch.setattr(f"pipeline.building.{name}.check_solid", lambda solid: next(judged, None) or usual(solid))
     result = reconstruct_building(gable(), "arrangement", ReconstructSettings())
     assert (result.status, result.lod) == (Status.FALLBACK, "1.2")
     assert result.reason_detail.startswith("validity codes none")

@@ -7,7 +7,7 @@ from candidates_by_hand import candidate
 
 from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Reason, Status
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 
 
 def shed(lowest_m: float, rise: float, *, with_footprint: bool) -> BuildingResult:

@@ -14,7 +14,7 @@ from pipeline.export.dimensions import dimensions
 from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, FaceKind, Status
 from pipeline.quality.validity import check_solid
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.ruler.simulation.als import ScannerSettings, scan_all
 from pipeline.ruler.simulation.scene import Building, Scene
 

@@ -7,12 +7,11 @@ import pytest
 import shapely
 from candidates_by_hand import candidate
 
-from pipeline import reconstruct
 from pipeline.errors import SettingsError
 from pipeline.methods import OVERHANGS, ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, FaceKind, FloatArray, NoOverhang, Outcome, OverhangSource, Solid
 from pipeline.quality.validity import check_solid
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.roof.overhangs import UndrawableError, floor_m2
 from pipeline.roof.settings import RoofSettings
 from pipeline.settings import RunSettings
@@ -117,7 +116,7 @@ def test_overhangs_that_cannot_be_drawn_leave_lod22(monkeypatch: pytest.MonkeyPa
     def undrawable(*_: object) -> list[Solid]:
         raise UndrawableError(NoOverhang.INVALID_SOLID, "no form")
 
-    monkeypatch.setattr(reconstruct, "overhanging_solids", undrawable)
+    monkeypatch.setattr("pipeline.building.overhang_model.overhanging_solids", undrawable)
     result = modelled(house(southern_wall(0.5)))
     assert (result.status, result.lod, len(result.solids)) == ("ok", "2.2", 1)
     assert result.overhangs is not None

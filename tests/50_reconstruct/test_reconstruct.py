@@ -10,11 +10,11 @@ import pytest
 import shapely
 from candidates_by_hand import candidate
 from faces_by_hand import plane
+from method_by_hand import MethodByHand
 from shapely import Polygon
 
-from pipeline import reconstruct
 from pipeline.errors import BuildingError, SettingsError
-from pipeline.methods import METHODS, Method, ReconstructSettings, method_named
+from pipeline.methods import METHODS, ReconstructSettings, method_named
 from pipeline.model import (
     BuildingResult,
     Candidate,
@@ -27,9 +27,8 @@ from pipeline.model import (
     Solid,
     Status,
 )
-from pipeline.parameters import Parameters
 from pipeline.quality.validity import check_solid
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.roof.settings import RoofSettings
 
 Install = Callable[[Callable[[Candidate], Segmentation]], None]
@@ -53,9 +52,8 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> Install:
     """`stub(function)` makes a segmentation function the method `stub`."""
 
     def install(segment: Callable[[Candidate], Segmentation]) -> None:
-        own = {"settings_type": Parameters, "faithful": Parameters()}
-        method = Method(name="stub", segment=lambda cloud, _: segment(cloud.candidate), **own)
-        monkeypatch.setattr(reconstruct, "method_named", lambda _: method)
+        method = MethodByHand(name="stub", segment=lambda cloud, _: segment(cloud.candidate))
+        monkeypatch.setattr("pipeline.recipe.method_named", lambda _: method)
 
     return install
 
@@ -158,7 +156,8 @@ def test_a_solid_that_stays_invalid_becomes_a_block_with_the_codes(monkeypatch: 
     def judge(solid: Solid) -> tuple[int, ...]:
         return (204, 303) if sum(face.kind is FaceKind.ROOF for face in solid.faces) > 1 else ()
 
-    monkeypatch.setattr(reconstruct, "check_solid", judge)
+    for name in ("form_search", "drawing", "record"):
+        monkeypatch.setattr(f"pipeline.building.{name}.check_solid", judge)
     result = modelled(gable())
     assert (result.status, result.reason, result.lod) == (Status.FALLBACK, Reason.INVALID_SOLID, "1.2")
     assert result.validity_codes == (204, 303)
@@ -166,7 +165,8 @@ def test_a_solid_that_stays_invalid_becomes_a_block_with_the_codes(monkeypatch: 
 
 
 def test_nothing_invalid_is_delivered_even_where_no_block_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconstruct, "check_solid", lambda _: (305,))
+    for name in ("form_search", "drawing", "record"):
+        monkeypatch.setattr(f"pipeline.building.{name}.check_solid", lambda _: (305,))
     result = modelled(gable())
     assert (result.status, result.reason, result.solids) == (Status.FAILED, Reason.NO_FOOTPRINT, ())
 

@@ -11,7 +11,7 @@ from candidates_by_hand import candidate
 
 from pipeline.model import BuildingResult, Candidate, FloatArray, Status
 from pipeline.quality.validity import check_solid
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.settings import RunSettings
 
 Heights = Callable[[FloatArray, FloatArray], FloatArray]

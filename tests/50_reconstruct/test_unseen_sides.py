@@ -10,7 +10,7 @@ from candidates_by_hand import candidate
 from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, Reason, RoofType, Status
 from pipeline.quality.validity import check_solid
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 
 LENGTH_M, WIDTH_M, EAVE_M, SLOPE = 12.0, 8.0, 5.0, 0.75
 RIDGE_M = EAVE_M + SLOPE * WIDTH_M / 2.0

@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
@@ -127,5 +127,5 @@ def candidates(monkeypatch: pytest.MonkeyPatch) -> list[Candidate]:
         seen.append(candidate)
         return reconstruct_building(candidate, method, settings)
 
-    monkeypatch.setattr("pipeline.reconstruct.reconstruct_building", watched)
+    monkeypatch.setattr("pipeline.recipe.reconstruct_building", watched)
     return seen

@@ -18,7 +18,7 @@ from faults.asked import environment
 from processes import LONG_S, wait_for
 from run_tables import rows_by_id
 
-import pipeline.reconstruct
+import pipeline.recipe
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.model import Reason
 from pipeline.runtime.isolation import child_main, child_pool
@@ -349,14 +349,14 @@ def test_a_building_with_an_internal_error_leaves_a_bundle_with_and_without_a_ch
     victim = min(rows_by_id(reconstruct(suburb).run_dir))
     for name, value in environment(**{"raise": [victim]}).items():
         monkeypatch.setenv(name, value)
-    real = pipeline.reconstruct._reconstruct
+    real = pipeline.recipe._reconstruct
 
     def faulty(building: Any, *rest: Any, **options: Any) -> Any:
         if building.candidate.building_id == victim:
             raise ZeroDivisionError("on purpose")
         return real(building, *rest, **options)
 
-    monkeypatch.setattr(pipeline.reconstruct, "_reconstruct", faulty)
+    monkeypatch.setattr(pipeline.recipe, "_reconstruct", faulty)
     events: list[Event] = []
     summary = reconstruct(suburb, isolate=isolate, on_event=events.append)
     row = rows_by_id(summary.run_dir)[victim]

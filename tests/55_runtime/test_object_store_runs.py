@@ -216,7 +216,7 @@ def test_bundles_of_poisonous_buildings_go_into_the_bucket(tile, bucket, monkeyp
     def fail(*_args, **_kwargs):
         raise ZeroDivisionError("poison")
 
-    monkeypatch.setattr("pipeline.reconstruct.reconstruct_building", fail)
+    monkeypatch.setattr("pipeline.recipe.reconstruct_building", fail)
     summary = run(request(tile, bucket))
     kept = [key for key in storage_at(f"{bucket}/run").keys("quarantine") if key.endswith(".bundle")]
     assert len(kept) == summary.statuses["failed"] > 0

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from run_tables import rows_by_id, write_footprints
 
-import pipeline.reconstruct
+import pipeline.recipe
 import pipeline.runtime.rerun
 import pipeline.runtime.stages.apply_overrides as applying
 from pipeline.errors import RunCancelledError, RunError, SettingsError
@@ -475,14 +475,14 @@ def test_a_rerun_models_no_other_building_and_splits_only_the_tiles_around(
     plain: Any, copied: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     modelled = []
-    real = pipeline.reconstruct.reconstruct_building
+    real = pipeline.recipe.reconstruct_building
 
     def watched(candidate: Any, *rest: Any) -> Any:
         modelled.append(candidate.building_id)
         return real(candidate, *rest)
 
     first = copied()
-    monkeypatch.setattr(pipeline.reconstruct, "reconstruct_building", watched)
+    monkeypatch.setattr(pipeline.recipe, "reconstruct_building", watched)
     name = max(rows_by_id(first.run_dir))
     (tmp_path / "o.toml").write_text(f'[[building]]\nbuilding_id = "{name}"\nmethod = "kmeans"')
     done = again(first.run_dir, overrides=str(tmp_path / "o.toml"))
@@ -610,7 +610,7 @@ def test_the_bundle_of_a_building_that_meets_a_fault_comes_with_the_other_files_
         raise RunCancelledError("cancelled")
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline.reconstruct, "reconstruct_building", faulty)
+        patch.setattr(pipeline.recipe, "reconstruct_building", faulty)
         with monkeypatch.context() as late:
             late.setattr("pipeline.runtime.rerun._prepared", called_off)
             with pytest.raises(RunCancelledError):

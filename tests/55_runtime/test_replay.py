@@ -14,13 +14,13 @@ import shapely
 from command_line import invoke
 from faults.asked import environment
 
-import pipeline.reconstruct
+import pipeline.recipe
 from pipeline.errors import SettingsError, UnreadableInputError
 from pipeline.io.crs import SpatialReference
 from pipeline.methods import ReconstructSettings
 from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import Candidate, Guide, GuideKind, Status
-from pipeline.reconstruct import reconstruct_building
+from pipeline.recipe import reconstruct_building
 from pipeline.roof.settings import ArrangementSettings, GuideSettings, RoofSettings
 from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.isolation.replay_bundle import Bundle, Incident, read_bundle, write_bundle
@@ -222,7 +222,7 @@ def test_a_building_that_fails_again_is_exit_code_1(path: Path, monkeypatch: pyt
     def fails(*_: Any) -> Any:
         raise ZeroDivisionError("again")
 
-    monkeypatch.setattr(pipeline.reconstruct, "_reconstruct", fails)
+    monkeypatch.setattr(pipeline.recipe, "_reconstruct", fails)
     code, said, _ = invoke("replay", str(path), "--no-isolate", "--json")
     assert code == 1
     assert json.loads(said)["record"]["reason"] == "internal_error"

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import shapely
 from las_files import write_las
+from method_by_hand import MethodByHand
 from run_tables import rows, write_footprints
 
 import pipeline.export.tile
-import pipeline.reconstruct
+import pipeline.recipe
 from pipeline.errors import BuildingError, EmptyInputError, InconsistentInputError, InputError, RunError
 from pipeline.model import Reason
 from pipeline.runtime.digest import run_digest
@@ -48,7 +49,7 @@ def test_the_state_of_each_tile_names_files_that_are_there(suburb: Path, reconst
 def test_one_broken_building_costs_only_itself(suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = reconstruct(suburb)
     victim = min(row["building_id"] for row in rows(whole.run_dir))
-    real = pipeline.reconstruct.method_named
+    real = pipeline.recipe.method_named
 
     def sabotaged(name: str) -> Any:
         method = real(name)
@@ -58,9 +59,9 @@ def test_one_broken_building_costs_only_itself(suburb: Path, reconstruct: Any, m
                 raise ZeroDivisionError("on purpose")
             return method.segment(cloud, settings)
 
-        return type(method)(**{**vars(method), "segment": segment})
+        return MethodByHand(name=name, segment=segment, settings_type=method.settings_type)
 
-    monkeypatch.setattr(pipeline.reconstruct, "method_named", sabotaged)
+    monkeypatch.setattr(pipeline.recipe, "method_named", sabotaged)
     hurt = {row["building_id"]: row for row in rows(reconstruct(suburb).run_dir)}
     assert hurt[victim]["status"] == "failed"
     assert hurt[victim]["reason"] == "internal_error"
@@ -74,14 +75,14 @@ def test_a_candidate_with_too_few_points_for_a_model_is_rejected_unless_a_user_o
 ) -> None:
     whole = reconstruct(suburb)
     victim = min(row["building_id"] for row in rows(whole.run_dir))
-    real = pipeline.reconstruct.roof_points
+    real = pipeline.recipe.roof_points
 
     def sparse(cloud: Any, settings: Any, decisions: Any = None) -> Any:
         if cloud.candidate.building_id == victim:
             raise BuildingError(Reason.TOO_FEW_POINTS, "on purpose")
         return real(cloud, settings, decisions)
 
-    monkeypatch.setattr(pipeline.reconstruct, "roof_points", sparse)
+    monkeypatch.setattr(pipeline.recipe, "roof_points", sparse)
     summary = reconstruct(suburb, out=str(tmp_path / "run"))
     (lost,) = [row for row in rows(summary.run_dir, "rejected") if row["object_id"] == victim]
     assert (lost["reason"], lost["reason_detail"]) == ("too_few_points", "on purpose")

@@ -40,7 +40,7 @@ def test_the_hash_ignores_what_cannot_change_results() -> None:
     assert RunSettings.from_mapping({"classes": "ignore"}).settings_hash != plain.settings_hash
 
 
-OF_PAPERS = [name for name, entry in METHODS.items() if entry.faithful is not None]
+OF_PAPERS = [name for name, entry in METHODS.items() if entry.follows_paper]
 
 
 def test_a_method_of_our_own_has_no_preset_that_keeps_to_a_paper() -> None:
@@ -53,11 +53,13 @@ def test_a_method_of_our_own_has_no_preset_that_keeps_to_a_paper() -> None:
 @pytest.mark.parametrize("name", OF_PAPERS)
 def test_a_preset_is_where_the_settings_of_a_method_start(name: str) -> None:
     faithful = RunSettings.from_mapping({"method": name, "preset": "faithful"})
-    assert faithful.building.method == METHODS[name].faithful
+    assert faithful.building.method == METHODS[name].preset("faithful")
     assert RunSettings.from_mapping({"method": name}).building.method == METHODS[name].settings_type()
     field = next(f for f in dataclasses.fields(METHODS[name].settings_type) if isinstance(f.default, int | float))
     changed = RunSettings.from_mapping({"method": name, "preset": "faithful", name: {field.name: field.default}})
-    assert changed.building.method == dataclasses.replace(METHODS[name].faithful, **{field.name: field.default})
+    assert changed.building.method == dataclasses.replace(
+        METHODS[name].preset("faithful"), **{field.name: field.default}
+    )
 
 
 def test_an_unknown_preset_is_reported_with_the_known_ones() -> None:
@@ -68,7 +70,8 @@ def test_an_unknown_preset_is_reported_with_the_known_ones() -> None:
 @pytest.mark.parametrize("name", OF_PAPERS)
 def test_the_hash_is_of_the_values_and_not_of_the_preset_that_gave_them(name: str) -> None:
     values = {
-        field.name: getattr(METHODS[name].faithful, field.name) for field in dataclasses.fields(METHODS[name].faithful)
+        field.name: getattr(METHODS[name].preset("faithful"), field.name)
+        for field in dataclasses.fields(METHODS[name].preset("faithful"))
     }
     spelt_out = RunSettings.from_mapping({"method": name, name: values})
     preset = RunSettings.from_mapping({"method": name, "preset": "faithful"})

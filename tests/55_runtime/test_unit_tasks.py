@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import RunCancelledError
 from pipeline.io.gps_time import GpsTimeKind
-from pipeline.reconstruct import ReconstructSettings, reconstruct_building
+from pipeline.recipe import ReconstructSettings, reconstruct_building
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages import outline

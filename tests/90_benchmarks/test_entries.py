@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from method_by_hand import MethodByHand
 
 from benchmarks.entries import (
     Entry,
@@ -20,7 +21,7 @@ from benchmarks.entries import (
 )
 from benchmarks.method_times import ClockedSettings
 from benchmarks.ruler import cell, methods_table
-from pipeline.methods import METHODS, Method, ReconstructSettings
+from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.model import Candidate, PreparedCloud, Segmentation
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.ruler.simulation.sweep import CELLS
@@ -72,7 +73,7 @@ def test_the_clock_stands_within_the_segmentation_and_changes_nothing() -> None:
             pass
         return answer
 
-    method = Method(name="busy", settings_type=settings_type, segment=segment, faithful=settings_type())
+    method = MethodByHand(name="busy", segment=segment, settings_type=settings_type)
     candidate = Candidate(
         building_id="a", origin=(0.0, 0.0, 0.0), points=np.zeros((0, 3)), ground=np.zeros((0, 3)), ground_z_m=0.0
     )

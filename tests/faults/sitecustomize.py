@@ -57,7 +57,7 @@ STAGES = {
 }
 """The function of each stage's tasks, by its module."""
 
-BUILDINGS = "pipeline.reconstruct"
+BUILDINGS = "pipeline.recipe"
 """The module that models one building."""
 
 URLS = "pipeline.io.urls"

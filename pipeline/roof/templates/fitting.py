@@ -14,6 +14,7 @@ from shapely import MultiPolygon
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, LabelArray, Plane, Reason
+from pipeline.roof.named_form import RankedFaces
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.templates.drawing import draw_parts
 from pipeline.roof.templates.parts import fit_parts, main_direction
@@ -25,8 +26,6 @@ _REACH_M = CAP_SIGMAS * SIGMA_M
 """A point farther from a template is not explained by it."""
 MIN_POINTS = 4
 """Least points of an outline: a level has one parameter, the others confirm it."""
-MAX_POINTS = 500
-"""With more points the arrangement has all it needs, and trying cuts takes time."""
 _POINTS_OF_PART = 3
 """Least points of a part: one more than a pent shape has parameters."""
 _MIN_EXPLAINED = 0.5
@@ -40,20 +39,6 @@ _STEP_M = 0.3
 _PARAMETERS_OF_PLANE = 3
 _PARAMETERS_OF_STEP = 2
 """Degrees of freedom in the information criterion."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RankedFaces:
-    """Roof faces that competed with others for the same points."""
-
-    partition: RoofPartition
-    """A coverage of the outline, labels are indices of `planes`."""
-    planes: tuple[Plane, ...]
-    """In local metres."""
-    labels: LabelArray
-    """(n,) int32, plane of every point; -1 for none."""
-    bic_margin: float = math.nan
-    """By how much their criterion is below that of the others, negative where it is above; nan without others."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

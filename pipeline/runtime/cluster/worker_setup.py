@@ -20,7 +20,7 @@ STAGES = (
         for name in ("ingest", "ground", "split_window", "join", "model_batch", "publish")
     ),
     "pipeline.strip_alignment",
-    "pipeline.reconstruct",
+    "pipeline.recipe",
 )
 """The modules of all tasks."""
 NAME = "gablework-work"

@@ -280,7 +280,7 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     OSError, GableworkError
         Scratch cannot be read, or the settings are wrong: a fault of the run, not of the candidate.
     """
-    from pipeline.reconstruct import reconstruct_building  # loads all methods, which the driver does not need
+    from pipeline.recipe import reconstruct_building  # loads all methods, which the driver does not need
 
     task = task.way_of(site)
     if task.compared:
@@ -360,7 +360,7 @@ def _lost(
 
 def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
     """The record of a building that ended its process, and its bundle in the quarantine."""
-    from pipeline.reconstruct import failed_building  # as above
+    from pipeline.recipe import failed_building  # as above
     from pipeline.runtime.isolation.replay_bundle import Incident
 
     task = task.way_of(site)
@@ -422,7 +422,7 @@ def failed_site(site: CandidateSite, method: str, reason: Reason, detail: str) -
 
 def model_bundle(bundle: Bundle) -> BuildingResult:
     """The building of a bundle, modelled again; raises MemoryError where memory runs out."""
-    from pipeline.reconstruct import reconstruct_building  # as above
+    from pipeline.recipe import reconstruct_building  # as above
 
     return reconstruct_building(bundle.candidate, bundle.method, bundle.settings)
 
@@ -435,7 +435,7 @@ def load_once(method: str) -> None:
 
 def load(*methods: str) -> None:
     """Load the libraries and compiled kernels for modelling, by modelling roofs of many and of few points."""
-    from pipeline.reconstruct import reconstruct_building  # as above
+    from pipeline.recipe import reconstruct_building  # as above
 
     lattice = np.arange(-4.5, 15.0)
     east, north = (axis.ravel() for axis in np.meshgrid(lattice, lattice, indexing="ij"))

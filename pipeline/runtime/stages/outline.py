@@ -15,7 +15,6 @@ from shapely.affinity import translate
 from pipeline.errors import GableworkError
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.roof.settings import RoofSettings
-from pipeline.roof.unit_outlines import unit_outlines
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.gather import canonical_order, gather, stored_points
 from pipeline.runtime.stages.sites import CandidateSite
@@ -66,6 +65,8 @@ def _drawn(
         points=len(points),
     )
     candidate, _ = gather(scratch, grid, whole, GpsTimeKind.NONE, settings if settings.at_walls else None)
+    from pipeline.roof.unit_outlines import unit_outlines  # most tiles have no touching units
+
     outlines = unit_outlines(candidate, unit[canonical_order(points)], settings)
     return {
         site.building_id: translate(outline, candidate.origin[0], candidate.origin[1])

@@ -1,0 +1,1 @@
+"""One building: its forms drawn and tried, the model judged, its record."""

@@ -1,0 +1,167 @@
+"""Solids over the roof faces that a form draws, and blocks."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon
+
+from pipeline.methods import ReconstructSettings
+from pipeline.model import Candidate, Decision, Doubt, Plane, RoofType, Segmentation
+from pipeline.quality.validity import check_solid
+from pipeline.roof.block import block_forms, block_plane
+from pipeline.roof.floor_cut import cut_at_floor
+from pipeline.roof.footprint import hull_of_points, outline
+from pipeline.roof.forms import FaceForm
+from pipeline.roof.named_form import BLOCK, NamedForm, RankedFaces
+from pipeline.roof.partition import RoofPartition
+from pipeline.roof.plan import RoofPlan, RoofPoints, partition_roof
+from pipeline.roof.solid import LodParts, SolidPart, solid_parts
+from pipeline.roof.unlike_points import contradiction_of
+from pipeline.roof.unsupported_faces import goes_far, level_unsupported_faces, levelled_share_of
+
+_MUCH_LEVELLED = 0.05
+"""Share of the plan. Where faces of more than this had to be made level, other forms are drawn and compared with it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Building:
+    """Common arguments of the steps for one building."""
+
+    candidate: Candidate
+    method: str
+    settings: ReconstructSettings
+    roof: RoofPoints
+    """The roof points, without labels."""
+    decisions: list[Decision]
+    """Grows with what is checked and tried."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DrawnModel(LodParts):
+    """A model of a building, not yet judged."""
+
+    roof_type: RoofType | None = None
+    """The type that the method names; None for the rule over the delivered planes."""
+    bic_margin: float = math.nan
+    """By how much its faces were better than those that they competed with; nan where they did not."""
+    is_levelled: bool = False
+    """True where a large part of its faces had to be made level, or where some went far or contradict the points."""
+    levelled_share: float = 0.0
+    """Share of the plan whose faces had to be made level."""
+    cleaned: str = ""
+    """What was changed on the drawn faces."""
+    contradiction: Doubt | None = None
+    """Why its faces are not those of its points; None if they are."""
+
+
+def own_model(building: Building, segmentation: Segmentation, roof: RoofPoints, form: FaceForm) -> DrawnModel:
+    """Solids over the roof faces that a form draws."""
+    settings, ground_z_m = building.settings.roof, building.candidate.ground_z_m
+    drawn, planes, margin = form(), segmentation.planes, math.nan
+    slopes = roof
+    if isinstance(drawn, RankedFaces):
+        planes, margin = drawn.planes, drawn.bic_margin
+        drawn, roof = drawn.partition, dataclasses.replace(roof, labels=drawn.labels)
+    elif drawn.planes is not None:
+        planes = drawn.planes
+    if segmentation.faces is not None:  # a primitive is one form: with a side made level it would be another
+        from pipeline.roof.flush_walls import unite_flush_walls
+
+        parts = large_parts(solid_parts(drawn, list(planes), ground_z_m), settings.min_part_area_m2)
+        return DrawnModel(
+            lod="2.2",
+            parts=[unite_flush_walls(part) for part in parts],
+            planes=list(planes),
+            roof_type=segmentation.roof_type,
+            bic_margin=margin,
+        )
+
+    is_far = goes_far(drawn, roof, planes, ground_z_m, settings)
+
+    def over(level: RoofPartition, extended: list[Plane]) -> DrawnModel:
+        cut, cut_planes = cut_at_floor(level, extended, ground_z_m + settings.min_clearance_m)
+        if (roof.index < 0).any():  # points were added on unseen sides
+            from pipeline.roof.unseen_slopes import with_support_of_seen
+
+            cut_planes = with_support_of_seen(cut, cut_planes, roof)
+        contradiction = contradiction_of(cut, cut_planes, roof, slopes, segmentation.planes)
+        all_parts = solid_parts(cut, cut_planes, ground_z_m)
+        parts = large_parts(all_parts, settings.min_part_area_m2)
+        levelled_share = levelled_share_of(level, len(planes))
+        return DrawnModel(
+            lod="2.2",
+            parts=parts,
+            planes=cut_planes,
+            roof_type=segmentation.roof_type,
+            bic_margin=margin,
+            is_levelled=is_far or levelled_share > _MUCH_LEVELLED or contradiction is not None,
+            levelled_share=levelled_share,
+            cleaned=_cleaned(level, len(planes), cut, len(all_parts) - len(parts)),
+            contradiction=contradiction,
+        )
+
+    model = over(*level_unsupported_faces(drawn, roof, planes, ground_z_m, settings))
+    if sum(len(part.faces) for part in model.parts) > len(drawn.polygons) and not _is_sound(model):
+        # the ends of slopes are small faces beside long ones: without them the roof may be sound
+        whole = over(*level_unsupported_faces(drawn, roof, planes, ground_z_m, settings, ends=False))
+        model = whole if _is_sound(whole) else model
+    return model
+
+
+def _is_sound(model: DrawnModel) -> bool:
+    """Whether a model has solids, and all of them are valid."""
+    return bool(model.parts) and not any(check_solid(part.solid) for part in model.parts)
+
+
+def _cleaned(level: RoofPartition, n_planes: int, cut: RoofPartition, left_out: int) -> str:
+    """What was changed on the drawn faces, in words; faces on planes beyond the first `n_planes` were made level."""
+    made_level = int(np.count_nonzero(level.labels >= n_planes))
+    return "; ".join(
+        filter(
+            None,
+            (
+                f"{made_level} faces made level" if made_level else "",
+                "cut at the floor" if cut is not level else "",
+                f"{left_out} small parts left out" if left_out else "",
+            ),
+        )
+    )
+
+
+def large_parts(parts: list[SolidPart], min_area_m2: float) -> list[SolidPart]:
+    """The parts that are large enough, or the largest one."""
+    large = [part for part in parts if part.footprint.area >= min_area_m2]
+    return large or sorted(parts, key=lambda part: -part.footprint.area)[:1]
+
+
+def blocks(building: Building, plan: RoofPlan | None) -> Iterator[NamedForm[DrawnModel]]:
+    """Blocks on the footprint, else on the partition's outline; behind them those on the points' outline."""
+    roof, settings, ground_z_m = building.roof, building.settings.roof, building.candidate.ground_z_m
+    plane = block_plane(roof.points, ground_z_m, settings.block_height_percentile)
+    if plan is None and roof.footprint_mm is not None:
+        outlines = [("the footprint", roof.footprint_mm)]
+    else:
+        if plan is None:
+            unlabelled = dataclasses.replace(roof, labels=np.zeros(len(roof.points), np.int32))
+            plan = partition_roof(unlabelled, [plane], settings)
+        outlines = [("the outline", plan.outline_mm)]
+        if plan.raw is not None:
+            outlines.append(("the raw outline", outline(plan.raw)))
+    hull = hull_of_points(roof.points)
+    if hull is not None:
+        outlines.append(("the points' hull", MultiPolygon([shapely.transform(hull, lambda xy: np.rint(xy * 1e3))])))
+    tolerance_m, least_m2 = settings.simplification_spacings * roof.spacing_m, settings.min_part_area_m2
+    for words, footprint in outlines:
+        for form in block_forms(footprint, plane, ground_z_m, tolerance_m, least_m2):
+            yield NamedForm(BLOCK, partial(block_model, form, plane), f"on {words}")
+
+
+def block_model(form: Callable[[], list[SolidPart]], plane: Plane) -> DrawnModel:
+    """The block that a form draws."""
+    return DrawnModel(lod="1.2", parts=form(), planes=[plane])

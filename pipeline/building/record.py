@@ -1,0 +1,171 @@
+"""The record of a building: its model at the levels of detail that are asked for, or why there is none."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from pipeline.building.drawing import Building, DrawnModel
+from pipeline.errors import BuildingError
+from pipeline.methods import OVERHANGS
+from pipeline.model import (
+    BuildingResult,
+    Candidate,
+    Decision,
+    DecisionKind,
+    HeightSource,
+    LodModel,
+    Outcome,
+    Reason,
+    RoofFace,
+    Status,
+)
+from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, model_quality
+from pipeline.quality.validity import check_solid
+from pipeline.roof.footprint import hull_of_points
+from pipeline.roof.plan import wall_outline, walls_of
+from pipeline.roof.roof_type import roof_type
+from pipeline.roof.solid import LodParts, renumbered, united
+
+
+def record_of(
+    building: Building, model: DrawnModel, fallback: BuildingError | None = None, codes: tuple[int, ...] = ()
+) -> BuildingResult:
+    """The record of a building with valid solids; planes that no face uses are left out.
+
+    `fallback` is why the model is a block, None where it is the requested model; `codes` are those of the faults that
+    kept the method's own solids from delivery.
+    """
+    candidate, roof = building.candidate, building.roof
+    used = sorted({face.plane for part in model.parts for face in part.faces})
+    number = {plane: k for k, plane in enumerate(used)}
+    planes = tuple(model.planes[plane] for plane in used)
+    faces = tuple(face for part in model.parts for face in part.faces)
+    solids = tuple(part.solid for part in model.parts)
+    if used != list(range(len(used))):
+        faces = tuple(RoofFace(plane=number[face.plane], polygon=face.polygon) for face in faces)
+        solids = tuple(renumbered(solid, number) for solid in solids)
+    footprint = united([part.footprint for part in model.parts])
+    guides = None
+    if candidate.guides:
+        from pipeline.roof.guides import followed, guide_steps
+
+        with guide_steps():
+            guides = followed(candidate.guides, [face.polygon for face in faces], roof.guide_distance_m)
+    residuals, quality = model_quality(
+        candidate.points,
+        faces,
+        planes,
+        solids,
+        spacing_m=roof.spacing_m,
+        outline_sigma_m=0.0 if candidate.footprint is not None else roof.spacing_m * DRAWN_OUTLINE_SPACINGS,
+        is_planar=model.lod == "2.2",
+        bic_margin=model.bic_margin,
+    )
+    walls = walls_of(footprint, roof, building.settings.roof)
+    overhangs = None
+    if OVERHANGS in building.settings.lods:
+        from pipeline.building.overhang_model import overhangs_of
+
+        overhangs = overhangs_of(building, model, walls)
+    return BuildingResult(
+        building_id=candidate.building_id,
+        origin=candidate.origin,
+        source_id=candidate.source_id,
+        status=Status.OK if fallback is None else Status.FALLBACK,
+        reason=None if fallback is None else fallback.reason,
+        reason_detail="" if fallback is None else fallback.detail,
+        method=building.method,
+        roof_type=model.roof_type or roof_type(planes, faces, solids, building.settings.roof_type),
+        lod=model.lod,
+        footprint=footprint,
+        footprint_share=math.nan if roof.footprint_mm is None else footprint.area / (roof.footprint_mm.area * 1e-6),
+        planes=planes,
+        faces=faces,
+        solids=solids,
+        validity_codes=codes,
+        ground_z_m=candidate.ground_z_m,
+        height_source=HeightSource.POINTS,
+        ground_source=candidate.ground_source,
+        n_points=len(candidate.points),
+        density_per_m2=len(candidate.points) / footprint.area,
+        rmse_m=residuals.rmse_m,
+        p95_m=residuals.p95_m,
+        coverage=residuals.coverage,
+        quality=quality,
+        touches_data_edge=candidate.touches_data_edge,
+        strip_offset_m=candidate.strip_offset_m,
+        ground_noise_m=candidate.ground_noise_m,
+        walls=wall_outline(walls),
+        overhangs=overhangs,
+        guides=guides,
+        decisions=tuple(building.decisions),
+    )
+
+
+def delivered(building: Building, model: DrawnModel) -> BuildingResult | None:
+    """The record of a model at the levels of detail that the settings ask for; None where the finest is not valid."""
+    settings, lods = building.settings, building.settings.record_lods
+    if lods == (model.lod,):
+        return record_of(building, model)
+    from pipeline.roof.lower_lods import lower_lods
+
+    models = lower_lods(
+        model, building.roof.points, building.candidate.ground_z_m, settings.roof, lods,
+        lambda solid: not check_solid(solid),
+    )  # fmt: skip
+    building.decisions.extend(_levels(lods, models))
+    if not models or models[0].lod != lods[-1]:
+        return None
+    finest, *coarser = models
+    if finest is not model:  # level parts say nothing about the roof's type, and nothing competed with them
+        own_type = record_of(building, model).roof_type
+        model = DrawnModel(lod=finest.lod, parts=finest.parts, planes=finest.planes, roof_type=own_type)
+    return dataclasses.replace(record_of(building, model), coarser=tuple(_lod_model(one) for one in coarser))
+
+
+def _levels(lods: Sequence[str], models: Sequence[LodParts]) -> Iterator[Decision]:
+    """Which of the levels of detail that were asked for were reached, the finest first."""
+    reached = {model.lod: model for model in models}
+    for lod in reversed(lods):
+        faces = [face.plane for part in reached[lod].parts for face in part.faces] if lod in reached else None
+        yield Decision(
+            kind=DecisionKind.LEVEL,
+            name=lod,
+            outcome=Outcome.UNDRAWABLE if faces is None else Outcome.CHOSEN,
+            detail="no form of its solids is valid" if faces is None else "",
+            n_faces=None if faces is None else len(faces),
+            n_planes=None if faces is None else len(set(faces)),
+        )
+
+
+def _lod_model(model: LodParts) -> LodModel:
+    """A coarser model as it is delivered."""
+    return LodModel(lod=model.lod, planes=tuple(model.planes), solids=tuple(part.solid for part in model.parts))
+
+
+def failed_building(candidate: Candidate, method: str, reason: Reason, detail: str) -> BuildingResult:
+    """The record of a building without a model."""
+    finite = candidate.points[np.isfinite(candidate.points).all(axis=1)]
+    footprint = candidate.footprint if candidate.footprint is not None else hull_of_points(finite)
+    area = footprint.area if footprint is not None else 0.0
+    return BuildingResult(
+        building_id=candidate.building_id,
+        origin=candidate.origin,
+        source_id=candidate.source_id,
+        status=Status.FAILED,
+        reason=reason,
+        reason_detail=detail,
+        method=method,
+        footprint=footprint,
+        ground_z_m=candidate.ground_z_m,
+        ground_source=candidate.ground_source,
+        n_points=len(candidate.points),
+        density_per_m2=len(candidate.points) / area if area > 0.0 else math.nan,
+        touches_data_edge=candidate.touches_data_edge,
+        strip_offset_m=candidate.strip_offset_m,
+        ground_noise_m=candidate.ground_noise_m,
+    )
