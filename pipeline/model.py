@@ -325,8 +325,8 @@ class Candidate:
     strip_offset_m: float = math.nan
     """Largest offset between two flight strips that was taken out of the points, metres; nan where none was."""
     ground_noise_m: float = math.nan
-    """Robust standard deviation of single points of open ground nearby about the terrain, metres; nan where there is
-    little such ground."""
+    """Robust standard deviation of single points of open, level ground nearby about the terrain, metres; nan where
+    there is little such ground."""
     guides: tuple[Guide, ...] = ()
     """Given lines near its points, in local metres."""
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import typer
+
+from pipeline.registry import loaded
 
 _HELP = "Building models from raw airborne LiDAR: it needs neither classes nor footprints, and uses both when given."
 
@@ -51,8 +52,7 @@ def command_line(table: Mapping[str, str], words: Sequence[str] = ()) -> typer.T
     made.callback()(gablework)
     called = [word for word in words[:1] if word in table]
     for name in called or table:
-        module, _, attribute = table[name].partition(":")
-        command = getattr(importlib.import_module(module), attribute)
+        command = loaded(table[name])
         if isinstance(command, typer.Typer):
             made.add_typer(command, name=name)
         else:

@@ -300,8 +300,8 @@ BUILDINGS = (
         "ground_noise_m",
         FLOAT64,
         "m",
-        "robust standard deviation of single points of open ground nearby about the terrain: the noise of the survey "
-        "and of low plants; null where there is little such ground",
+        "robust standard deviation of single points of open, level ground nearby about the terrain: the noise of the "
+        "survey and of low plants; null where there is little such ground",
         page="records.md#support",
     ),
     Column(

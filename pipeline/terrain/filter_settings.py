@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from pipeline.model import BoolArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.support import (
     CLUMP_CELLS,
@@ -18,9 +17,12 @@ from pipeline.terrain.support import (
     wide_support_m,
 )
 
+if TYPE_CHECKING:
+    from pipeline.model import BoolArray
+
 
 class GroundFilter(NamedTuple):
-    """A filter that tells the cells of ground from those of objects."""
+    """A filter that separates the cells of ground from objects."""
 
     find: str
     """Its function, as "module:name": from the lowest points of cells (rows, columns), the column and row of the first

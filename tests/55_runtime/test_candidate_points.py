@@ -11,6 +11,8 @@ import pytest
 from pipeline.model import Candidate
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.run import RunSummary
+from pipeline.runtime.stages.gather import noise_of_ground_m
+from pipeline.runtime.stages.surroundings import Surroundings
 
 WALLS = {"outline": "walls"}
 WALLS_BENEATH = {"wall_outline": True}
@@ -110,3 +112,18 @@ def test_candidates_know_the_noise_of_the_ground_nearby(
     reconstruct(made.laz)
     assert candidates
     assert np.median([candidate.ground_noise_m for candidate in candidates]) == pytest.approx(noise_m, rel=0.25)
+
+
+@pytest.mark.parametrize(("slope", "is_level"), [(0.0, True), (0.08, True), (0.3, False), (0.9, False)])
+@pytest.mark.parametrize("noise_m", [0.02, 0.15])
+def test_slopes_are_no_noise(slope: float, is_level: bool, noise_m: float) -> None:
+    """A cell's point may lie anywhere in it, and the terrain is that of its centre."""
+    rng, side = np.random.default_rng(2), 40
+    along = np.arange(side) + 0.5
+    terrain = np.broadcast_to(np.rint(1000 * slope * along).astype(np.int32), (side, side))
+    off_mm = 1000 * (slope * rng.uniform(-0.5, 0.5, (side, side)) + rng.normal(0.0, noise_m, (side, side)))
+    around = Surroundings(0, 0, terrain, np.ones((side, side), np.bool_), np.rint(off_mm).astype(np.int16))
+    found_m = noise_of_ground_m(around, 1.0)
+    assert np.isnan(found_m) != is_level
+    if is_level:
+        assert found_m == pytest.approx(noise_m / 0.9, rel=0.15, abs=0.025)

@@ -263,7 +263,7 @@ SUITES: dict[str, Suite] = {
         ),
         Suite(
             name="trust",
-            summary="what is taken for a house, and houses seen badly: small scenes of 18 kinds under several surveys",
+            summary="what is taken for a house, and houses seen badly: small scenes of 21 kinds under several surveys",
             make=lambda seed, _: trust(seed, TRUST_CELLS[0].key),
             scanner=TRUST_SCANNER,
             size_m=(80.0, 80.0),
