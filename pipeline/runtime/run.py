@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline import __version__
-from pipeline.errors import InputError, RunCancelledError, RunError
+from pipeline.errors import RunCancelledError, RunError
 from pipeline.export.coordinates import one_unit
 from pipeline.export.folders import POINTS_FOLDER, TERRAIN_FOLDER
 from pipeline.io import SourceInfo, SpatialReference, Storage, is_url, shown, storage_at
-from pipeline.methods import ReconstructSettings, method_named
+from pipeline.methods import ReconstructSettings
 from pipeline.runtime.cluster.serial_executor import Executor, run_alone
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.manifest import NAME, PAGE, InputFile, PointFileFacts, RunManifest, RunStatus, write_manifest
@@ -38,6 +38,7 @@ from pipeline.runtime.stages.cleanup import OVERRIDDEN, publishing, tidy
 from pipeline.runtime.stages.content_digest import STAGE as DIGEST
 from pipeline.runtime.stages.content_digest import content_digest
 from pipeline.runtime.stages.counts import about_emptiness, run_counts
+from pipeline.runtime.stages.given_files import footprints_for, guides_for, overrides_for
 from pipeline.runtime.stages.ground import Ground, find_ground
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.join import join
@@ -212,15 +213,13 @@ def run_variants(
     progress = Progress(on_event)
     progress.tell("run", "plan", f"run into {request.out}")
     plan, paths = plan_inputs(request, progress, cancelled, executor)
-    footprints = _given_footprints(request, plan)
+    footprints = footprints_for(request, plan)
     for warning in () if footprints is None else footprints.warnings:
         progress.warn("plan", warning)
-    guides = None
-    if request.guides is not None:
-        guides = _given_guides(request, plan, variants)
-        for warning in guides.warnings:
-            progress.warn("plan", warning)
-    overrides = _given_overrides(request, plan, settings)
+    guides = guides_for(request, plan, [variant.settings_in(request.settings) for variant in variants])
+    for warning in () if guides is None else guides.warnings:
+        progress.warn("plan", warning)
+    overrides = overrides_for(request, plan, settings)
     runs = [_VariantRun.of(variant, request, plan, progress, started_at) for variant in variants]
     progress.timings["plan"] = time.perf_counter() - began
     with contextlib.ExitStack() as locks:
@@ -310,25 +309,6 @@ def _find_candidates(
     return _Candidates(ingested=inputs.ingested, moves_mm=inputs.moves_mm, ground=ground, splits=splits, joined=joined)
 
 
-def _given_footprints(request: RunRequest, plan: Plan) -> GivenFootprints | None:
-    """The footprints of a run; None without a file, a layer or a column of them."""
-    named = (request.footprints, request.footprints_layer)
-    if named == (None, None) and not request.settings.footprints.columns:
-        return None
-    from pipeline.runtime.stages.given_footprints import footprints_of_run
-
-    return footprints_of_run(request.footprints, plan, request.settings.footprints, request.footprints_layer)
-
-
-def _given_overrides(request: RunRequest, plan: Plan, settings: RunSettings) -> Sequence[Override]:
-    """The overrides of a run."""
-    if request.overrides is None:
-        return ()
-    from pipeline.runtime.overrides.overrides_file import read_overrides
-
-    return read_overrides(request.overrides, plan.reference, settings)
-
-
 def _override(
     context: RunContext,
     settings: RunSettings,
@@ -351,21 +331,6 @@ def _override(
     changed = joined_of(store_sites(context, OVERRIDDEN, applied.sites), 0, {})
     joined = found.joined.in_place_of(applied.owners, changed)
     return dataclasses.replace(found, joined=joined)
-
-
-def _given_guides(request: RunRequest, plan: Plan, variants: Sequence[RunVariant]) -> GivenGuides:
-    """The guides of a run; raises InputError if they cannot be used, also by a method that takes none."""
-    from pipeline.runtime.stages.given_guides import given_guides
-
-    settings = [variant.settings_in(request.settings) for variant in variants]
-    for one in settings:
-        if not one.building.arranges(method_named(one.general.method)):
-            raise InputError(
-                shown(str(request.guides)),
-                f"{one.general.method} traces roof faces from labelled points and takes no guides",
-                'Use faces = "arranged" or the method arrangement, or leave --guides out',
-            )
-    return given_guides(str(request.guides), plan, settings[0].building.guides.kind_column)
 
 
 def _model(
