@@ -110,10 +110,10 @@ def run_here(order: tuple[Case, Path]) -> int:
     os.chdir(folder)
     code: object = _NOT_JUDGED
     try:
-        from pipeline.cli import app
+        from pipeline.cli import COMMANDS, command_line
 
         try:
-            app(command(case, folder))
+            command_line(COMMANDS)(command(case, folder))
         except SystemExit as end:
             code = end.code
         if code == ExitCode.DONE:

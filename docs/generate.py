@@ -14,6 +14,7 @@ from typing import Any
 import typer
 
 from pipeline.batch.batch_file import TABLES
+from pipeline.cli import command_line as built
 from pipeline.console import EXIT_CODES
 from pipeline.export import cityjson, geopackage, party_wall_tables, pmtiles, solar_table
 from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, Column
@@ -25,7 +26,7 @@ from pipeline.ruler.epochs.settings import DiffSettings
 from pipeline.ruler.evaluation.chapters import TITLES
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.settings import SECTIONS, GeneralSettings
-from service.cli import app
+from service.cli import COMMANDS
 
 REFERENCE = Path(__file__).resolve().parent / "reference"
 NOTE = "<!-- Written by `make docs` from the code; do not edit. -->"
@@ -92,7 +93,7 @@ def default_of(parameter: Any) -> str:
 def commands(group: Any | None = None, prefix: str = "") -> dict[str, Any]:
     """The commands of the console script by their words, those of groups included."""
     found: dict[str, Any] = {}
-    for name, command in (group or typer.main.get_command(app)).commands.items():
+    for name, command in (group or typer.main.get_command(built(COMMANDS))).commands.items():
         words = f"{prefix}{name}"
         is_group = hasattr(command, "commands")
         if is_group:

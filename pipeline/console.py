@@ -136,15 +136,16 @@ class Console:
     def __enter__(self) -> Self:
         """Start logging; raises typer.Exit if `GABLEWORK_LOG_JSON` is neither 1 nor 0."""
         if self._log_json or os.environ.get("GABLEWORK_LOG_JSON"):
-            from pipeline.runtime.monitoring import logs
+            from pipeline.runtime.monitoring.log_lines import log_everything_as_json
+            from pipeline.runtime.monitoring.logs import wants_json
 
             try:
-                self._log_json = logs.wants_json() or self._log_json
+                self._log_json = wants_json() or self._log_json
             except SettingsError as error:
                 self._show_error(error, ExitCode.USAGE)
                 raise typer.Exit(ExitCode.USAGE) from error
             if self._log_json:
-                self._logs.callback(logs.log_everything_as_json())
+                self._logs.callback(log_everything_as_json())
         return self
 
     def __exit__(

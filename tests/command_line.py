@@ -2,7 +2,10 @@
 
 from typer.testing import CliRunner
 
-from pipeline.cli import app
+from pipeline.cli import command_line
+from service.cli import COMMANDS
+
+app = command_line(COMMANDS)
 
 
 def invoke(*words: str) -> tuple[int, str, str]:

@@ -26,7 +26,7 @@ from pipeline.export.mesh_kinds import MESHES
 from pipeline.io.reading import INPUT_TIMEOUT_S
 from pipeline.parameters import Parameters, build, is_finite_number, parameter, quoted, read_toml
 from pipeline.runtime.cluster.tls import given_tls
-from pipeline.runtime.isolation.isolated_items import IsolationLimits
+from pipeline.runtime.isolation.limits import IsolationLimits
 from pipeline.schedule import Cron, Missed, Overlap, Rules
 from pipeline.settings import RunSettings
 

@@ -1,25 +1,28 @@
 """The science commands. Each imports what it composes only when it runs, since start-up time counts."""
 
-from pipeline.cli.app import app
-from pipeline.cli.batch import batch
-from pipeline.cli.classifying import classify
-from pipeline.cli.cluster import worker
-from pipeline.cli.measuring import digest, evaluate, inspect, report
-from pipeline.cli.modelling import compare, reconstruct, replay, rerun
-from pipeline.cli.options import AsJson
-from pipeline.cli.party_walls import party_walls
-from pipeline.cli.publishing import publish
-from pipeline.cli.simulating import demo, simulate, warm_up
-from pipeline.cli.solar import solar
+from collections.abc import Mapping
 
-__all__ = ["AsJson", "app"]
+from pipeline.cli.app import command_line
 
-# in the order of `gablework --help`
-_COMMANDS = (
-    *(reconstruct, rerun, compare, classify, inspect, evaluate, report, publish, solar, party_walls),
-    *(digest, replay),
-    *(simulate, demo, warm_up, worker),
-)
-for _command in _COMMANDS:
-    app.command()(_command)
-app.add_typer(batch, name="batch")
+__all__ = ["COMMANDS", "command_line"]
+
+COMMANDS: Mapping[str, str] = {
+    "reconstruct": "pipeline.cli.modelling:reconstruct",
+    "rerun": "pipeline.cli.remodelling:rerun",
+    "compare": "pipeline.cli.comparing:compare",
+    "classify": "pipeline.cli.classifying:classify",
+    "inspect": "pipeline.cli.measuring:inspect",
+    "evaluate": "pipeline.cli.measuring:evaluate",
+    "report": "pipeline.cli.measuring:report",
+    "publish": "pipeline.cli.publishing:publish",
+    "solar": "pipeline.cli.solar:solar",
+    "party-walls": "pipeline.cli.party_walls:party_walls",
+    "digest": "pipeline.cli.measuring:digest",
+    "replay": "pipeline.cli.remodelling:replay",
+    "simulate": "pipeline.cli.simulating:simulate",
+    "demo": "pipeline.cli.simulating:demo",
+    "warm-up": "pipeline.cli.simulating:warm_up",
+    "worker": "pipeline.cli.cluster:worker",
+    "batch": "pipeline.cli.batch:batch",
+}
+"""Where each command or group is, in the order of `gablework --help`."""

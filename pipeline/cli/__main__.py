@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from pipeline.cli import app
+import sys
+
+from pipeline.cli import COMMANDS, command_line
 from pipeline.runtime.isolation.start_up import start_own_process
 
 if __name__ == "__main__":
     start_own_process()
-    app(prog_name="gablework")
+    command_line(COMMANDS, sys.argv[1:])(prog_name="gablework")

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipeline.batch.remaining_time import duration
-from pipeline.cli.modelling import show_summary
 from pipeline.cli.options import AsJson, Quiet
+from pipeline.cli.summary import show_summary
 from pipeline.console import Console, ExitCode
 
 if TYPE_CHECKING:

@@ -24,6 +24,7 @@ from pipeline.cli.options import (
     TlsKey,
     VerticalUnit,
     Workers,
+    tls_files,
 )
 from pipeline.console import Console
 from pipeline.runtime.isolation.preloading import is_surely_small, start_early
@@ -65,7 +66,6 @@ def classify(
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.runtime.classify import ClassifyRequest
         from pipeline.runtime.classify import classify as classify_files
-        from pipeline.runtime.cluster.tls import given_tls
         from pipeline.runtime.compiling import RECONSTRUCT, compile_for
         from pipeline.runtime.resources import Resources
         from pipeline.settings import RunSettings
@@ -84,7 +84,7 @@ def classify(
             resources=Resources(
                 workers=workers,
                 scheduler=scheduler,
-                tls=given_tls(tls_ca, tls_cert, tls_key),
+                tls=tls_files(tls_ca, tls_cert, tls_key),
                 input_timeout_s=input_timeout,
             ),
             overwrite=overwrite,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +19,7 @@ from pipeline.cli.options import (
     Truth,
     VerticalUnit,
 )
+from pipeline.cli.summary import show_statistics
 from pipeline.console import Console
 from pipeline.errors import SettingsError
 
@@ -184,14 +184,6 @@ def evaluate(
             console.say(f"the picture is {picture}")
             document["picture"] = picture
         console.document(document)
-
-
-def show_statistics(console: Console, statistics: Mapping[str, Any]) -> None:
-    """The figures of a run as tables."""
-    from pipeline.report.table import statistics_tables
-
-    for table in statistics_tables(statistics):
-        console.table(table.title, table.header, table.rows)
 
 
 def show_evaluation(console: Console, evaluation: Evaluation) -> dict[str, Any]:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import os
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+
+if TYPE_CHECKING:
+    from pipeline.runtime.cluster.tls import TlsFiles
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document; events as JSON lines on stderr.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress; warnings and errors only.")]
@@ -106,6 +110,17 @@ TlsKey = Annotated[
     str | None,
     typer.Option(metavar="FILE", help="Its key, unless in the same file; default GABLEWORK_TLS_KEY."),
 ]
+
+
+def tls_files(ca: str | None, cert: str | None, key: str | None) -> TlsFiles | None:
+    """The files of these three options or of the environment; None if there are none. Raises SettingsError."""
+    if not any((ca, cert, key)) and not any(name.startswith("GABLEWORK_TLS_") for name in os.environ):
+        return None
+    from pipeline.runtime.cluster.tls import given_tls
+
+    return given_tls(ca, cert, key)
+
+
 PerformanceReport = Annotated[
     str | None, typer.Option(metavar="FILE", help="Write a page (HTML) about the workers' time.")
 ]

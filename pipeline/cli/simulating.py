@@ -8,13 +8,13 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.modelling import show_summary
 from pipeline.cli.options import (
     AsJson,
     Overwrite,
     Quiet,
     Workers,
 )
+from pipeline.cli.summary import show_summary
 from pipeline.console import Console
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 
-FOLDER = "points"
-"""The folder of all of them."""
 TILESET = "tileset.json"
 """The root tileset, and in the folder of each tile the tileset of its octree."""
 GLOBE_TILESET = "tileset-ecef.json"

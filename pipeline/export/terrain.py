@@ -10,12 +10,10 @@ import numpy as np
 
 from pipeline.export.cityjson import decimals_of, heading, json_line, whole_units
 from pipeline.export.coordinates import SpatialReference, crs_coordinates
+from pipeline.export.folders import TERRAIN_FOLDER
 from pipeline.export.obj import vertex_lines
 from pipeline.kernels.union_find import numbered_sets, united
 from pipeline.model import BoolArray, FloatArray, LabelArray
-
-FOLDER = "terrain"
-"""The folder of the run directory with the terrain of all tiles."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,7 +32,7 @@ def terrain_path(tile_key: str, ending: str) -> str:
     >>> terrain_path("x85_y447", "obj")
     'terrain/tile=x85_y447/part-0.obj'
     """
-    return f"{FOLDER}/tile={tile_key}/part-0.{ending}"
+    return f"{TERRAIN_FOLDER}/tile={tile_key}/part-0.{ending}"
 
 
 def in_crs(

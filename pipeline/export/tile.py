@@ -16,7 +16,6 @@ from pipeline.export.coordinates import one_unit
 from pipeline.export.decisions import decision_rows, decisions_path, decisions_table
 from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.geoparquet import geo_table, parquet_bytes
-from pipeline.export.glb import glb_bytes
 from pipeline.export.mesh_kinds import MESHES
 from pipeline.export.obj import obj_text
 from pipeline.export.putting import Put, put_local
@@ -101,6 +100,8 @@ def mesh_files(
         modelled = [result for result in results if model_at(result, lod) is not None]
         groups = [[result] for result in modelled] if meshes == "building" else [modelled] if modelled else []
         if meshes == "glb":
+            from pipeline.export.glb import glb_bytes
+
             path = mesh_path(tile_key, "", meshes, lod)
             if path is not None and (data := glb_bytes(lines, *units_m, lod)):
                 yield path, data

@@ -1,15 +1,13 @@
 """Reading of point clouds and footprints, and storage of results."""
 
 from pipeline.io.crs import SpatialReference
-from pipeline.io.footprints import Footprints, read_area, read_footprints
 from pipeline.io.inputs import find_inputs
+from pipeline.io.locations import is_url, shown
 from pipeline.io.places import arrow_at, place_below, storage_at
 from pipeline.io.source import ReadOptions, Source, SourceInfo, open_source
 from pipeline.io.storage import LocalStorage, Storage, sha256_of
-from pipeline.io.urls import is_url, shown
 
 __all__ = [
-    "Footprints",
     "LocalStorage",
     "ReadOptions",
     "Source",
@@ -21,8 +19,6 @@ __all__ = [
     "is_url",
     "open_source",
     "place_below",
-    "read_area",
-    "read_footprints",
     "sha256_of",
     "shown",
     "storage_at",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
+from pipeline.io.locations import is_url
 from pipeline.io.readable import Readable
 
 MAGIC = {b"LASF": "las", b"ply\n": "ply", b"ply\r": "ply"}
@@ -52,7 +53,10 @@ UNREAD_VECTORS = {
 CONVERT = "Convert it to GeoPackage (.gpkg)"
 """The fix for a vector format that is not read."""
 VALID = "Valid are LAS and LAZ (.las, .laz, .copc.laz), PLY (.ply) and ASCII x y z (.xyz, .txt, .csv, .asc, .pts)"
+TEXT_SUFFIXES = (".txt", ".csv", ".lst", ".list")
+"""Endings of text files that may be indexes; what they begin with decides."""
 SNIFF_BYTES = 4096
+_FIRST_LINES = 1 << 12
 
 
 def first_bytes(path: Readable) -> bytes:
@@ -150,3 +154,34 @@ def _is_point_file(path: Readable) -> bool:
     if path.name.startswith(".") or suffix not in POINT_SUFFIXES:
         return False
     return suffix not in ASCII_SUFFIXES or (path.stat().st_size > 0 and looks_like_points(first_bytes(path)))
+
+
+def names_points(text: str) -> bool:
+    """Whether a text is a URL, or the name of a point file by its ending.
+
+    >>> names_points("tiles/a.LAZ"), names_points("https://host/get?tile=7"), names_points("1.0 2.0 3.0")
+    (True, True, False)
+    """
+    return is_url(text) or text.partition("?")[0].strip().lower().endswith(POINT_SUFFIXES)
+
+
+def is_index(file: Readable) -> bool:
+    """Whether a file is a tile index: by its ending, and where text may be points, by what it begins with."""
+    suffix = file.suffix.lower()
+    if suffix in VECTOR_SUFFIXES:
+        return True
+    if suffix not in TEXT_SUFFIXES:
+        return False
+    try:
+        with file.open("rb") as stream:
+            head = stream.read(_FIRST_LINES)
+    except OSError:  # reading it reports the fault
+        return False
+    line = next(iter(lines_of(head.decode("utf-8-sig", errors="replace"))), "")
+    return names_points(line)
+
+
+def lines_of(text: str) -> list[str]:
+    """Lines that say something."""
+    stripped = (line.strip() for line in text.splitlines())
+    return [line for line in stripped if line and not line.startswith("#")]

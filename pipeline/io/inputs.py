@@ -6,23 +6,20 @@ import glob
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from pipeline.errors import InputError, RunError, UnreadableInputError, all_at_fault
+from pipeline.errors import InputError, UnreadableInputError, all_at_fault
 from pipeline.io.formats import (
-    ASCII_SUFFIXES,
-    POINT_SUFFIXES,
-    VALID,
     files_in,
     first_bytes,
-    looks_like_points,
+    is_index,
 )
-from pipeline.io.remote_file import RemoteFile
-from pipeline.io.retries import GaveUpError, persistently
-from pipeline.io.tile_index import TileIndex, is_index, read_tile_index
-from pipeline.io.urls import filesystem_of, is_url, name_in, scheme_of, shown
+from pipeline.io.locations import is_url, shown
 
-Cut = Callable[[TileIndex], Sequence[str]]
+if TYPE_CHECKING:
+    from pipeline.io.tile_index import TileIndex
+
+Cut = Callable[["TileIndex"], Sequence[str]]
 """From an index to those of its files that are wanted."""
 
 
@@ -83,7 +80,9 @@ def _file(entry: str | Path) -> str:
 def _files_of(entry: str | Path, cut: Cut) -> list[str]:
     """The files of one path, folder, pattern, URL or index."""
     if is_url(entry):
-        return _files_at(str(entry), cut)
+        from pipeline.io.remote_inputs import files_at
+
+        return files_at(str(entry), cut)
     path = Path(entry)
     if path.is_dir():
         return [str(file) for file in files_in(path)]
@@ -94,61 +93,8 @@ def _files_of(entry: str | Path, cut: Cut) -> list[str]:
             raise UnreadableInputError(str(entry), "the pattern matches no file", "Check the pattern and the folder")
         return files
     first_bytes(path)
-    return list(cut(read_tile_index(str(path)))) if is_index(path) else [str(path)]
+    if not is_index(path):
+        return [str(path)]
+    from pipeline.io.tile_index import read_tile_index
 
-
-def _files_at(url: str, cut: Cut) -> list[str]:
-    """The files of one URL."""
-    try:
-        lists = scheme_of(url).stores
-    except RunError as error:
-        raise UnreadableInputError(shown(url), "its scheme is not understood", str(error)) from None
-    pattern = lists and glob.has_magic(url) and not filesystem_of(url).isfile(url)
-    if pattern or url.endswith("/"):
-        if not lists:
-            raise UnreadableInputError(
-                shown(url), "a web server does not list its files", "Name the files, or a tile index that names them"
-            )
-        return _listed(url, pattern=pattern)
-    file = RemoteFile(url)
-    if is_index(file):
-        return list(cut(read_tile_index(url)))
-    file.stat()  # fails now, not when its turn comes
-    return [url]
-
-
-def _listed(url: str, *, pattern: bool) -> list[str]:
-    """The point files of a folder, or of a pattern, of an object store."""
-    filesystem = filesystem_of(url)
-    scheme, _, path = url.partition("://")
-
-    def ask() -> Any:
-        if pattern:
-            return filesystem.glob(path, detail=True)
-        # the exact answer of the store, whatever was listed before
-        return {info["name"]: info for info in filesystem.ls(path.rstrip("/"), detail=True, refresh=True)}
-
-    try:
-        found = persistently(ask)
-    except GaveUpError as error:
-        raise UnreadableInputError(shown(url), f"cannot be listed: {error.problem}", error.cause.fix) from None
-    files = [f"{scheme}://{name}" for name, info in sorted(found.items()) if info["type"] == "file" and info["size"]]
-    if pattern:
-        if not files:
-            raise UnreadableInputError(shown(url), "the pattern matches no file", "Check the pattern and the bucket")
-        return files
-    points = [file for file in files if _is_point_file(file)]
-    if not points:
-        what = f"none of the {len(files)} files in the folder is a point file" if files else "the folder is empty"
-        raise UnreadableInputError(shown(url), what, VALID)
-    return points
-
-
-def _is_point_file(url: str) -> bool:
-    """Whether a file that was listed is meant, by its suffix, and text by its content."""
-    name = name_in(url).lower()
-    if name.startswith(".") or not name.endswith(POINT_SUFFIXES):
-        return False
-    if not name.endswith(ASCII_SUFFIXES):
-        return True
-    return looks_like_points(first_bytes(RemoteFile(url)))
+    return list(cut(read_tile_index(str(path))))

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import laspy
 import lazrs
 import numpy as np
+from laspy.copc import CopcInfoVlr
 from laspy.point.record import PackedPointRecord
 
 from pipeline.errors import InconsistentInputError, UnreadableInputError
-from pipeline.io import copc
 from pipeline.io.apart import apart
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.las_header import REWRITE, header_crs, read_header_block
@@ -32,15 +32,16 @@ from pipeline.io.laz_chunks import (
     read_chunk_table,
 )
 from pipeline.io.laz_decoder import DECODING_ERRORS, decoding
-from pipeline.io.readable import Readable
+from pipeline.io.readable import Readable, bytes_of
 from pipeline.io.reading import moved
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Share, Window
-from pipeline.io.remote_file import bytes_of
 from pipeline.io.strays import Bounds, header_box_problem, typical_bounds
 from pipeline.model import FloatArray
 
 if TYPE_CHECKING:
     import numpy.typing as npt
+
+    from pipeline.io.copc import OctreeInfo
 
 SAMPLE_PLACES = 8
 SAMPLE_SIZE = 2_000
@@ -88,7 +89,7 @@ class LasFile:
             if self._block.compressed:
                 self._laszip_record = self._read_laszip_record()
                 self._chunks = read_chunk_table(path, stream, self._block, self._laszip_record)
-                self._copc = copc.octree_info(self._header)
+                self._copc = _octree_of(self._header)
             else:
                 self._check_room()
         self.facts = self._read_facts() if facts is None else facts
@@ -138,7 +139,9 @@ class LasFile:
         with self._path.open("rb") as stream:
             chunks = np.flatnonzero(table.counts)
             if window is not None and self._copc is not None:
-                nodes = copc.nodes_within(self._path, stream, self._copc, window, self._block.file_size)
+                from pipeline.io.copc import nodes_within
+
+                nodes = nodes_within(self._path, stream, self._copc, window, self._block.file_size)
                 chunks = self._chunks_of(nodes)
             if share is not None:
                 ends = np.cumsum(table.counts[chunks])
@@ -327,8 +330,10 @@ class LasFile:
         """The chunk of an octree's root; None without one, or where it is damaged: the file can still be read whole."""
         if self._copc is None or self._chunks is None or self._chunks.is_large:
             return None
+        from pipeline.io.copc import root_node
+
         try:
-            root = self._chunks_of(copc.root_node(self._path, stream, self._copc, self._block.file_size))
+            root = self._chunks_of(root_node(self._path, stream, self._copc, self._block.file_size))
         except UnreadableInputError:
             return None
         return int(root[0]) if len(root) else None
@@ -392,6 +397,15 @@ class LasFile:
         for piece in self.records(1_000_000, None):
             lows, highs = np.minimum(lows, piece.xyz.min(axis=0)), np.maximum(highs, piece.xyz.max(axis=0))
         return lows, highs
+
+
+def _octree_of(header: laspy.LasHeader) -> OctreeInfo | None:
+    """The octree of a COPC file; None for other files."""
+    if not header.vlrs or not isinstance(header.vlrs[0], CopcInfoVlr):
+        return None
+    from pipeline.io.copc import octree_info
+
+    return octree_info(header)
 
 
 def _places(last: int) -> list[int]:

@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pipeline.errors import RunError
+from pipeline.io.locations import shown
 from pipeline.io.retries import GONE, POLICY, GaveUpError, RetryPolicy, persistently
 from pipeline.io.storage import Puts, parts_of_key
 from pipeline.io.temporary import temporary_folder
-from pipeline.io.urls import filesystem_of, scheme_of, shown
+from pipeline.io.urls import filesystem_of, scheme_of
 
 Result = TypeVar("Result")
 

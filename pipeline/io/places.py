@@ -1,4 +1,4 @@
-"""Places: a folder of this machine or a URL, as storage and as a file system of Arrow."""
+"""Places: a folder or file of this machine or behind a URL; what serves URLs is loaded for one alone."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.io.object_storage import ObjectStorage
+from pipeline.io.locations import is_url
+from pipeline.io.readable import Readable
 from pipeline.io.storage import LocalStorage, Storage
 from pipeline.io.temporary import temporary_folder
-from pipeline.io.urls import is_url
 
 if TYPE_CHECKING:
     import pyarrow.fs as pafs
@@ -23,8 +23,37 @@ def storage_at(place: str | Path) -> Storage:
     's3://bucket/runs/a'
     """
     if isinstance(place, str) and is_url(place):
+        from pipeline.io.object_storage import ObjectStorage
+
         return ObjectStorage(url=place)
     return LocalStorage(root=Path(place).resolve())
+
+
+def file_at(location: str | Path) -> Readable:
+    """A file of this machine, or behind a URL."""
+    if not is_url(location):
+        return Path(location)
+    from pipeline.io.remote_file import RemoteFile
+
+    return RemoteFile(str(location))
+
+
+@contextlib.contextmanager
+def on_this_machine(location: str | Path) -> Iterator[Path]:
+    """A file as a path of this machine, for libraries that need one; fetched if it is behind a URL.
+
+    A fetched copy lies in a temporary folder while the block runs. Raises UnreadableInputError if it cannot be fetched.
+    """
+    if not is_url(location):
+        yield Path(location)
+        return
+    from pipeline.io.remote_file import RemoteFile
+
+    file = RemoteFile(str(location))
+    with temporary_folder() as folder:
+        path = folder / f"file{file.suffix}"
+        file.fetch(path)
+        yield path
 
 
 @contextlib.contextmanager
@@ -59,6 +88,7 @@ def arrow_at(place: str | Path) -> tuple[pafs.FileSystem, str]:
     if not is_url(str(place)):
         return pafs.LocalFileSystem(), str(place)
     from pipeline.io.arrow_objects import ObjectHandler
+    from pipeline.io.object_storage import ObjectStorage
 
     storage = ObjectStorage(url=str(place))
     return pafs.PyFileSystem(ObjectHandler(storage.url)), storage.url.partition("://")[2]

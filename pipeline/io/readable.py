@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 
 class FileStatus(Protocol):
@@ -34,3 +34,19 @@ class Readable(Protocol):
 
     def open(self, mode: Literal["rb"], /) -> io.BufferedReader:
         """Its bytes."""
+
+
+@runtime_checkable
+class ReadsOnce(Protocol):
+    """A file behind a URL."""
+
+    def read_once(self, begin: int, length: int) -> bytes:
+        """Some bytes that no one reads again; no others are fetched."""
+
+
+def bytes_of(file: Readable, stream: io.BufferedReader, begin: int, length: int) -> bytes:
+    """Some bytes of an open file, which are read once; of a remote one no others are fetched."""
+    if isinstance(file, ReadsOnce):
+        return file.read_once(begin, length)
+    stream.seek(begin)
+    return stream.read(length)

@@ -15,17 +15,17 @@ import io
 import shutil
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io import urls
-from pipeline.io.readable import FileStatus, Readable
+from pipeline.io.locations import name_in, shown
 from pipeline.io.reading import moved
 from pipeline.io.retries import POLICY, GaveUpError, RetryPolicy, ShortReadError, persistently
 from pipeline.io.temporary import temporary_folder
-from pipeline.io.urls import filesystem_of, is_url, name_in, range_options, shown
+from pipeline.io.urls import filesystem_of, range_options
 
 BLOCK_BYTES = 1 << 18
 """Read at least, and kept together."""
@@ -279,37 +279,3 @@ def _time_ns(info: dict[str, Any]) -> int:
         except ValueError:
             return 0
     return int(written.timestamp()) * 1_000_000_000 if isinstance(written, dt.datetime) else 0
-
-
-def etag_of(status: FileStatus) -> str:
-    """What a server calls a state of a file; empty for files of this machine."""
-    return status.etag if isinstance(status, RemoteStatus) else ""
-
-
-def file_at(location: str | Path) -> Readable:
-    """A file of this machine, or behind a URL."""
-    return RemoteFile(str(location)) if is_url(location) else Path(location)
-
-
-def bytes_of(file: Readable, stream: io.BufferedReader, begin: int, length: int) -> bytes:
-    """Some bytes of an open file, which are read once; of a remote one no others are fetched."""
-    if isinstance(file, RemoteFile):
-        return file.read_once(begin, length)
-    stream.seek(begin)
-    return stream.read(length)
-
-
-@contextlib.contextmanager
-def on_this_machine(location: str | Path) -> Iterator[Path]:
-    """A file as a path of this machine, for libraries that need one; fetched if it is behind a URL.
-
-    A fetched copy lies in a temporary folder while the block runs. Raises UnreadableInputError if it cannot be fetched.
-    """
-    if not is_url(location):
-        yield Path(location)
-        return
-    file = RemoteFile(str(location))
-    with temporary_folder() as folder:
-        path = folder / f"file{file.suffix}"
-        file.fetch(path)
-        yield path

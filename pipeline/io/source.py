@@ -17,10 +17,10 @@ from pipeline.io.area_of_use import Location, location_of
 from pipeline.io.crs import SpatialReference, resolve_reference
 from pipeline.io.formats import recognise_format
 from pipeline.io.gps_time import GpsTimeKind, utc_of
-from pipeline.io.readable import Readable
+from pipeline.io.places import file_at
+from pipeline.io.readable import FileStatus, Readable
 from pipeline.io.reading import one_input
 from pipeline.io.records import DivisibleFile, FileFacts, PointFile, PointRecords, Share, Window
-from pipeline.io.remote_file import RemoteFile, etag_of, file_at
 from pipeline.io.strays import MOST_STRAYS, ROUNDING, off_earth, without_strays
 from pipeline.model import BoolArray, ByteArray, FloatArray, PointCloud
 
@@ -155,7 +155,7 @@ class SourceInfo:
             now = path.stat()
         except OSError:  # opening it reports the fault
             return False
-        return (now.st_size, now.st_mtime_ns, etag_of(now)) == (self.file_size, self.modified_ns, self.etag)
+        return (now.st_size, now.st_mtime_ns, _etag_of(now)) == (self.file_size, self.modified_ns, self.etag)
 
 
 @dataclasses.dataclass(kw_only=True, slots=True)
@@ -389,7 +389,7 @@ def open_source(
         The CRS is geographic or not understood.
     """
     file = file_at(path) if isinstance(path, str | Path) else path
-    if isinstance(file, RemoteFile):  # requests have limits of their own
+    if not isinstance(file, Path):  # requests have limits of their own
         return Source(file, options or ReadOptions(), known)
     with one_input(str(file)):
         return Source(file, options or ReadOptions(), known)
@@ -435,9 +435,14 @@ def _info_of(path: Readable, file: PointFile, options: ReadOptions) -> SourceInf
         file_size=now.st_size,
         modified_ns=now.st_mtime_ns,
         facts=facts,
-        etag=etag_of(now),
-        in_parts=not (isinstance(path, RemoteFile) and path.is_held),
+        etag=_etag_of(now),
+        in_parts=not getattr(path, "is_held", False),
     )
+
+
+def _etag_of(status: FileStatus) -> str:
+    """What a server calls a state of a file; empty for files of this machine."""
+    return str(getattr(status, "etag", ""))
 
 
 def _refuse_degrees(path: Readable, facts: FileFacts, reference: SpatialReference) -> None:

@@ -21,11 +21,10 @@ import shapely
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io.crs import SpatialReference, horizontal_part, parse_crs
-from pipeline.io.formats import POINT_SUFFIXES, VECTOR_SUFFIXES
+from pipeline.io.formats import POINT_SUFFIXES, VECTOR_SUFFIXES, lines_of, names_points
+from pipeline.io.locations import is_url, name_in, shown
 from pipeline.io.nearby import TILES
-from pipeline.io.readable import Readable
-from pipeline.io.remote_file import file_at
-from pipeline.io.urls import is_url, name_in, shown
+from pipeline.io.places import file_at
 from pipeline.io.vector_layer import read_layer
 
 if TYPE_CHECKING:
@@ -33,13 +32,10 @@ if TYPE_CHECKING:
 
 COLUMNS = ("location", "path", "url", "href", "filename", "file_name", "file", "name")
 """Columns that name the file of a tile, in this order."""
-TEXT_SUFFIXES = (".txt", ".csv", ".lst", ".list")
-"""Endings of text files that may be indexes; what they begin with decides."""
 AROUND = 100.0
 """How far off an area, in the units of its CRS, a tile is still taken: outlines are those of the nominal sheets, and
 those of another CRS bend."""
 _LONGEST_TEXT = 1 << 26
-_FIRST_LINES = 1 << 12
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -85,37 +81,6 @@ class TileIndex:
         return boxes
 
 
-def names_points(text: str) -> bool:
-    """Whether a text is a URL, or the name of a point file by its ending.
-
-    >>> names_points("tiles/a.LAZ"), names_points("https://host/get?tile=7"), names_points("1.0 2.0 3.0")
-    (True, True, False)
-    """
-    return is_url(text) or text.partition("?")[0].strip().lower().endswith(POINT_SUFFIXES)
-
-
-def is_index(file: Readable) -> bool:
-    """Whether a file is a tile index: by its ending, and where text may be points, by what it begins with."""
-    suffix = file.suffix.lower()
-    if suffix in VECTOR_SUFFIXES:
-        return True
-    if suffix not in TEXT_SUFFIXES:
-        return False
-    try:
-        with file.open("rb") as stream:
-            head = stream.read(_FIRST_LINES)
-    except OSError:  # reading it reports the fault
-        return False
-    line = next(iter(_lines(head.decode("utf-8-sig", errors="replace"))), "")
-    return names_points(line)
-
-
-def _lines(text: str) -> list[str]:
-    """Lines that say something."""
-    stripped = (line.strip() for line in text.splitlines())
-    return [line for line in stripped if line and not line.startswith("#")]
-
-
 def read_tile_index(location: str) -> TileIndex:
     """The files that an index names.
 
@@ -151,7 +116,7 @@ def _of_text(location: str) -> list[str]:
         ) from fault
     except UnicodeDecodeError as fault:
         raise UnreadableInputError(str(file), f"a tile index must be UTF-8 ({fault})", "Write it again") from fault
-    lines = _lines(text)
+    lines = lines_of(text)
     strange = next((line for line in lines if not names_points(line)), None)
     if strange is not None:
         raise UnreadableInputError(

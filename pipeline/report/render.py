@@ -26,7 +26,8 @@ from pipeline.model import RoofType, Status
 from pipeline.report.maps import round_length
 from pipeline.report.perspective import MAP_SUN, View, ViewedFace, draw_view, drawn_path, lambert, shaded
 from pipeline.report.statistics import run_statistics
-from pipeline.runtime.manifest import NAME, read_manifest
+from pipeline.runtime.manifest import NAME
+from pipeline.runtime.manifest_reading import read_manifest
 
 ROOF_COLOURS = {
     RoofType.FLAT: "#9fb4c7",

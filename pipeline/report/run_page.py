@@ -22,7 +22,8 @@ from pipeline.report.maps import BAD, DOUBTFUL, FAIR, GOOD, MISSING, NO_FIGURE
 from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
 from pipeline.report.statistics import QUANTILES, run_statistics
-from pipeline.runtime.manifest import NAME, PAGE, RunManifest, RunStatus, read_manifest
+from pipeline.runtime.manifest import NAME, PAGE, RunManifest, RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 
 LISTED = 500
 """Largest number of buildings without a roof model in the list of the page: those without any model first, then the

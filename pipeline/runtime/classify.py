@@ -172,7 +172,7 @@ def classify(
         progress,
         request.resources,
         locked_work(str(out / _SCRATCH)) if request.resources.resume else _scratch(out),
-        dataclasses.replace(expected(plan, 0), models=False),
+        lambda: dataclasses.replace(expected(plan, 0), models=False),
         loads=loads_of("classify", footprints=footprints is not None),
         executor=executor,
         cancelled=cancelled,

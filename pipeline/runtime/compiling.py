@@ -6,16 +6,14 @@ import functools
 import os
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pipeline.compiler import store
-from pipeline.compiler.kernel import kernel_named
-from pipeline.compiler.warm_up import Listed, about_s, compile_kernels, listed
-from pipeline.io import find_inputs, is_url
-from pipeline.io.formats import first_bytes
 from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled
-from pipeline.runtime.isolation.child_main import end_with_parent
 from pipeline.runtime.monitoring.events import Event, Listener, never
 from pipeline.runtime.monitoring.machine import cores
+
+if TYPE_CHECKING:
+    from pipeline.compiler.warm_up import Listed
 
 STAGE = "compile"
 """The stage of these events."""
@@ -37,19 +35,28 @@ def missing_kernels(groups: Collection[str] = RECONSTRUCT) -> list[Listed]:
     A few kernels stand for each group, since looking at all would import most of the science. If one of them is not
     compiled all of its group count: loading what is there takes no time.
     """
-    return [one for name in groups if not _is_compiled(name) for one in listed([name])]
+    if lacking := [name for name in groups if not _is_compiled(name)]:
+        from pipeline.compiler.warm_up import listed
+
+        return [one for name in lacking for one in listed([name])]
+    return []
 
 
 def _is_compiled(group: str) -> bool:
     """Whether the kernels of a group are compiled: of most runs by their own, else the first and the last to be."""
     if group in RECONSTRUCT:
         return kernels_are_compiled()
+    from pipeline.compiler.kernel import kernel_named
+    from pipeline.compiler.warm_up import listed
+
     kernels = listed([group])
     return all(kernel_named(one.kernel).is_compiled for one in (kernels[0], kernels[-1]))
 
 
 def compiling_s(groups: Collection[str] = RECONSTRUCT) -> float:
     """About how many seconds a job of some groups of kernels first compiles; 0 if all are compiled."""
+    from pipeline.compiler.warm_up import about_s
+
     return about_s(missing_kernels(groups), cores())
 
 
@@ -67,6 +74,9 @@ def compile_for(
     """
     if scheduler is not None or not missing_kernels(groups):
         return
+    from pipeline.io import find_inputs, is_url
+    from pipeline.io.formats import first_bytes
+
     find_inputs(inputs)
     for file in files:
         if file is not None and not is_url(file):
@@ -85,7 +95,10 @@ def compile_first(
     kernels = missing_kernels(groups)
     if not kernels:
         return
+    from pipeline.compiler import store
     from pipeline.compiler.backend import is_known  # loads numba
+    from pipeline.compiler.warm_up import about_s, compile_kernels
+    from pipeline.runtime.isolation.child_main import end_with_parent
 
     if not is_known():  # plain numba stores what it compiles by itself, as it is called
         return

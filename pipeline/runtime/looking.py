@@ -15,11 +15,9 @@ from pipeline.io import ReadOptions, SourceInfo, is_url
 from pipeline.io.reading import set_input_timeout
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring.events import Watch
-from pipeline.runtime.plan import looked_at, usable
+from pipeline.runtime.plan import MANY_FILES, looked_at, usable
 from pipeline.runtime.resources import Resources
 
-_MANY = 256
-"""From so many files on tasks look at them: two seconds of work, more than the start of a process takes."""
 _FILES_PER_TASK = 32
 
 
@@ -68,7 +66,7 @@ def look_at_all(
         The scheduler does not answer.
     """
     # remote inputs are mostly waited for
-    local = len(paths) < _MANY or any(is_url(path) for path in paths)
+    local = len(paths) < MANY_FILES or any(is_url(path) for path in paths)
     looking = None if local else executor or _executor(resources)
     if looking is None:
         return looked_at(paths, options)

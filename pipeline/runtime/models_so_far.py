@@ -14,7 +14,8 @@ from typing import Any
 from pipeline.errors import RunCancelledError
 from pipeline.export.facts import RecordContext
 from pipeline.io import SpatialReference
-from pipeline.runtime.manifest import NAME, RunStatus, read_manifest
+from pipeline.runtime.manifest import NAME, RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.location import SCRATCH
 from pipeline.runtime.scratch.outcomes import Place, keys_of, stored_units

@@ -24,7 +24,6 @@ from pipeline.io.crs import with_one_vertical
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.io.records import Share
 from pipeline.io.source import IMPOSSIBLE_DENSITY
-from pipeline.runtime.cluster.memory_needs import WINDOW_BASE_BYTES
 from pipeline.runtime.scratch.folder import POINT
 from pipeline.settings import RunSettings
 from pipeline.terrain.filter_settings import FILTERS
@@ -32,6 +31,8 @@ from pipeline.terrain.scene_settings import APRON_M, ClassesInUse
 from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
+WINDOW_BASE_BYTES = 300 * 2**20
+"""Memory of a worker, before the first split."""
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
 _ONE_CRS = (
     "Run inputs of different CRS apart, or give --crs if one header is wrong, with its vertical part (such as "
@@ -45,6 +46,8 @@ _POINTS_PER_SHARE = 2_000_000
 """Points of a file that a task of ingest takes: some seconds of work."""
 _MOST_SHARES = 128
 """Tasks of ingest per file: each leaves a file in every tile that it meets."""
+MANY_FILES = 256
+"""From so many files on tasks look at them: two seconds of work, more than the start of a process takes."""
 _ASKED_AT_ONCE = 8
 """Remote files whose headers are read at once: a header takes some ten requests of tens of milliseconds each."""
 _BYTES_PER_POINT = 220

@@ -24,15 +24,16 @@ from pipeline.export.cityjson import lines_of
 from pipeline.export.cityjson_file import city_of
 from pipeline.export.columns import HORIZONTAL, VERTICAL
 from pipeline.export.decisions import NAME as DECISIONS_NAME
+from pipeline.export.folders import TERRAIN_FOLDER
 from pipeline.export.geopackage import LAYERS, SUFFIX, TILE, GeoPackage, stored_batch
 from pipeline.export.geoparquet import table_batches, table_files
 from pipeline.export.projection import Project, projection_to
 from pipeline.export.qml import STYLES
-from pipeline.export.terrain import FOLDER as TERRAIN
 from pipeline.export.terrain import terrain_path
 from pipeline.io import LocalStorage, SpatialReference, arrow_at, is_url, storage_at
 from pipeline.io.crs_units import unit_name
-from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
+from pipeline.runtime.manifest import RunManifest, RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.monitoring.events import Event, Listener, ignore
 
 ROWS = 8192
@@ -414,7 +415,7 @@ def terrains_of(run_dir: str) -> dict[str, str]:
     """The files with the terrain of a run, by the keys of their tiles."""
     return {
         key.split("/")[1].removeprefix(f"{TILE}="): key
-        for key in storage_at(run_dir).keys(TERRAIN)
+        for key in storage_at(run_dir).keys(TERRAIN_FOLDER)
         if key == terrain_path(key.split("/")[1].removeprefix(f"{TILE}="), "city.jsonl")
     }
 

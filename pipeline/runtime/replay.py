@@ -17,7 +17,8 @@ from pipeline.export.solid_geometry import SHAPE_COLUMNS
 from pipeline.export.tile import city_lines
 from pipeline.model import BuildingResult, Reason
 from pipeline.recipe import failed_building
-from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
+from pipeline.runtime.isolation.isolated_items import supervise
+from pipeline.runtime.isolation.limits import IsolationLimits, Loss
 from pipeline.runtime.isolation.replay_bundle import Bundle
 from pipeline.runtime.stages.model_batch import model_bundle
 

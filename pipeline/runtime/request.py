@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import shapely
 from shapely import MultiPolygon, Polygon
 
-from pipeline.io import ReadOptions, SpatialReference, find_inputs, is_url, open_source, sha256_of, shown
-from pipeline.io.footprints import read_area
+from pipeline.io import ReadOptions, SourceInfo, SpatialReference, find_inputs, is_url, open_source, sha256_of, shown
+from pipeline.io.places import on_this_machine
 from pipeline.io.reading import one_input, set_input_timeout
-from pipeline.io.remote_file import on_this_machine
-from pipeline.io.tile_index import TileIndex
 from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.looking import look_at_all
 from pipeline.runtime.manifest import InputFile
 from pipeline.runtime.monitoring.events import Watch, never
 from pipeline.runtime.monitoring.progress import Progress
-from pipeline.runtime.plan import Plan, check_places, make_plan, without_far_files
+from pipeline.runtime.plan import MANY_FILES, Plan, check_places, looked_at, make_plan, without_far_files
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.scratch.location import SCRATCH
 from pipeline.settings import RunSettings
+
+if TYPE_CHECKING:
+    from pipeline.io.tile_index import TileIndex
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,8 +109,16 @@ def plan_inputs(
     if request.aoi is not None:
         reference = open_source(paths[0], options).info.reference
         options = dataclasses.replace(options, aoi=_area(request.aoi, reference))
-    watch = Watch(cancelled=cancelled, listener=progress.listener)
-    look = functools.partial(look_at_all, resources=request.resources, watch=watch, executor=executor)
+
+    def look(paths: Sequence[str], options: ReadOptions) -> tuple[SourceInfo, ...]:
+        """The headers of all inputs, of many in tasks."""
+        if len(paths) < MANY_FILES:
+            return looked_at(paths, options)
+        from pipeline.runtime.looking import look_at_all
+
+        watch = Watch(cancelled=cancelled, listener=progress.listener)
+        return look_at_all(paths, options, request.resources, watch, executor)
+
     plan = make_plan(paths, options, request.settings, look)
     if not request.allow_outside_area_of_use:
         check_places(plan)
@@ -124,6 +132,8 @@ def plan_inputs(
 
 def _area(path: str, reference: SpatialReference) -> Polygon | MultiPolygon:
     """The area of interest, read within the time limit of an input."""
+    from pipeline.io.footprints import read_area
+
     with one_input(shown(path)):
         return read_area(path, reference)
 

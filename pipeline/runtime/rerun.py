@@ -21,8 +21,7 @@ from pathlib import Path
 import shapely
 
 from pipeline.errors import RunError
-from pipeline.export.point_files import FOLDER as POINTS_FOLDER
-from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
+from pipeline.export.folders import POINTS_FOLDER, TERRAIN_FOLDER
 from pipeline.export.tile_update import updated_tile
 from pipeline.io import LocalStorage
 from pipeline.model import Reason, Status
@@ -37,8 +36,8 @@ from pipeline.runtime.earlier import (
     request_of,
 )
 from pipeline.runtime.expected import expected
+from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX
 from pipeline.runtime.isolation.preloading import loads_of
-from pipeline.runtime.isolation.replay_bundle import SUFFIX
 from pipeline.runtime.manifest import PAGE, SLOWEST, RunManifest, RunStatus, SlowBuilding, write_manifest
 from pipeline.runtime.monitoring.events import Listener, ignore, never
 from pipeline.runtime.monitoring.progress import Progress
@@ -167,7 +166,7 @@ def _rerun(
         request.resources,
         run_scratch(str(earlier.run_dir), None),
         # a few tiles are split, which are not known yet; all inputs are read
-        dataclasses.replace(expected(plan, 0), seen_points=0.0, ground_km2=()),
+        lambda: dataclasses.replace(expected(plan, 0), seen_points=0.0, ground_km2=()),
         loads=loads_of("reconstruct", footprints=False, method=wanted.settings.general.method),
         executor=executor,
         cancelled=cancelled,
@@ -433,7 +432,7 @@ def _put_bundles(
     """Replace the bundles of an earlier fault by those of this rerun."""
     reasons = {m.building_id: m.reason for m in modelled}
     for name in sorted(changed):
-        key = f"{QUARANTINE}/{name}{SUFFIX}"
+        key = f"{QUARANTINE}/{name}{BUNDLE_SUFFIX}"
         made = Path(scratch.root, key)
         if reasons.get(name) in _QUARANTINED and made.is_file():
             storage.put(key, made.read_bytes())

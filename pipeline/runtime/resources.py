@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import TYPE_CHECKING
 
 from pipeline.errors import SettingsError
 from pipeline.io.reading import INPUT_TIMEOUT_S
-from pipeline.runtime.cluster.priorities import Traffic
-from pipeline.runtime.cluster.tls import TlsFiles
-from pipeline.runtime.isolation.isolated_items import IsolationLimits
+from pipeline.runtime.isolation.limits import IsolationLimits
+
+if TYPE_CHECKING:
+    from pipeline.runtime.cluster.priorities import Traffic
+    from pipeline.runtime.cluster.tls import TlsFiles
 
 READING_MEMORY_BYTES = 4 * 2**30
 """Memory of a process that reads an input. Not a setting: readers hold pieces, and the largest take a tenth of this."""
@@ -53,10 +56,14 @@ class Resources:
             raise SettingsError([f"the time-out of an input is {self.input_timeout_s:g} s: use more than 0"])
 
     @property
+    def is_serial(self) -> bool:
+        """Whether this process runs all tasks itself."""
+        return self.workers == 0 and self.scheduler is None
+
+    @property
     def isolation(self) -> IsolationLimits | None:
         """Limits of the supervised child processes; None models buildings in the workers themselves."""
-        serial = self.workers == 0 and self.scheduler is None
-        if self.isolate is False or (self.isolate is None and serial):
+        if self.isolate is False or (self.isolate is None and self.is_serial):
             return None
         return IsolationLimits(timeout_s=self.building_timeout_s, memory_bytes=self.building_memory_bytes)
 

@@ -10,49 +10,35 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline import __version__
-from pipeline.errors import InputError, RunCancelledError, RunError
+from pipeline.errors import RunCancelledError, RunError
 from pipeline.export.coordinates import one_unit
-from pipeline.export.point_files import FOLDER as POINTS_FOLDER
-from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
+from pipeline.export.folders import POINTS_FOLDER, TERRAIN_FOLDER
 from pipeline.io import SourceInfo, SpatialReference, Storage, is_url, shown, storage_at
-from pipeline.methods import ReconstructSettings, method_named
+from pipeline.methods import ReconstructSettings
 from pipeline.runtime.cluster.serial_executor import Executor, run_alone
-from pipeline.runtime.cluster.worker_fork_server import start_early
-from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.preloading import loads_of
-from pipeline.runtime.manifest import (
-    NAME,
-    PAGE,
-    InputFile,
-    PointFileFacts,
-    RunManifest,
-    RunStatus,
-    read_manifest,
-    write_manifest,
-)
+from pipeline.runtime.manifest import NAME, PAGE, InputFile, PointFileFacts, RunManifest, RunStatus, write_manifest
 from pipeline.runtime.monitoring.events import Listener, ignore, never
 from pipeline.runtime.monitoring.measurement import peak_of_process
 from pipeline.runtime.monitoring.progress import Progress
-from pipeline.runtime.overrides.overrides_file import Override, read_overrides
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
 from pipeline.runtime.run_context import RunContext, run_context
+from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import check_scratch, run_scratch
 from pipeline.runtime.scratch.outcomes import Place
-from pipeline.runtime.scratch.work_folder import is_known, locked_work
-from pipeline.runtime.stages.apply_overrides import about_no_effect, apply_overrides
 from pipeline.runtime.stages.batch_figures import Counted
 from pipeline.runtime.stages.cleanup import OVERRIDDEN, publishing, tidy
 from pipeline.runtime.stages.content_digest import STAGE as DIGEST
 from pipeline.runtime.stages.content_digest import content_digest
 from pipeline.runtime.stages.counts import about_emptiness, run_counts
-from pipeline.runtime.stages.given_footprints import GivenFootprints, footprints_of_run
-from pipeline.runtime.stages.given_guides import GivenGuides, given_guides
+from pipeline.runtime.stages.given_files import footprints_for, guides_for, overrides_for
 from pipeline.runtime.stages.ground import Ground, find_ground
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.join import join
@@ -66,7 +52,11 @@ from pipeline.settings import RunSettings
 from pipeline.terrain.flight_strip import Strip
 from pipeline.tiling import MM
 
-if TYPE_CHECKING:  # loads kernels, which few drivers need
+if TYPE_CHECKING:
+    from pipeline.runtime.expected import Expected
+    from pipeline.runtime.overrides.overrides_file import Override
+    from pipeline.runtime.stages.given_footprints import GivenFootprints
+    from pipeline.runtime.stages.given_guides import GivenGuides
     from pipeline.runtime.stages.terrain import TerrainOutcome
 
 FOOTPRINTS = "footprints.json"
@@ -217,19 +207,19 @@ def run_variants(
     for variant in variants:
         storage_at(variant.out)  # refuses a URL of no storage before anything is read
     if resources.workers and resources.scheduler is None and executor is None:
+        from pipeline.runtime.cluster.worker_fork_server import start_early
+
         start_early()
     progress = Progress(on_event)
     progress.tell("run", "plan", f"run into {request.out}")
     plan, paths = plan_inputs(request, progress, cancelled, executor)
-    footprints = footprints_of_run(request.footprints, plan, request.settings.footprints, request.footprints_layer)
+    footprints = footprints_for(request, plan)
     for warning in () if footprints is None else footprints.warnings:
         progress.warn("plan", warning)
-    guides = None
-    if request.guides is not None:
-        guides = _given_guides(request, plan, variants)
-        for warning in guides.warnings:
-            progress.warn("plan", warning)
-    overrides = () if request.overrides is None else read_overrides(request.overrides, plan.reference, settings)
+    guides = guides_for(request, plan, [variant.settings_in(request.settings) for variant in variants])
+    for warning in () if guides is None else guides.warnings:
+        progress.warn("plan", warning)
+    overrides = overrides_for(request, plan, settings)
     runs = [_VariantRun.of(variant, request, plan, progress, started_at) for variant in variants]
     progress.timings["plan"] = time.perf_counter() - began
     with contextlib.ExitStack() as locks:
@@ -242,8 +232,8 @@ def run_variants(
                 plan,
                 progress,
                 resources,
-                run_scratch(request.out, resources.scratch) if work is None else locked_work(work),
-                expected(plan, None if footprints is None else len(footprints.polygons)),
+                _scratch_of(request),
+                functools.partial(_expected, plan, None if footprints is None else len(footprints.polygons)),
                 loads=loads_of("reconstruct", footprints=footprints is not None, method=settings.general.method),
                 executor=executor,
                 cancelled=cancelled,
@@ -279,6 +269,22 @@ def run_variants(
     return outcomes
 
 
+def _scratch_of(request: RunRequest) -> AbstractContextManager[Scratch]:
+    """The scratch of a run: its work folder, if it has one."""
+    if request.work is None:
+        return run_scratch(request.out, request.resources.scratch)
+    from pipeline.runtime.scratch.work_folder import locked_work
+
+    return locked_work(request.work)
+
+
+def _expected(plan: Plan, footprints: int | None) -> Expected:
+    """The cost of the run, with so many footprints."""
+    from pipeline.runtime.expected import expected
+
+    return expected(plan, footprints)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Candidates:
     """What the stages that all variants share found."""
@@ -311,6 +317,8 @@ def _override(
     runs: Sequence[_VariantRun],
 ) -> _Candidates:
     """The candidates after the overrides; the outcome of each entry goes into the run directories."""
+    from pipeline.runtime.stages.apply_overrides import about_no_effect, apply_overrides
+
     context.check(listed.place.folder for listed in (*found.joined.groups, *found.joined.rejected))
     applied = apply_overrides(context, settings, found.joined, overrides, found.ingested, found.ground)
     for entry in applied.outcomes:
@@ -323,19 +331,6 @@ def _override(
     changed = joined_of(store_sites(context, OVERRIDDEN, applied.sites), 0, {})
     joined = found.joined.in_place_of(applied.owners, changed)
     return dataclasses.replace(found, joined=joined)
-
-
-def _given_guides(request: RunRequest, plan: Plan, variants: Sequence[RunVariant]) -> GivenGuides:
-    """The guides of a run; raises InputError if they cannot be used, also by a method that takes none."""
-    settings = [variant.settings_in(request.settings) for variant in variants]
-    for one in settings:
-        if not one.building.arranges(method_named(one.general.method)):
-            raise InputError(
-                shown(str(request.guides)),
-                f"{one.general.method} traces roof faces from labelled points and takes no guides",
-                'Use faces = "arranged" or the method arrangement, or leave --guides out',
-            )
-    return given_guides(str(request.guides), plan, settings[0].building.guides.kind_column)
 
 
 def _model(
@@ -614,9 +609,13 @@ def put_json(run_dir: str | Path, name: str, content: object) -> None:
 
 def _is_of_work(run_dir: str, work: str) -> bool:
     """Whether a run directory was written from this work folder, which then knows what is there."""
+    from pipeline.runtime.manifest_reading import read_manifest
+
     try:
         known = read_manifest(run_dir).request.get("work")
     except RunError:
+        from pipeline.runtime.scratch.work_folder import is_known
+
         # missing or damaged
         return is_known(work, publishing(run_dir))
     return known == str(Path(work).resolve())

@@ -10,19 +10,15 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from pipeline.errors import FolderLostError, RunOverError
-from pipeline.runtime.cluster.dispatch import TICK_S
-from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.engine import executor_for
-from pipeline.runtime.expected import Expected
-from pipeline.runtime.isolation.isolated_items import IsolationLimits
-from pipeline.runtime.monitoring import tracing
-from pipeline.runtime.monitoring.events import Watch, never
+from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
+from pipeline.runtime.isolation.limits import IsolationLimits
+from pipeline.runtime.monitoring.events import TICK_S, Watch, never
 from pipeline.runtime.monitoring.logs import about
-from pipeline.runtime.monitoring.progress import Progress
-from pipeline.runtime.monitoring.tracing import Part
+from pipeline.runtime.monitoring.progress import Progress, span
+from pipeline.runtime.monitoring.traces import Part
 from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.scratch.folder import Scratch
@@ -35,6 +31,9 @@ from pipeline.runtime.scratch.outcomes import (
     check_outcome,
     run_and_store,
 )
+
+if TYPE_CHECKING:
+    from pipeline.runtime.expected import Expected
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -246,7 +245,7 @@ def run_context(
     progress: Progress,
     resources: Resources,
     scratch: AbstractContextManager[Scratch],
-    work: Expected,
+    work: Callable[[], Expected],
     *,
     loads: Sequence[str],
     executor: Executor | None = None,
@@ -259,8 +258,8 @@ def run_context(
 
     Parameters
     ----------
-    work : Expected
-        What there is to do: decides which executor runs it.
+    work : callable
+        What there is to do; called where it decides which executor runs it.
     loads : sequence of str
         What child processes load, from `loads_of`.
 
@@ -275,11 +274,10 @@ def run_context(
     """
     with scratch as opened:
         folder = str(Path(opened.root, "dask"))
-        engine = executor or executor_for(resources, local_directory=folder, work=work, loads=loads)
+        engine = executor or _own_executor(resources, folder, work, loads)
         starting = time.perf_counter()
         # the driver of a service has a span already
-        traced = tracing.span("run") if tracing.current() is None else contextlib.nullcontext()
-        with traced, about(run=opened.name), _watching(opened, cancelled) as was_cancelled, engine:
+        with span("run", first=True), about(run=opened.name), _watching(opened, cancelled) as was_cancelled, engine:
             progress.watch = Watch(
                 cancelled=was_cancelled,
                 check_scratch=opened.check_mark,
@@ -303,6 +301,17 @@ def run_context(
             except BaseException:
                 opened.cancel()
                 raise
+
+
+def _own_executor(
+    resources: Resources, local_directory: str, work: Callable[[], Expected], loads: Sequence[str]
+) -> Executor:
+    """The executor that a run starts for itself."""
+    if resources.is_serial and resources.performance_report is None:
+        return SerialExecutor()
+    from pipeline.runtime.engine import executor_for
+
+    return executor_for(resources, local_directory=local_directory, work=work(), loads=loads)
 
 
 @contextlib.contextmanager

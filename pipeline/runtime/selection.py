@@ -28,7 +28,8 @@ from pipeline.io import arrow_at, storage_at
 from pipeline.io.crs import SpatialReference
 from pipeline.io.temporary import temporary_folder
 from pipeline.model import Status
-from pipeline.runtime.manifest import RunManifest, RunStatus, city_unit_m, read_manifest, write_manifest
+from pipeline.runtime.manifest import RunManifest, RunStatus, write_manifest
+from pipeline.runtime.manifest_reading import city_unit_m, read_manifest
 from pipeline.runtime.publishing import check_complete, disk_at, terrains_of
 
 _MESH = re.compile(r"meshes/(?P<tile>[^/]+)/(?P<stem>[^/]+?)(-lod(?P<lod>[0-9]{2}))?\.(?P<kind>obj|glb)")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 
-from pipeline.runtime.monitoring import logs
+from pipeline.runtime.monitoring import log_lines
 
 
 def configure(*, as_json: bool) -> None:
     """Log the driver's own lines with their fields to standard error, independent of all other loggers."""
-    logs.configure(as_json=as_json)
+    log_lines.configure(as_json=as_json)
     quieten()
 
 

@@ -22,7 +22,8 @@ from pipeline.io import arrow_at, is_url
 from pipeline.io.crs_units import unit_name
 from pipeline.model import Reason, RoofType, Status
 from pipeline.runtime.manifest import NAME as MANIFEST_NAME
-from pipeline.runtime.manifest import RunStatus, read_manifest
+from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 from service.errors import NoSuchCollectionError, ResultNotReadyError, StartUpError
 from service.features.coordinates import CollectionCrs
 from service.features.row_index import RowIndex, Totals, write_index

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.export.point_files import FOLDER as POINTS_FOLDER
+from pipeline.export.folders import POINTS_FOLDER
 from pipeline.export.point_files import TILESET
 from service.outputs.catalogue import NAME as CATALOGUE_NAME
 from service.outputs.catalogue import Catalogue, StoredOutput
@@ -154,7 +154,8 @@ def _manifest(run_dir: Path) -> Mapping[str, Any]:
         The run did not end, or does not exist.
     """
     from pipeline.errors import RunError
-    from pipeline.runtime.manifest import NAME, RunStatus, read_manifest
+    from pipeline.runtime.manifest import NAME, RunStatus
+    from pipeline.runtime.manifest_reading import read_manifest
 
     status = read_manifest(run_dir).status
     if status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
@@ -241,8 +242,8 @@ class _Sinks:
 
     def add(self, tile: RunTile) -> None:
         """Write one tile to all files."""
+        from pipeline.export.folders import TERRAIN_FOLDER
         from pipeline.export.solid_geometry import SHAPE_COLUMNS
-        from pipeline.export.terrain import FOLDER as TERRAIN_FOLDER
         from service.outputs.footprints import feature_texts
         from service.outputs.merged_table import read_tile
         from service.outputs.meshes import zip_files

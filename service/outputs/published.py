@@ -182,7 +182,7 @@ def _stac(run_dir: Path, out_dir: Path, options: _Options, on_event: Listener) -
 
 def _solar(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
     from pipeline.errors import RunError
-    from pipeline.runtime.manifest import read_manifest
+    from pipeline.runtime.manifest_reading import read_manifest
     from pipeline.runtime.solar import solar
 
     if not (read_manifest(str(run_dir)).crs or {}).get("wkt"):

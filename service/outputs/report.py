@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.model import Status
-from pipeline.runtime.manifest import city_unit_m
+from pipeline.runtime.manifest_reading import city_unit_m
 from service.outputs.catalogue import ResultsCrs
 from service.wording import as_inputs
 

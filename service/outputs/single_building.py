@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.export.building_points import building_points
+from pipeline.export.folders import POINTS_FOLDER
 from pipeline.export.obj_parts import lines_of_buildings
-from pipeline.export.point_files import FOLDER, TILESET
+from pipeline.export.point_files import TILESET
 from pipeline.export.solid_geometry import OVERHANGS
 from service.errors import NoSuchBuildingError, NoSuchOutputError
 from service.outputs.building_index import FEATURES_NAME
@@ -188,7 +189,7 @@ def points_of_building(run_dir: Path, building: StoredBuilding) -> bytes:
     NoSuchBuildingError
         The job was requested without points, or their files are gone.
     """
-    name, folder = building.building_id, run_dir / FOLDER
+    name, folder = building.building_id, run_dir / POINTS_FOLDER
     if not (folder / TILESET).is_file():
         raise NoSuchBuildingError(f"the results hold no points, so none of building {name}: request points")
     try:

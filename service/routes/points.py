@@ -7,7 +7,8 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Request, Response
 
-from pipeline.export.point_files import FOLDER, NAMED_FILE, TILESET
+from pipeline.export.folders import POINTS_FOLDER
+from pipeline.export.point_files import NAMED_FILE, TILESET
 from service.errors import NoSuchOutputError
 from service.outputs.kinds import GLB
 from service.routes.finished_jobs import FinishedJob, FinishedRun
@@ -16,6 +17,7 @@ from service.routes.results import file_answers, unchanging_file
 router = APIRouter(tags=["results"])
 
 _JSON = "application/json"
+_ROOT = f"{POINTS_FOLDER}/{TILESET}"
 
 
 _ANSWERS = file_answers(
@@ -54,12 +56,12 @@ def node(
 
 def _answer(request: Request, finished: FinishedJob, name: str) -> Response:
     """The answer to a request for a file."""
-    path = _path(finished.run_dir / FOLDER, name)
+    path = _path(finished.run_dir / POINTS_FOLDER, name)
     media_type = GLB if name.endswith(".glb") else _JSON
     try:
         return unchanging_file(request, finished, path, media_type)
     except FileNotFoundError:
-        raise NoSuchOutputError(f"the points of this job have no file {name}: start at {FOLDER}/{TILESET}") from None
+        raise NoSuchOutputError(f"the points of this job have no file {name}: start at {_ROOT}") from None
 
 
 def _path(folder: FilePath, name: str) -> FilePath:
@@ -73,5 +75,5 @@ def _path(folder: FilePath, name: str) -> FilePath:
     if not folder.is_dir():
         raise NoSuchOutputError("this job was requested without points: submit it again with points")
     if not NAMED_FILE.fullmatch(name):
-        raise NoSuchOutputError(f"the points of this job have no file {name[:80]!r}: start at {FOLDER}/{TILESET}")
+        raise NoSuchOutputError(f"the points of this job have no file {name[:80]!r}: start at {_ROOT}")
     return folder / name

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 import shapely
+from command_line import app
 from typer.testing import CliRunner
 
-from pipeline.cli import app
 from pipeline.errors import SettingsError
 from pipeline.ruler.simulation.roofs import RoofShape
 from pipeline.ruler.simulation.scene import Scene

@@ -10,7 +10,8 @@ from one_file_site import CONTENT, one_file_site
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io import ReadOptions, open_source, urls
-from pipeline.io.remote_file import BLOCK_BYTES, BLOCKS_KEPT, RemoteFile, file_at, on_this_machine
+from pipeline.io.places import file_at, on_this_machine
+from pipeline.io.remote_file import BLOCK_BYTES, BLOCKS_KEPT, RemoteFile
 from pipeline.io.retries import RetryPolicy
 
 QUICK = RetryPolicy(attempts=3, first_wait_s=0.01, longest_wait_s=0.01)

@@ -11,8 +11,9 @@ import pytest
 from shapely import LineString, box
 
 from pipeline.errors import CrsError, EmptyInputError, UnreadableInputError
-from pipeline.io import SpatialReference, read_area, read_footprints
+from pipeline.io import SpatialReference
 from pipeline.io.crs import resolve_reference
+from pipeline.io.footprints import read_area, read_footprints
 from pipeline.io.guides import read_guides
 from pipeline.io.placed_features import Elsewhere, off_the_data
 from pipeline.io.tile_index import read_tile_index

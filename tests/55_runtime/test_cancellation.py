@@ -11,7 +11,8 @@ import pytest
 
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
-from pipeline.runtime.manifest import RunStatus, read_manifest
+from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.monitoring.measurement import Measured, measure
 from pipeline.runtime.request import RunRequest

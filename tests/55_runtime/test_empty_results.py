@@ -17,7 +17,7 @@ from shapely import Polygon
 
 from pipeline.errors import CrsError, EmptyInputError, SettingsError, UnreadableInputError
 from pipeline.inspection import inspect
-from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL

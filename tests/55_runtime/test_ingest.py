@@ -16,7 +16,7 @@ from pipeline.errors import InconsistentInputError, UnreadableInputError
 from pipeline.io import ReadOptions
 from pipeline.io.las import LasFile
 from pipeline.io.records import PointRecords
-from pipeline.runtime.isolation.isolated_items import IsolationLimits
+from pipeline.runtime.isolation.limits import IsolationLimits
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.ingest import IngestTask, ingest_file
 from pipeline.runtime.stages.ingested import spread_m

@@ -22,7 +22,8 @@ import pipeline.recipe
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.model import Reason
 from pipeline.runtime.isolation import child_main, child_pool
-from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
+from pipeline.runtime.isolation.isolated_items import supervise
+from pipeline.runtime.isolation.limits import IsolationLimits, Loss
 from pipeline.runtime.isolation.messages import Frames, frame
 from pipeline.runtime.monitoring.events import Event
 
@@ -296,7 +297,8 @@ import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started us with SIGINT ignored
 sys.path.insert(0, sys.argv[1])
 from pipeline.runtime.isolation import child_pool
-from pipeline.runtime.isolation.isolated_items import IsolationLimits, supervise
+from pipeline.runtime.isolation.isolated_items import supervise
+from pipeline.runtime.isolation.limits import IsolationLimits
 child_pool._LOADS = ()
 import orders_of_a_test
 for _ in supervise(orders_of_a_test.do, [sys.argv[2]], IsolationLimits()):

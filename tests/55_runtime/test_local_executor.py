@@ -16,7 +16,7 @@ from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.cluster.local_executor import LocalExecutor
 from pipeline.runtime.cluster.serial_executor import run_alone
 from pipeline.runtime.isolation import child_pool
-from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.monitoring.measurement import Measured, peak_of_process
 

@@ -13,7 +13,8 @@ from pipeline.batch.status import read_status
 from pipeline.errors import FolderLostError, InputError, RunCancelledError, RunOverError
 from pipeline.runtime.classify import ClassifyRequest, classify
 from pipeline.runtime.cluster.local_executor import LocalExecutor
-from pipeline.runtime.manifest import RunStatus, read_manifest
+from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources

@@ -21,7 +21,7 @@ from pipeline.runtime.cluster.memory_needs import (
     building_bytes,
     declared_bytes,
 )
-from pipeline.runtime.isolation.isolated_items import IsolationLimits
+from pipeline.runtime.isolation.limits import IsolationLimits
 from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.plan import window_bytes
 from pipeline.runtime.stages.model_batch import BatchTask

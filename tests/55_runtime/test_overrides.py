@@ -19,7 +19,7 @@ from run_tables import rows_by_id, write_footprints
 
 import pipeline.recipe
 import pipeline.runtime.rerun
-import pipeline.runtime.run
+import pipeline.runtime.stages.apply_overrides as applying
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.io import SpatialReference
 from pipeline.io.storage import sha256_of
@@ -124,8 +124,8 @@ def test_the_driver_keeps_only_the_tile_of_an_override_in_memory(
 ) -> None:
     before = rows_by_id(plain.run_dir)
     name = max(before)
-    apply, seen = pipeline.runtime.run.apply_overrides, []
-    monkeypatch.setattr(pipeline.runtime.run, "apply_overrides", lambda *a: seen.append(apply(*a)) or seen[0])
+    apply, seen = applying.apply_overrides, []
+    monkeypatch.setattr(applying, "apply_overrides", lambda *a: seen.append(apply(*a)) or seen[0])
     summary = overridden(f'[[building]]\nbuilding_id = "{name}"\nmethod = "kmeans"')
     (applied,) = seen
     assert [site.building_id for site in applied.before.candidates] == [name]

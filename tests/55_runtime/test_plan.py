@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.errors import CrsError, InconsistentInputError, InputError, RunCancelledError, UnreadableInputError
 from pipeline.io import ReadOptions
-from pipeline.runtime import looking
+from pipeline.runtime import looking, request
 from pipeline.runtime.classify import ClassifyRequest, classify
 from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 from pipeline.runtime.looking import look_at_all
@@ -108,7 +108,8 @@ def test_a_file_whose_points_lie_over_millions_of_tiles_is_refused_unless_a_regi
 @pytest.fixture
 def many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """More inputs than this process looks at itself."""
-    monkeypatch.setattr(looking, "_MANY", 5)
+    for module in (looking, request):
+        monkeypatch.setattr(module, "MANY_FILES", 5)
     monkeypatch.setattr(looking, "_FILES_PER_TASK", 3)
     return [_file(tmp_path / f"{number}.laz", "EPSG:25832") for number in range(8)]
 
@@ -150,11 +151,11 @@ def test_a_look_at_many_inputs_is_the_callers_and_can_be_cancelled(many: list[st
             self.seen.append(stage)
             return super().map(stage, function, tasks, watch)
 
-    request = RunRequest(inputs=tuple(many), out="nowhere", resources=Resources(workers=2))
-    assert plan_inputs(request, Progress(ignore), executor=Noted())[1] == many
+    asked = RunRequest(inputs=tuple(many), out="nowhere", resources=Resources(workers=2))
+    assert plan_inputs(asked, Progress(ignore), executor=Noted())[1] == many
     assert Noted.seen == ["plan"]
     with pytest.raises(RunCancelledError):
-        plan_inputs(request, Progress(ignore), cancelled=lambda: True)
+        plan_inputs(asked, Progress(ignore), cancelled=lambda: True)
 
 
 def test_commands_that_run_in_this_process_look_here(many: list[str], tmp_path: Path, monkeypatch: Any) -> None:

@@ -18,7 +18,8 @@ from pipeline.export.point_glb import NO_BUILDING, NO_PLANE, NO_RESIDUAL, Modell
 from pipeline.quality.residuals import summarise
 from pipeline.quality.roof_returns import roof_returns
 from pipeline.runtime.classify import ClassifySummary
-from pipeline.runtime.manifest import RunStatus, read_manifest
+from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL, Resources

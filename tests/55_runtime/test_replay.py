@@ -120,7 +120,7 @@ def test_what_is_unknown_comes_back_as_unknown(bundle: Bundle, tmp_path: Path) -
 
 @pytest.mark.parametrize("isolated", [False, True])
 def test_a_replay_models_exactly_what_the_run_would(bundle: Bundle, path: Path, isolated: bool) -> None:
-    from pipeline.runtime.isolation.isolated_items import IsolationLimits
+    from pipeline.runtime.isolation.limits import IsolationLimits
 
     here = reconstruct_building(bundle.candidate, bundle.method, bundle.settings)
     there = replay(read_bundle(str(path)), IsolationLimits() if isolated else None).result

@@ -17,7 +17,7 @@ import pipeline.recipe
 from pipeline.errors import BuildingError, EmptyInputError, InconsistentInputError, InputError, RunError
 from pipeline.model import Reason
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.publishing import publish_stac
 from pipeline.runtime.request import RunRequest

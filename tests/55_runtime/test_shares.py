@@ -14,7 +14,7 @@ from one_file_site import Site, one_file_site
 from pipeline.errors import UnreadableInputError
 from pipeline.io import ReadOptions, open_source
 from pipeline.io.records import Share
-from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.plan import is_fetched_by_nodes, shares_of
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.ingest import IngestTask, ingest_file

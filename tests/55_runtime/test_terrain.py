@@ -9,7 +9,8 @@ import pytest
 import shapely
 
 from pipeline.export.terrain import TerrainTriangles, read_terrain
-from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
+from pipeline.runtime.manifest import RunManifest, RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import RunSummary

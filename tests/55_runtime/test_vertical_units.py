@@ -18,7 +18,7 @@ from pipeline.export.terrain import read_terrain
 from pipeline.io import ReadOptions, arrow_at
 from pipeline.io.crs import vertical_unit_of
 from pipeline.ruler.evaluation.reading import read_models
-from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.plan import make_plan
 from pipeline.runtime.publishing import publish_geopackage, publish_pmtiles
 from pipeline.runtime.publishing_3dtiles import publish_3dtiles

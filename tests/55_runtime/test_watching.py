@@ -24,7 +24,7 @@ from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.performance_report import BINS, ROWS, PerformanceReport
 from pipeline.runtime.cluster.run_metrics import RunMetrics, TallyMetrics, combined, serve_metrics
 from pipeline.runtime.engine import executor_for
-from pipeline.runtime.monitoring import logs
+from pipeline.runtime.monitoring import log_lines, logs
 from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.monitoring.measurement import Measured, measure
 from pipeline.runtime.monitoring.tallies import TALLIES, Tallies
@@ -125,7 +125,7 @@ def lines() -> Iterator[io.StringIO]:
     """What the loggers of gablework write, as JSON."""
     stream = io.StringIO()
     handler = logging.StreamHandler(stream)
-    handler.setFormatter(logs.formatter(as_json=True))
+    handler.setFormatter(log_lines.formatter(as_json=True))
     logger = logging.getLogger("gablework")
     before, level = list(logger.handlers), logger.level
     logger.handlers = [handler]

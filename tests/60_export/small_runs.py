@@ -16,7 +16,8 @@ from pipeline.export.tile import write_tile
 from pipeline.io import storage_at
 from pipeline.io.crs import SpatialReference
 from pipeline.model import BuildingResult, Reason, Status
-from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest, write_manifest
+from pipeline.runtime.manifest import RunManifest, RunStatus, write_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 
 
 def moved(result: BuildingResult, east: float, north: float = 0.0) -> BuildingResult:

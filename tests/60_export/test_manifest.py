@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import RunError
-from pipeline.runtime.manifest import InputFile, PointFileFacts, RunManifest, RunStatus, read_manifest, write_manifest
+from pipeline.runtime.manifest import InputFile, PointFileFacts, RunManifest, RunStatus, write_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 
 FILE = PointFileFacts(
     format="las",

@@ -17,7 +17,7 @@ from pipeline.errors import RunError
 from pipeline.export.globe_terrain import PlacedTerrain, terrain_glb
 from pipeline.export.terrain import TerrainTriangles, read_terrain, terrain_lines, terrain_path
 from pipeline.io import storage_at
-from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.publishing import publish_cityjson, publish_stac
 from pipeline.runtime.publishing_3dtiles import publish_3dtiles
 

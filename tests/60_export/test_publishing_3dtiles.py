@@ -29,7 +29,8 @@ from pipeline.io.crs import SpatialReference
 from pipeline.io.globe import geodesy, to_globe
 from pipeline.model import BuildingResult
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.manifest import RunStatus, read_manifest, write_manifest
+from pipeline.runtime.manifest import RunStatus, write_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.publishing_3dtiles import publish_3dtiles
 from pipeline.tiling import Tile
 

@@ -13,17 +13,18 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 import small_buildings as small
+from command_line import app
 from small_runs import TREE, content, moved, street
 from typer.testing import CliRunner
 
-from pipeline.cli.app import app
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import RecordContext
 from pipeline.export.tile import write_tile
 from pipeline.io import storage_at
 from pipeline.model import BuildingResult, Doubt, Reason, Status
-from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest, write_manifest
+from pipeline.runtime.manifest import RunManifest, RunStatus, write_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.selection import run_of, select_run
 
 DOUBT = Doubt.of(Reason.SCATTERED, "its roof returns scatter by 0.32 m, more than 0.15 m", "scatter_m", 0.32, 0.15)

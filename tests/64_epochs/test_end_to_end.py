@@ -14,7 +14,7 @@ from pipeline.ruler.simulation.als import scan
 from pipeline.ruler.simulation.suburb import suburb
 from pipeline.ruler.simulation.suites import suite_named
 from pipeline.ruler.simulation.survey_files import write_points
-from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run

@@ -12,10 +12,10 @@ import pyarrow.parquet as pq
 import pyproj
 import pytest
 import shapely
+from command_line import app
 from epochs_by_hand import EXTENT, UTM, house, write_epoch
 from typer.testing import CliRunner
 
-from pipeline.cli import app
 from pipeline.errors import CrsError, RunError, SettingsError
 from pipeline.io import storage_at
 from pipeline.io.crs_units import with_vertical_unit

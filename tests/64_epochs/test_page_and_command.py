@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from command_line import app
 from page_reader import Reader, assert_links_stay_within, count
 
-from pipeline.cli import app
 from pipeline.console import ExitCode
 from pipeline.report import class_map
 from pipeline.report.class_map import ClassMap

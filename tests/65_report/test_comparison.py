@@ -33,7 +33,8 @@ from pipeline.ruler.report.comparison_figures import seconds_text
 from pipeline.ruler.report.comparison_pictures import BLOCK_COLOUR, REACH_M, draw_building, place_of
 from pipeline.ruler.report.comparison_points import points_within
 from pipeline.ruler.report.section import RESIDUAL_CLASSES
-from pipeline.runtime.manifest import read_manifest, write_manifest
+from pipeline.runtime.manifest import write_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 
 MakeRun = Callable[..., Path]
 EVIL = '"><script>alert(1)</script>'

@@ -15,22 +15,15 @@ from typer.testing import CliRunner
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import small_buildings as small
+from command_line import app
 from page_reader import Reader, assert_links_stay_within, count
 
-from pipeline.cli import app
 from pipeline.errors import RunError
 from pipeline.model import Reason, Status
 from pipeline.report import class_map, run_page
 from pipeline.report.run_page import write_run_page
-from pipeline.runtime.manifest import (
-    PAGE,
-    InputFile,
-    RunManifest,
-    RunStatus,
-    SlowBuilding,
-    read_manifest,
-    write_manifest,
-)
+from pipeline.runtime.manifest import PAGE, InputFile, RunManifest, RunStatus, SlowBuilding, write_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 
 
 def change(run: Path, **values: Any) -> RunManifest:

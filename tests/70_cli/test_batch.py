@@ -9,12 +9,12 @@ from typing import Any
 
 import laspy
 import pytest
+from command_line import app
 from typer.testing import CliRunner
 
 from pipeline.batch.batch_file import read_batch
 from pipeline.batch.estimates import estimate
 from pipeline.batch.status import buildings_before
-from pipeline.cli import app
 from pipeline.cli.batching import _end_by_signals
 from pipeline.errors import RunError
 from pipeline.io import storage_at

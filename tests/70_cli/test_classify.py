@@ -47,12 +47,13 @@ def test_this_process_or_its_children_as_the_estimate_says_give_the_same_file(
     serial = tmp_path / "serial"
     assert invoke("classify", str(house), "--out", str(serial), "--workers", "0", "--quiet")[0] == 0
     engines: list[Executor] = []
+    chosen = engine.executor_for
 
     def executor_for(*asked: Any, **more: Any) -> Executor:
-        engines.append(engine.executor_for(*asked, **more))
+        engines.append(chosen(*asked, **more))
         return engines[-1]
 
-    monkeypatch.setattr("pipeline.runtime.run_context.executor_for", executor_for)
+    monkeypatch.setattr("pipeline.runtime.engine.executor_for", executor_for)
     if not is_small:
         monkeypatch.setattr(engine, "ALONE_S", 0.0)
         monkeypatch.setattr("pipeline.runtime.isolation.preloading._SMALL_BYTES", 0)

@@ -9,10 +9,9 @@ from typing import Any
 
 import pytest
 import typer
-from command_line import invoke
+from command_line import app, invoke
 
 from pipeline import __version__
-from pipeline.cli import app
 from pipeline.cli.options import worker_count
 from pipeline.cli.party_walls import party_walls
 from pipeline.cli.solar import solar

@@ -10,6 +10,7 @@ import sqlite3
 from pathlib import Path
 
 import pytest
+from command_line import app
 from copy_contract import every_row
 from live_service import POINTS
 from store_contract import claim
@@ -17,7 +18,6 @@ from typer.testing import CliRunner
 
 from pipeline.errors import RunError
 from service.backup import MARK, Report, back_up, restore
-from service.cli import app
 from service.errors import StartUpError
 from service.files import StateFolder
 from service.jobs import InputReference, Job, JobRequest, JobStatus, Upload

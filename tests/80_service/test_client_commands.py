@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from click.testing import Result
 from client_site import LINES, OUTLINES, Site
+from command_line import app
 from live_service import POINTS
 from typer.testing import CliRunner
 
-from service.cli import app
 from service.jobs import Fault, JobFailure
 from service.keys import Scope
 from service.problems import FAILURES

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from command_line import app
 from live_service import settings_in
 from typer.testing import CliRunner
 
 from pipeline.console import ExitCode
 from service.app import start
-from service.cli import app
 from service.errors import StartUpError
 from service.files import StateFolder, keep_private
 from service.store import JobStore

@@ -23,7 +23,7 @@ from pipeline.errors import (
     UnreadableInputError,
     VersionMismatchError,
 )
-from pipeline.runtime.monitoring.logs import formatter
+from pipeline.runtime.monitoring.log_lines import formatter
 from service.driver.failures import failure_of, is_tried_again, pause_s
 from service.driver.messages import Scrubber, digest_of, outcome
 from service.driver.progress import CLASSIFY_WEIGHTS, COMPILING, WEIGHTS, WORDS, percent

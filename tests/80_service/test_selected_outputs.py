@@ -14,6 +14,7 @@ import finished_runs as runs
 import pyarrow.parquet as pq
 import pytest
 from client_site import Site
+from command_line import app
 from processes import wait_for
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
@@ -22,7 +23,6 @@ import pipeline.runtime.publishing
 import pipeline.runtime.selection
 from pipeline.model import Doubt, Reason, Status
 from pipeline.runtime.publishing import disk_at
-from service.cli import app
 from service.errors import SelectionBusyError
 from service.outputs import selected
 

@@ -17,14 +17,14 @@ import httpx
 import psutil
 import pytest
 from click.testing import Result
+from command_line import app
 from live_service import POINTS
 from processes import LONG_S, wait_for
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
-from pipeline.runtime.isolation.isolated_items import MIN_MEMORY_BYTES
+from pipeline.runtime.isolation.limits import MIN_MEMORY_BYTES
 from service import supervisor as supervisor_module
-from service.cli import app
 from service.connections import listen
 from service.settings import ServiceSettings
 from service.supervisor import Supervisor, environment_of, pause_s

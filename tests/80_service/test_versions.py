@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from command_line import app
 from driver_bench import Bench
 from migrated import with_tables
 from processes import wait_for
 from typer.testing import CliRunner
 
 from service import migrations
-from service.cli import app
 from service.jobs import JobStatus
 from service.store import JobStore
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pyarrow.dataset as pads
 import pytest
+from command_line import app
 from deployment import Gates, kill_process
 from faults import asked
 from object_store import FaultyProxy
@@ -18,7 +19,6 @@ from object_store import environment as environment_of
 from processes import Program, Programs, free_port, program
 from typer.testing import CliRunner
 
-from pipeline.cli import app
 from pipeline.io.urls import filesystem_of
 from pipeline.runtime.digest import run_digest
 

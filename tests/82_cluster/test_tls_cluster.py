@@ -16,7 +16,7 @@ from processes import Programs, free_port, missing
 from pipeline.errors import ClusterError
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.tls import VARIABLES, TlsFiles
-from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.monitoring.events import Watch
 
 pytestmark = pytest.mark.slow

@@ -12,7 +12,7 @@ from faults import asked
 from processes import Programs, free_port, wait_for
 
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL, Resources
 from pipeline.runtime.run import run

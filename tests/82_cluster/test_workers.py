@@ -17,7 +17,8 @@ from processes import Program, Programs, free_port, lives, program, wait_for
 
 from pipeline.errors import ClusterError, RunCancelledError, VersionMismatchError
 from pipeline.runtime.cluster.dask_executor import Cluster
-from pipeline.runtime.manifest import RunStatus, read_manifest
+from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.monitoring.measurement import Measured
 from pipeline.runtime.request import RunRequest

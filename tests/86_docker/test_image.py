@@ -11,13 +11,13 @@ from types import ModuleType
 
 import pytest
 import typer
+from command_line import app
 from container_files import Compose, Image, read_compose, sent_to_the_builder
 from moto.server import ThreadedMotoServer
 from processes import program
 
 from pipeline import __version__
 from pipeline.runtime.cluster.tls import DASK_VARIABLES, VARIABLES
-from service.cli import app
 from service.settings import ServiceSettings
 
 OURS = ("api", "driver", "scheduler", "worker")

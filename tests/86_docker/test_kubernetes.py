@@ -10,12 +10,12 @@ import jsonschema
 import pytest
 import typer
 import yaml
+from command_line import app
 from container_files import NO_RIGHTS, Image
 
 from pipeline import __version__
 from pipeline.runtime.cluster.dispatch import SETTLE_S
 from pipeline.runtime.cluster.tls import VARIABLES
-from service.cli import app
 from service.settings import ServiceSettings
 
 with warnings.catch_warnings():

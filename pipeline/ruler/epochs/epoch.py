@@ -23,7 +23,8 @@ from pipeline.io.crs import SpatialReference
 from pipeline.model import FloatArray, IntArray
 from pipeline.ruler.epochs.coverage import Coverage, coverage_of
 from pipeline.ruler.epochs.roof_raster import RoofFaces
-from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
+from pipeline.runtime.manifest import RunManifest, RunStatus
+from pipeline.runtime.manifest_reading import read_manifest
 
 COLUMNS = (
     *("building_id", "source_id", "status", "roof_type", "geometry", "ground_z", "ridge_z", "height_m"),

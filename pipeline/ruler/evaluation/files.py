@@ -18,7 +18,7 @@ from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.reference_points import read_points_reference
 from pipeline.ruler.evaluation.reference_truth import read_truth_reference
 from pipeline.runtime.manifest import NAME as MANIFEST
-from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.settings import RunSettings
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.errors import InconsistentInputError
 from pipeline.io import ReadOptions, open_source
-from pipeline.io.remote_file import file_at
+from pipeline.io.places import file_at
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.ruler.evaluation.bootstrap import Statistic, Sums, share
 from pipeline.ruler.evaluation.measure import Better, Measure, defined

@@ -18,7 +18,7 @@ from pipeline.ruler.report.comparison_pictures import draw_building, place_of
 from pipeline.ruler.report.comparison_points import PointFiles, points_within
 from pipeline.ruler.report.comparison_records import buildings_table, projjson_of, read_buildings
 from pipeline.runtime.compare import BUILDINGS, PAGE, REPORT
-from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.manifest_reading import read_manifest
 
 __all__ = ["BUILDINGS", "PAGE", "REPORT", "ComparedRun", "PointFiles", "write_comparison"]
 

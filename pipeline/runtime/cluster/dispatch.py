@@ -23,14 +23,12 @@ from typing import Any, Generic
 
 from pipeline.errors import ClusterError, GableworkError, RunCancelledError, RunError
 from pipeline.runtime.cluster.memory_needs import RESOURCE, announced_bytes, declared_bytes
-from pipeline.runtime.monitoring.events import Event, Watch
+from pipeline.runtime.monitoring.events import TICK_S, Event, Watch
 from pipeline.runtime.monitoring.logs import LOG, facts_of_task
 from pipeline.runtime.monitoring.measurement import Measured, Result, Task, measure_packed, pack_tasks
 from pipeline.runtime.monitoring.tallies import TALLIES
 from pipeline.runtime.monitoring.versions import fingerprint
 
-TICK_S = 0.2
-"""Seconds between two checks of the cluster and of the run's cancellation."""
 TASKS_PER_THREAD = 3
 """Tasks in flight per thread of the cluster: one runs, the others are on their way."""
 SETTLE_S = 30.0

@@ -26,10 +26,10 @@ from types import TracebackType
 from typing import Any, Generic, Self
 
 from pipeline.errors import RunCancelledError, RunError
-from pipeline.runtime.cluster.dispatch import SETTLE_INTERRUPTED_S, TICK_S, blame, tried_alone
+from pipeline.runtime.cluster.dispatch import SETTLE_INTERRUPTED_S, blame, tried_alone
 from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, borrowed_child, start_failure
 from pipeline.runtime.isolation.supervision import ChildEnd
-from pipeline.runtime.monitoring.events import Watch
+from pipeline.runtime.monitoring.events import TICK_S, Watch
 from pipeline.runtime.monitoring.logs import LOG, facts_of_task
 from pipeline.runtime.monitoring.machine import cores, memory_bytes
 from pipeline.runtime.monitoring.measurement import Measured, Result, Task, measure, measure_in_child

@@ -21,8 +21,6 @@ BUILDING_BYTES_PER_POINT = 2_000
 """Peak above it, in bytes per point. Measured at commit 3d991134: 390 to 430 for flat halls, up to 490 for
 saw-tooth roofs, 580 to 1,070 for roofs full of things. It depends on the number of faces, which is unknown before, so
 this is twice the maximum; the limit of a building's process bounds it."""
-WINDOW_BASE_BYTES = 300 * 2**20
-"""Memory of a worker, before the first split."""
 
 
 def building_bytes(points: int, limit_bytes: int | None = None) -> int:

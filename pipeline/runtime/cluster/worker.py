@@ -25,7 +25,7 @@ from pipeline.runtime.cluster import worker_setup
 from pipeline.runtime.cluster.memory_needs import RESOURCE
 from pipeline.runtime.cluster.tls import TlsFiles, check_address, explain_failure
 from pipeline.runtime.cluster.worker_fork_server import forked_workers
-from pipeline.runtime.monitoring import logs
+from pipeline.runtime.monitoring import log_lines
 
 _POLL_S = 0.1
 _HAND_OVER_S = 30.0
@@ -111,7 +111,7 @@ def serve_worker(options: WorkerOptions, say: Callable[[str], None]) -> None:
     """
     configured = bool(dask.config.get("distributed.comm.tls.ca-file", None))
     check_address(options.scheduler, options.tls, configured=configured)
-    logs.configure(as_json=options.log_json)
+    log_lines.configure(as_json=options.log_json)
     quiet = {
         "distributed.admin.log-format": "%(asctime)s %(name)s %(levelname)s %(message)s",
         "distributed.worker.daemon": True,
@@ -119,7 +119,7 @@ def serve_worker(options: WorkerOptions, say: Callable[[str], None]) -> None:
     }
     with dask.config.set(quiet), forked_workers() as forked, dask.config.set(forked):
         if options.log_json:
-            logs.configure(as_json=True, also=("distributed",))
+            log_lines.configure(as_json=True, also=("distributed",))
         asyncio.run(_serve(options, say))
 
 

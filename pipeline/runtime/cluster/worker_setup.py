@@ -12,13 +12,14 @@ import signal
 
 from pipeline.runtime.isolation.child_pool import close_children
 from pipeline.runtime.isolation.start_up import start_own_process
-from pipeline.runtime.monitoring import logs
+from pipeline.runtime.monitoring import log_lines, logs
 
 STAGES = (
     *(
         f"pipeline.runtime.stages.{name}"
         for name in ("ingest", "ground", "split_window", "join", "model_batch", "publish")
     ),
+    "pipeline.strip_alignment",
     "pipeline.recipe",
 )
 """The modules of all tasks."""
@@ -52,10 +53,10 @@ def dask_setup(worker: object) -> None:
     if os.environ.get(LOG):
         as_json = os.environ[LOG] == "json"
         if as_json:
-            logs.log_everything_as_json()
-        logs.configure(as_json=as_json, also=("distributed",) if as_json else ())
-    else:
-        logs.configure_once()
+            log_lines.log_everything_as_json()
+        log_lines.configure(as_json=as_json, also=("distributed",) if as_json else ())
+    elif logs.wants_json():
+        log_lines.configure_as_json()
     if os.environ.get(METRICS_PORT):
         from pipeline.runtime.cluster.run_metrics import serve_metrics
 

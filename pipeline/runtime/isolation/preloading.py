@@ -5,6 +5,7 @@ The server loads what the children need while the command itself reads its optio
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -15,9 +16,11 @@ _METHOD = "arrangement"
 """The default method; a child loads other methods itself."""
 _STAGES = (
     "numpy.ma",
+    "pipeline.runtime.isolation.isolated_items",
     "pipeline.runtime.stages.ingest",
     "pipeline.runtime.stages.ground",
     "pipeline.runtime.stages.split_window",
+    "pipeline.strip_alignment",
 )
 _LOADS = {
     "reconstruct": ("pipeline.runtime.stages.publish", "pipeline.export.tile", "pipeline.runtime.digest"),
@@ -42,6 +45,12 @@ def loads_of(job: Job, *, footprints: bool, method: str | None = None) -> list[s
     if job == "reconstruct":
         loads.append(f"pipeline.runtime.stages.model_batch:load_once:{method or _METHOD}")
     return loads
+
+
+def has_idle_child() -> bool:
+    """Whether a child of this process is idle; a process that never loaded the pool has none."""
+    pool = sys.modules.get("pipeline.runtime.isolation.child_pool")
+    return pool is not None and bool(pool.has_idle_child())
 
 
 def start_early(job: Job, *, workers: int | None, scheduler: str | None, footprints: bool, method: str | None) -> None:

@@ -28,9 +28,8 @@ from pipeline.io import place_below, storage_at
 from pipeline.io.crs import SpatialReference
 from pipeline.methods import ReconstructSettings, method_named
 from pipeline.model import Candidate, FloatArray, GivenHeights, Guide, GuideKind
+from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX
 from pipeline.settings import RunSettings
-
-SUFFIX = ".bundle"
 
 _FORMAT = "gablework bundle 2"
 _OPTIONAL = ("beside", "beside_later", "elsewhere", "voids")
@@ -124,7 +123,7 @@ def write_bundle(folder: str, bundle: Bundle) -> str:
         "incident": incident,
         "reference": dataclasses.asdict(bundle.reference),
     }
-    key = candidate.building_id + SUFFIX
+    key = candidate.building_id + BUNDLE_SUFFIX
     with (
         storage_at(folder).putting(key) as temporary,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive,

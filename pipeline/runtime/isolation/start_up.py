@@ -65,12 +65,14 @@ def start_own_process() -> None:
     atexit.unregister(gc.freeze)
     atexit.register(gc.freeze)
     if os.environ.get("GABLEWORK_LOG_JSON"):
-        from pipeline.runtime.monitoring import logs
+        from pipeline.runtime.monitoring.logs import wants_json
 
         # the command itself reports an invalid value
         with contextlib.suppress(SettingsError):
-            if logs.wants_json():
-                logs.log_everything_as_json()
+            if wants_json():
+                from pipeline.runtime.monitoring.log_lines import log_everything_as_json
+
+                log_everything_as_json()
 
 
 def _keep_freed_memory() -> None:

@@ -8,6 +8,9 @@ from typing import Literal
 
 from pipeline.errors import RunCancelledError
 
+TICK_S = 0.2
+"""Seconds between two checks of the cluster and of the run's cancellation."""
+
 EventKind = Literal["run", "stage", "progress", "warning", "waiting", "detail", "finished"]
 
 

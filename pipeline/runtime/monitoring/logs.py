@@ -1,22 +1,18 @@
 """Log lines with ids, plain or JSON, from the driver of a run, from workers and from the service.
 
 All lines of gablework go to loggers below `gablework`. As a library it prints none of them; a process of gablework
-calls `configure`. A line has facts beside its message: its own (`extra=`), and those of the current work (`about`). A
-worker thus names run, stage and tile of the current task in every line.
+calls `configure` of `log_lines.py`. A line has facts beside its message: its own (`extra=`), and those of the current
+work (`about`). A worker thus names run, stage and tile of the current task in every line.
 """
 
 from __future__ import annotations
 
 import contextlib
-import datetime as dt
-import functools
 import logging
 import os
-import sys
-import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import Any
 
 from pipeline.errors import SettingsError
@@ -30,17 +26,14 @@ FACTS = (
 VARIABLE = "GABLEWORK_LOG_JSON"
 """Environment variable that makes workers and commands log JSON; the service's setting has the same name."""
 
-_NAME = "gablework"
-_CHATTY = ("alembic", "distributed")
-"""Libraries that log only warnings and errors in a process of gablework. Dask sets its own levels when it is loaded, so
-a level set earlier would not last."""
+NAME = "gablework"
 _CURRENT: ContextVar[Mapping[str, object]] = ContextVar("gablework facts", default=MappingProxyType({}))
 _KEY_DIGITS = 12
 """Logged digits of a batch's key: enough to find it in scratch."""
 
-LOG = logging.getLogger(f"{_NAME}.run")
+LOG = logging.getLogger(f"{NAME}.run")
 """Logger of runs and their tasks."""
-logging.getLogger(_NAME).addHandler(logging.NullHandler())
+logging.getLogger(NAME).addHandler(logging.NullHandler())
 
 
 @contextlib.contextmanager
@@ -72,117 +65,6 @@ def facts_of(record: logging.LogRecord) -> dict[str, Any]:
     return {name: value for name, value in found.items() if value is not None}
 
 
-def formatter(*, as_json: bool) -> logging.Formatter:
-    """The format of lines with their facts: one JSON object per line, or plain."""
-    return _json_lines() if as_json else PlainLines()
-
-
-@functools.cache
-def _json_lines() -> logging.Formatter:
-    from pythonjsonlogger.json import JsonFormatter  # here, as most processes log plain lines or none
-
-    class JsonLines(JsonFormatter):
-        """One JSON object per line; of the facts of libraries only those of `FACTS`."""
-
-        def add_fields(self, log_data: dict[str, Any], record: logging.LogRecord, message_dict: dict[str, Any]) -> None:
-            at = dt.datetime.fromtimestamp(record.created, dt.UTC).isoformat(timespec="milliseconds")
-            log_data |= {
-                "at": at,
-                "level": record.levelname.lower(),
-                "logger": record.name,
-                "message": record.getMessage(),
-            }
-            log_data |= facts_of(record)
-            if record.exc_info:
-                log_data["exception"] = message_dict["exc_info"]
-
-    return JsonLines(json_default=str)
-
-
-class PlainLines(logging.Formatter):
-    """A plain line, with an exception below it."""
-
-    def __init__(self) -> None:
-        super().__init__("%(asctime)s %(levelname)s %(message)s%(facts)s")
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Format the record, its facts in brackets."""
-        facts = [f"{name} {value}" for name, value in facts_of(record).items()]
-        record.facts = f" [{', '.join(facts)}]" if facts else ""
-        return super().format(record)
-
-
-def configure(*, as_json: bool, name: str = _NAME, also: tuple[str, ...] = ()) -> None:
-    """Send the lines of a logger to standard error with their facts, whatever the program does with other loggers.
-
-    Lines are plain or one JSON object each. By default the logger is that of all of gablework. The loggers of the
-    libraries in `also` are formatted in the same way; their levels stay.
-    """
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(formatter(as_json=as_json))
-    for one in (name, *also):
-        logger = logging.getLogger(one)
-        logger.handlers = [handler]
-        logger.propagate = False
-    logging.getLogger(name).setLevel(logging.INFO)
-
-
-class _QuietLibraries(logging.Filter):
-    """Drops the informative lines of chatty libraries."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Whether the line is shown."""
-        return record.levelno >= logging.WARNING or record.name.partition(".")[0] not in _CHATTY
-
-
-def log_everything_as_json() -> Callable[[], None]:
-    """Write all lines of this process as JSON to standard error; returns what restores the logging of before.
-
-    This includes lines of libraries, also of those loaded later, Python's warnings, and uncaught exceptions of any
-    thread. It is for processes of gablework, never for one that imports it as a library.
-    """
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(formatter(as_json=True))
-    handler.addFilter(_QuietLibraries())
-    root = logging.getLogger()
-    loggers = (root, *map(logging.getLogger, (_NAME, "distributed", "py.warnings")))
-    before = [(logger, logger.handlers, logger.propagate, logger.level) for logger in loggers]
-    hooks = sys.excepthook, threading.excepthook
-    for logger in loggers:
-        logger.handlers, logger.propagate = [], True
-    # Dask adds a handler of its own as it loads, unless the root logger has one
-    root.handlers = [handler]
-    logging.captureWarnings(True)
-    sys.excepthook, threading.excepthook = _log_fault, _log_fault_of_thread
-    configure(as_json=True)
-
-    def undo() -> None:
-        logging.captureWarnings(False)
-        sys.excepthook, threading.excepthook = hooks
-        for logger, handlers, propagates, level in before:
-            logger.handlers, logger.propagate = handlers, propagates
-            logger.setLevel(level)
-
-    return undo
-
-
-def _log_fault(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    LOG.critical("an uncaught exception: %s", error or kind.__name__, exc_info=(kind, error, trace))
-
-
-def _log_fault_of_thread(fault: threading.ExceptHookArgs) -> None:
-    if fault.exc_type is SystemExit:
-        return
-    name = "a thread" if fault.thread is None else f"the thread {fault.thread.name}"
-    error = fault.exc_type() if fault.exc_value is None else fault.exc_value
-    LOG.critical(
-        "%s ended with an exception: %s",
-        name,
-        error or fault.exc_type.__name__,
-        exc_info=(fault.exc_type, error, fault.exc_traceback),
-    )
-
-
 def wants_json() -> bool:
     """Whether the environment asks for JSON lines; raises SettingsError if the variable is neither yes nor no."""
     given = os.environ.get(VARIABLE, "").strip().lower()
@@ -191,10 +73,3 @@ def wants_json() -> bool:
     if given in {"", "0", "false", "no", "off"}:
         return False
     raise SettingsError([f"{VARIABLE} is {given!r}: use 1 or 0"])
-
-
-@functools.cache
-def configure_once() -> None:
-    """Log JSON in a worker if the environment asks for it, whatever program started it."""
-    if wants_json():
-        configure(as_json=True, also=("distributed",))

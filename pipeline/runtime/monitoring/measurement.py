@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar
 
 from pipeline.errors import GableworkError, RunCancelledError, VersionMismatchError
-from pipeline.runtime.monitoring.logs import LOG, about, configure_once, facts_of_task
+from pipeline.runtime.monitoring.logs import LOG, about, facts_of_task, wants_json
 from pipeline.runtime.monitoring.tallies import TALLIES
 from pipeline.runtime.monitoring.versions import differences, fingerprint, versions_here, versions_of
 
@@ -123,7 +123,10 @@ def measure_packed(client_fingerprint: str, packed: bytes, stage: str = "") -> l
     If it has others VersionMismatchError is raised, since a late worker must not mix other versions into a result. This
     happens before the tasks are unpickled, which could then fail in strange ways.
     """
-    configure_once()
+    if wants_json():
+        from pipeline.runtime.monitoring.log_lines import configure_as_json
+
+        configure_as_json()
     if client_fingerprint != fingerprint():
         process, _ = peak_of_process()
         differing = differences(versions_of(client_fingerprint), versions_here())

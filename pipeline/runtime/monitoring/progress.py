@@ -7,10 +7,19 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-from pipeline.runtime.monitoring import tracing
+from pipeline.runtime.monitoring import traces
 from pipeline.runtime.monitoring.events import Event, EventKind, Listener, Watch
 from pipeline.runtime.monitoring.measurement import Measured
-from pipeline.runtime.monitoring.tracing import Part
+from pipeline.runtime.monitoring.traces import Part
+
+
+def span(name: str, *, first: bool = False, **facts: Any) -> contextlib.AbstractContextManager[Any]:
+    """A span around a block while traces are on; the `first` one only if there is none around it."""
+    if not traces.are_wanted():
+        return contextlib.nullcontext()
+    from pipeline.runtime.monitoring import tracing
+
+    return contextlib.nullcontext() if first and tracing.current() else tracing.span(name, **facts)
 
 
 class Progress:
@@ -68,6 +77,10 @@ class Progress:
     def measured(self, found: Measured[Any], parts: Callable[[], Iterable[Part]] = tuple) -> None:
         """Note the peak memory of the process that ran a task, and the spans of the task and of its parts."""
         self.peaks[found.process] = max(self.peaks.get(found.process, 0), found.peak_bytes)
+        if not traces.are_wanted():
+            return
+        from pipeline.runtime.monitoring import tracing
+
         if tracing.is_on():
             name, times = "task" if found.tile is None else "tile", (found.began_s, found.began_s + found.seconds)
             facts: dict[str, Any] = {"tile": found.tile, "process": found.process, "cpu_s": round(found.cpu_s, 3)}
@@ -82,7 +95,7 @@ class Progress:
         stage = StageProgress(self, name, self._part * total, self._parts * total, quiet=quiet)
         if not quiet:
             self.tell("stage", name, self._label, done=stage.done, total=stage.total)
-        with contextlib.nullcontext() if quiet else tracing.span(f"stage {name}", stage=name, total=total):
+        with contextlib.nullcontext() if quiet else span(f"stage {name}", stage=name, total=total):
             yield stage
         if not quiet:
             self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started

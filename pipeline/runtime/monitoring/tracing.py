@@ -11,7 +11,6 @@ import atexit
 import contextlib
 import dataclasses
 import functools
-import logging
 import os
 import re
 import threading
@@ -19,16 +18,12 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from pipeline.runtime.monitoring.traces import ENDPOINTS, LOG, are_wanted
+
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace import SpanProcessor, TracerProvider
     from opentelemetry.trace import Span
 
-LOG = logging.getLogger("gablework.tracing")
-
-ENDPOINTS = ("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT")
-"""Variables that turn traces on."""
-SLOW_BUILDING_S = 1.0
-"""Seconds of a building from which it gets a span, unless `GABLEWORK_TRACE_BUILDING_S` has another number."""
 END_S = 5.0
 """Maximum seconds for sending the last spans when a process ends."""
 _TRACEPARENT = re.compile(r"00-([0-9a-f]{32})-([0-9a-f]{16})-([0-9a-f]{2})")
@@ -70,25 +65,10 @@ class Parent:
         return f"00-{self.trace_id:032x}-{self.span_id:016x}-{int(self.is_sampled):02x}"
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Part:
-    """A part of a task that gets a span of its own."""
-
-    name: str
-    """Its kind."""
-    began_s: float
-    ended_s: float
-    """Its times in seconds since 1970."""
-    error: str | None = None
-    """Why it failed."""
-    facts: Mapping[str, Any]
-    """Its attributes."""
-
-
 @functools.cache
 def is_on() -> bool:
     """Whether spans are made; read from the environment once."""
-    if not any(os.environ.get(name) for name in ENDPOINTS):
+    if not are_wanted():
         return False
     if os.environ.get("OTEL_SDK_DISABLED", "").lower() == "true" or os.environ.get("OTEL_TRACES_EXPORTER") == "none":
         return False
@@ -99,18 +79,6 @@ def is_on() -> bool:
         LOG.warning("%s asks for traces, which need OpenTelemetry: install gablework[otel]", " or ".join(ENDPOINTS))
         return False
     return True
-
-
-@functools.cache
-def slow_building_s() -> float:
-    """Seconds of a building from which it gets a span of its own; a number that makes no sense costs a warning."""
-    text = os.environ.get("GABLEWORK_TRACE_BUILDING_S", "")
-    with contextlib.suppress(ValueError):
-        seconds = float(text or SLOW_BUILDING_S)
-        if seconds >= 0.0:
-            return seconds
-    LOG.warning("GABLEWORK_TRACE_BUILDING_S is %r: give seconds from 0 on; %g is used", text, SLOW_BUILDING_S)
-    return SLOW_BUILDING_S
 
 
 def span(

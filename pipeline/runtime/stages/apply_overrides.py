@@ -21,10 +21,10 @@ from pipeline.runtime.plan import split_grid
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.cleanup import REDRAWN
+from pipeline.runtime.stages.footprint_sites import join_footprints
 from pipeline.runtime.stages.given_footprints import numbers_by_tile
 from pipeline.runtime.stages.ground import Ground
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
-from pipeline.runtime.stages.join import join_footprints
 from pipeline.runtime.stages.sites import (
     CandidateSite,
     FoundSites,

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export.point_files import COARSE, FOLDER, GLOBE_TILESET, TERRAIN, TILESET
+from pipeline.export.folders import POINTS_FOLDER
+from pipeline.export.point_files import COARSE, GLOBE_TILESET, TERRAIN, TILESET
 from pipeline.export.point_glb import ModelledPoints, points_glb, united
 from pipeline.export.point_octree import CELL_BITS, Cube
 from pipeline.export.tileset import TilesetNode, node_error_m, root_tileset
@@ -72,7 +73,7 @@ def write_coarse(task: CoarseTask) -> int:
     if len(points):
         origin_m = [value // MM for value in task.origin_mm]
         content = points_glb(points, task.key, {"origin_m": origin_m})
-        storage_at(task.run_dir).put(f"{FOLDER}/{task.key}", content)
+        storage_at(task.run_dir).put(f"{POINTS_FOLDER}/{task.key}", content)
     return len(points)
 
 
@@ -135,18 +136,18 @@ def write_coarse_points(
     counts = {at: made[place] for at, place in places.items()}
     root = _root(pyramid, context.plan, counts)
     extras = _extras(context.plan, tiles, sum(counts.values()), root)
-    written = {f"{FOLDER}/{tasks[places[at]].key}" for at, count in counts.items() if count}
-    storage.put(f"{FOLDER}/{TERRAIN}", _terrain(tiles.values(), terrain_spacing(all_tiles, context.plan.grid)))
-    written.add(f"{FOLDER}/{TERRAIN}")
+    written = {f"{POINTS_FOLDER}/{tasks[places[at]].key}" for at, count in counts.items() if count}
+    storage.put(f"{POINTS_FOLDER}/{TERRAIN}", _terrain(tiles.values(), terrain_spacing(all_tiles, context.plan.grid)))
+    written.add(f"{POINTS_FOLDER}/{TERRAIN}")
     globe = to_globe(context.plan.reference)
     on_globe = None if globe is None else root_tileset(root, extras, globe)
     if on_globe is not None:
-        storage.put(f"{FOLDER}/{GLOBE_TILESET}", on_globe)
-        written.add(f"{FOLDER}/{GLOBE_TILESET}")
+        storage.put(f"{POINTS_FOLDER}/{GLOBE_TILESET}", on_globe)
+        written.add(f"{POINTS_FOLDER}/{GLOBE_TILESET}")
     content = root_tileset(root, extras)
     if content is not None:
-        storage.put(f"{FOLDER}/{TILESET}", content)
-        written.add(f"{FOLDER}/{TILESET}")
+        storage.put(f"{POINTS_FOLDER}/{TILESET}", content)
+        written.add(f"{POINTS_FOLDER}/{TILESET}")
     return written
 
 

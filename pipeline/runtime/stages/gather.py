@@ -24,7 +24,6 @@ from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.sites import CandidateSite, PointRange
 from pipeline.runtime.stages.surroundings import NO_GROUND, NO_POINT, Surroundings, surroundings_of
 from pipeline.runtime.stages.window_points import bucket_paths
-from pipeline.strip_alignment import aligned_mm
 from pipeline.terrain.lattice import CELL_MM, HALF_DIAGONAL_M, NO_DATA
 from pipeline.tiling import MM, TileGrid, Window
 
@@ -299,7 +298,9 @@ def gather(
     ground_noise_m = noise_of_ground_m(around, len(points) / max(1, int(np.count_nonzero(cells))))
     digest.update(np.float64(ground_noise_m).tobytes())
     strip_offset_m = math.nan
-    if roof is not None:
+    if roof is not None and (own.strip != own.strip[:1]).any():
+        from pipeline.strip_alignment import aligned_mm
+
         xyz_mm, is_split, strip_offset_m = aligned_mm(xyz_mm, own.strip, is_split, roof.min_strip_offset_m)
     points_m = _in_metres(xyz_mm, origin_mm)
     candidate = Candidate(

@@ -11,6 +11,7 @@ import functools
 import hashlib
 import math
 from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +25,6 @@ from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.stages.cells import TileCells, digests_of, find_all_cells
 from pipeline.runtime.stages.cleanup import clear_tiles
-from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
 from pipeline.runtime.stages.surroundings import FOLDER, NO_POINT, distances_to_terrain
 from pipeline.runtime.stages.tile_content import ZoneSums, content_of_window, zone_sums_of
@@ -38,6 +38,9 @@ from pipeline.terrain.roofs_alone import SUPPORT_CELLS, roofs_alone
 from pipeline.terrain.scene_settings import APRON_M, ClassesInUse
 from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
+
+if TYPE_CHECKING:
+    from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
 
 _ABOUT_ROOFS_ALONE = (
     "no points lie around given footprints with points on {} m2: the points there count as roof, not ground, and a "

@@ -20,14 +20,13 @@ import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, UnreadableInputError
 from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
+from pipeline.io.places import file_at
 from pipeline.io.reading import heard_by, moved, one_input, stalled
 from pipeline.io.records import Share
-from pipeline.io.remote_file import RemoteFile, file_at
 from pipeline.io.storage import sha256_of
 from pipeline.io.strays import MOST_STRAYS
 from pipeline.model import IntArray, PointCloud, Reason
-from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
-from pipeline.runtime.isolation.progress_reports import report_progress
+from pipeline.runtime.isolation.limits import IsolationLimits, Loss
 from pipeline.runtime.plan import is_fetched_by_nodes, shares_of
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
@@ -201,6 +200,8 @@ def ingest_file(task: IngestTask) -> Ingested:
     if task.limits is None:
         with one_input(shown(task.path)):
             return _ingest_here(task)
+    from pipeline.runtime.isolation.isolated_items import supervise
+
     cancelled = functools.partial(_cancelled, task.scratch)
     ((_, found),) = supervise(_ingest_watched, [task], task.limits, cancelled, loads=(), one="reader")
     if isinstance(found, Loss):
@@ -222,6 +223,8 @@ def _lost(task: IngestTask, loss: Loss, limits: IsolationLimits) -> InputError:
 
 def _ingest_watched(task: IngestTask) -> Ingested:
     """As `ingest_file`, in the child process."""
+    from pipeline.runtime.isolation.progress_reports import report_progress
+
     with heard_by(report_progress):
         return _ingest_here(task)
 
@@ -232,6 +235,8 @@ def _ingest_here(task: IngestTask) -> Ingested:
         return _ingested(task)
     if task.known is not None and is_fetched_by_nodes(task.known, task.options):
         return dataclasses.replace(_ingested(task), path=shown(task.path))
+    from pipeline.io.remote_file import RemoteFile
+
     file = RemoteFile(task.path)
     copy = task.scratch.path("fetched", uuid4().hex, f"points{file.suffix}")
     try:

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import collections
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-import shapely
 
 from pipeline.kernels.union_find import united
 from pipeline.model import BoolArray, IntArray
@@ -26,9 +25,8 @@ from pipeline.runtime.scratch.outcomes import InParts, Place, brief_within, drop
 from pipeline.runtime.stages.border_facets import are_beyond, united_by_name
 from pipeline.runtime.stages.cleanup import clear_units
 from pipeline.runtime.stages.finished_surfaces import Finished, finished
-from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
 from pipeline.runtime.stages.open_fragments import BorderFacets, OpenSurfaces
-from pipeline.runtime.stages.sites import UNITS, CandidateSite, FoundSites, Joined, PointRange, largest_first, object_id
+from pipeline.runtime.stages.sites import UNITS, FoundSites, Joined
 from pipeline.runtime.stages.split import Splits
 from pipeline.runtime.stages.split_window import Split
 from pipeline.runtime.stages.stored_sites import joined_of, store_sites
@@ -38,7 +36,10 @@ from pipeline.terrain.candidates import NOWHERE, Surfaces
 from pipeline.terrain.fragment_sums import N_SUMS
 from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.terrain.settings import CandidateSettings
-from pipeline.tiling import MM, Tile, TileGrid
+from pipeline.tiling import Tile, TileGrid
+
+if TYPE_CHECKING:
+    from pipeline.runtime.stages.given_footprints import GivenFootprints
 
 _STAGE = "join"
 _TILES_ACROSS = 8
@@ -269,6 +270,8 @@ def join(
     plan = context.plan
     crs_name = plan.reference.named
     if footprints is not None:
+        from pipeline.runtime.stages.footprint_sites import join_footprints
+
         with context.progress.stage(_STAGE, 1) as counter:
             found = join_footprints(
                 splits.stored(context),
@@ -351,63 +354,3 @@ def join_tiles(
     done, _ = finished_within(last, None, settings)
     sites.append(TileSites(found=done, tiles=last.tiles))
     return sites_of(sites, grid, settings, crs_name), sum(one.found.small for one in sites)
-
-
-def join_footprints(
-    splits: Iterable[Split],
-    grid: TileGrid,
-    numbers: Mapping[Tile, Sequence[int]],
-    footprints: Sequence[Outline],
-    source_ids: Sequence[str],
-    crs_name: str,
-    given: GivenFootprints | None = None,
-) -> FoundSites:
-    """The candidates where footprints were given: one per footprint, also where it holds no point; splits in any order.
-
-    Parameters
-    ----------
-    numbers : mapping
-        By tile, the numbers of its footprints; its split numbers them from 0.
-    footprints, source_ids : sequences
-        The given outlines in metres, in the order of their numbers, and their own ids.
-    crs_name : str
-        Goes into the ids. A footprint without points is named by its smallest corner and its own id, and by its place
-        among those that share both.
-    given : GivenFootprints, optional
-        What else is known of them.
-    """
-    ranges: dict[int, list[PointRange]] = {}
-    lowest: dict[int, tuple[int, ...]] = {}
-    for s in sorted(splits, key=lambda s: s.tile):
-        if s.footprints is None:
-            continue
-        held = s.footprints
-        starts = held.starts.tolist()
-        for j, (key, point) in enumerate(zip(held.keys.tolist(), held.lowest_points_mm.tolist(), strict=True)):
-            owner = numbers[s.tile][key]
-            ranges.setdefault(owner, []).append(PointRange(tile=s.tile, start=starts[j], stop=starts[j + 1]))
-            lowest[owner] = min(lowest.get(owner, tuple(point)), tuple(point))
-    candidates = []
-    alike: collections.Counter[str] = collections.Counter()
-    for number, (footprint, source_id) in enumerate(zip(footprints, source_ids, strict=True)):
-        name, point = crs_name, lowest.get(number)
-        if point is None:
-            corner = min(map(tuple, shapely.get_coordinates(footprint).tolist()))
-            name, point = f"{crs_name}|{source_id}", (round(corner[0] * MM), round(corner[1] * MM), 0)
-            alike[f"{name} {point}"] += 1
-            name += "|" * (alike[f"{name} {point}"] - 1)
-        found = ranges.get(number, [])
-        candidates.append(
-            CandidateSite(
-                building_id=object_id(name, point),
-                owner=grid.tile_of(point[0], point[1]),
-                ranges=tuple(found),
-                points=sum(r.stop - r.start for r in found),
-                footprint=footprint,
-                source_id=source_id,
-                source_attributes=None if given is None else given.attributes[number],
-                given=None if given is None else given.heights[number],
-                overlap="" if given is None else given.overlaps[number],
-            )
-        )
-    return FoundSites(candidates=largest_first(candidates), rejected=())

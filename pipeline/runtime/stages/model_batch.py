@@ -9,6 +9,7 @@ import pickle
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -19,18 +20,19 @@ from pipeline.io.crs import SpatialReference
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, Guide, Reason, Status
-from pipeline.runtime.cluster.memory_needs import building_bytes
-from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
-from pipeline.runtime.isolation.replay_bundle import SUFFIX, Bundle, Incident, is_whole, write_bundle
+from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX, IsolationLimits, Loss
 from pipeline.runtime.monitoring.logs import LOG
 from pipeline.runtime.monitoring.tallies import TALLIES
-from pipeline.runtime.overrides.overrides_file import OwnModelling
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import DamagedError, Place, key_of, result_of
 from pipeline.runtime.stages.batch_figures import LOST, REJECTED, BatchFigures, Modelled
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.sites import CandidateSite, StoredGroup
 from pipeline.tiling import TileGrid
+
+if TYPE_CHECKING:
+    from pipeline.runtime.isolation.replay_bundle import Bundle, Incident
+    from pipeline.runtime.overrides.overrides_file import OwnModelling
 
 _BUNDLE_TIMEOUT_S = 60.0
 _NO_BUNDLE = "there is no bundle, since its points cannot be put together"
@@ -70,6 +72,8 @@ class BatchTask:
     @property
     def memory_bytes(self) -> int:
         """Estimated peak memory of the process that models them, one after the other."""
+        from pipeline.runtime.cluster.memory_needs import building_bytes
+
         limit_bytes = None if self.isolation is None else self.isolation.memory_bytes
         return building_bytes(self.group.figures.largest, limit_bytes)
 
@@ -156,8 +160,10 @@ def figures_of(batch: Batch) -> BatchFigures:
 
 def bundles_are_whole(task: BatchTask, figures: BatchFigures, _: str) -> bool:
     """Whether the bundles that a batch left in the quarantine are whole; not each loss has one."""
+    from pipeline.runtime.isolation.replay_bundle import is_whole
+
     lost = (model.building_id for model in figures.notable if model.reason in LOST)
-    bundles = [Path(task.quarantine, f"{building_id}{SUFFIX}") for building_id in lost]
+    bundles = [Path(task.quarantine, f"{building_id}{BUNDLE_SUFFIX}") for building_id in lost]
     return all(is_whole(bundle) for bundle in bundles if bundle.is_file())
 
 
@@ -232,6 +238,8 @@ def _here(task: BatchTask, sites: Sequence[CandidateSite]) -> Iterator[tuple[int
 
 def _in_child(task: BatchTask, sites: Sequence[CandidateSite], limits: IsolationLimits) -> Iterator[tuple[int, Packed]]:
     """Models made in a supervised child process, so that a building can only harm itself."""
+    from pipeline.runtime.isolation.isolated_items import supervise
+
     common = opened(task)
     cancelled = functools.partial(_cancelled, task)
     work = functools.partial(model_site, common)
@@ -295,6 +303,8 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
         result = failed_site(site, task.method, Reason.INTERNAL_ERROR, f"{type(error).__name__}: {error}")
     seconds = time.perf_counter() - started
     if result.reason is Reason.INTERNAL_ERROR:
+        from pipeline.runtime.isolation.replay_bundle import Incident
+
         incident = Incident(reason=result.reason.value, detail=result.reason_detail, seconds=seconds)
         result = _quarantined(task, candidate, result, incident)
         made_from = ""
@@ -336,6 +346,8 @@ def _lost(
     task: BatchTask, site: CandidateSite, loss: Loss, limits: IsolationLimits, cancelled: Callable[[], bool]
 ) -> Packed:
     """The record and the bundle of a building that ended its process; also made in a child."""
+    from pipeline.runtime.isolation.isolated_items import supervise
+
     patient = dataclasses.replace(limits, timeout_s=max(limits.timeout_s, _BUNDLE_TIMEOUT_S))
     describe = functools.partial(lost_site, task, loss)
     ((_, described),) = supervise(describe, [site], patient, cancelled, second_chance=False, loads=_loads(task))
@@ -349,6 +361,7 @@ def _lost(
 def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
     """The record of a building that ended its process, and its bundle in the quarantine."""
     from pipeline.recipe import failed_building  # as above
+    from pipeline.runtime.isolation.replay_bundle import Incident
 
     task = task.way_of(site)
     candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, task.settings.roof, task.guides)
@@ -371,6 +384,8 @@ def _quarantined(
         return result
     if candidate is None:
         return dataclasses.replace(result, reason_detail=f"{result.reason_detail}; {_NO_BUNDLE}")
+    from pipeline.runtime.isolation.replay_bundle import Bundle, write_bundle
+
     bundle = Bundle(
         candidate=candidate,
         method=task.method,

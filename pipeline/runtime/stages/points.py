@@ -6,7 +6,8 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
-from pipeline.export.point_files import FOLDER, INDEX
+from pipeline.export.folders import POINTS_FOLDER
+from pipeline.export.point_files import INDEX
 from pipeline.io import storage_at
 from pipeline.runtime.plan import window_bytes
 from pipeline.runtime.run_context import ProgressUnits, RunContext
@@ -52,7 +53,7 @@ def write_points(
     stage = writing_points(output.run_dir)
     there: set[str] = set()
     if scratch.attempt:
-        found = (key.split("/") for key in storage.keys(FOLDER))
+        found = (key.split("/") for key in storage.keys(POINTS_FOLDER))
         there = {key[1] for key in found if len(key) == 3 and key[2] == INDEX}
     tasks = _tasks(context, settings, joined, models, output)
     tasks = {
@@ -72,7 +73,7 @@ def write_points(
     wanted = {place.unit for place in good}
     if good:
         wanted |= write_coarse_points(context, good, sorted(output.splits.places), output.run_dir)
-    for key in storage.keys(FOLDER) if there else []:
+    for key in storage.keys(POINTS_FOLDER) if there else []:
         # the tasks of tiles have removed what they no longer have
         if key not in wanted and key.split("/")[1] not in wanted:
             storage.delete(key)

@@ -20,7 +20,7 @@ from pipeline.io import LocalStorage, Storage, is_url, storage_at
 from pipeline.io.storage import Puts, sha256_of
 from pipeline.model import BuildingResult, Reason, Status
 from pipeline.quality.detection import confidence_of_rejected
-from pipeline.runtime.isolation.replay_bundle import SUFFIX
+from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
@@ -333,7 +333,7 @@ def _put_bundles(task: PublishTask, storage: Storage) -> tuple[dict[str, str], s
     for place in task.batches:
         figures: BatchFigures = brief_of(task.scratch, place)
         for model in figures.notable:
-            bundle = Path(task.scratch.root, QUARANTINE, f"{model.building_id}{SUFFIX}")
+            bundle = Path(task.scratch.root, QUARANTINE, f"{model.building_id}{BUNDLE_SUFFIX}")
             if model.status != Status.FAILED.value or not bundle.is_file():
                 continue
             content = bundle.read_bytes()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from pipeline.runtime.scratch.outcomes import (
     run_and_store,
     whole,
 )
-from pipeline.runtime.stages.given_footprints import GivenFootprints
 from pipeline.runtime.stages.ground import BlockCells, cells_of_blocks
 from pipeline.runtime.stages.ingest import ingest, tasks_of
 from pipeline.runtime.stages.ingested import Ingested, slices_in
@@ -28,6 +28,9 @@ from pipeline.terrain.flight_passes import passes_of
 from pipeline.terrain.flight_strip import Strip
 from pipeline.terrain.strip_moves import moves_of, offsets_of, strips_warning, surfaces_warning
 from pipeline.terrain.survey_strips import NO_ROWS, Rows, counted, rows_of
+
+if TYPE_CHECKING:
+    from pipeline.runtime.stages.given_footprints import GivenFootprints
 
 _STRIPS = "strips"
 """The stage under which it is stored how strips that were moved differ in the files."""

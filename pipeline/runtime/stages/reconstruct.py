@@ -6,16 +6,15 @@ import dataclasses
 import operator
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.model import Status
-from pipeline.runtime.monitoring.tracing import Part, slow_building_s
-from pipeline.runtime.overrides.overrides_file import own_modelling
+from pipeline.runtime.monitoring.traces import Part, slow_building_s
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, keys_of, result_of
 from pipeline.runtime.stages.batch_figures import LOST, BatchFigures, Counted, Modelled
-from pipeline.runtime.stages.given_guides import GivenGuides
 from pipeline.runtime.stages.model_batch import (
     Batch,
     BatchTask,
@@ -28,6 +27,10 @@ from pipeline.runtime.stages.model_batch import (
 from pipeline.runtime.stages.sites import Joined, folders_around
 from pipeline.settings import RunSettings
 from pipeline.tiling import Tile
+
+if TYPE_CHECKING:
+    from pipeline.runtime.overrides.overrides_file import Override, OwnModelling
+    from pipeline.runtime.stages.given_guides import GivenGuides
 
 QUARANTINE = "quarantine"
 """Folder of a run directory, and of scratch, for the bundles of buildings that ended their process."""
@@ -90,7 +93,7 @@ def reconstruct(
         owner, figures = group.figures.owner, group.figures
         if owner not in earlier:
             earlier[owner] = tuple(Place(stage, owner.key, key) for key in keys_of(scratch, stage, owner.key))
-        own = {building_id: own_modelling(override, settings) for building_id, override in figures.overridden}
+        own = _own(figures.overridden, settings)
         near = () if guides is None else guides.near(figures.tiles, plan.grid)
         key = key_of(alike, figures.digest, joined.around(figures.tiles), own, *near)
         place = Place(stage, owner.key, key)
@@ -142,6 +145,15 @@ def reconstruct(
     drop_outcomes(scratch, stage, tasks)
     counted = Counted.of(found.values(), made)
     return Models(places=dict(sorted(places.items())), scratch=scratch, contents=contents, counted=counted)
+
+
+def _own(overridden: Sequence[tuple[str, Override]], settings: RunSettings) -> dict[str, OwnModelling]:
+    """Method and settings of the buildings that have their own, by building_id."""
+    if not overridden:
+        return {}
+    from pipeline.runtime.overrides.overrides_file import own_modelling
+
+    return {building_id: own_modelling(override, settings) for building_id, override in overridden}
 
 
 def _tell(context: RunContext, model: Modelled) -> None:

@@ -12,7 +12,6 @@ from pipeline.model import Reason
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.gather import canonical_order
 from pipeline.runtime.stages.sites import RejectedSite
-from pipeline.strip_alignment import disagreement_m
 from pipeline.terrain.candidates import Verdict
 from pipeline.tiling import MM
 
@@ -34,6 +33,8 @@ def _judged(site: RejectedSite, scratch: Scratch, min_offset_m: float) -> Reject
     points = np.concatenate(pieces)
     if (points["source"] == points["source"][0]).all():
         return site
+    from pipeline.strip_alignment import disagreement_m
+
     points = points[canonical_order(points)]
     places = np.column_stack([points[axis].astype(np.int64) - int(points[axis][0]) for axis in "xyz"]) / MM
     apart_m = disagreement_m(places, points["source"], min_offset_m)

@@ -6,17 +6,19 @@ import base64
 import dataclasses
 import hashlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from shapely import MultiPolygon, Polygon
 
 from pipeline.model import GivenHeights
-from pipeline.runtime.overrides.overrides_file import Override
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import Place, part_of
 from pipeline.runtime.stages.window_points import folders_of
 from pipeline.terrain.candidates import Verdict
 from pipeline.tiling import MM, Tile, TileGrid, Window
+
+if TYPE_CHECKING:
+    from pipeline.runtime.overrides.overrides_file import Override
 
 UNITS = "units"
 """The stage under which the sites of tiles are stored, and the folder of scratch with the points of units."""

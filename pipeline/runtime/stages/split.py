@@ -7,13 +7,13 @@ import functools
 import operator
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from pipeline.runtime.plan import split_grid, window_bytes
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.kept_files import Files
 from pipeline.runtime.scratch.outcomes import Place, key_of, result_of
 from pipeline.runtime.stages.cleanup import clear_tiles
-from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline, numbers_by_tile
 from pipeline.runtime.stages.ground import Ground, terrain_of_window, terrain_window
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, content_by_tile, points_by_tile
 from pipeline.runtime.stages.split_window import Split, SplitFigures, SplitTask, is_intact, split_window
@@ -22,6 +22,9 @@ from pipeline.runtime.stages.window_points import folders_of
 from pipeline.settings import RunSettings
 from pipeline.terrain.scene_settings import ClassesInUse
 from pipeline.tiling import Tile, TileGrid
+
+if TYPE_CHECKING:
+    from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -78,8 +81,13 @@ def split(
         tiles = Counter({tile: points for tile, points in tiles.items() if tile in only})
     if why:
         progress.warn("split", why)
-    polygons = () if footprints is None else footprints.polygons
-    numbers = {} if footprints is None else numbers_by_tile(tiles, plan.grid, polygons)
+    polygons: Sequence[Outline] = ()
+    numbers: Mapping[Tile, Sequence[int]] = {}
+    if footprints is not None:
+        from pipeline.runtime.stages.given_footprints import numbers_by_tile
+
+        polygons = footprints.polygons
+        numbers = numbers_by_tile(tiles, plan.grid, polygons)
     # the fullest first, so that no long task is left for the end
     order = [tile for tile, _ in sorted(tiles.items(), key=lambda item: (-item[1], item[0]))]
     outlines = {tile: None if footprints is None else tuple(polygons[k] for k in numbers[tile]) for tile in order}

@@ -13,10 +13,11 @@ import numpy as np
 
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.export.coordinates import SpatialReference, one_unit
-from pipeline.export.terrain import FOLDER, in_crs, terrain_lines, terrain_obj, terrain_path
+from pipeline.export.folders import TERRAIN_FOLDER
+from pipeline.export.terrain import in_crs, terrain_lines, terrain_obj, terrain_path
 from pipeline.io import storage_at
 from pipeline.model import BuildingResult, FaceKind
-from pipeline.runtime.cluster.memory_needs import WINDOW_BASE_BYTES
+from pipeline.runtime.plan import WINDOW_BASE_BYTES
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files
@@ -104,7 +105,7 @@ def write_terrain(
     scratch, storage = context.scratch, storage_at(run_dir)
     stage, there = writing_terrain(run_dir), set[str]()
     if scratch.attempt:
-        there = {key for key in storage.keys(FOLDER) if not key.rpartition("/")[2].startswith(".")}
+        there = {key for key in storage.keys(TERRAIN_FOLDER) if not key.rpartition("/")[2].startswith(".")}
     floors = _floors_reaching(context, models)
     tasks = {}
     for tile in sorted(ground.tiles):

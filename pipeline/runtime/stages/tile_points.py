@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import RunCancelledError
-from pipeline.export.point_files import FOLDER, INDEX, TILESET
+from pipeline.export.folders import POINTS_FOLDER
+from pipeline.export.point_files import INDEX, TILESET
 from pipeline.export.point_glb import (
     NO_BUILDING,
     NO_PLANE,
@@ -123,7 +124,7 @@ def _written(task: PointsTask, storage: Storage) -> InParts[TilePoints]:
     # what points of one place carry gives them an order
     ties = (points.point_class.astype(np.int64) << 32) | (points.building.astype(np.int64) << 16) | points.plane
     tree = octree_of(points.xyz_mm, ties, cube, task.above)
-    folder = f"{FOLDER}/{tile.key}"
+    folder = f"{POINTS_FOLDER}/{tile.key}"
     origin_m = [value // MM for value in origin_mm]
     written = set()
     with storage.several(scratch.check_cancelled) as puts:

@@ -40,7 +40,6 @@ from pipeline.runtime.stages.split_window import Split
 from pipeline.runtime.stages.stored_sites import SitesBrief, scale_of, stored_sites
 from pipeline.runtime.stages.tile_sites import TileSites, TileSitesFigures, sites_of
 from pipeline.runtime.stages.window_points import folders_of
-from pipeline.strip_alignment import strip_offsets_m
 from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.terrain.units import smallest_points, units_of
 from pipeline.tiling import MM, Tile, TileGrid
@@ -258,6 +257,8 @@ def _aligned_mm(
     source = points["source"]
     if len(points) == 0 or (source == source[0]).all():
         return xyz_mm
+    from pipeline.strip_alignment import strip_offsets_m
+
     order = canonical_order(points)
     places = np.column_stack([values[order] - values[order[0]] for values in xyz_mm]) / MM
     offsets = np.empty_like(places)

@@ -19,7 +19,7 @@ from pipeline.export.coordinates import one_unit
 from pipeline.export.geoparquet import read_table
 from pipeline.io import arrow_at, is_url, place_below, storage_at
 from pipeline.io.crs import resolve_reference
-from pipeline.io.remote_file import file_at
+from pipeline.io.places import file_at
 from pipeline.model import FaceKind, RoofType, Solid, SolidFace, Status
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel, RoofSurface
 from pipeline.ruler.evaluation.reading.cityjson import features
@@ -27,7 +27,8 @@ from pipeline.ruler.evaluation.reading.cityjson_geometry import chosen, parts_of
 from pipeline.ruler.evaluation.reading.collected import Collected
 from pipeline.ruler.evaluation.reading.raw import MILLIMETRES_PER_METRE, RawPart
 from pipeline.ruler.evaluation.reading.surfaces import GRID_M
-from pipeline.runtime.manifest import NAME, RunStatus, city_unit_m, read_manifest
+from pipeline.runtime.manifest import NAME, RunStatus
+from pipeline.runtime.manifest_reading import city_unit_m, read_manifest
 
 _CONDITIONS = "conditions.parquet"
 Solids = dict[str, tuple[tuple[Solid, ...], tuple[float, float, float]]]

@@ -1,0 +1,124 @@
+"""Commands that model single buildings of a run again."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.options import (
+    BUILDING_MEMORY_GIB,
+    BUILDING_TIMEOUT_S,
+    INPUT_TIMEOUT_S,
+    AsJson,
+    BuildingMemory,
+    BuildingTimeout,
+    InputTimeout,
+    Isolate,
+    Quiet,
+    Scheduler,
+    TlsCa,
+    TlsCert,
+    TlsKey,
+    Workers,
+    tls_files,
+)
+from pipeline.console import Console, ExitCode
+from pipeline.runtime.isolation.preloading import start_early
+
+
+def rerun(
+    run_dir: Annotated[str, typer.Argument(metavar="RUN", help="The directory of a finished run.")],
+    overrides: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="The overrides that replace the run's; default its own file."),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID", help="A building to model again in any case; repeat --only for several."),
+    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+    isolate: Annotated[bool | None, Isolate] = None,
+    input_timeout: InputTimeout = INPUT_TIMEOUT_S,
+    building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
+    building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Model single buildings of a run again, after other overrides; all others stay untouched."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.runtime.compiling import compile_for, kernel_groups
+        from pipeline.runtime.earlier import earlier_run, request_of
+        from pipeline.runtime.rerun import RerunRequest
+        from pipeline.runtime.rerun import rerun as rerun_buildings
+        from pipeline.runtime.resources import Resources
+
+        request = RerunRequest(
+            run_dir=run_dir,
+            overrides=overrides,
+            only=tuple(only or ()),
+            resources=Resources(
+                workers=workers,
+                scheduler=scheduler,
+                tls=tls_files(tls_ca, tls_cert, tls_key),
+                isolate=isolate,
+                input_timeout_s=input_timeout,
+                building_timeout_s=building_timeout,
+                building_memory_bytes=round(building_memory * 2**30),
+            ),
+        )
+        earlier = request_of(earlier_run(run_dir).manifest)
+        general = earlier.settings.general
+        groups = kernel_groups(method=general.method, terrain=general.terrain)
+        compile_for(console.on_event, groups, earlier.inputs, (overrides,), scheduler=scheduler)
+        start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=False, method=general.method)
+        summary = rerun_buildings(request, console.on_event)
+        console.table("Made again", ["building", "status"], list(summary.buildings.items()))
+        console.say(f"{len(summary.buildings)} buildings, {len(summary.tiles)} tiles written, {summary.seconds:.1f} s")
+        console.say(f"content sha256 {summary.digest}")
+        console.document(dataclasses.asdict(summary))
+
+
+def replay(
+    bundle: Annotated[str, typer.Argument(metavar="BUNDLE", help="A file of a run's quarantine folder.")],
+    isolate: Annotated[bool, Isolate] = True,
+    building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
+    building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
+    out: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Write the record, and the model as OBJ and CityJSON, here.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Model one quarantined building again, from its bundle alone."""
+    with Console(as_json=as_json) as console:
+        from pipeline import __version__
+        from pipeline.io.places import on_this_machine
+        from pipeline.runtime.isolation.limits import IsolationLimits
+        from pipeline.runtime.isolation.replay_bundle import read_bundle
+        from pipeline.runtime.replay import replay as replay_building
+        from pipeline.runtime.replay import replay_row, write_replay
+
+        limits = IsolationLimits(timeout_s=building_timeout, memory_bytes=round(building_memory * 2**30))
+        with on_this_machine(bundle) as file:
+            found = read_bundle(str(file))
+        if found.incident.engine_version != __version__:
+            console.warn(f"it happened to gablework {found.incident.engine_version}; this is {__version__}")
+        console.say(f"{found.candidate.building_id} in its run: {found.incident.reason}, {found.incident.detail}")
+        replayed = replay_building(found, limits if isolate else None)
+        row = replay_row(found, replayed)
+        console.table("This time", ["column", "value"], [(name, value) for name, value in row.items() if value != []])
+        if replayed.loss is not None and replayed.loss.stderr:
+            console.say(f"the last lines of its process:\n{replayed.loss.stderr}")
+        written = [str(path) for path in write_replay(out, found, replayed)] if out is not None else []
+        for path in written:
+            console.say(f"wrote {path}")
+        incident = dataclasses.asdict(found.incident)
+        stderr = "" if replayed.loss is None else replayed.loss.stderr
+        console.document({"incident": incident, "record": dict(row), "stderr": stderr, "written": written})
+        if row["status"] == "failed":
+            raise typer.Exit(ExitCode.TILES_FAILED)
