@@ -30,6 +30,7 @@ from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from typing import Any
 
+from pipeline.backoff import Backoff
 from service.jobs import Fault, Job, JobFailure, JobRequest, JobStatus
 
 SECRET_PREFIX = "whsec_"  # noqa: S105 - the prefix that the standard gives to secrets
@@ -44,8 +45,6 @@ PROGRESS_S = 10.0
 
 LONGEST_PAUSE_S = 4.0 * 3600.0
 """Longest pause between two attempts: a receiver that comes back after a night gets its news within the morning."""
-_GROWTH = 3.0
-"""Each pause is so many times the one before: about ten attempts in a day."""
 
 ROOM = 24
 """Most deliveries of one endpoint that wait in rows of their own. Others wait as events, which all endpoints share."""
@@ -287,16 +286,6 @@ class Result:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RetryPolicy:
-    """For how long a delivery is tried."""
-
-    hours: float
-    """Hours from the event, or from a replay."""
-    first_pause_s: float
-    """Seconds before the second attempt."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Verdict:
     """What becomes of a delivery after an attempt."""
 
@@ -306,20 +295,14 @@ class Verdict:
     reason: str | None = None
 
 
-def pause_s(attempts: int, policy: RetryPolicy, chance: float) -> float:
-    """Seconds after a number of failed attempts; `chance` in [0, 1) spreads receivers that fail together.
-
-    >>> policy = RetryPolicy(hours=24.0, first_pause_s=5.0)
-    >>> [round(pause_s(n, policy, 0.5)) for n in (1, 2, 3, 7, 8, 20)]
-    [5, 15, 45, 3645, 10935, 14400]
-    >>> pause_s(1, policy, 0.0), pause_s(500, policy, 0.0)
-    (2.5, 7200.0)
-    """
-    grown = policy.first_pause_s * _GROWTH ** min(attempts - 1, 50)
-    return min(grown, LONGEST_PAUSE_S) * (0.5 + chance)
+def retry_policy(hours: float, first_pause_s: float) -> Backoff:
+    """When a delivery is tried again, for so many hours from its event or from a replay: about ten times in a day."""
+    return Backoff(
+        first_s=first_pause_s, longest_s=LONGEST_PAUSE_S, factor=3.0, jitter=(0.5, 1.5), limit_s=hours * 3600.0
+    )
 
 
-def verdict(delivery: Delivery, result: Result, now: dt.datetime, policy: RetryPolicy, chance: float) -> Verdict:
+def verdict(delivery: Delivery, result: Result, now: dt.datetime, policy: Backoff, chance: float) -> Verdict:
     """What becomes of a delivery whose attempt has just ended."""
     if result.is_success:
         return Verdict(state=DeliveryState.DELIVERED)
@@ -327,12 +310,13 @@ def verdict(delivery: Delivery, result: Result, now: dt.datetime, policy: RetryP
         return Verdict(state=DeliveryState.GONE, reason="the receiver answered 410: nothing more is sent to this URL")
     if result.is_final:
         return Verdict(state=DeliveryState.FAILED, reason=result.error)
-    pause = max(pause_s(delivery.attempts, policy, chance), min(result.retry_after_s, LONGEST_PAUSE_S))
-    due_at = now + dt.timedelta(seconds=pause)
-    if due_at > delivery.tried_since + dt.timedelta(hours=policy.hours):
-        reason = f"tried for {policy.hours:g} hours; the last time: {result.error}"
+    elapsed_s = (now - delivery.tried_since).total_seconds()
+    wanted_s = min(result.retry_after_s, LONGEST_PAUSE_S)
+    pause_s = policy.pause_s(delivery.attempts, elapsed_s=elapsed_s, draw=chance, wanted_s=wanted_s)
+    if pause_s is None:
+        reason = f"tried for {policy.limit_s / 3600.0:g} hours; the last time: {result.error}"
         return Verdict(state=DeliveryState.FAILED, reason=reason)
-    return Verdict(state=DeliveryState.WAITING, due_at=due_at, reason=result.error)
+    return Verdict(state=DeliveryState.WAITING, due_at=now + dt.timedelta(seconds=pause_s), reason=result.error)
 
 
 # --- the job as it was

@@ -13,7 +13,7 @@ from service.errors import LeaseLostError, NoSuchDeliveryError, NoSuchWebhookErr
 from service.jobs import Fault, Job, JobFailure, JobStatus, Subscriber
 from service.store import DeliveryFilter, JobStore
 from service.store.tables import WEBHOOK_DELIVERIES, WEBHOOK_EVENTS, WEBHOOK_SECRETS, WEBHOOKS
-from service.webhooks import PROGRESS_S, Delivery, DeliveryState, EventType, Parcel, Result, RetryPolicy
+from service.webhooks import PROGRESS_S, Delivery, DeliveryState, EventType, Parcel, Result, retry_policy
 
 URL = "https://hooks.example.org/a"
 SUBSCRIBER = Subscriber(
@@ -22,7 +22,7 @@ SUBSCRIBER = Subscriber(
     failed_uri="https://a.example/f",
     base="http://h",
 )
-POLICY = RetryPolicy(hours=1.0, first_pause_s=100.0)
+POLICY = retry_policy(1.0, 100.0)
 TAKEN = Result(duration_ms=3, status=204, body="{}")
 REFUSED = Result(duration_ms=3, status=500, error="the receiver answered 500", body="{}")
 

@@ -10,6 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
+from pipeline.backoff import Backoff
 from service.errors import NoSuchDeliveryError, NotReplayableError
 from service.files import is_id
 from service.jobs import Job
@@ -26,7 +27,6 @@ from service.webhooks import (
     EventType,
     Parcel,
     Result,
-    RetryPolicy,
     job_of,
     verdict,
 )
@@ -224,7 +224,7 @@ def settle(
     ended: Sequence[tuple[Parcel, Result]],
     *,
     now: dt.datetime,
-    policy: RetryPolicy,
+    policy: Backoff,
     chance: Callable[[], float],
 ) -> list[DeliveryState | None]:
     """Write how attempts ended, and what becomes of the deliveries: their states.

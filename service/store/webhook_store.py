@@ -7,6 +7,7 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from pipeline.backoff import Backoff
 from service import deliveries as deliveries_of_requests
 from service.errors import LeaseLostError
 from service.receivers import Avoided, Due
@@ -17,7 +18,7 @@ from service.store.backlog import Refilled
 from service.store.database import LOCK_SECRETS, LOCK_SUBMISSIONS, Database
 from service.store.delivering import creating
 from service.store.webhook_deliveries import DeliveryFilter
-from service.webhooks import Delivery, DeliveryState, Endpoint, EventType, Parcel, Result, RetryPolicy, SigningSecret
+from service.webhooks import Delivery, DeliveryState, Endpoint, EventType, Parcel, Result, SigningSecret
 
 
 class WebhookStore:
@@ -249,7 +250,7 @@ class WebhookStore:
             self._database.lock(connection, LOCK_SECRETS)
             return deliveries.take(connection, chosen, driver, now=self._database.now(connection), lease_s=lease_s)
 
-    def settle(self, parcel: Parcel, result: Result, policy: RetryPolicy) -> DeliveryState:
+    def settle(self, parcel: Parcel, result: Result, policy: Backoff) -> DeliveryState:
         """Write how an attempt ended; the state of the delivery afterwards.
 
         Raises
@@ -264,7 +265,7 @@ class WebhookStore:
         return state
 
     def settle_all(
-        self, ended: Sequence[tuple[Parcel, Result]], policy: RetryPolicy
+        self, ended: Sequence[tuple[Parcel, Result]], policy: Backoff
     ) -> builtins.list[DeliveryState | None]:
         """Write how attempts ended, in one transaction; the states of the deliveries.
 

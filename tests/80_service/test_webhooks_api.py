@@ -11,11 +11,11 @@ from service.jobs import JobStatus, Subscriber
 from service.keys import Scope
 from service.settings import ServiceSettings
 from service.store import DeliveryFilter
-from service.webhooks import ROOM, EventType, Result, RetryPolicy
+from service.webhooks import ROOM, EventType, Result, retry_policy
 
 LISTED = "http://127.0.0.1:9"
 HOOK = f"{LISTED}/hook"
-POLICY = RetryPolicy(hours=1.0, first_pause_s=100.0)
+POLICY = retry_policy(1.0, 100.0)
 
 
 @pytest.fixture
