@@ -291,7 +291,7 @@ class Attempts:
         headers = {
             "Content-Type": "application/json",
             "User-Agent": f"gablework/{__version__}",
-            **signed_headers(parcel.secrets, delivery.delivery_id, int(parcel.sent_at.timestamp()), raw),
+            **signed_headers(parcel.secret, delivery.delivery_id, int(parcel.sent_at.timestamp()), raw),
         }
         here = tracing.current()
         if here is not None:

@@ -203,14 +203,14 @@ def take(
         if event is not None and event.event_id not in jobs:
             jobs[event.event_id] = job_of(event.snapshot)
         endpoint = endpoints.get(row.endpoint_id)
-        secret = own_secrets[row.owner] if endpoint is None else webhooks.secret_of(endpoint)
+        secret = own_secrets[row.owner] if endpoint is None else endpoint.secret
         parcels.append(
             Parcel(
                 delivery=dataclasses.replace(_delivery(row), attempts=row.attempts + 1, body=_body(row, event)),
                 driver=name,
                 job=job_of(row.snapshot) if event is None else jobs[event.event_id],
                 base=row.base,
-                secrets=secret.valid(now),
+                secret=secret,
                 sent_at=now,
                 event_id=row.event_id,
                 payer=payers[row.delivery_id],
