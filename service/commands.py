@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import datetime as dt
 import functools
 import os
@@ -220,15 +221,14 @@ def backup(
     with Console(as_json=as_json) as console, _service_errors():
         from service.backup import back_up
         from service.files import StateFolder
-        from service.store import JobStore
 
         settings = _settings(state=state, database_url=database_url)
-        with JobStore(settings.database) as store:
-            report = back_up(store, StateFolder(settings.state), Path(to), console.status)
+        console.status(f"copying {settings.state} to {to}")
+        report = back_up(settings.database, StateFolder(settings.state), Path(to))
         for name in report.missing:
             console.warn(f"{name} is in the database and not in the state folder: the backup does not have it")
-        console.say(f"{to} holds the service of {report.made:%Y-%m-%d %H:%M:%S} UTC: {report.sentence}")
-        console.document({"backup": to, **report.as_dict()})
+        console.say(f"{to} holds the service, {report.sentence}")
+        console.document({"backup": to, **dataclasses.asdict(report)})
 
 
 def restore(
@@ -243,15 +243,12 @@ def restore(
         from service.files import StateFolder
 
         settings = _settings(state=state, database_url=database_url)
-        folder = StateFolder(settings.state)
-        report, freed = restore_service(Path(source), folder, settings.database, console.status)
+        console.status(f"copying {source} to {settings.state}")
+        report, freed = restore_service(Path(source), StateFolder(settings.state), settings.database)
         for name in report.missing:
-            console.warn(f"{name} was lost before the backup was made: the restored service does not have it")
-        console.say(
-            f"{settings.state} holds the service of {report.made:%Y-%m-%d %H:%M:%S} UTC: {report.sentence}; "
-            f"{freed} running jobs wait again"
-        )
-        console.document({"state": str(settings.state), "waitingAgain": freed, **report.as_dict()})
+            console.warn(f"{name} is in the database and not in the backup: the restored service does not have it")
+        console.say(f"{settings.state} holds the service, {report.sentence}; {freed} running jobs wait again")
+        console.document({"state": str(settings.state), "waitingAgain": freed, **dataclasses.asdict(report)})
 
 
 # --- keys ------------------------------------------------------------------------------------------------------------

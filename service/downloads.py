@@ -19,6 +19,7 @@ from urllib.parse import unquote
 
 import httpx
 
+from pipeline.backoff import Backoff
 from pipeline.errors import RunCancelledError, UnreadableInputError
 from service.disk import FULL, MAKE_ROOM, Disk
 from service.errors import NoSpaceError, TooLargeError
@@ -27,11 +28,8 @@ from service.input_policy import checked_url, shown
 from service.pace import Pace, look_s
 from service.settings import ServiceSettings
 
-ATTEMPTS = 4
-"""Attempts to fetch a file."""
-FIRST_PAUSE_S = 1.0
-"""Seconds before the second attempt; each further pause is four times the one before."""
-LONGEST_PAUSE_S = 60.0
+BACKOFF = Backoff(first_s=1.0, longest_s=60.0, factor=4.0, attempts=4)
+"""Attempts to fetch a file. A server that asks for a longer pause than the longest gets that."""
 PASSING = frozenset({408, 425, 429, 500, 502, 503, 504})
 """Status codes after which another attempt may help."""
 REDIRECTS = frozenset({301, 302, 303, 307, 308})
@@ -74,10 +72,10 @@ def pause_s(attempt: int, *, status: int | None, retry_after: str | None = None)
     >>> pause_s(1, status=404) is None
     True
     """
-    if attempt >= ATTEMPTS or (status is not None and status not in PASSING):
+    if status is not None and status not in PASSING:
         return None
     wanted = float(retry_after) if retry_after is not None and retry_after.isascii() and retry_after.isdigit() else 0.0
-    return min(max(FIRST_PAUSE_S * 4.0 ** (attempt - 1), wanted), LONGEST_PAUSE_S)
+    return BACKOFF.pause_s(attempt, wanted_s=min(wanted, BACKOFF.longest_s))
 
 
 class _PassingError(Exception):

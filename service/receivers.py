@@ -9,6 +9,8 @@ import dataclasses
 from collections import Counter
 from collections.abc import Sequence
 
+from pipeline.backoff import Backoff
+
 SENDERS = 256
 """Messages that one driver sends at once. Each has a thread, which mostly waits."""
 MAX_SLOW = SENDERS // 4
@@ -20,7 +22,6 @@ SLOW_S = 1.0
 """Seconds from which on an answer counts as slow."""
 LONGEST_REST_S = 300.0
 """Longest rest of a receiver that cannot be reached, so that one that is back gets its news soon."""
-_GROWTH = 3.0
 _MAX_KNOWN = 2000
 """Most receivers that are remembered; beyond it those to which nothing is sent are forgotten."""
 
@@ -74,7 +75,7 @@ class Receivers:
     """
 
     def __init__(self, first_rest_s: float) -> None:
-        self._first_rest_s = first_rest_s
+        self._rests = Backoff(first_s=first_rest_s, longest_s=LONGEST_REST_S, factor=3.0)
         self._known: dict[str, _Known] = {}
 
     @property
@@ -93,8 +94,7 @@ class Receivers:
         known.began_s, known.is_slow, known.rests_until_s = None, duration_s > SLOW_S, 0.0
         known.failures = 0 if was_reached else known.failures + 1
         if not was_reached:
-            grown = self._first_rest_s * _GROWTH ** min(known.failures - 1, 50)
-            known.rests_until_s = now_s + min(grown, LONGEST_REST_S)
+            known.rests_until_s = now_s + self._rests.bound_s(known.failures)
         elif not known.is_slow:
             # most are quick: nothing has to be remembered of them
             del self._known[receiver]

@@ -280,26 +280,6 @@ def create(
             raise
 
 
-def copy_unfinished(place: Path, target: Path) -> bool:
-    """Copy the folder of an unfinished upload, to which others may write meanwhile; False if it is gone.
-
-    Of the copy only those bytes count that were on the disk when the copy began: a client sends the others again.
-    """
-    try:
-        progress = dataclasses.replace(_progress(place), boot=None)
-    except (FileNotFoundError, ValueError):
-        return False
-    try:
-        shutil.copytree(place, target, ignore=shutil.ignore_patterns(_PROGRESS, "*.new"))
-        _write_progress(target, progress)
-    except (FileNotFoundError, shutil.Error):
-        shutil.rmtree(target, ignore_errors=True)
-        if (place / _FILE).exists():
-            raise
-        return False
-    return True
-
-
 def new_id() -> str:
     """The id of a new upload: random, so it cannot be guessed."""
     return uuid.uuid4().hex

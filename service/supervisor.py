@@ -21,17 +21,15 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI
 
+from pipeline.backoff import Backoff
 from service.app import create_app, start
 from service.connections import listen, server_config
 from service.errors import StoreError
 from service.settings import ServiceSettings
 from service.store import JobStore
 
-MIN_PAUSE_S = 0.5
-"""Seconds before a driver that died is started again, the first time."""
-
-LONGEST_PAUSE_S = 5.0
-"""Maximum seconds before it is started again, if it dies repeatedly; meanwhile no job goes on."""
+RESTARTS = Backoff(first_s=0.5, longest_s=5.0)
+"""Pauses before a driver that died is started again; meanwhile no job goes on."""
 
 STEADY_S = 60.0
 """Seconds after which a driver counts as steady: if it dies, the pauses begin anew."""
@@ -49,15 +47,6 @@ START_S = 120.0
 _TICK_S = 0.2
 
 _log = logging.getLogger("gablework.serve")
-
-
-def pause_s(deaths: int) -> float:
-    """Seconds before the next start after a number of deaths in a row.
-
-    >>> [pause_s(n) for n in (1, 2, 3, 10)]
-    [0.5, 1.0, 2.0, 5.0]
-    """
-    return min(LONGEST_PAUSE_S, MIN_PAUSE_S * 2.0 ** min(deaths - 1, 10))
 
 
 def environment_of(settings: ServiceSettings, inherited: Mapping[str, str]) -> dict[str, str]:
@@ -155,7 +144,7 @@ class Supervisor:
             if self._ending.is_set():
                 return
             self.deaths = 1 if time.monotonic() - began > STEADY_S else self.deaths + 1
-            wait_s = pause_s(self.deaths)
+            wait_s = RESTARTS.bound_s(self.deaths)
             _log.error("the driver ended with code %d; another one starts in %.1f s", code, wait_s)
             self._on_death(self._name)
             if self._ending.wait(wait_s):

@@ -26,26 +26,22 @@ import datetime as dt
 import hashlib
 import hmac
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import Any
+from typing import Any, Self
 
+from pipeline.backoff import Backoff
 from service.jobs import Fault, Job, JobFailure, JobRequest, JobStatus
 
 SECRET_PREFIX = "whsec_"  # noqa: S105 - the prefix that the standard gives to secrets
 _SECRET_BYTES = 32
 """As long as the digest that it keys; the standard asks for 24 to 64."""
 
-OLD_SECRET = dt.timedelta(days=1)
-"""How long a replaced secret still signs: receivers have a day to take the new one."""
-
 PROGRESS_S = 10.0
 """Minimum seconds between two reports of progress to one receiver; people who look at it need no more."""
 
 LONGEST_PAUSE_S = 4.0 * 3600.0
 """Longest pause between two attempts: a receiver that comes back after a night gets its news within the morning."""
-_GROWTH = 3.0
-"""Each pause is so many times the one before: about ten attempts in a day."""
 
 ROOM = 24
 """Most deliveries of one endpoint that wait in rows of their own. Others wait as events, which all endpoints share."""
@@ -64,22 +60,30 @@ GONE = 410
 
 
 class EventType(StrEnum):
-    """What a webhook reports."""
+    """What a webhook reports: the table of all events, from which requests, answers and the web page derive."""
 
-    ACCEPTED = "job.accepted"
-    """A job waits for a driver: it is new, or an attempt was lost."""
-    RUNNING = "job.running"
-    """A driver has begun."""
-    PROGRESS = "job.progress"
+    words: str
+    """The event in words, for people."""
+    uri_field: str | None
+    """The field of a subscriber with the URI that gets it; None if none does."""
+    is_end: bool
+    """Whether nothing follows."""
+
+    def __new__(cls, value: str, words: str = "", uri_field: str | None = None, is_end: bool = False) -> Self:
+        """One row."""
+        event = str.__new__(cls, value)
+        event._value_ = value
+        event.words, event.uri_field, event.is_end = words, uri_field, is_end
+        return event
+
+    ACCEPTED = ("job.accepted", "a job waits", None, False)
+    """A job waits for a driver: it is new, or an attempt was lost. Its own client knows that."""
+    RUNNING = ("job.running", "a job has begun", "in_progress_uri", False)
+    PROGRESS = ("job.progress", "progress", "in_progress_uri", False)
     """The job has progressed; at most once in `PROGRESS_S` seconds."""
-    SUCCESSFUL = "job.successful"
-    FAILED = "job.failed"
-    DISMISSED = "job.dismissed"
-
-    @property
-    def is_end(self) -> bool:
-        """Whether nothing follows."""
-        return self in {EventType.SUCCESSFUL, EventType.FAILED, EventType.DISMISSED}
+    SUCCESSFUL = ("job.successful", "a job is done", "success_uri", True)
+    FAILED = ("job.failed", "a job failed", "failed_uri", True)
+    DISMISSED = ("job.dismissed", "a job was cancelled", "failed_uri", True)
 
 
 EVENT_OF: Mapping[JobStatus, EventType] = {status: EventType(f"job.{status.value}") for status in JobStatus}
@@ -109,28 +113,6 @@ def new_secret() -> str:
     return SECRET_PREFIX + base64.b64encode(secrets.token_bytes(_SECRET_BYTES)).decode()
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SigningSecret:
-    """A secret, and the one that it replaced."""
-
-    secret: str
-    """Signs every delivery."""
-    old_secret: str | None = None
-    """Signs as well, until `old_until`."""
-    old_until: dt.datetime | None = None
-    changed_at: dt.datetime
-    """When the secret was made."""
-
-    def rotated(self, now: dt.datetime) -> SigningSecret:
-        """A new secret; this one still signs for a day."""
-        return SigningSecret(secret=new_secret(), old_secret=self.secret, old_until=now + OLD_SECRET, changed_at=now)
-
-    def valid(self, now: dt.datetime) -> list[str]:
-        """All secrets that sign now, the newest first."""
-        is_old_valid = self.old_secret is not None and self.old_until is not None and now < self.old_until
-        return [self.secret, *([self.old_secret] if is_old_valid and self.old_secret is not None else [])]
-
-
 def signature(secret: str, message_id: str, timestamp_s: int, body: bytes) -> str:
     """The signature of a message: `v1,` and the base64 of HMAC-SHA256 over id, timestamp and body.
 
@@ -147,12 +129,12 @@ def signature(secret: str, message_id: str, timestamp_s: int, body: bytes) -> st
     return f"v1,{base64.b64encode(digest).decode()}"
 
 
-def signed_headers(secrets_: Sequence[str], message_id: str, timestamp_s: int, body: bytes) -> dict[str, str]:
-    """The headers of a message, with one signature per secret."""
+def signed_headers(secret: str, message_id: str, timestamp_s: int, body: bytes) -> dict[str, str]:
+    """The headers of a message."""
     return {
         "webhook-id": message_id,
         "webhook-timestamp": str(timestamp_s),
-        "webhook-signature": " ".join(signature(secret, message_id, timestamp_s, body) for secret in secrets_),
+        "webhook-signature": signature(secret, message_id, timestamp_s, body),
     }
 
 
@@ -177,8 +159,6 @@ class Endpoint:
     created_at: dt.datetime
     """With a time zone, like all times here."""
     updated_at: dt.datetime
-    old_secret_until: dt.datetime | None = None
-    """Time until which the replaced secret still signs."""
     owner: str | None = None
     """The key that made it; None if keys are not used."""
     paused_at: dt.datetime | None = None
@@ -246,8 +226,8 @@ class Parcel:
     """The job at the time of the event."""
     base: str
     """The service's own URL, for links."""
-    secrets: Sequence[str]
-    """All that sign."""
+    secret: str
+    """Signs it."""
     sent_at: dt.datetime
     """The time of this attempt."""
     event_id: str | None = None
@@ -287,16 +267,6 @@ class Result:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RetryPolicy:
-    """For how long a delivery is tried."""
-
-    hours: float
-    """Hours from the event, or from a replay."""
-    first_pause_s: float
-    """Seconds before the second attempt."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Verdict:
     """What becomes of a delivery after an attempt."""
 
@@ -306,20 +276,14 @@ class Verdict:
     reason: str | None = None
 
 
-def pause_s(attempts: int, policy: RetryPolicy, chance: float) -> float:
-    """Seconds after a number of failed attempts; `chance` in [0, 1) spreads receivers that fail together.
-
-    >>> policy = RetryPolicy(hours=24.0, first_pause_s=5.0)
-    >>> [round(pause_s(n, policy, 0.5)) for n in (1, 2, 3, 7, 8, 20)]
-    [5, 15, 45, 3645, 10935, 14400]
-    >>> pause_s(1, policy, 0.0), pause_s(500, policy, 0.0)
-    (2.5, 7200.0)
-    """
-    grown = policy.first_pause_s * _GROWTH ** min(attempts - 1, 50)
-    return min(grown, LONGEST_PAUSE_S) * (0.5 + chance)
+def retry_policy(hours: float, first_pause_s: float) -> Backoff:
+    """When a delivery is tried again, for so many hours from its event or from a replay: about ten times in a day."""
+    return Backoff(
+        first_s=first_pause_s, longest_s=LONGEST_PAUSE_S, factor=3.0, jitter=(0.5, 1.5), limit_s=hours * 3600.0
+    )
 
 
-def verdict(delivery: Delivery, result: Result, now: dt.datetime, policy: RetryPolicy, chance: float) -> Verdict:
+def verdict(delivery: Delivery, result: Result, now: dt.datetime, policy: Backoff, chance: float) -> Verdict:
     """What becomes of a delivery whose attempt has just ended."""
     if result.is_success:
         return Verdict(state=DeliveryState.DELIVERED)
@@ -327,12 +291,13 @@ def verdict(delivery: Delivery, result: Result, now: dt.datetime, policy: RetryP
         return Verdict(state=DeliveryState.GONE, reason="the receiver answered 410: nothing more is sent to this URL")
     if result.is_final:
         return Verdict(state=DeliveryState.FAILED, reason=result.error)
-    pause = max(pause_s(delivery.attempts, policy, chance), min(result.retry_after_s, LONGEST_PAUSE_S))
-    due_at = now + dt.timedelta(seconds=pause)
-    if due_at > delivery.tried_since + dt.timedelta(hours=policy.hours):
-        reason = f"tried for {policy.hours:g} hours; the last time: {result.error}"
+    elapsed_s = (now - delivery.tried_since).total_seconds()
+    wanted_s = min(result.retry_after_s, LONGEST_PAUSE_S)
+    pause_s = policy.pause_s(delivery.attempts, elapsed_s=elapsed_s, draw=chance, wanted_s=wanted_s)
+    if pause_s is None:
+        reason = f"tried for {policy.limit_s / 3600.0:g} hours; the last time: {result.error}"
         return Verdict(state=DeliveryState.FAILED, reason=reason)
-    return Verdict(state=DeliveryState.WAITING, due_at=due_at, reason=result.error)
+    return Verdict(state=DeliveryState.WAITING, due_at=now + dt.timedelta(seconds=pause_s), reason=result.error)
 
 
 # --- the job as it was

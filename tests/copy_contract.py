@@ -10,7 +10,9 @@ import sqlalchemy as sa
 from store_contract import DatabaseContract, claim, happened, ids, running, submit, upload
 
 from service import migrations
-from service.errors import LeaseLostError, StoreNewerError
+from service.backup import back_up, restore
+from service.errors import LeaseLostError, StartUpError, StoreNewerError
+from service.files import StateFolder
 from service.jobs import JobStatus
 from service.keys import Scope, new_key
 from service.store import JobStore
@@ -28,47 +30,57 @@ def every_row(store: JobStore) -> dict[str, list[tuple[Any, ...]]]:
 class CopyContract(DatabaseContract):
     """What a store does when it is copied, restored or updated, whatever the database."""
 
-    def test_a_copy_has_every_row_and_can_be_loaded_into_an_empty_database(
-        self, store: JobStore, tmp_path: Path
-    ) -> None:
+    def test_a_restored_database_has_every_row(self, store: JobStore, url: str, tmp_path: Path) -> None:
         held = running(store)
         store.record(held, [happened("stage", stage="split", message="na\u00efve \u2713")])
-        submit(store, bbox=(0.1, 1e-17, 2.0, 1e300))
+        store.succeed(held, message="done", summary={})
         sent = upload(store)
         key, _ = new_key("mine", Scope.ADMIN, now=store.now(), lasting=dt.timedelta(days=1))
         store.add_key(key)
-        before = every_row(store)
-        assert store.is_empty is False
-        store.copy_to(tmp_path / "copy.db")
-        assert stat.S_IMODE((tmp_path / "copy.db").stat().st_mode) == 0o600
-        submit(store)
-        assert len(every_row(store)["jobs"]) == 3
-        with store._database.write() as connection:
-            for table in reversed(METADATA.sorted_tables):
-                connection.execute(sa.delete(table))
-        assert store.is_empty
-        store.load(tmp_path / "copy.db")
-        assert every_row(store) == before
-        assert store.upload(sent.upload_id) == sent
+        before, folder = every_row(store), StateFolder(tmp_path / "state")
+        folder.make()
+        # the files of the job were removed by hand
+        report = back_up(url, folder, tmp_path / "backup")
+        assert report.missing == (f"jobs/{held.job_id}/attempt-1", f"uploads/{sent.upload_id}")
+        assert stat.S_IMODE((tmp_path / "backup" / "service.db").stat().st_mode) == 0o600
+        elsewhere = f"sqlite:///{tmp_path / 'elsewhere' / 'service.db'}"
+        assert restore(tmp_path / "backup", StateFolder(tmp_path / "elsewhere"), elsewhere) == (report, 0)
+        with JobStore(elsewhere) as copy:
+            assert every_row(copy) == before
+        # and back into a database of the first kind
+        if store._database.path is None:
+            with pytest.raises(StartUpError, match="holds a service already"):
+                restore(tmp_path / "backup", StateFolder(tmp_path / "again"), url)
+            with store._database.write() as connection:
+                for table in reversed(METADATA.sorted_tables):
+                    connection.execute(sa.delete(table))
+            restore(tmp_path / "backup", StateFolder(tmp_path / "again"), url)
+            assert every_row(store) == before
         assert store.keys() == [key]
 
-    def test_jobs_that_ran_when_the_copy_was_made_wait_again_and_no_attempt_is_lost(self, store: JobStore) -> None:
-        held, waiting = running(store), submit(store)
+    def test_jobs_that_ran_when_the_copy_was_made_wait_again_and_no_attempt_is_lost(
+        self, store: JobStore, url: str, tmp_path: Path
+    ) -> None:
+        held, waiting = running(store), submit(store, bbox=(0.1, 1e-17, 2.0, 1e300))
         unwanted = claim(store, "b") if submit(store, priority=1) else None
         assert unwanted is not None
         store.dismiss(unwanted.job_id)
         last = store.events(held.job_id)[-1].sequence
-        made = dt.datetime(2026, 3, 1, 12, 30, tzinfo=dt.UTC)
-        assert store.free_running(made) == 2
-        freed = store.get(held.job_id)
-        assert (freed.status, freed.attempt, freed.lost_attempts) == (JobStatus.ACCEPTED, 1, 0)
-        assert "backup of 2026-03-01 12:30:00" in freed.message
-        assert store.get(unwanted.job_id).status is JobStatus.DISMISSED
-        assert store.events(held.job_id)[-1].sequence > last + 1000
-        # a driver of before no longer holds it
-        with pytest.raises(LeaseLostError):
-            store.succeed(held, message="", summary={})
-        assert {claim(store).job_id, claim(store).job_id} == {held.job_id, waiting.job_id}
+        folder, restored = StateFolder(tmp_path / "state"), StateFolder(tmp_path / "restored")
+        folder.make()
+        back_up(url, folder, tmp_path / "backup")
+        assert restore(tmp_path / "backup", restored, f"sqlite:///{restored.root}/service.db")[1] == 2
+        with JobStore(f"sqlite:///{restored.root}/service.db") as copy:
+            freed = copy.get(held.job_id)
+            assert (freed.status, freed.attempt, freed.lost_attempts) == (JobStatus.ACCEPTED, 1, 0)
+            assert "restored from a backup" in freed.message
+            assert copy.get(unwanted.job_id).status is JobStatus.DISMISSED
+            assert copy.events(held.job_id)[-1].sequence > last + 1000
+            # a driver of before no longer holds it
+            with pytest.raises(LeaseLostError):
+                copy.succeed(held, message="", summary={})
+            assert {claim(copy).job_id, claim(copy).job_id} == {held.job_id, waiting.job_id}
+            assert copy.get(waiting.job_id).request == waiting.request
 
     def test_a_process_stops_where_a_newer_version_migrates_its_database(self, store: JobStore) -> None:
         held, waiting = running(store), submit(store)

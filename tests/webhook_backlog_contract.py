@@ -20,7 +20,7 @@ from webhook_store_contract import (
     take,
 )
 
-from service.errors import NoSuchWebhookError, NotReplayableError, TooManyWebhooksError
+from service.errors import NotReplayableError, TooManyWebhooksError
 from service.jobs import Job
 from service.receivers import Avoided, Receivers
 from service.store import JobStore
@@ -126,18 +126,14 @@ class WebhookBacklogContract(DatabaseContract):
         with pytest.raises(NotReplayableError, match="paused: replay the webhook"):
             store.webhooks.replay(log(store)[0].delivery_id)
 
-    @pytest.mark.parametrize("way", ["replay", "enable"])
-    def test_a_paused_webhook_gets_all_ends_when_it_is_replayed_or_enabled(self, store: JobStore, way: str) -> None:
+    def test_a_paused_webhook_gets_all_ends_when_it_is_replayed(self, store: JobStore) -> None:
         one, jobs = paused(store)
         jobs += dismissed(store, 3)
         # jobs may be removed meanwhile, and old entries of the log, too
         for job_id in jobs:
             store.remove(job_id)
         store.webhooks.forget(1.0, most=1)
-        if way == "replay":
-            assert store.webhooks.replay_all(one).paused_at is None
-        else:
-            assert store.webhooks.change(one, {"is_enabled": True}).paused_at is None
+        assert store.webhooks.replay_all(one).paused_at is None
         sent = send_and_refill(store)
         assert Counter(parcel.delivery.job_id for parcel in sent) == Counter(jobs)
         found = store.webhooks.get(one)
@@ -173,19 +169,20 @@ class WebhookBacklogContract(DatabaseContract):
         sent = send_and_refill(store)
         assert done.delivery_id in {parcel.delivery.delivery_id for parcel in sent}
 
-    def test_a_webhook_that_is_disabled_is_not_replayed(self, store: JobStore) -> None:
-        one, _ = paused(store)
-        store.webhooks.change(one, {"is_enabled": False})
-        assert (store.webhooks.get(one).paused_at, waiting(store)) == (None, 0)
-        with pytest.raises(NotReplayableError, match="the webhook was disabled; enable it first"):
-            store.webhooks.replay_all(one)
-        with pytest.raises(NoSuchWebhookError):
-            store.webhooks.replay_all("f" * 32)
-        # what happened while it was disabled is not sent
+    def test_a_webhook_whose_receiver_answered_410_is_enabled_by_a_replay(self, store: JobStore) -> None:
+        one, jobs = paused(store)
+        store.webhooks.replay_all(one)
+        gone = Result(duration_ms=1, status=410, error="the receiver answered 410", body="{}")
+        store.webhooks.settle(take(store), gone, POLICY)
+        found = store.webhooks.get(one)
+        assert (found.is_enabled, found.paused_at, found.not_sent, waiting(store)) == (False, None, 0, 0)
+        # what happens meanwhile is not sent
         dismissed(store, 1)
-        store.webhooks.change(one, {"is_enabled": True})
+        assert store.webhooks.replay_all(one).is_enabled
         store.webhooks.refill(max_waiting=MANY)
-        assert waiting(store) == 0
+        sent = send_and_refill(store)
+        assert {parcel.delivery.job_id for parcel in sent} <= set(jobs)
+        assert len(sent) == ROOM
 
     def test_an_event_that_was_committed_late_arrives_still(self, store: JobStore) -> None:
         """Its endpoint had no room, and was noted as keeping up by another transaction at that moment."""
@@ -249,29 +246,6 @@ class WebhookBacklogContract(DatabaseContract):
         lines: list[list[str]] = []
         store.webhooks.claim_some("d", lambda line: lines.append([due.receiver for due in line]) or [], lease_s=60.0)
         assert len(lines[0]) == len(set(lines[0])) == 2
-
-    def test_what_is_replayed_goes_to_the_url_that_the_webhook_has_now(self, store: JobStore) -> None:
-        one = endpoint(store, EventType.DISMISSED, url="https://old.example/")
-        dismissed(store, 2)
-        final = Result(duration_ms=1, status=403, error="the receiver answered 403", is_final=True, body="{}")
-        send_all(store, final)
-        store.webhooks.change(one, {"url": "https://new.example/"})
-        single = log(store, state=DeliveryState.FAILED)[0]
-        store.webhooks.replay(single.delivery_id)
-        store.webhooks.replay_all(one)
-        sent = send_and_refill(store)
-        assert len(sent) == 2
-        assert {parcel.delivery.url for parcel in sent} == {"https://new.example/"}
-
-    def test_a_webhook_that_is_disabled_forgets_what_it_should_have_sent_again(self, store: JobStore) -> None:
-        one = endpoint(store, EventType.DISMISSED)
-        dismissed(store, MANY)
-        final = Result(duration_ms=1, status=403, error="the receiver answered 403", is_final=True, body="{}")
-        send_and_refill(store, final)
-        store.webhooks.replay_all(one)
-        store.webhooks.change(one, {"is_enabled": False})
-        store.webhooks.change(one, {"is_enabled": True})
-        assert send_and_refill(store) == []
 
     def test_a_key_makes_so_many_webhooks_and_not_more_also_at_once(self, store: JobStore) -> None:
         def make(number: int) -> bool:

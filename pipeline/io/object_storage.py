@@ -16,9 +16,10 @@ from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pipeline.backoff import Backoff
 from pipeline.errors import RunError
 from pipeline.io.locations import shown
-from pipeline.io.retries import GONE, POLICY, GaveUpError, RetryPolicy, persistently
+from pipeline.io.retries import GONE, POLICY, GaveUpError, persistently
 from pipeline.io.storage import Puts, parts_of_key
 from pipeline.io.temporary import temporary_folder
 from pipeline.io.urls import filesystem_of, scheme_of
@@ -35,7 +36,7 @@ class ObjectStorage:
 
     url: str
     """Such as `s3://bucket/prefix`; the bucket is there."""
-    policy: RetryPolicy = POLICY
+    policy: Backoff = POLICY
     """How often and how long requests are made again."""
 
     def __post_init__(self) -> None:

@@ -19,11 +19,12 @@ from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
+from pipeline.backoff import Backoff
 from pipeline.errors import UnreadableInputError
 from pipeline.io import urls
 from pipeline.io.locations import name_in, shown
 from pipeline.io.reading import moved
-from pipeline.io.retries import POLICY, GaveUpError, RetryPolicy, ShortReadError, persistently
+from pipeline.io.retries import POLICY, GaveUpError, ShortReadError, persistently
 from pipeline.io.temporary import temporary_folder
 from pipeline.io.urls import filesystem_of, range_options
 
@@ -58,11 +59,11 @@ class RemoteFile:
     ----------
     url : str
         `s3://`, `https://` or `http://`, with its query.
-    policy : RetryPolicy
+    policy : Backoff
         How often and how long requests are repeated.
     """
 
-    def __init__(self, url: str, policy: RetryPolicy = POLICY) -> None:
+    def __init__(self, url: str, policy: Backoff = POLICY) -> None:
         self.url = url
         self._policy = policy
         self._filesystem = filesystem_of(url)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, TypeVar
 
+from pipeline.backoff import Backoff
 from pipeline.errors import GableworkError, causes
 
 Result = TypeVar("Result")
@@ -22,39 +23,9 @@ Result = TypeVar("Result")
 _LONGEST_DETAIL = 300
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RetryPolicy:
-    """How often and how long a request is tried."""
-
-    attempts: int = 6
-    """Largest number; the waits between them add up to 15 s, longer than a storage server takes to fail over."""
-    first_wait_s: float = 0.5
-    """Longest wait after the first failure; it doubles with each further one."""
-    longest_wait_s: float = 20.0
-    """Longest wait of all."""
-    patience_s: float = 300.0
-    """Time after the first attempt when no other begins: attempts that time out take a minute each."""
-
-    def wait_s(self, failures: int, elapsed_s: float, draw: float) -> float | None:
-        """Seconds to wait before the next attempt, by a random number from 0 to 1; None if there is none.
-
-        Examples
-        --------
-        >>> policy = RetryPolicy(attempts=4, first_wait_s=1.0, longest_wait_s=3.0, patience_s=60.0)
-        >>> [policy.wait_s(failures, 0.0, 1.0) for failures in (1, 2, 3, 4)]
-        [1.0, 2.0, 3.0, None]
-        >>> policy.wait_s(1, 0.0, 0.0), policy.wait_s(1, 59.5, 1.0)
-        (0.5, None)
-        """
-        if failures >= self.attempts:
-            return None
-        bound_s = min(self.longest_wait_s, self.first_wait_s * 2.0 ** (failures - 1))
-        wait_s = bound_s * (0.5 + 0.5 * draw)
-        return None if elapsed_s + wait_s > self.patience_s else wait_s
-
-
-POLICY = RetryPolicy()
-"""The default policy."""
+POLICY = Backoff(first_s=0.5, longest_s=20.0, jitter=(0.5, 1.0), attempts=6, limit_s=300.0)
+"""The default policy. Its pauses add up to 15 s, longer than a storage server takes to fail over. The limit is for
+attempts that time out: each takes a minute."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -267,7 +238,7 @@ def detail_of(error: BaseException) -> str:
 
 def persistently(
     work: Callable[[], Result],
-    policy: RetryPolicy = POLICY,
+    policy: Backoff = POLICY,
     *,
     check: Callable[[], None] = lambda: None,
     clock: Callable[[], float] = time.monotonic,
@@ -305,7 +276,7 @@ def persistently(
                 raise
             failures += 1
             cause = cause_of(error)
-            wait_s = policy.wait_s(failures, clock() - began_s, draw()) if cause.again else None
+            wait_s = policy.pause_s(failures, elapsed_s=clock() - began_s, draw=draw()) if cause.again else None
             if wait_s is None:
                 # the libraries' error may hold secrets and would be shown with it
                 raise GaveUpError(cause, detail_of(error), failures) from None

@@ -13,8 +13,8 @@ import httpx
 
 from pipeline.errors import SettingsError
 from service.client.answers import Event, FetchedFile, Job, Output, Submitted
+from service.client.attempts import PATIENCE_S
 from service.client.operations import JobRef, OnEvent, Operations, Paths, ignore
-from service.client.patience import PATIENCE_S
 from service.client.session import Notify, Session, service_key, service_url
 from service.client.transport import AsyncTransport, BlockingTransport, finished
 from service.client.upload_memory import UploadMemory

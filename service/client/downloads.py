@@ -132,7 +132,7 @@ async def _complete(
     session: Session, path: str, output: Output, part: Path, name: str, on_transfer: OnTransfer
 ) -> None:
     """Fetch what a part lacks."""
-    patience = session.patience()
+    attempts = session.attempts()
     while (before := _length(part)) < output.size_bytes:
         at = Transfer(name=name, done_bytes=max(0, before), total_bytes=output.size_bytes)
         headers = {"Range": f"bytes={before}-", "If-Range": f'"{output.sha256}"'} if before > 0 else {}
@@ -146,11 +146,11 @@ async def _complete(
         except LostError as error:
             lost = error
         if _length(part) > before:
-            patience.progressed()
+            attempts.progressed()
         if refused is not None:
-            await session.after_refusal(refused, patience)
+            await session.after_refusal(refused, attempts)
         elif _length(part) < output.size_bytes:
-            await session.after_loss(lost, patience)
+            await session.after_loss(lost, attempts)
 
 
 def _length(part: Path) -> int:

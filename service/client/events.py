@@ -20,7 +20,7 @@ async def follow(session: Session, job_id: str, after: int) -> AsyncGenerator[Ev
     UnreachableError, ForeignAnswerError, RefusedError
         Those of every request; NotFoundError also if the job is removed meanwhile.
     """
-    path, patience = path_of("jobs", job_id, "events", f="sse"), session.patience()
+    path, attempts = path_of("jobs", job_id, "events", f="sse"), session.attempts()
     while True:
         headers = {"Accept": "text/event-stream", "Last-Event-ID": str(after)}
         refused, lost = None, LostError("the stream of events has ended")
@@ -34,7 +34,7 @@ async def follow(session: Session, job_id: str, after: int) -> AsyncGenerator[Ev
                     raise ForeignAnswerError(f"{session.url} answers with something else than events: check the URL")
                 else:
                     # a service that answers is there, however quiet the job is
-                    patience.progressed()
+                    attempts.progressed()
                     async for text in _messages(answer.pieces):
                         event = _event(session, text)
                         after = event.id
@@ -45,9 +45,9 @@ async def follow(session: Session, job_id: str, after: int) -> AsyncGenerator[Ev
             lost = error
         if refused is None:
             # also after an end without the last status: the service stops, or the job is gone
-            await session.after_loss(lost, patience)
+            await session.after_loss(lost, attempts)
         else:
-            await session.after_refusal(refused, patience)
+            await session.after_refusal(refused, attempts)
 
 
 def _event(session: Session, text: str) -> Event:

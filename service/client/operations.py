@@ -195,7 +195,7 @@ class Operations:
 
     async def cancel(self, job: JobRef) -> Job:
         """Stop a job that waits or runs; one that is over stays as it is."""
-        patience = self._session.patience()
+        attempts = self._session.attempts()
         while True:
             found = await self.job(job)
             if found.is_over:
@@ -206,11 +206,11 @@ class Operations:
                 async with self._session.open("DELETE", path) as opened:
                     answer = await opened.whole()
             except LostError as lost:
-                await self._session.after_loss(lost, patience)
+                await self._session.after_loss(lost, attempts)
                 continue
             if answer.status < 300:
                 return self._job(self._session.document(answer))
-            await self._session.after_refusal(answer, patience)
+            await self._session.after_refusal(answer, attempts)
 
     async def retry(self, job: JobRef, *, outputs: Sequence[str] | None = None, **inputs: Any) -> Job:
         """A new job with the request of one that is over; inputs replace those of the old one, None takes one away."""

@@ -16,6 +16,7 @@ from urllib.parse import quote, urlencode, urlsplit
 from pipeline import __version__
 from pipeline.errors import SettingsError
 from service.client.answers import Problem
+from service.client.attempts import FIRST_CONTACT_S, Attempts, is_passing, wanted_pause_s
 from service.client.errors import (
     BusyError,
     ForbiddenError,
@@ -25,7 +26,6 @@ from service.client.errors import (
     UnauthorizedError,
     UnreachableError,
 )
-from service.client.patience import FIRST_CONTACT_S, Patience, is_passing, wanted_pause_s
 from service.client.transport import READ_S, Answer, FileBytes, LostError, OpenAnswer, Request, Transport
 
 DEFAULT_URL = "http://127.0.0.1:8000"
@@ -136,9 +136,9 @@ class Session:
         if key is not None and parts.scheme == "http" and parts.hostname not in LOOPBACK:
             notify(f"the key travels to {parts.netloc} without encryption: use https if the service has it")
 
-    def patience(self) -> Patience:
-        """A new patience, for one call."""
-        return Patience(self.patience_s)
+    def attempts(self) -> Attempts:
+        """The attempts of one call."""
+        return Attempts(self.patience_s)
 
     # --- requests
 
@@ -169,7 +169,7 @@ class Session:
         UnreachableError, ForeignAnswerError, RefusedError
             By the cause.
         """
-        patience = self.patience()
+        attempts = self.attempts()
         # equal documents are equal bytes, whatever the order of their members: an Idempotency-Key needs that
         body = b"" if document is None else json.dumps(document, sort_keys=True, allow_nan=False).encode()
         more = dict(headers or {}) | ({} if document is None else {"Content-Type": "application/json"})
@@ -178,12 +178,12 @@ class Session:
                 async with self.open(method, path, headers=more, body=body) as opened:
                     answer = await opened.whole()
             except LostError as lost:
-                await self.after_loss(lost, patience, is_repeatable=is_repeatable)
+                await self.after_loss(lost, attempts, is_repeatable=is_repeatable)
                 continue
             if answer.status < 300:
                 return answer
             if is_repeatable or answer.status == 429:
-                await self.after_refusal(answer, patience)
+                await self.after_refusal(answer, attempts)
             else:
                 raise self.refusal(answer)
 
@@ -222,7 +222,7 @@ class Session:
 
     # --- after a failure
 
-    async def after_loss(self, lost: LostError, patience: Patience, *, is_repeatable: bool = True) -> None:
+    async def after_loss(self, lost: LostError, attempts: Attempts, *, is_repeatable: bool = True) -> None:
         """Wait for another attempt after an answer was lost.
 
         Raises
@@ -233,14 +233,14 @@ class Session:
         if lost.is_final or not is_repeatable:
             raise UnreachableError(f"{self.url} cannot be used: {lost}") from lost
         limit_s = math.inf if self._has_answered else FIRST_CONTACT_S
-        pause_s = patience.pause_s(time.monotonic(), limit_s=limit_s)
+        pause_s = attempts.pause_s(time.monotonic(), limit_s=limit_s)
         if pause_s is None:
             fix = "Try again later" if self._has_answered else "Check the URL and the network"
             raise UnreachableError(f"{self.url} does not answer: {lost}. {fix}") from lost
         self.notify(f"{self.url} does not answer ({lost}); trying again in {pause_s:.1f} s")
         await self.transport.sleep(pause_s)
 
-    async def after_refusal(self, answer: Answer, patience: Patience, *, can_pass: bool = False) -> None:
+    async def after_refusal(self, answer: Answer, attempts: Attempts, *, can_pass: bool = False) -> None:
         """Wait for another attempt after the service has refused one. With `can_pass` it may help in any case.
 
         Raises
@@ -252,10 +252,10 @@ class Session:
         if not can_pass and not is_passing(answer.status, retry_after):
             raise self.refusal(answer)
         wanted_s = wanted_pause_s(retry_after, dt.datetime.now(dt.UTC))
-        pause_s = patience.pause_s(time.monotonic(), wanted_s=wanted_s)
+        pause_s = attempts.pause_s(time.monotonic(), wanted_s=wanted_s)
         if pause_s is None:
-            after = f"It asks to wait {wanted_s:.0f} s" if wanted_s else f"It stayed so for {patience.limit_s:.0f} s"
-            raise self.refusal(answer, f"{after}; the patience is {patience.limit_s:.0f} s")
+            after = f"It asks to wait {wanted_s:.0f} s" if wanted_s else f"It stayed so for {attempts.limit_s:.0f} s"
+            raise self.refusal(answer, f"{after}; the patience is {attempts.limit_s:.0f} s")
         refused = self.refusal(answer)
         self.notify(f"{refused} (status {answer.status}); trying again in {pause_s:.1f} s")
         await self.transport.sleep(pause_s)

@@ -71,26 +71,26 @@ async def _begin(session: Session, file: LocalFile, sha256: str) -> str:
 
 async def _continue(session: Session, upload_id: str, file: LocalFile, on_transfer: OnTransfer) -> None:
     """Send the rest of a file, from where the service has it."""
-    path, patience, furthest = path_of("uploads", "tus", upload_id), session.patience(), -1
+    path, attempts, furthest = path_of("uploads", "tus", upload_id), session.attempts(), -1
     while True:
         at = await _offset(session, path, file)
         on_transfer(Transfer(name=file.path.name, done_bytes=at, total_bytes=file.size_bytes))
         if at >= file.size_bytes:
             return
         if at > furthest:
-            patience.progressed()
+            attempts.progressed()
         furthest = at
         _check_unchanged(file)
         try:
             answer = await _send_from(session, path, file, at, on_transfer)
         except LostError as lost:
-            await session.after_loss(lost, patience)
+            await session.after_loss(lost, attempts)
             continue
         except OSError as error:
             raise UnreadableInputError(str(file.path), f"cannot be read ({error.strerror})", "Check the file") from None
         if answer.status >= 300:
             # 409: the bytes of a broken connection have arrived since, so the next request continues elsewhere
-            await session.after_refusal(answer, patience, can_pass=answer.status == 409)
+            await session.after_refusal(answer, attempts, can_pass=answer.status == 409)
 
 
 async def _offset(session: Session, path: str, file: LocalFile) -> int:

@@ -11,12 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from pipeline.backoff import Backoff, Pauses
 from pipeline.errors import ClusterError, GableworkError, RunCancelledError
 from service import traces
 from service.disk import FULL_BYTES, has_no_space
 from service.driver import workplace
 from service.driver.attempt_process import DriverParts, Perform
-from service.driver.failures import NO_SPACE_PAUSE_S, failure_of, is_tried_again, pause_s
+from service.driver.failures import failure_of, is_tried_again
 from service.driver.finished_work import leave, take_over
 from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.driver.so_far import shown_while_watched
@@ -32,9 +33,12 @@ from service.errors import (
 from service.jobs import EndedAttempt, JobStatus, LogLevel
 from service.store.policies import after_end
 
-FIRST_PAUSE_S = 0.5
-LONGEST_PAUSE_S = 15.0
-"""Seconds between two tries to reach the database: the first and the longest pause; each is twice the one before."""
+DATABASE = Backoff(first_s=0.5, longest_s=15.0)
+"""Pauses between tries to reach the database."""
+LOST_CLUSTER = Backoff(first_s=2.0, longest_s=60.0)
+"""Pauses until a job whose cluster was lost is tried again."""
+NO_SPACE_PAUSE_S = 30.0
+"""Seconds until a job that the disk had no room for is tried again: others may end by then."""
 LAST_PAUSE_S = 1.0
 """Seconds before the last try of a driver that ends."""
 
@@ -149,7 +153,8 @@ class Attempts:
         if not (is_again and isinstance(error, ClusterError) and self._hand_back(held)):
             self._forget(held)
         if is_again:
-            pause = NO_SPACE_PAUSE_S if isinstance(error, NoSpaceError) else pause_s(job.lost_attempts)
+            lost_s = LOST_CLUSTER.bound_s(job.lost_attempts + 1)
+            pause = NO_SPACE_PAUSE_S if isinstance(error, NoSpaceError) else lost_s
             message = f"waiting: {held.scrub(str(error))}; tried again in {pause:g} s"
             lost = isinstance(error, ClusterError | NoSpaceError)
             self._settle(
@@ -221,7 +226,7 @@ class Attempts:
         makes after a commit, is then made here. None if the driver must end before the outcome is known: the job goes
         back to the queue when its lease has ended, and the next driver finds what was done.
         """
-        pause, is_last, is_repeated = FIRST_PAUSE_S, False, False
+        pauses, is_last, is_repeated = Pauses(DATABASE), False, False
         while True:
             try:
                 try:
@@ -243,8 +248,7 @@ class Attempts:
                     return None
                 if self._ending.is_set():
                     time.sleep(LAST_PAUSE_S)
-                is_last = self._ending.wait(pause)
-                pause = min(LONGEST_PAUSE_S, 2.0 * pause)
+                is_last = self._ending.wait(pauses.next_s())
             else:
                 return True
 

@@ -18,20 +18,6 @@ from service.errors import (
 )
 from service.jobs import Fault, Job, JobFailure
 
-_FIRST_PAUSE_S = 2.0
-_LONGEST_PAUSE_S = 60.0
-NO_SPACE_PAUSE_S = 30.0
-"""Seconds until a job that the disk had no room for is tried again: others may end by then."""
-
-
-def pause_s(losses: int) -> float:
-    """Seconds until a job whose cluster was lost is tried again: doubles with every loss.
-
-    >>> [pause_s(losses) for losses in (0, 1, 2, 9)]
-    [2.0, 4.0, 8.0, 60.0]
-    """
-    return min(_LONGEST_PAUSE_S, _FIRST_PAUSE_S * 2.0 ** min(losses, 30))
-
 
 def is_tried_again(error: BaseException, job: Job, max_attempts: int) -> bool:
     """Whether the job goes back to the queue: the cluster, the database or the disk failed, and not too often yet."""

@@ -14,11 +14,12 @@ import time
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+from pipeline.backoff import Pauses
 from pipeline.errors import ClusterError
 from pipeline.io.temporary import remove_left_folders
 from pipeline.schedule import Outcome
 from service.driver.attempt_process import DriverParts, InOwnProcess, Perform
-from service.driver.attempts import FIRST_PAUSE_S, LONGEST_PAUSE_S, Attempts
+from service.driver.attempts import DATABASE, Attempts
 from service.driver.disk_watch import LOOK_S, DiskWatch
 from service.driver.janitor import tidy
 from service.driver.leased_job import LOG, LeasedJob, Stop
@@ -246,7 +247,7 @@ class Driver:
 
     def _slot(self) -> None:
         """Claim and work, one job after the other."""
-        pause = FIRST_PAUSE_S
+        pauses = Pauses(DATABASE)
         while True:
             with self._lock:
                 # under the lock: the end of the driver must see every claim
@@ -255,14 +256,14 @@ class Driver:
                 self._busy += 1
             try:
                 worked = self._claim_and_work()
-                pause = FIRST_PAUSE_S
+                pauses.begin_anew()
                 wait_s = 0.0 if worked else self._settings.poll_s
             except StoreError as error:
-                LOG.warning("cannot claim a job, next try in %g s: %s", pause, error, extra=self._facts)
-                wait_s, pause = pause, min(LONGEST_PAUSE_S, 2.0 * pause)
+                wait_s = pauses.next_s()
+                LOG.warning("cannot claim a job, next try in %g s: %s", wait_s, error, extra=self._facts)
             except Exception:  # noqa: BLE001 - a slot that ended would leave a driver that looks alive and claims nothing
-                LOG.exception("an unexpected fault, next try in %g s", pause, extra=self._facts)
-                wait_s, pause = pause, min(LONGEST_PAUSE_S, 2.0 * pause)
+                wait_s = pauses.next_s()
+                LOG.exception("an unexpected fault, next try in %g s", wait_s, extra=self._facts)
             finally:
                 with self._lock:
                     self._busy -= 1
@@ -313,20 +314,19 @@ class Driver:
 
     def _keep_time(self) -> None:
         """Check regularly for schedules that are due. Every driver does so; one of them decides each slot."""
-        pause = FIRST_PAUSE_S
+        pauses = Pauses(DATABASE)
         while not self._stopping.is_set():
             try:
                 self._tick()
+                pauses.begin_anew()
+                wait_s = self._settings.poll_s
             except StoreError as error:
-                LOG.warning("cannot read the schedules, next try in %g s: %s", pause, error, extra=self._facts)
+                wait_s = pauses.next_s()
+                LOG.warning("cannot read the schedules, next try in %g s: %s", wait_s, error, extra=self._facts)
             except Exception:  # noqa: BLE001 - without this thread the driver would look alive
-                LOG.exception("an unexpected fault with the schedules, next try in %g s", pause, extra=self._facts)
-            else:
-                pause = FIRST_PAUSE_S
-                self._stopping.wait(self._settings.poll_s)
-                continue
-            self._stopping.wait(pause)
-            pause = min(LONGEST_PAUSE_S, 2.0 * pause)
+                wait_s = pauses.next_s()
+                LOG.exception("an unexpected fault with the schedules, next try in %g s", wait_s, extra=self._facts)
+            self._stopping.wait(wait_s)
 
     def _tick(self) -> None:
         """Decide what is due and log it.
@@ -365,14 +365,14 @@ class Driver:
 
     def _until_done(self, action: Callable[[], None], complaint: str) -> bool:
         """Repeat an action until the database answers; False if the driver must end."""
-        pause = FIRST_PAUSE_S
+        pauses = Pauses(DATABASE)
         while not self._stopping.is_set():
             try:
                 action()
             except StoreError as error:
-                LOG.warning("%s, next try in %g s: %s", complaint, pause, error, extra=self._facts)
-                self._stopping.wait(pause)
-                pause = min(LONGEST_PAUSE_S, 2.0 * pause)
+                wait_s = pauses.next_s()
+                LOG.warning("%s, next try in %g s: %s", complaint, wait_s, error, extra=self._facts)
+                self._stopping.wait(wait_s)
             else:
                 return True
         return False

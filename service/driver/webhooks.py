@@ -14,8 +14,9 @@ import time
 from collections.abc import Callable, Mapping
 
 from pipeline import __version__
+from pipeline.backoff import Pauses
 from pipeline.runtime.monitoring import tracing
-from service.driver.attempts import FIRST_PAUSE_S, LONGEST_PAUSE_S
+from service.driver.attempts import DATABASE
 from service.errors import NoSuchOutputError, StoreError, TargetRefusedError
 from service.files import StateFolder
 from service.outputs import read_catalogue
@@ -25,7 +26,7 @@ from service.status import results_document, status_info
 from service.store import JobStore
 from service.traces import of_job
 from service.webhook_targets import SEND_S, SendError, post
-from service.webhooks import DeliveryState, EventType, Parcel, Result, RetryPolicy, signed_headers
+from service.webhooks import DeliveryState, EventType, Parcel, Result, retry_policy, signed_headers
 from service.wire.webhooks import Message
 
 LOG = logging.getLogger("gablework.driver")
@@ -73,7 +74,7 @@ class Sender:
         self._store = store
         self._settings = settings
         self._name = name
-        self._policy = RetryPolicy(hours=settings.webhook_hours, first_pause_s=settings.webhook_pause_s)
+        self._policy = retry_policy(settings.webhook_hours, settings.webhook_pause_s)
         self._receivers = Receivers(settings.webhook_pause_s)
         self._attempts = Attempts(folder, settings, send)
         self._crew: list[threading.Thread] = []
@@ -97,7 +98,7 @@ class Sender:
     # --- the thread that claims and settles
 
     def _work(self) -> None:
-        pause = FIRST_PAUSE_S
+        pauses = Pauses(DATABASE)
         while not (self._stopping.is_set() and self._receivers.under_way == 0):
             began_s = time.monotonic()
             self._look_again.clear()
@@ -105,13 +106,13 @@ class Sender:
                 self._settle()
                 wait_s = LATE_S if self._stopping.is_set() else self._send_what_is_due()
             except StoreError as error:
-                LOG.warning("cannot look for webhooks, next try in %g s: %s", pause, error, extra=self._facts)
-                wait_s, pause = pause, min(LONGEST_PAUSE_S, 2.0 * pause)
+                wait_s = pauses.next_s()
+                LOG.warning("cannot look for webhooks, next try in %g s: %s", wait_s, error, extra=self._facts)
             except Exception:
-                LOG.exception("an unexpected fault with webhooks, next try in %g s", pause, extra=self._facts)
-                wait_s, pause = pause, min(LONGEST_PAUSE_S, 2.0 * pause)
+                wait_s = pauses.next_s()
+                LOG.exception("an unexpected fault with webhooks, next try in %g s", wait_s, extra=self._facts)
             else:
-                pause = FIRST_PAUSE_S
+                pauses.begin_anew()
             self._look_again.wait(wait_s)
             self._stopping.wait(max(0.0, began_s + PACE_S - time.monotonic()))
 
@@ -290,7 +291,7 @@ class Attempts:
         headers = {
             "Content-Type": "application/json",
             "User-Agent": f"gablework/{__version__}",
-            **signed_headers(parcel.secrets, delivery.delivery_id, int(parcel.sent_at.timestamp()), raw),
+            **signed_headers(parcel.secret, delivery.delivery_id, int(parcel.sent_at.timestamp()), raw),
         }
         here = tracing.current()
         if here is not None:

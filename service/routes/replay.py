@@ -28,7 +28,7 @@ from service.errors import (
 from service.multipart import Form
 from service.resumable import find
 from service.routes.writing import Writer
-from service.store import JobStore, Patience
+from service.store import JobStore, RequestDeadline
 from service.wire import patterns
 
 KEPT_HEADERS = (
@@ -211,7 +211,7 @@ class HeldKey:
     async def _write(self, write: object) -> None:
         def patiently() -> None:
             assert callable(write)
-            with Patience(FREE_S):
+            with RequestDeadline(FREE_S):
                 write(self.claim)
 
         await anyio.to_thread.run_sync(patiently, limiter=self.writer.threads)

@@ -8,8 +8,8 @@ from fastapi import APIRouter, Body, Path, Query, Response
 
 from service import webhooks as records
 from service.deliveries import Delivery
-from service.routes.answers import JOB_ID, document, header, problems, reference
-from service.routes.bound import Admin, Base, Reader, Settings_, Store, Submitter
+from service.routes.answers import JOB_ID, document, header, problems
+from service.routes.bound import Admin, Base, Reader, Store, Submitter
 from service.routes.submission import Submitting
 from service.routes.writing import Write
 from service.store import DeliveryFilter
@@ -39,12 +39,17 @@ _EXAMPLE = {
     "updated": "2026-03-01T09:30:00.000Z",
     "links": [{"href": f"http://127.0.0.1:8000/webhooks/{WEBHOOK_ID}", "rel": "self", "type": "application/json"}],
 }
-_SECRET_EXAMPLE = {"secret": _SECRET, "changed": "2026-03-01T09:30:00.000Z"}
+_LIST_EXAMPLE = {
+    "webhooks": [_EXAMPLE],
+    "eventTypes": [{"type": "job.successful", "title": "a job is done", "isDefault": True}],
+    "links": [],
+}
 _DELIVERY_EXAMPLE = {
     "deliveryID": DELIVERY_ID,
     "jobID": JOB_ID,
     "url": "https://hooks.example.org/gablework",
     "type": "job.successful",
+    "title": "a job is done",
     "state": "waiting",
     "reason": "the receiver answered 503",
     "created": "2026-03-01T09:40:00.000Z",
@@ -66,7 +71,7 @@ DeliveryId = Annotated[str, Path(alias="deliveryID", description="As in the list
 @router.get(
     "/webhooks/secret",
     summary="The secret of a key's subscribers",
-    responses={200: document(wire.Secret, "The secret.", _SECRET_EXAMPLE)},
+    responses={200: document(wire.Secret, "The secret.", {"secret": _SECRET})},
 )
 async def own_secret(store: Store, caller: Submitter, write: Write) -> Response:
     """The secret that signs messages to the subscribers of this key's jobs."""
@@ -76,11 +81,11 @@ async def own_secret(store: Store, caller: Submitter, write: Write) -> Response:
 @router.post(
     "/webhooks/secret/rotate",
     summary="Replace the secret of a key's subscribers",
-    responses={200: document(wire.Secret, "The new secret.", _SECRET_EXAMPLE)},
+    responses={200: document(wire.Secret, "The new secret.", {"secret": _SECRET})},
 )
-async def rotate_own_secret(store: Store, caller: Submitter, write: Write) -> Response:
-    """Make a new secret. For a day messages carry a signature by each of the two."""
-    return _secret(await write(lambda: store.webhooks.rotate_own_secret(caller.key_id)))
+async def replace_own_secret(store: Store, caller: Submitter, write: Write) -> Response:
+    """Make a new secret. The one before signs no longer: give the new one to the receivers at once."""
+    return _secret(await write(lambda: store.webhooks.replace_own_secret(caller.key_id)))
 
 
 # --- the log
@@ -193,7 +198,7 @@ async def make_webhook(
     "/webhooks",
     summary="List webhooks",
     responses={
-        200: document(wire.WebhookList, "The webhooks, newest first.", {"webhooks": [_EXAMPLE], "links": []}),
+        200: document(wire.WebhookList, "The webhooks, newest first.", _LIST_EXAMPLE),
         **problems(400),
     },
 )
@@ -202,7 +207,8 @@ def webhooks(base: Base, store: Store, _caller: Admin, page: Annotated[Page, Que
     found = store.webhooks.list(limit=page.limit + 1, offset=page.offset)
     links = page_links(f"{base}/webhooks", (), len(found), page.limit, page.offset)
     listed = [wire.Webhook(**_members(one, base)) for one in found[: page.limit]]
-    return respond(wire.WebhookList(webhooks=listed, links=links))
+    kinds = [wire.EventKind(type=one.value, title=one.words, isDefault=one.is_end) for one in EventType]
+    return respond(wire.WebhookList(webhooks=listed, eventTypes=kinds, links=links))
 
 
 @router.get(
@@ -215,47 +221,17 @@ def webhook(webhook_id: WebhookId, base: Base, store: Store, _caller: Admin) -> 
     return respond(wire.Webhook(**_members(store.webhooks.get(webhook_id), base)))
 
 
-@router.patch(
-    "/webhooks/{webhookID}",
-    summary="Change, disable or enable a webhook",
-    responses={200: document(wire.Webhook, "The webhook as it is now.", _EXAMPLE), **problems(400, 404)},
-    openapi_extra={
-        "requestBody": {"content": {"application/merge-patch+json": {"schema": reference(wire.WebhookPatch)}}}
-    },
-)
-async def change_webhook(
-    webhook_id: WebhookId,
-    body: Annotated[wire.WebhookPatch, Body(openapi_examples={"disable": {"value": {"enabled": False}}})],
-    base: Base,
-    settings: Settings_,
-    store: Store,
-    write: Write,
-    _caller: Admin,
-) -> Response:
-    """Change what is given; the rest stays. Messages that wait are dropped if it is disabled.
-
-    A webhook that is paused goes on where it stopped if it is enabled.
-    """
-    given = {name: getattr(body, name) for name in body.model_fields_set}
-    if "url" in given:
-        await check_receiver(body.url, settings)
-    changes: dict[str, Any] = {name: value for name, value in given.items() if name in {"url", "description"}}
-    if "events" in given:
-        changes["events"] = [EventType(word) for word in body.events]
-    if "enabled" in given:
-        changes["is_enabled"] = body.enabled
-    changed = await write(lambda: store.webhooks.change(webhook_id, changes))
-    return respond(wire.Webhook(**_members(changed, base)))
-
-
 @router.post(
     "/webhooks/{webhookID}/replay",
     summary="Send what was not sent to a webhook",
     status_code=202,
-    responses={202: document(wire.Webhook, "Its messages are sent soon.", _EXAMPLE), **problems(404, 409)},
+    responses={202: document(wire.Webhook, "Its messages are sent soon.", _EXAMPLE), **problems(404)},
 )
 async def replay_webhook(webhook_id: WebhookId, base: Base, store: Store, write: Write, _caller: Admin) -> Response:
-    """Send all that waits for a webhook, and the ends of jobs that failed or were dropped. This ends its pause."""
+    """Send all that waits for a webhook, and the ends of jobs that failed or were dropped.
+
+    This ends its pause, and enables it if its receiver had answered 410.
+    """
     found = await write(lambda: store.webhooks.replay_all(webhook_id))
     return respond(wire.Webhook(**_members(found, base)), status_code=202)
 
@@ -276,19 +252,6 @@ async def remove_webhook(webhook_id: WebhookId, store: Store, write: Write, _cal
     return Response(status_code=204)
 
 
-@router.post(
-    "/webhooks/{webhookID}/rotate-secret",
-    summary="Replace the secret of a webhook",
-    responses={
-        200: document(wire.Secret, "The new secret, which is shown only now.", _SECRET_EXAMPLE),
-        **problems(404),
-    },
-)
-async def rotate_secret(webhook_id: WebhookId, store: Store, write: Write, _caller: Admin) -> Response:
-    """Make a new secret. For a day messages carry a signature by each of the two."""
-    return _secret(await write(lambda: store.webhooks.rotate_secret(webhook_id)))
-
-
 def _members(found: records.Endpoint, base: str) -> dict[str, Any]:
     """A webhook as clients see it."""
     place = f"{base}/webhooks/{found.endpoint_id}"
@@ -301,7 +264,6 @@ def _members(found: records.Endpoint, base: str) -> dict[str, Any]:
         "disabledReason": found.disabled_reason,
         "created": found.created_at,
         "updated": found.updated_at,
-        "oldSecretUntil": found.old_secret_until,
         "pausedSince": found.paused_at,
         "notSent": found.not_sent or None,
         "links": [
@@ -311,9 +273,8 @@ def _members(found: records.Endpoint, base: str) -> dict[str, Any]:
     }
 
 
-def _secret(found: records.SigningSecret) -> Response:
-    answer = wire.Secret(secret=found.secret, changed=found.changed_at, oldSecretUntil=found.old_until)
-    return respond(answer, headers={"Cache-Control": "no-store"})
+def _secret(secret: str) -> Response:
+    return respond(wire.Secret(secret=secret), headers={"Cache-Control": "no-store"})
 
 
 def delivery_document(found: records.Delivery, base: str, *, is_whole: bool = True) -> wire.Delivery:
@@ -330,6 +291,7 @@ def delivery_document(found: records.Delivery, base: str, *, is_whole: bool = Tr
         webhookID=found.endpoint_id,
         url=found.url,
         type=found.event.value,
+        title=found.event.words,
         state=found.state.value,
         reason=found.reason,
         created=found.created_at,

@@ -14,7 +14,7 @@ from starlette.requests import ClientDisconnect
 
 from service.errors import StoreFullError
 from service.settings import ServiceSettings
-from service.store import Patience
+from service.store import RequestDeadline
 
 Written = TypeVar("Written")
 """What a write returns."""
@@ -53,10 +53,10 @@ class Writer:
         return await self._run(write, asyncio.get_running_loop().create_future())
 
     async def _run(self, write: Callable[[], Written], gone: asyncio.Future[None]) -> Written:
-        patience = Patience(self.wait_s)
+        deadline = RequestDeadline(self.wait_s)
 
         def patiently() -> Written:
-            with patience:
+            with deadline:
                 try:
                     return write()
                 except StoreFullError:
@@ -67,15 +67,15 @@ class Writer:
         both: set[asyncio.Future[Any]] = {work, gone}
         try:
             await asyncio.wait(both, timeout=self.wait_s, return_when=asyncio.FIRST_COMPLETED)
-            if work.done() or not patience.abandon():
+            if work.done() or not deadline.abandon():
                 return await work
             if not gone.done():
-                raise patience.used_up()
+                raise deadline.used_up()
             # the thread keeps its place until it has seen that: clients that go away do not add threads
             await asyncio.wait({work})
             raise ClientDisconnect
         finally:
-            if not patience.abandon():
+            if not deadline.abandon():
                 with anyio.CancelScope(shield=True):
                     await asyncio.wait({work})
             for task in both:

@@ -1,9 +1,9 @@
 """Jobs, events, uploads, schedules and keys in SQL: SQLite by default, the same code on PostgreSQL."""
 
+from service.store.deadline import RequestDeadline
 from service.store.job_store import JobStore
-from service.store.patience import Patience
 from service.store.queries import JobFilter
 from service.store.schedules import ScheduleFilter
 from service.store.webhook_deliveries import DeliveryFilter
 
-__all__ = ["DeliveryFilter", "JobFilter", "JobStore", "Patience", "ScheduleFilter"]
+__all__ = ["DeliveryFilter", "JobFilter", "JobStore", "RequestDeadline", "ScheduleFilter"]

@@ -124,13 +124,17 @@ def not_sent(connection: Connection, row: sa.Row[Any]) -> int:
 
 
 def replay_all(connection: Connection, endpoint_id: str, now: dt.datetime) -> None:
-    """Let all that was not sent to an endpoint be sent, as it has room; its pause is over.
+    """Let all that was not sent to an endpoint be sent, as it has room; its pause is over, and its hours count anew.
 
     These are the events that wait, and the ends of jobs in its log that failed or were dropped.
     """
     own = _DELIVERIES.endpoint_id == endpoint_id
-    resume(connection, endpoint_id, now)
-    lost = _DELIVERIES.state.in_([DeliveryState.FAILED.value, DeliveryState.DROPPED.value])
+    waiting = sa.and_(own, _DELIVERIES.state == _WAITING, _DELIVERIES.lease_until.is_(None))
+    connection.execute(sa.update(WEBHOOK_DELIVERIES).where(waiting).values(due_at=now, tried_since=now))
+    # the next look at the events corrects it
+    values = {"paused_at": None, "is_behind": True, "updated_at": now}
+    connection.execute(sa.update(WEBHOOKS).where(_HOOKS.endpoint_id == endpoint_id).values(**values))
+    lost = _DELIVERIES.state.in_([DeliveryState.FAILED.value, DeliveryState.GONE.value, DeliveryState.DROPPED.value])
     ends = sa.and_(own, lost, _DELIVERIES.event.in_(_ENDS))
     connection.execute(sa.update(WEBHOOK_DELIVERIES).where(ends).values(replay_at=now))
 
@@ -139,16 +143,6 @@ def forget_replays(connection: Connection, endpoint_id: str) -> None:
     """Leave out the replays that an endpoint still waits for."""
     waiting = sa.and_(_DELIVERIES.endpoint_id == endpoint_id, _DELIVERIES.replay_at.is_not(None))
     connection.execute(sa.update(WEBHOOK_DELIVERIES).where(waiting).values(replay_at=None))
-
-
-def resume(connection: Connection, endpoint_id: str, now: dt.datetime) -> None:
-    """End the pause of an endpoint: what waits is sent, and its hours count anew."""
-    own = sa.and_(_DELIVERIES.endpoint_id == endpoint_id, _DELIVERIES.state == _WAITING)
-    free = sa.and_(own, _DELIVERIES.lease_until.is_(None))
-    connection.execute(sa.update(WEBHOOK_DELIVERIES).where(free).values(due_at=now, tried_since=now))
-    # the next look at the events corrects it
-    values = {"paused_at": None, "is_behind": True, "updated_at": now}
-    connection.execute(sa.update(WEBHOOKS).where(_HOOKS.endpoint_id == endpoint_id).values(**values))
 
 
 def forget(connection: Connection, now: dt.datetime, days: float, most: int | None) -> int:

@@ -19,7 +19,7 @@ from service import migrations
 from service.disk import Ballast, Disk
 from service.errors import StartUpError, StoreBusyError, StoreError, StoreFullError, StoreNewerError
 from service.files import folder_fault, keep_private, make_private_file
-from service.store.patience import CURRENT
+from service.store.deadline import CURRENT
 
 _EPOCH = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
 _EPOCH_JULIAN = 2440587.5
@@ -57,8 +57,8 @@ class Database:
     url : str
         `sqlite:///PATH` or `postgresql+pg8000://…`.
     wait_s : float
-        Seconds that a transaction waits for locks and for a connection. A request with a `Patience` waits no longer
-        than that.
+        Seconds that a transaction waits for locks and for a connection. A request waits no longer
+        than its `RequestDeadline`.
 
     Raises
     ------
@@ -158,7 +158,7 @@ class Database:
         Parameters
         ----------
         wait_s : float, optional
-            Maximum seconds for locks; by default the current `Patience`, or that of the database.
+            Maximum seconds for locks; by default the current `RequestDeadline`, or that of the database.
 
         Raises
         ------
@@ -169,9 +169,9 @@ class Database:
         StoreError
             The database does not answer.
         """
-        patience = CURRENT.get()
+        deadline = CURRENT.get()
         if wait_s is None:
-            wait_s = self._wait_s if patience is None else patience.left_s()
+            wait_s = self._wait_s if deadline is None else deadline.left_s()
         until_s = time.monotonic() + wait_s
         after: list[Callable[[], None]] = []
         with self._faults_in_our_words(), self._alone(wait_s), self.engine.connect() as connection:
@@ -182,8 +182,8 @@ class Database:
                     _limit(connection, left_ms)
                 self._check_not_migrated_since(connection)
                 yield connection
-                if patience is not None:
-                    patience.commit()
+                if deadline is not None:
+                    deadline.commit()
         for action in after:
             action()
 

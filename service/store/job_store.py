@@ -6,7 +6,6 @@ import builtins
 import datetime as dt
 import math
 from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Self
 
 from service.deliveries import Claim, Delivery, StoredAnswer
@@ -27,7 +26,6 @@ from service.keys import Key
 from service.store import (
     changes,
     claims,
-    copies,
     idempotency,
     keys,
     logs,
@@ -104,41 +102,6 @@ class JobStore:
             It does not answer, or has other tables.
         """
         self._database.check()
-
-    def copy_to(self, path: Path) -> None:
-        """Copy the database into a new SQLite file, as it is at one moment; others may write meanwhile.
-
-        Raises
-        ------
-        StoreError
-            The database does not answer, or has other tables.
-        """
-        copies.copy_database(self._database, path)
-
-    def load(self, path: Path) -> None:
-        """Copy all rows of a SQLite file, which has this version's tables, into this database; its tables are empty.
-
-        Raises
-        ------
-        StoreError
-            A database does not answer; nothing is copied then.
-        """
-        copies.load_database(path, self._database)
-
-    @property
-    def path(self) -> Path | None:
-        """The file of a SQLite database; None for another."""
-        return self._database.path
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no table has a row."""
-        return copies.is_empty(self._database)
-
-    def free_running(self, made_at: dt.datetime) -> int:
-        """Give all running jobs of a copy back to the queue, without counting the attempt; returns their number."""
-        with self._database.write() as connection:
-            return copies.free_running(connection, self._database.now(connection), made_at)
 
     def fill_ballast(self, reserve_bytes: int) -> None:
         """Set room aside for a SQLite database, if the reserve stays free; it is used when the disk is full."""

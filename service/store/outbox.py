@@ -225,13 +225,7 @@ def uri_for(subscriber: Subscriber, event: EventType) -> str | None:
     >>> uri_for(Subscriber(failed_uri="https://example.org/f"), EventType.DISMISSED)
     'https://example.org/f'
     """
-    return {
-        EventType.RUNNING: subscriber.in_progress_uri,
-        EventType.PROGRESS: subscriber.in_progress_uri,
-        EventType.SUCCESSFUL: subscriber.success_uri,
-        EventType.FAILED: subscriber.failed_uri,
-        EventType.DISMISSED: subscriber.failed_uri,
-    }.get(event)
+    return None if event.uri_field is None else getattr(subscriber, event.uri_field)
 
 
 def _is_progress_due(connection: Connection, job_id: str, now: dt.datetime) -> bool:

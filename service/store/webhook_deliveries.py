@@ -10,6 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
+from pipeline.backoff import Backoff
 from service.errors import NoSuchDeliveryError, NotReplayableError
 from service.files import is_id
 from service.jobs import Job
@@ -26,7 +27,6 @@ from service.webhooks import (
     EventType,
     Parcel,
     Result,
-    RetryPolicy,
     job_of,
     verdict,
 )
@@ -203,14 +203,14 @@ def take(
         if event is not None and event.event_id not in jobs:
             jobs[event.event_id] = job_of(event.snapshot)
         endpoint = endpoints.get(row.endpoint_id)
-        secret = own_secrets[row.owner] if endpoint is None else webhooks.secret_of(endpoint)
+        secret = own_secrets[row.owner] if endpoint is None else endpoint.secret
         parcels.append(
             Parcel(
                 delivery=dataclasses.replace(_delivery(row), attempts=row.attempts + 1, body=_body(row, event)),
                 driver=name,
                 job=job_of(row.snapshot) if event is None else jobs[event.event_id],
                 base=row.base,
-                secrets=secret.valid(now),
+                secret=secret,
                 sent_at=now,
                 event_id=row.event_id,
                 payer=payers[row.delivery_id],
@@ -224,7 +224,7 @@ def settle(
     ended: Sequence[tuple[Parcel, Result]],
     *,
     now: dt.datetime,
-    policy: RetryPolicy,
+    policy: Backoff,
     chance: Callable[[], float],
 ) -> list[DeliveryState | None]:
     """Write how attempts ended, and what becomes of the deliveries: their states.

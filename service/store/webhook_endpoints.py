@@ -11,19 +11,17 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from service.errors import NoSuchWebhookError, NotReplayableError, TooManyWebhooksError
+from service.errors import NoSuchWebhookError, TooManyWebhooksError
 from service.files import is_id
 from service.store import backlog
 from service.store.outbox import drop
 from service.store.records import storable
 from service.store.tables import WEBHOOK_DELIVERIES, WEBHOOK_SECRETS, WEBHOOKS
-from service.webhooks import Endpoint, EventType, SigningSecret, new_secret
+from service.webhooks import Endpoint, EventType, new_secret
 
 REMOVED = "the webhook was removed"
-DISABLED = "the webhook was disabled"
 _CLOSED: Mapping[str, Any] = {"paused_at": None, "is_behind": False}
 """Columns of an endpoint for which nothing waits any longer."""
-_WRITABLE = ("url", "description", "disabled_reason")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,8 +40,8 @@ class NewEndpoint:
     """The key that makes it; None if keys are not used."""
 
 
-def insert(connection: Connection, new: NewEndpoint, *, most: int | None, now: dt.datetime) -> str:
-    """Store a new endpoint with a secret; its id.
+def insert(connection: Connection, new: NewEndpoint, *, most: int | None, now: dt.datetime) -> tuple[str, str]:
+    """Store a new endpoint; its id and its secret.
 
     Raises
     ------
@@ -58,7 +56,7 @@ def insert(connection: Connection, new: NewEndpoint, *, most: int | None, now: d
             f"there are {found} {whose}, the limit is {most}: remove one, or raise GABLEWORK_MAX_WEBHOOKS_PER_KEY"
         )
     endpoint_id = uuid.uuid4().hex
-    secret = SigningSecret(secret=new_secret(), changed_at=now)
+    secret = new_secret()
     connection.execute(
         sa.insert(WEBHOOKS).values(
             endpoint_id=endpoint_id,
@@ -71,10 +69,11 @@ def insert(connection: Connection, new: NewEndpoint, *, most: int | None, now: d
             sent_until=now,
             created_at=now,
             updated_at=now,
-            **_columns(secret),
+            secret=secret,
+            changed_at=now,
         )
     )
-    return endpoint_id
+    return endpoint_id, secret
 
 
 def get(connection: Connection, endpoint_id: str) -> Endpoint:
@@ -96,53 +95,18 @@ def listed(connection: Connection, limit: int, offset: int) -> list[Endpoint]:
     return [_endpoint(row, backlog.not_sent(connection, row)) for row in rows]
 
 
-def change(connection: Connection, endpoint_id: str, changes: Mapping[str, Any], now: dt.datetime) -> None:
-    """Change what is given: `url`, `events`, `description`, `is_enabled`.
-
-    Deliveries that wait go to the new URL. If it is disabled, they are dropped, and so are events that wait. If it is
-    enabled and was paused, it goes on where it stopped.
-
-    Raises
-    ------
-    NoSuchWebhookError
-        It does not exist.
-    """
-    row = _row(connection, endpoint_id, locked=True)
-    values = dict(changes)
-    if "events" in values:
-        values["events"] = [event.value for event in values["events"]]
-    if "is_enabled" in values:
-        values["disabled_reason"] = None if values["is_enabled"] else DISABLED
-    values |= {name: storable(values[name]) for name in _WRITABLE if values.get(name) is not None}
-    one = WEBHOOKS.c.endpoint_id == endpoint_id
-    theirs = WEBHOOK_DELIVERIES.c.endpoint_id == endpoint_id
-    if "url" in values:
-        waiting = sa.and_(theirs, WEBHOOK_DELIVERIES.c.state == "waiting")
-        connection.execute(sa.update(WEBHOOK_DELIVERIES).where(waiting).values(url=values["url"]))
-    if values.get("is_enabled") is False:
-        drop(connection, theirs, DISABLED, now)
-        backlog.forget_replays(connection, endpoint_id)
-        values |= _CLOSED
-    elif values.get("is_enabled") and not row.is_enabled:
-        values["sent_until"] = now
-    connection.execute(sa.update(WEBHOOKS).where(one).values(**values, updated_at=now))
-    if values.get("is_enabled") and row.paused_at is not None:
-        backlog.resume(connection, endpoint_id, now)
-
-
 def replay(connection: Connection, endpoint_id: str, now: dt.datetime) -> None:
-    """Send all that was not sent, and end the pause.
+    """Send all that was not sent, end the pause, and enable it.
 
     Raises
     ------
     NoSuchWebhookError
         It does not exist.
-    NotReplayableError
-        It is disabled.
     """
     row = _row(connection, endpoint_id, locked=True)
     if not row.is_enabled:
-        raise NotReplayableError(f"nothing is sent to webhook {endpoint_id}: {row.disabled_reason}; enable it first")
+        values = {"is_enabled": True, "disabled_reason": None, "sent_until": now}
+        connection.execute(sa.update(WEBHOOKS).where(WEBHOOKS.c.endpoint_id == endpoint_id).values(**values))
     backlog.replay_all(connection, endpoint_id, now)
 
 
@@ -169,54 +133,29 @@ def remove(connection: Connection, endpoint_id: str, now: dt.datetime) -> None:
     backlog.forget_replays(connection, endpoint_id)
 
 
-def endpoint_secret(connection: Connection, endpoint_id: str) -> SigningSecret:
-    """The secret of an endpoint.
-
-    Raises
-    ------
-    NoSuchWebhookError
-        It does not exist.
-    """
-    return secret_of(_row(connection, endpoint_id))
-
-
-def rotate_endpoint_secret(connection: Connection, endpoint_id: str, now: dt.datetime) -> SigningSecret:
-    """Give an endpoint a new secret.
-
-    Raises
-    ------
-    NoSuchWebhookError
-        It does not exist.
-    """
-    secret = endpoint_secret(connection, endpoint_id).rotated(now)
-    one = WEBHOOKS.c.endpoint_id == endpoint_id
-    connection.execute(sa.update(WEBHOOKS).where(one).values(**_columns(secret), updated_at=now))
+def replace_own_secret(connection: Connection, owner: str | None, now: dt.datetime) -> str:
+    """Give a key a new secret for its subscribers; the one before signs no longer."""
+    own_secret(connection, owner, now)
+    secret = new_secret()
+    one = WEBHOOK_SECRETS.c.owner == storable(owner or "", 64)
+    connection.execute(sa.update(WEBHOOK_SECRETS).where(one).values(secret=secret, changed_at=now))
     return secret
 
 
-def own_secret(connection: Connection, owner: str | None, now: dt.datetime) -> SigningSecret:
+def own_secret(connection: Connection, owner: str | None, now: dt.datetime) -> str:
     """The secret that signs messages to the subscribers of a key; made when it is needed first."""
     found = known_secret(connection, owner)
-    if found is not None:
-        return found
-    secret = SigningSecret(secret=new_secret(), changed_at=now)
-    connection.execute(sa.insert(WEBHOOK_SECRETS).values(owner=storable(owner or "", 64), **_columns(secret)))
-    return secret
+    if found is None:
+        found = new_secret()
+        row = {"owner": storable(owner or "", 64), "secret": found, "changed_at": now}
+        connection.execute(sa.insert(WEBHOOK_SECRETS).values(**row))
+    return found
 
 
-def known_secret(connection: Connection, owner: str | None) -> SigningSecret | None:
+def known_secret(connection: Connection, owner: str | None) -> str | None:
     """The secret of a key; None if it was not needed yet."""
-    chosen = sa.select(WEBHOOK_SECRETS).where(WEBHOOK_SECRETS.c.owner == storable(owner or "", 64))
-    row = connection.execute(chosen).one_or_none()
-    return None if row is None else secret_of(row)
-
-
-def rotate_own_secret(connection: Connection, owner: str | None, now: dt.datetime) -> SigningSecret:
-    """Give a key a new secret for its subscribers."""
-    secret = own_secret(connection, owner, now).rotated(now)
-    one = WEBHOOK_SECRETS.c.owner == storable(owner or "", 64)
-    connection.execute(sa.update(WEBHOOK_SECRETS).where(one).values(**_columns(secret)))
-    return secret
+    chosen = sa.select(WEBHOOK_SECRETS.c.secret).where(WEBHOOK_SECRETS.c.owner == storable(owner or "", 64))
+    return connection.execute(chosen).scalar_one_or_none()
 
 
 def _row(connection: Connection, endpoint_id: str, *, locked: bool = False) -> sa.Row[Any]:
@@ -227,22 +166,6 @@ def _row(connection: Connection, endpoint_id: str, *, locked: bool = False) -> s
     if row is None:
         raise NoSuchWebhookError(f"there is no webhook {endpoint_id[:64]!r}")
     return row
-
-
-def _columns(secret: SigningSecret) -> dict[str, Any]:
-    return {
-        "secret": secret.secret,
-        "old_secret": secret.old_secret,
-        "old_until": secret.old_until,
-        "changed_at": secret.changed_at,
-    }
-
-
-def secret_of(row: sa.Row[Any]) -> SigningSecret:
-    """The secret in a row of `webhooks` or `webhook_secrets`."""
-    return SigningSecret(
-        secret=row.secret, old_secret=row.old_secret, old_until=row.old_until, changed_at=row.changed_at
-    )
 
 
 def _endpoint(row: sa.Row[Any], not_sent: int) -> Endpoint:
@@ -257,7 +180,6 @@ def _endpoint(row: sa.Row[Any], not_sent: int) -> Endpoint:
         base=row.base,
         created_at=row.created_at,
         updated_at=row.updated_at,
-        old_secret_until=row.old_until,
         owner=row.owner,
         paused_at=row.paused_at,
         not_sent=not_sent,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import builtins
 import random
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
+from pipeline.backoff import Backoff
 from service import deliveries as deliveries_of_requests
 from service.errors import LeaseLostError
 from service.receivers import Avoided, Due
@@ -17,7 +17,7 @@ from service.store.backlog import Refilled
 from service.store.database import LOCK_SECRETS, LOCK_SUBMISSIONS, Database
 from service.store.delivering import creating
 from service.store.webhook_deliveries import DeliveryFilter
-from service.webhooks import Delivery, DeliveryState, Endpoint, EventType, Parcel, Result, RetryPolicy, SigningSecret
+from service.webhooks import Delivery, DeliveryState, Endpoint, EventType, Parcel, Result
 
 
 class WebhookStore:
@@ -75,8 +75,7 @@ class WebhookStore:
         with creating(self._database, delivery) as (connection, made):
             # no other process adds one between counting and adding
             self._database.lock(connection, LOCK_SUBMISSIONS)
-            endpoint_id = webhooks.insert(connection, new, most=most, now=self._database.now(connection))
-            secret = webhooks.endpoint_secret(connection, endpoint_id).secret
+            endpoint_id, secret = webhooks.insert(connection, new, most=most, now=self._database.now(connection))
             return made((webhooks.get(connection, endpoint_id), secret))
 
     def get(self, endpoint_id: str) -> Endpoint:
@@ -95,23 +94,8 @@ class WebhookStore:
         with self._database.read() as connection:
             return webhooks.listed(connection, limit, offset)
 
-    def change(self, endpoint_id: str, changes: Mapping[str, Any]) -> Endpoint:
-        """Change what is given: `url`, `events`, `description`, `is_enabled`.
-
-        Deliveries that wait go to the new URL. If it is disabled, they are dropped, and so are events that wait. If it
-        is enabled and was paused, it goes on where it stopped.
-
-        Raises
-        ------
-        NoSuchWebhookError
-            It does not exist.
-        """
-        with self._database.write() as connection:
-            webhooks.change(connection, endpoint_id, changes, self._database.now(connection))
-            return webhooks.get(connection, endpoint_id)
-
     def replay_all(self, endpoint_id: str) -> Endpoint:
-        """Send all that was not sent to an endpoint, as it has room, and end its pause.
+        """Send all that was not sent to an endpoint, as it has room; end its pause, and enable it.
 
         These are the events that wait, and the ends of jobs in its log that failed or were dropped.
 
@@ -119,8 +103,6 @@ class WebhookStore:
         ------
         NoSuchWebhookError
             It does not exist.
-        NotReplayableError
-            It is disabled.
         """
         with self._database.write() as connection:
             webhooks.replay(connection, endpoint_id, self._database.now(connection))
@@ -137,21 +119,9 @@ class WebhookStore:
         with self._database.write() as connection:
             webhooks.remove(connection, endpoint_id, self._database.now(connection))
 
-    def rotate_secret(self, endpoint_id: str) -> SigningSecret:
-        """Give an endpoint a new secret; the old one still signs for a day.
-
-        Raises
-        ------
-        NoSuchWebhookError
-            It does not exist.
-        """
-        with self._database.write() as connection:
-            self._database.lock(connection, LOCK_SECRETS)
-            return webhooks.rotate_endpoint_secret(connection, endpoint_id, self._database.now(connection))
-
     # --- secrets of keys
 
-    def own_secret(self, owner: str | None) -> SigningSecret:
+    def own_secret(self, owner: str | None) -> str:
         """The secret that signs messages to a key's subscribers (None if keys are not used); made if there is none."""
         with self._database.read() as connection:
             found = webhooks.known_secret(connection, owner)
@@ -161,11 +131,11 @@ class WebhookStore:
             self._database.lock(connection, LOCK_SECRETS)
             return webhooks.own_secret(connection, owner, self._database.now(connection))
 
-    def rotate_own_secret(self, owner: str | None) -> SigningSecret:
-        """Give a key a new secret for its subscribers; the old one still signs for a day."""
+    def replace_own_secret(self, owner: str | None) -> str:
+        """Give a key a new secret for its subscribers; the one before signs no longer."""
         with self._database.write() as connection:
             self._database.lock(connection, LOCK_SECRETS)
-            return webhooks.rotate_own_secret(connection, owner, self._database.now(connection))
+            return webhooks.replace_own_secret(connection, owner, self._database.now(connection))
 
     # --- deliveries, for clients
 
@@ -249,7 +219,7 @@ class WebhookStore:
             self._database.lock(connection, LOCK_SECRETS)
             return deliveries.take(connection, chosen, driver, now=self._database.now(connection), lease_s=lease_s)
 
-    def settle(self, parcel: Parcel, result: Result, policy: RetryPolicy) -> DeliveryState:
+    def settle(self, parcel: Parcel, result: Result, policy: Backoff) -> DeliveryState:
         """Write how an attempt ended; the state of the delivery afterwards.
 
         Raises
@@ -264,7 +234,7 @@ class WebhookStore:
         return state
 
     def settle_all(
-        self, ended: Sequence[tuple[Parcel, Result]], policy: RetryPolicy
+        self, ended: Sequence[tuple[Parcel, Result]], policy: Backoff
     ) -> builtins.list[DeliveryState | None]:
         """Write how attempts ended, in one transaction; the states of the deliveries.
 

@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
-from service.wire.base import Answer, Link, Request, Time, at_most, optional_members
-from service.wire.faults import FaultsError
+from service import webhooks as records
+from service.wire.base import Answer, Link, Request, Time, at_most
 from service.wire.queries import Page
 
 ReceiverUrl = Annotated[str, Field(min_length=1, max_length=4096)]
 """Where messages go; whether it is allowed depends on the service's settings."""
 
-EventType = Literal["job.accepted", "job.running", "job.progress", "job.successful", "job.failed", "job.dismissed"]
-"""What is reported."""
+if TYPE_CHECKING:
+    EventType = str
+    State = str
+else:
+    EventType = Literal[tuple(event.value for event in records.EventType)]
+    """What is reported."""
+    State = Literal[tuple(state.value for state in records.DeliveryState)]
 
-DEFAULT_EVENTS: tuple[EventType, ...] = ("job.successful", "job.failed", "job.dismissed")
+DEFAULT_EVENTS = tuple(event.value for event in records.EventType if event.is_end)
 """The ends of jobs, which most receivers want."""
-
-State = Literal["waiting", "delivered", "failed", "gone", "dropped"]
 
 
 def _each_once(events: list[EventType]) -> list[EventType]:
@@ -33,39 +36,6 @@ Events = Annotated[
     AfterValidator(_each_once),
     at_most(20),
 ]
-
-
-def _changes(schema: dict[str, Any]) -> None:
-    """Describe a change: at least one member, and no defaults."""
-    optional_members(schema)
-    for found in schema["properties"].values():
-        found.pop("default", None)
-    schema["minProperties"] = 1
-
-
-class WebhookPatch(Request):
-    """A change of a webhook: members that are not given stay."""
-
-    model_config = ConfigDict(json_schema_extra=_changes)
-
-    HINTS: ClassVar[Mapping[str, str]] = {"url": "give the URL that receives the messages"}
-
-    url: ReceiverUrl = Field(default_factory=str, description="Receives the messages; those that wait go there, too.")
-    events: Events = Field(default_factory=lambda: [*DEFAULT_EVENTS])
-    description: Annotated[str, Field(max_length=500)] | None = Field(
-        None, description="Your own words; null for none.", json_schema_extra={"nullable": True}
-    )
-    enabled: bool = Field(
-        True,
-        description="Whether anything is sent. If not, messages that wait are dropped. True also ends a pause.",
-    )
-
-    @classmethod
-    def prepared(cls, given: Any) -> Any:
-        """The change, if there is one."""
-        if given == {}:
-            raise FaultsError([f"nothing is given: give the members to change, of {', '.join(cls.model_fields)}"])
-        return given
 
 
 class WebhookRequest(Request):
@@ -89,7 +59,6 @@ class Webhook(Answer):
     disabledReason: str | None = Field(None, description="Why nothing is sent.")
     created: Time
     updated: Time
-    oldSecretUntil: Time | None = Field(None, description="Time until which the replaced secret still signs.")
     pausedSince: Time | None = Field(
         None, description="Time since which nothing is sent because the receiver did not keep up; a replay ends it."
     )
@@ -103,10 +72,19 @@ class NewWebhook(Webhook):
     secret: str = Field(description="Signs the messages, as in Standard Webhooks.")
 
 
+class EventKind(Answer):
+    """An event that webhooks may get."""
+
+    type: EventType
+    title: str = Field(description="In words.")
+    isDefault: bool = Field(description="Whether a webhook gets it that names no events.")
+
+
 class WebhookList(Answer):
     """A page of webhooks."""
 
     webhooks: list[Webhook]
+    eventTypes: list[EventKind] = Field(description="All events that webhooks may get.")
     links: list[Link]
 
 
@@ -114,8 +92,6 @@ class Secret(Answer):
     """A secret that signs messages."""
 
     secret: str = Field(description="As in Standard Webhooks: `whsec_` and base64.")
-    changed: Time = Field(description="When it was made.")
-    oldSecretUntil: Time | None = Field(None, description="Time until which the replaced secret still signs.")
 
 
 class Attempt(Answer):
@@ -136,6 +112,7 @@ class Delivery(Answer):
     webhookID: str | None = Field(None, description="The webhook; left out if the receiver is a job's subscriber.")
     url: str
     type: EventType
+    title: str = Field(description="The event in words.")
     state: State
     reason: str | None = Field(None, description="Why it is in this state.")
     created: Time = Field(description="Time of the event.")

@@ -10,12 +10,12 @@ import pytest
 from object_store import SECRET
 from processes import LONG_S
 
+from pipeline.backoff import Backoff
 from pipeline.errors import RunError
 from pipeline.io import arrow_at, object_storage, storage_at, urls
 from pipeline.io.object_storage import AT_ONCE, ObjectStorage
-from pipeline.io.retries import RetryPolicy
 
-QUICK = RetryPolicy(attempts=4, first_wait_s=0.01, longest_wait_s=0.02)
+QUICK = Backoff(attempts=4, first_s=0.01, longest_s=0.02)
 
 
 @pytest.fixture

@@ -8,13 +8,13 @@ import pytest
 from hostile_host import hostile_host
 from one_file_site import CONTENT, one_file_site
 
+from pipeline.backoff import Backoff
 from pipeline.errors import UnreadableInputError
 from pipeline.io import ReadOptions, open_source, urls
 from pipeline.io.places import file_at, on_this_machine
 from pipeline.io.remote_file import BLOCK_BYTES, BLOCKS_KEPT, RemoteFile
-from pipeline.io.retries import RetryPolicy
 
-QUICK = RetryPolicy(attempts=3, first_wait_s=0.01, longest_wait_s=0.01)
+QUICK = Backoff(attempts=3, first_s=0.01, longest_s=0.01)
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def test_a_server_that_is_not_there_is_reported():
 def test_a_request_ends_in_time_however_often_a_byte_comes(temper, monkeypatch):
     monkeypatch.setattr(urls, "REQUEST_S", 0.5)
     with hostile_host(pause_s=0.02) as host:
-        file = RemoteFile(f"http://{host.origin}/{temper}/a.laz", RetryPolicy(attempts=1))
+        file = RemoteFile(f"http://{host.origin}/{temper}/a.laz", Backoff(attempts=1, first_s=0.0))
         with pytest.raises(UnreadableInputError, match="no answer in time"):
             file.read_at(0, 1000)
 

@@ -4,7 +4,8 @@ import errno
 
 import pytest
 
-from pipeline.io.retries import CODES, STATUSES, GaveUpError, RetryPolicy, cause_of, persistently, without_secrets
+from pipeline.backoff import Backoff
+from pipeline.io.retries import CODES, POLICY, STATUSES, GaveUpError, cause_of, persistently, without_secrets
 
 
 class AnswerError(Exception):
@@ -47,27 +48,27 @@ def attempts(policy, errors, *, seconds_each=0.0, draw=1.0):
 
 
 def test_waits_double_up_to_a_bound_and_are_drawn_between_half_and_all_of_it():
-    policy = RetryPolicy(attempts=8, first_wait_s=0.5, longest_wait_s=4.0, patience_s=1e9)
-    assert [policy.wait_s(n, 0.0, 1.0) for n in range(1, 9)] == [0.5, 1.0, 2.0, 4.0, 4.0, 4.0, 4.0, None]
-    assert policy.wait_s(3, 0.0, 0.0) == 1.0
-    assert policy.wait_s(3, 0.0, 0.5) == 1.5
+    policy = Backoff(first_s=0.5, longest_s=4.0, jitter=(0.5, 1.0), attempts=8)
+    assert [policy.pause_s(n, draw=1.0) for n in range(1, 9)] == [0.5, 1.0, 2.0, 4.0, 4.0, 4.0, 4.0, None]
+    assert policy.pause_s(3, draw=0.0) == 1.0
+    assert policy.pause_s(3, draw=0.5) == 1.5
 
 
 def test_work_that_recovers_is_done_and_was_waited_for():
-    result, clock = attempts(RetryPolicy(first_wait_s=1.0), [TimeoutError(), ConnectionResetError()])
+    result, clock = attempts(Backoff(first_s=1.0), [TimeoutError(), ConnectionResetError()])
     assert result == "done"
     assert clock.waits == [1.0, 2.0]
 
 
 def test_the_number_of_attempts_is_bounded_and_reported():
-    gave_up, clock = attempts(RetryPolicy(attempts=3, first_wait_s=1.0), [TimeoutError("late")] * 9)
+    gave_up, clock = attempts(Backoff(attempts=3, first_s=1.0), [TimeoutError("late")] * 9)
     assert gave_up.attempts == 3
     assert clock.waits == [1.0, 2.0]
     assert gave_up.problem == "no answer in time at all of 3 attempts (late)"
 
 
-def test_no_attempt_begins_when_patience_is_over():
-    policy = RetryPolicy(attempts=100, first_wait_s=1.0, longest_wait_s=1.0, patience_s=130.0)
+def test_no_attempt_begins_after_the_limit():
+    policy = Backoff(attempts=100, first_s=1.0, longest_s=1.0, limit_s=130.0)
     gave_up, clock = attempts(policy, [TimeoutError()] * 99, seconds_each=60.0)
     assert gave_up.attempts == 3
     assert clock.now_s - 100.0 <= 130.0 + 60.0
@@ -75,7 +76,7 @@ def test_no_attempt_begins_when_patience_is_over():
 
 def test_what_another_attempt_cannot_mend_is_reported_at_once():
     for error in (AnswerError("AccessDenied", 403), FileNotFoundError("x"), ValueError("a fault of ours")):
-        gave_up, clock = attempts(RetryPolicy(), [error])
+        gave_up, clock = attempts(POLICY, [error])
         assert (gave_up.attempts, clock.waits) == (1, [])
 
 

@@ -13,6 +13,7 @@ from live_service import POINTS
 from migrated import with_tables
 from starlette.testclient import TestClient
 
+from pipeline.backoff import Backoff
 from service.app import create_app
 from service.jobs import InputReference, Job, JobRequest
 from service.keys import Scope, new_key
@@ -93,7 +94,7 @@ def local_service(starting: Starting) -> LocalService:
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     """A service behind a gate, for clients that are programs; its pauses are short."""
-    monkeypatch.setattr("service.client.patience.FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr("service.client.attempts.BACKOFF", Backoff(first_s=0.01, longest_s=15.0))
     with Site.opened(tmp_path) as opened:
         yield opened
 

@@ -19,7 +19,7 @@ from processes import wait_for
 
 from service.errors import StoreBusyError
 from service.settings import ServiceSettings
-from service.store import JobFilter, JobStore, Patience
+from service.store import JobFilter, JobStore, RequestDeadline
 
 WAIT_S = 1.0
 EXECUTE = {"inputs": {"tiles": [{"href": "/uploads/ID"}], "crs": "EPSG:28992"}}
@@ -97,7 +97,7 @@ def test_a_client_that_gives_up_while_the_database_is_locked_makes_nothing(tmp_p
     settings = settings_in(tmp_path, database_wait_s=30.0)
     waits, abandoned = threading.Event(), threading.Event()
 
-    class Watched(Patience):
+    class Watched(RequestDeadline):
         def left_s(self) -> float:
             waits.set()
             return super().left_s()
@@ -108,7 +108,7 @@ def test_a_client_that_gives_up_while_the_database_is_locked_makes_nothing(tmp_p
             return found
 
     with pytest.MonkeyPatch.context() as patch, serving(settings) as url, JobStore(settings.database) as store:
-        patch.setattr("service.routes.writing.Patience", Watched)
+        patch.setattr("service.routes.writing.RequestDeadline", Watched)
         with locked(settings):
             with raw_request(url, "POST /uploads?filename=a.xyz", POINTS, Content_Length=str(len(POINTS))):
                 assert waits.wait(DEADLINE_S)
@@ -131,21 +131,21 @@ def test_what_was_abandoned_before_the_commit_is_not_written_and_what_was_not_ca
     starting: Any,
 ) -> None:
     store = starting().store
-    patience = Patience(DEADLINE_S)
+    deadline = RequestDeadline(DEADLINE_S)
 
     def write() -> None:
-        with patience, store._database.write() as connection:
+        with deadline, store._database.write() as connection:
             connection.exec_driver_sql("UPDATE alembic_version SET version_num = 'x'")
-            assert patience.abandon()
+            assert deadline.abandon()
 
     with pytest.raises(StoreBusyError):
         write()
     store.check()
-    second = Patience(DEADLINE_S)
+    second = RequestDeadline(DEADLINE_S)
     with second:
         store.forget_answers()
     assert not second.abandon()
-    used_up = Patience(0.0)
+    used_up = RequestDeadline(0.0)
     time.sleep(0.001)
     with used_up, pytest.raises(StoreBusyError):
         store.forget_answers()

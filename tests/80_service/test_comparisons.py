@@ -15,6 +15,7 @@ from driver_bench import Bench
 from live_service import POINTS
 from starlette.testclient import TestClient
 
+from pipeline.backoff import Backoff
 from pipeline.errors import ClusterError, SettingsError
 from pipeline.methods import METHODS
 from pipeline.runtime import compare
@@ -193,7 +194,7 @@ def test_a_running_comparison_that_is_dismissed_stops_and_leaves_no_file(bench: 
 
 
 def test_a_comparison_whose_cluster_is_lost_is_tried_again(bench: Bench) -> None:
-    bench.patch.setattr("service.driver.attempts.pause_s", lambda _losses: 0.0)
+    bench.patch.setattr("service.driver.attempts.LOST_CLUSTER", Backoff(first_s=0.0))
     job = bench.submit(COMPARISON)
     bench.script.raises(ClusterError("the scheduler was lost"))
     bench.driver()

@@ -14,6 +14,7 @@ import pytest
 from driver_bench import Bench, Engine
 from processes import LONG_S, wait_for
 
+from pipeline.backoff import Backoff
 from pipeline.errors import ClusterError, RunError, UnreadableInputError
 from pipeline.runtime.monitoring.events import Event
 from service.driver import attempts, process
@@ -298,7 +299,7 @@ def test_bad_settings_fail_before_the_run(bench: Bench) -> None:
 
 
 def test_a_lost_cluster_is_replaced_and_the_job_tried_again(bench: Bench) -> None:
-    bench.patch.setattr(attempts, "pause_s", lambda _losses: 0.05)
+    bench.patch.setattr(attempts, "LOST_CLUSTER", Backoff(first_s=0.05))
     bench.patch.setattr(Engine, "started", 0)
     done = bench.done(ClusterError("the scheduler tcp://127.0.0.1:5 was lost"))
     assert (done.status, done.attempt, done.lost_attempts) == (JobStatus.SUCCESSFUL, 2, 1)
@@ -308,7 +309,7 @@ def test_a_lost_cluster_is_replaced_and_the_job_tried_again(bench: Bench) -> Non
 
 
 def test_a_cluster_that_is_lost_again_and_again_fails_the_job(bench: Bench) -> None:
-    bench.patch.setattr(attempts, "pause_s", lambda _losses: 0.01)
+    bench.patch.setattr(attempts, "LOST_CLUSTER", Backoff(first_s=0.01))
     failure = bench.failure(*[ClusterError("gone")] * 3)
     assert bench.script.runs == 3
     assert failure.fault is Fault.CLUSTER

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime as dt
 import gzip
 import hashlib
@@ -21,7 +22,7 @@ from pipeline.errors import InputError, RunCancelledError, UnreadableInputError
 from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.request import plan_inputs
 from service import downloads
-from service.downloads import ATTEMPTS, LONGEST_PAUSE_S, PASSING, pause_s
+from service.downloads import BACKOFF, PASSING, pause_s
 from service.driver.attempt import run_request
 from service.errors import (
     InputRefusedError,
@@ -445,7 +446,7 @@ def server() -> Iterator[tuple[str, type[Answers]]]:
 @pytest.fixture
 def web(tmp_path: Path, server: tuple[str, type[Answers]], monkeypatch: pytest.MonkeyPatch) -> World:
     """A world that may fetch from the server, and does not wait long between tries."""
-    monkeypatch.setattr(downloads, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(downloads, "BACKOFF", dataclasses.replace(BACKOFF, first_s=0.01))
     world = World(tmp_path, input_hosts=(server[0],), max_upload_bytes=1_000_000)
     world.server, world.answers = server
     return world
@@ -541,12 +542,12 @@ def test_a_busy_server_is_asked_again_and_a_refusing_one_is_not(web: World) -> N
 def test_an_answer_that_breaks_off_is_requested_again_and_then_reported(web: World) -> None:
     with pytest.raises(UnreadableInputError, match=r"does not answer .* \(tried 4 times\)"):
         web.fetched("cut/a.laz")
-    assert len(web.answers.seen) == ATTEMPTS
+    assert len(web.answers.seen) == BACKOFF.attempts
     assert left_of(web) == []
 
 
 def test_an_absent_server_is_reported_without_the_secrets_in_the_url(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(downloads, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(downloads, "BACKOFF", dataclasses.replace(BACKOFF, first_s=0.01))
     world = World(tmp_path, input_hosts=("http://127.0.0.1:9",))
     with pytest.raises(UnreadableInputError, match="does not answer") as caught:
         world.materialise(url("http://127.0.0.1:9/a.laz?signature=secret"))
@@ -561,7 +562,7 @@ def test_a_job_that_is_called_off_stops_fetching(web: World) -> None:
 
 
 def test_a_job_that_is_called_off_does_not_wait_for_the_next_try(web: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(downloads, "FIRST_PAUSE_S", 3600.0)
+    monkeypatch.setattr(downloads, "BACKOFF", dataclasses.replace(BACKOFF, first_s=3600.0, longest_s=3600.0))
     with pytest.raises(RunCancelledError):
         web.fetched("status/503/a.laz", lambda: bool(web.answers.seen))
 
@@ -591,13 +592,13 @@ def test_pauses_are_bounded_and_only_for_what_may_pass(
     attempt: int, status: int | None, retry_after: str | None
 ) -> None:
     wait_s = pause_s(attempt, status=status, retry_after=retry_after)
-    assert (wait_s is not None) == (attempt < ATTEMPTS and (status is None or status in PASSING))
-    assert wait_s is None or 0.0 < wait_s <= LONGEST_PAUSE_S
+    assert (wait_s is not None) == (attempt < 4 and (status is None or status in PASSING))
+    assert wait_s is None or 0.0 < wait_s <= BACKOFF.longest_s
 
 
 def test_a_server_that_asks_for_patience_gets_it_within_reason() -> None:
     assert pause_s(1, status=429, retry_after="7") == 7.0
-    assert pause_s(1, status=429, retry_after="9" * 400) == LONGEST_PAUSE_S
+    assert pause_s(1, status=429, retry_after="9" * 400) == BACKOFF.longest_s
     assert pause_s(1, status=429, retry_after="Wed, 21 Oct 2026 07:28:00 GMT") == 1.0
 
 

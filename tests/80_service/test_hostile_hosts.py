@@ -1,5 +1,6 @@
 """Hosts of inputs that do their worst: each wait for them ends in time, and at once if the job is cancelled."""
 
+import dataclasses
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import RunCancelledError, UnreadableInputError
 from service import downloads
-from service.downloads import ATTEMPTS, LONGEST_PAUSE_S, download
+from service.downloads import BACKOFF, download
 from service.errors import TooLargeError
 from service.fetching import gather
 from service.files import StateFolder
@@ -97,32 +98,32 @@ def test_the_time_for_one_file_holds_however_fast_it_comes(host: HostileHost, tm
 def test_silence_ends_an_attempt_and_another_one_follows(
     host: HostileHost, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(downloads, "FIRST_PAUSE_S", 0.0)
+    monkeypatch.setattr(downloads, "BACKOFF", dataclasses.replace(BACKOFF, first_s=0.0))
     with pytest.raises(UnreadableInputError, match=r"does not answer \(ReadTimeout\) \(tried 4 times\)"):
         fetched(host, "stop", tmp_path, silent_s=0.2)
-    assert len(host.requests) == ATTEMPTS
+    assert len(host.requests) == BACKOFF.attempts
 
 
 @pytest.mark.parametrize("temper", ["heads", "short", "negative"])
 def test_an_answer_that_breaks_the_protocol_is_given_up_after_some_attempts(
     host: HostileHost, temper: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(downloads, "FIRST_PAUSE_S", 0.0)
+    monkeypatch.setattr(downloads, "BACKOFF", dataclasses.replace(BACKOFF, first_s=0.0))
     with pytest.raises(UnreadableInputError, match=r"does not answer \(RemoteProtocolError\) \(tried 4 times\)"):
         fetched(host, temper, tmp_path)
-    assert len(host.requests) == ATTEMPTS
+    assert len(host.requests) == BACKOFF.attempts
 
 
 def test_pauses_that_a_host_asks_for_are_short_and_do_not_count_as_slow(
     host: HostileHost, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert LONGEST_PAUSE_S <= 60.0
+    assert BACKOFF.longest_s <= 60.0
     rests: list[float] = []
-    monkeypatch.setattr(downloads, "LONGEST_PAUSE_S", 0.01)
+    monkeypatch.setattr(downloads, "BACKOFF", dataclasses.replace(BACKOFF, longest_s=0.01))
     monkeypatch.setattr(Pace, "rest", lambda _pace, seconds: rests.append(seconds))
     with pytest.raises(UnreadableInputError, match=r"the server answers 429 \(tried 4 times\)"):
         fetched(host, "busy", tmp_path)
-    assert rests == [0.01] * (ATTEMPTS - 1)
+    assert rests == [0.01] * 3
 
 
 def test_bytes_are_reported_as_they_come_and_a_trickle_is_not(

@@ -24,7 +24,7 @@ from pipeline.errors import (
     VersionMismatchError,
 )
 from pipeline.runtime.monitoring.log_lines import formatter
-from service.driver.failures import failure_of, is_tried_again, pause_s
+from service.driver.failures import failure_of, is_tried_again
 from service.driver.messages import Scrubber, digest_of, outcome
 from service.driver.progress import CLASSIFY_WEIGHTS, COMPILING, WEIGHTS, WORDS, percent
 from service.errors import (
@@ -235,12 +235,6 @@ def test_only_a_lost_cluster_an_absent_database_and_a_full_disk_are_tried_again(
     assert is_tried_again(NoSpaceError("x"), job(), max_attempts=3)
     assert not is_tried_again(NoSpaceError("x"), job(lost_attempts=2), max_attempts=3)
     assert not is_tried_again(RunError("x"), job(), max_attempts=3)
-
-
-def test_pauses_grow_and_stay_bounded() -> None:
-    pauses = [pause_s(losses) for losses in range(2000)]
-    assert pauses == sorted(pauses)
-    assert pauses[-1] == 60.0
 
 
 # --- logs

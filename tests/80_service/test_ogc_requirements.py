@@ -16,7 +16,7 @@ from service.jobs import Fault, JobFailure, JobStatus, Subscriber
 from service.outputs.kinds import ON_REQUEST
 from service.routes.landing import CONFORMANCE
 from service.settings import ServiceSettings
-from service.webhooks import RetryPolicy
+from service.webhooks import retry_policy
 
 OGC = "http://www.opengis.net/def/rel/ogc/1.0/"
 PROBLEM = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
@@ -372,7 +372,7 @@ def callback(service: runs.Service) -> None:
 
     sender = Sender(service.store, service.folder, ServiceSettings(state=service.folder.root), name="d", send=send)
     while (parcel := service.store.webhooks.claim("d", lease_s=60.0)) is not None:
-        service.store.webhooks.settle(parcel, sender.attempt(parcel), RetryPolicy(hours=1.0, first_pause_s=100.0))
+        service.store.webhooks.settle(parcel, sender.attempt(parcel), retry_policy(1.0, 100.0))
     results = service.client.get(f"/jobs/{CONTEXT['reported']}/results").json()
     assert [body for url, body in sent if url == SUBSCRIBER["success_uri"]] == [results]
     failed = [body for url, body in sent if url == SUBSCRIBER["failed_uri"]]

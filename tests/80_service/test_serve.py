@@ -27,7 +27,7 @@ from pipeline.runtime.isolation.limits import MIN_MEMORY_BYTES
 from service import supervisor as supervisor_module
 from service.connections import listen
 from service.settings import ServiceSettings
-from service.supervisor import Supervisor, environment_of, pause_s
+from service.supervisor import Supervisor, environment_of
 
 
 def gablework(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -104,12 +104,6 @@ def test_a_process_imports_nothing_that_it_does_not_need(module: str, heavy: lis
     code = f"import sys; import {module}; print([m for m in {heavy} if m in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
-
-
-def test_the_next_start_waits_longer_after_every_death_but_not_for_ever() -> None:
-    pauses = [pause_s(deaths) for deaths in range(1, 40)]
-    assert pauses == sorted(pauses)
-    assert (pauses[0], pauses[-1]) == (0.5, 5.0)
 
 
 def test_another_process_reads_the_same_settings_from_its_environment(tmp_path: Path, monkeypatch) -> None:

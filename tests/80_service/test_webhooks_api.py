@@ -11,11 +11,11 @@ from service.jobs import JobStatus, Subscriber
 from service.keys import Scope
 from service.settings import ServiceSettings
 from service.store import DeliveryFilter
-from service.webhooks import ROOM, EventType, Result, RetryPolicy
+from service.webhooks import ROOM, EventType, Result, retry_policy
 
 LISTED = "http://127.0.0.1:9"
 HOOK = f"{LISTED}/hook"
-POLICY = RetryPolicy(hours=1.0, first_pause_s=100.0)
+POLICY = retry_policy(1.0, 100.0)
 
 
 @pytest.fixture
@@ -65,23 +65,25 @@ def test_a_webhook_that_is_made_twice_under_one_key_is_there_once(local_service)
     assert len(local_service.client.get("/webhooks").json()["webhooks"]) == 1
 
 
-def test_a_webhook_is_changed_disabled_and_removed(local_service) -> None:
+def test_a_webhook_is_removed_and_what_waits_for_it_is_dropped(local_service) -> None:
     made = make(local_service, events=["job.accepted", "job.accepted"])
     place = f"/webhooks/{made['webhookID']}"
     assert made["events"] == ["job.accepted"]
     local_service.waiting()
-    changed = local_service.client.patch(place, json={"description": "new", "url": f"{LISTED}/b"}).json()
-    assert (changed["description"], changed["url"], changed["events"]) == ("new", f"{LISTED}/b", ["job.accepted"])
-    changed = local_service.client.patch(place, json={"enabled": False}).json()
-    assert (changed["enabled"], changed["disabledReason"]) == (False, "the webhook was disabled")
-    listed = local_service.client.get(f"/webhooks/deliveries?webhook={made['webhookID']}").json()["deliveries"]
-    assert [(one["state"], one["reason"]) for one in listed] == [("dropped", "the webhook was disabled")]
-    changed = local_service.client.patch(place, json={"enabled": True, "description": None}).json()
-    assert changed["enabled"] is True
-    assert "disabledReason" not in changed
-    assert "description" not in changed
     assert local_service.client.delete(place).status_code == 204
     assert local_service.client.get(place).status_code == 404
+    listed = local_service.client.get(f"/webhooks/deliveries?webhook={made['webhookID']}").json()["deliveries"]
+    assert [(one["state"], one["reason"]) for one in listed] == [("dropped", "the webhook was removed")]
+
+
+def test_the_list_names_all_events_in_words_and_the_default(local_service) -> None:
+    kinds = local_service.client.get("/webhooks").json()["eventTypes"]
+    assert [kind["type"] for kind in kinds] == [event.value for event in EventType]
+    assert [kind["type"] for kind in kinds if kind["isDefault"]] == make(local_service)["events"]
+    local_service.store.dismiss(local_service.waiting().job_id)
+    (delivery,) = local_service.client.get("/webhooks/deliveries").json()["deliveries"]
+    assert delivery["title"] == "a job was cancelled"
+    assert {"type": delivery["type"], "title": delivery["title"], "isDefault": True} in kinds
 
 
 @pytest.mark.parametrize(
@@ -102,20 +104,6 @@ def test_a_webhook_that_cannot_be_is_refused_with_the_reason(
 ) -> None:
     answer = local_service.client.post("/webhooks", json=body)
     assert (answer.status_code, words in answer.text.replace('\\"', '"')) == (status, True), answer.text
-    if "url" in body and status == 403:
-        made = make(local_service)
-        answer = local_service.client.patch(f"/webhooks/{made['webhookID']}", json=body)
-        assert (answer.status_code, words in answer.text) == (403, True), answer.text
-    assert local_service.client.patch(f"/webhooks/{'0' * 32}", json={}).status_code == 400
-
-
-def test_a_rotated_secret_is_shown_with_the_end_of_the_old_one(local_service) -> None:
-    made = make(local_service)
-    rotated = local_service.client.post(f"/webhooks/{made['webhookID']}/rotate-secret").json()
-    assert rotated["secret"] != made["secret"]
-    shown = local_service.client.get(f"/webhooks/{made['webhookID']}").json()
-    assert shown["oldSecretUntil"] == rotated["oldSecretUntil"]
-    assert "secret" not in shown
 
 
 # --- subscribers
@@ -270,9 +258,6 @@ def test_a_webhook_that_does_not_keep_up_is_shown_paused_and_its_owner_replays_i
         store.webhooks.refill(max_waiting=1000)
     assert sorted(sent) == sorted(job.job_id for job in jobs)
     assert "notSent" not in local_service.client.get(place).json()
-    local_service.client.patch(place, json={"enabled": False})
-    refused = local_service.client.post(f"{place}/replay")
-    assert (refused.status_code, refused.json()["type"]) == (409, "urn:gablework:problem:not-replayable")
     assert local_service.client.post(f"/webhooks/{'0' * 32}/replay").status_code == 404
 
 
@@ -290,9 +275,7 @@ def test_only_an_admin_manages_webhooks_and_owners_see_their_own_deliveries(keye
             client.post("/webhooks", json={"url": HOOK}, headers=headers),
             client.get("/webhooks", headers=headers),
             client.get(place, headers=headers),
-            client.patch(place, json={"enabled": False}, headers=headers),
             client.delete(place, headers=headers),
-            client.post(f"{place}/rotate-secret", headers=headers),
             client.post(f"{place}/replay", headers=headers),
         ]
         assert {answer.status_code for answer in answers} == {403}
@@ -313,7 +296,7 @@ def test_only_an_admin_manages_webhooks_and_owners_see_their_own_deliveries(keye
     assert client.post(f"/webhooks/deliveries/{own}/replay", headers=reading).status_code == 403
 
 
-def test_each_key_reads_and_rotates_its_own_secret(keyed) -> None:
+def test_each_key_reads_and_replaces_its_own_secret(keyed) -> None:
     mine, yours = keyed.key(Scope.SUBMIT), keyed.key(Scope.SUBMIT)
     client = keyed.client
     first = client.get("/webhooks/secret", headers=mine)

@@ -37,8 +37,8 @@ class OldState:
         self.folder.make()
         self._tile = tile
         with JobStore(url) as store:
-            if store.path is not None:
-                store.path.touch()
+            if store._database.path is not None:
+                store._database.path.touch()
             with store._database.write() as connection:
                 config = migrations._config()
                 config.attributes["connection"] = connection

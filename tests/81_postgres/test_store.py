@@ -7,7 +7,7 @@ from processes import PostgresServer
 from store_contract import StoreContract, claim, running, submit
 
 from service.errors import StoreBusyError, StoreError
-from service.store import JobStore, Patience
+from service.store import JobStore, RequestDeadline
 
 pytestmark = pytest.mark.slow
 
@@ -99,6 +99,6 @@ def test_a_writer_that_others_hold_up_at_a_row_gives_way(postgres_url: str) -> N
         held = running(store)
         with other._database.write() as connection:
             connection.exec_driver_sql(f"SELECT 1 FROM jobs WHERE job_id = '{held.job_id}' FOR UPDATE")
-            with Patience(1.0), pytest.raises(StoreBusyError):
+            with RequestDeadline(1.0), pytest.raises(StoreBusyError):
                 store.succeed(held, message="done", summary={})
         store.succeed(held, message="done", summary={})

@@ -20,7 +20,7 @@ from service.outputs import write_comparison_outputs, write_outputs
 from service.schedules import Definition
 from service.settings import ServiceSettings
 from service.store import JobStore
-from service.webhooks import EventType, Result, RetryPolicy
+from service.webhooks import EventType, Result, retry_policy
 
 HOOK = "https://hooks.example.org/gablework"
 DRIVER = "a driver"
@@ -142,7 +142,7 @@ class Stocking:
 
     def _deliver(self) -> tuple[str, str]:
         """Send all messages that wait; one arrives, the others are refused."""
-        policy = RetryPolicy(hours=1.0, first_pause_s=100.0)
+        policy = retry_policy(1.0, 100.0)
         sent: list[str] = []
         while (parcel := self._store.webhooks.claim(DRIVER, lease_s=60.0)) is not None:
             delivery_id = parcel.delivery.delivery_id

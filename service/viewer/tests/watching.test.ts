@@ -28,7 +28,7 @@ const RUNNING = { jobs: [{ jobID: "1", status: "running", title: "a town" }], nu
 const LOG = "GET webhooks/deliveries?limit=25&offset=0";
 const RECEIVERS = "GET webhooks?limit=1000";
 const RECEIVER = { webhookID: "w", url: "https://a.example", description: "ours", events: [], enabled: true, created: "2026-01-01T00:00:00Z" };
-const DELIVERY = { deliveryID: "d", jobID: "1", url: "https://a.example", type: "job.failed", state: "failed", created: "2026-01-01T00:00:00Z", attemptCount: 1 };
+const DELIVERY = { deliveryID: "d", jobID: "1", url: "https://a.example", type: "job.failed", title: "a job failed", state: "failed", created: "2026-01-01T00:00:00Z", attemptCount: 1 };
 
 /** Choose an entry of the menu of this name. */
 function choose(menu: string, words: string): void {
@@ -73,13 +73,13 @@ const VIEWS = [
   {
     name: "the log of messages",
     reads: LOG,
-    action: "PATCH webhooks/w",
+    action: "POST webhooks/w/replay",
     open: () => {
       service.on(LOG, { deliveries: [DELIVERY], links: [] });
-      service.on(RECEIVERS, { webhooks: [RECEIVER] });
+      service.on(RECEIVERS, { webhooks: [RECEIVER], eventTypes: [] });
       return showWebhooks(place, partsOf("#/webhooks"), hooks);
     },
-    act: () => choose("ours", "Disable"),
+    act: () => choose("ours", "Send what it missed"),
   },
   {
     name: "a message",

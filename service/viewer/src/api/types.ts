@@ -151,15 +151,18 @@ export interface Webhook {
   enabled: boolean;
   disabledReason?: string;
   created: string;
-  oldSecretUntil?: string;
   pausedSince?: string;
   notSent?: number;
 }
 
+export interface EventKind {
+  type: string;
+  title: string;
+  isDefault: boolean;
+}
+
 export interface Secret {
   secret: string;
-  changed: string;
-  oldSecretUntil?: string;
 }
 
 export interface Delivery {
@@ -168,6 +171,7 @@ export interface Delivery {
   webhookID?: string;
   url: string;
   type: string;
+  title: string;
   state: string;
   reason?: string;
   created: string;

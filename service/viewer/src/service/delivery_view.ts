@@ -12,15 +12,6 @@ import { count, counted } from "../words/numbers";
 
 const REFRESH_MS = 2000;
 
-export const EVENT_WORDS: Record<string, string> = {
-  "job.accepted": "a job waits",
-  "job.running": "a job has begun",
-  "job.progress": "progress",
-  "job.successful": "a job is done",
-  "job.failed": "a job failed",
-  "job.dismissed": "a job was cancelled",
-};
-
 export const DELIVERY_WORDS: Record<string, string> = {
   waiting: "waiting",
   delivered: "delivered",
@@ -35,7 +26,7 @@ export function deliveryRemedy(state: string): string {
     case "failed":
       return "Mend the receiver, then send the message again.";
     case "gone":
-      return "The receiver answered that it wants no more messages. If that was a mistake, enable the webhook and send the message again.";
+      return "The receiver answered that it wants no more messages. If that was a mistake, choose “Send what it missed” for the webhook.";
     case "dropped":
       return "It was no longer needed. You can still send it again.";
     default:
@@ -129,7 +120,7 @@ class DeliveryView extends Watching implements View {
     const hadFocus = this.sheet.contains(document.activeElement) && document.activeElement?.tagName === "BUTTON";
     const remedy = deliveryRemedy(found.state);
     this.sheet.replaceChildren(
-      el("div", { class: "sheet-head" }, el("h1", {}, `Message: ${EVENT_WORDS[found.type] ?? found.type}`), again),
+      el("div", { class: "sheet-head" }, el("h1", {}, `Message: ${found.title}`), again),
       backLink(),
       this.note,
       this.refusal,

@@ -1,7 +1,7 @@
 /** Webhooks: the receivers of all jobs, the secret of this key, and the log of what was sent. */
 
 import { getJson, request, type Problem } from "../api/requests";
-import type { Delivery, Secret, Webhook } from "../api/types";
+import type { Delivery, EventKind, Secret, Webhook } from "../api/types";
 import { actionMenu, type Item } from "../page/action_menu";
 import { hashOf, type Address } from "../page/address";
 import { ask, openDialog, openForm } from "../page/dialogs";
@@ -13,13 +13,12 @@ import { nothing, table } from "../page/tables";
 import type { Hooks, View } from "../page/view";
 import { Watching } from "../page/watching";
 import { ago } from "../words/numbers";
-import { DELIVERY_WORDS, EVENT_WORDS, receiverState, showDelivery, unsentWords } from "./delivery_view";
+import { DELIVERY_WORDS, receiverState, showDelivery, unsentWords } from "./delivery_view";
 import "../page/pages.css";
 
 const SIZE = 25;
 const REFRESH_MS = 4000;
 const LOG_HEADS = ["Message", ["Receiver", "only-wide"], "State", ["Attempts", "only-wide"], ["When", "only-wide"]] as const;
-const ENDS = ["job.successful", "job.failed", "job.dismissed"];
 
 export function showWebhooks(place: HTMLElement, address: Address, hooks: Hooks): View {
   const [part, id] = address.rest;
@@ -41,6 +40,7 @@ class Webhooks implements View {
   private readonly make = el("button", { type: "button", hidden: true }, "New webhook…");
   private readonly log: Log;
   private webhooks: Webhook[] = [];
+  private kinds: EventKind[] = [];
 
   constructor(
     place: HTMLElement,
@@ -48,7 +48,7 @@ class Webhooks implements View {
   ) {
     document.title = "Webhooks · gablework";
     this.log = new Log(hooks, (id) => this.webhooks.find(({ webhookID }) => webhookID === id)?.description ?? null);
-    this.make.addEventListener("click", () => this.edit(null));
+    this.make.addEventListener("click", () => this.create());
     place.replaceChildren(
       el(
         "div",
@@ -82,7 +82,8 @@ class Webhooks implements View {
   private async load(): Promise<void> {
     const { signal } = this.calledOff;
     try {
-      this.webhooks = (await getJson<{ webhooks: Webhook[] }>("webhooks?limit=1000", { signal })).webhooks;
+      const found = await getJson<{ webhooks: Webhook[]; eventTypes: EventKind[] }>("webhooks?limit=1000", { signal });
+      [this.webhooks, this.kinds] = [found.webhooks, found.eventTypes];
       if (signal.aborted) return;
       this.make.hidden = false;
       this.log.offer(this.webhooks);
@@ -110,16 +111,13 @@ class Webhooks implements View {
 
   private row(one: Webhook): HTMLElement {
     const path = `webhooks/${encodeURIComponent(one.webhookID)}`;
-    const events = one.events.map((event) => EVENT_WORDS[event] ?? event).join(", ");
+    const events = this.kinds
+      .filter(({ type }) => one.events.includes(type))
+      .map(({ title }) => title)
+      .join(", ");
     const items: Item[] = [
-      { label: "Change…", act: () => this.edit(one) },
-      ...(one.enabled ? [{ label: "Send what it missed", act: () => this.changed(change(`${path}/replay`, "POST"), "What it missed is sent.") }] : []),
-      {
-        label: one.enabled ? "Disable" : "Enable",
-        act: () => this.changed(change(path, "PATCH", { enabled: !one.enabled }), one.enabled ? "It is disabled." : "It is enabled."),
-      },
+      { label: "Send what it missed", act: () => this.changed(change(`${path}/replay`, "POST"), "What it missed is sent.") },
       { label: "Its messages", href: hashOf(["webhooks"], { webhook: one.webhookID }) },
-      { label: "New secret…", act: () => this.rotate(path) },
       { label: "Remove…", act: () => this.remove(one, path) },
     ];
     const name = one.description ?? one.url;
@@ -142,24 +140,9 @@ class Webhooks implements View {
         el("span", { class: `chip ${state === "enabled" ? "chip-good" : "chip-warn"}` }, state),
         unsent === "" ? null : el("span", { class: "sub" }, unsent),
         one.disabledReason === undefined ? null : el("span", { class: "sub" }, one.disabledReason),
-        one.oldSecretUntil === undefined ? null : el("span", { class: "sub" }, `old secret signs until ${new Date(one.oldSecretUntil).toLocaleString()}`),
       ),
       el("td", { class: "acts" }, actionMenu(name, () => items, this.hooks.onProblem)),
     );
-  }
-
-  private rotate(path: string): void {
-    ask({
-      title: "Replace the secret?",
-      text: "The old secret signs for one more day, beside the new one. Change the receiver within that time.",
-      yes: "Replace it",
-      act: async () => {
-        const secret = (await (await change(`${path}/rotate-secret`, "POST")).json()) as Secret;
-        await this.load();
-        return () => showSecret(secret);
-      },
-      onProblem: this.hooks.onProblem,
-    });
   }
 
   private remove({ url }: Webhook, path: string): void {
@@ -179,18 +162,15 @@ class Webhooks implements View {
     this.log.refresh();
   }
 
-  /** Make a webhook, or change one. */
-  private edit(one: Webhook | null): void {
+  private create(): void {
     const url = el("input", { type: "url", id: "webhook-url", autocomplete: "off", placeholder: "https://hooks.example.org/gablework", "aria-describedby": "webhook-url-hint" });
-    url.value = one?.url ?? "";
     const description = el("input", { type: "text", id: "webhook-description", maxlength: 500, autocomplete: "off" });
-    description.value = one?.description ?? "";
-    const boxes = Object.entries(EVENT_WORDS).map(([value, words]) => {
-      const box = el("input", { type: "checkbox", value, checked: (one?.events ?? ENDS).includes(value) });
-      return { box, label: el("label", {}, box, ` ${words}`) };
+    const boxes = this.kinds.map(({ type, title, isDefault }) => {
+      const box = el("input", { type: "checkbox", value: type, checked: isDefault });
+      return { box, label: el("label", {}, box, ` ${title}`) };
     });
     openForm({
-      title: one === null ? "New webhook" : "Change the webhook",
+      title: "New webhook",
       content: [
         el(
           "div",
@@ -202,17 +182,13 @@ class Webhooks implements View {
         el("fieldset", { class: "field" }, el("legend", {}, "Events"), el("div", { class: "boxes" }, ...boxes.map(({ label }) => label))),
         el("div", { class: "field" }, el("label", { for: description.id }, "Description"), description),
       ],
-      send: one === null ? "Make it" : "Save",
+      send: "Make it",
       act: async () => {
         const body = {
           url: url.value.trim(),
           events: boxes.filter(({ box }) => box.checked).map(({ box }) => box.value),
           description: description.value.trim() || null,
         };
-        if (one !== null) {
-          await this.changed(change(`webhooks/${encodeURIComponent(one.webhookID)}`, "PATCH", body), "It is changed.");
-          return;
-        }
         const made = (await (await change("webhooks", "POST", body)).json()) as Secret;
         await this.load();
         return () => showSecret(made);
@@ -239,7 +215,7 @@ class Webhooks implements View {
     replace.addEventListener("click", () =>
       ask({
         title: "Replace the secret of this key?",
-        text: "The old secret signs for one more day, beside the new one. Change the receivers within that time.",
+        text: "The old secret signs no longer. Give the new one to the receivers at once.",
         yes: "Replace it",
         act: async () => {
           const secret = (await (await change("webhooks/secret/rotate", "POST")).json()) as Secret;
@@ -260,7 +236,7 @@ class Webhooks implements View {
 }
 
 /** Show a secret with a button that copies it. */
-function showSecret({ secret, oldSecretUntil }: Secret): void {
+function showSecret({ secret }: Secret): void {
   const field = el("input", { type: "text", id: "secret", readonly: true, value: secret, spellcheck: "false" });
   const copy = el("button", { type: "button", class: "primary" }, "Copy");
   const done = el("button", { type: "button", class: "quiet" }, "Done");
@@ -275,7 +251,6 @@ function showSecret({ secret, oldSecretUntil }: Secret): void {
   const { close } = openDialog("The secret", [
     el("p", {}, "Give it to the receiver: it checks with it that messages are from this service. The secret of a webhook is shown only now."),
     el("div", { class: "field" }, el("label", { for: field.id }, "Secret"), field),
-    oldSecretUntil === undefined ? null : el("p", { class: "hint" }, `The old secret signs until ${new Date(oldSecretUntil).toLocaleString()}.`),
     el("div", { class: "actions" }, done, copy),
   ]);
   done.addEventListener("click", close);
@@ -380,7 +355,7 @@ class Log extends Watching {
       el(
         "th",
         { scope: "row" },
-        el("a", { href: hashOf(["webhooks", "deliveries", one.deliveryID]) }, EVENT_WORDS[one.type] ?? one.type),
+        el("a", { href: hashOf(["webhooks", "deliveries", one.deliveryID]) }, one.title),
         el("span", { class: "sub" }, `of job ${one.jobID.slice(0, 8)}`, el("span", { class: "only-narrow" }, ` · ${when} · ${one.url}`)),
       ),
       el("td", { class: "only-wide url" }, one.url, receiver === "" ? null : el("span", { class: "sub" }, receiver)),

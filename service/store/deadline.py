@@ -1,4 +1,4 @@
-"""The patience of a request: how long it waits for the database, and whether its client still wants the answer."""
+"""The deadline of a request: how long it waits for the database, and whether its client still wants the answer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class _State(Enum):
     ABANDONED = auto()
 
 
-class Patience:
+class RequestDeadline:
     """One request's wait for the database. As a context manager it holds for all transactions of this thread.
 
     The request may be abandoned until the commit begins, and not afterwards. So an abandoned request has written
@@ -34,7 +34,7 @@ class Patience:
         self._until_s = time.monotonic() + wait_s
         self._lock = threading.Lock()
         self._state = _State.OPEN
-        self._token: contextvars.Token[Patience | None] | None = None
+        self._token: contextvars.Token[RequestDeadline | None] | None = None
 
     def __enter__(self) -> Self:
         """Begin."""
@@ -87,5 +87,5 @@ class Patience:
         return StoreBusyError(f"the database was busy for {self.wait_s:g} s, or the client has gone")
 
 
-CURRENT: contextvars.ContextVar[Patience | None] = contextvars.ContextVar("patience", default=None)
-"""The patience of the request that this thread works for; None in a driver."""
+CURRENT: contextvars.ContextVar[RequestDeadline | None] = contextvars.ContextVar("deadline", default=None)
+"""The deadline of the request that this thread works for; None in a driver."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime as dt
 import math
 from email.utils import parsedate_to_datetime
 
-FIRST_PAUSE_S = 0.5
-"""Seconds before the second attempt; each further pause is twice the one before."""
-LONGEST_PAUSE_S = 15.0
-"""Longest pause that the client chooses by itself."""
+from pipeline.backoff import Backoff
+
+BACKOFF = Backoff(first_s=0.5, longest_s=15.0)
+"""Pauses that the client chooses by itself."""
 FIRST_CONTACT_S = 5.0
 """Seconds of patience with a service that has never answered: its URL is probably wrong."""
 PATIENCE_S = 300.0
@@ -46,19 +47,19 @@ def wanted_pause_s(retry_after: str | None, now: dt.datetime) -> float:
     return max(0.0, ((at if at.tzinfo is not None else at.replace(tzinfo=dt.UTC)) - now).total_seconds())
 
 
-class Patience:
-    """How long one call goes on without progress.
+class Attempts:
+    """The failures of one call without progress between them.
 
     Parameters
     ----------
     limit_s : float
-        Seconds without progress after which it ends.
+        Seconds without progress after which the call ends.
 
-    >>> patience = Patience(2.0)
-    >>> [patience.pause_s(at_s) for at_s in (10.0, 10.5, 11.5, 12.0)]
+    >>> attempts = Attempts(2.0)
+    >>> [attempts.pause_s(at_s) for at_s in (10.0, 10.5, 11.5, 12.0)]
     [0.5, 1.0, 0.5, None]
-    >>> patience.progressed()
-    >>> patience.pause_s(50.0), patience.pause_s(50.5, wanted_s=60.0)
+    >>> attempts.progressed()
+    >>> attempts.pause_s(50.0), attempts.pause_s(50.5, wanted_s=60.0)
     (0.5, None)
     """
 
@@ -79,15 +80,12 @@ class Patience:
         now_s : float
             A monotonic time.
         wanted_s : float
-            The pause that the service wants. One that ends after the patience ends it now.
+            The pause that the service wants.
         limit_s : float
             A lower limit for this failure.
         """
         if self._since_s is None:
             self._since_s = now_s
-        left_s = min(self.limit_s, limit_s) - (now_s - self._since_s)
         self._failures += 1
-        if left_s <= 0.0 or wanted_s > left_s:
-            return None
-        own_s = min(FIRST_PAUSE_S * 2.0 ** min(self._failures - 1, 10), LONGEST_PAUSE_S)
-        return max(wanted_s, min(own_s, left_s))
+        backoff = dataclasses.replace(BACKOFF, limit_s=min(self.limit_s, limit_s))
+        return backoff.pause_s(self._failures, elapsed_s=now_s - self._since_s, wanted_s=wanted_s)
