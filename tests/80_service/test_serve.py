@@ -131,7 +131,7 @@ def handed_on(monkeypatch) -> list[ServiceSettings]:
     taken: list[ServiceSettings] = []
     monkeypatch.setattr("service.supervisor.serve", lambda settings, *_, **__: taken.append(settings))
     monkeypatch.setattr("service.driver.run_driver", lambda settings, **_: taken.append(settings))
-    monkeypatch.setattr("service.cli._log_to_stderr", lambda: None)
+    monkeypatch.setattr("service.commands._log_to_stderr", lambda: None)
     monkeypatch.setenv("GABLEWORK_WORKERS", "2")
     return taken
 
