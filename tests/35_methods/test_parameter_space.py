@@ -263,11 +263,8 @@ def test_contradicting_settings_of_all_stages_are_named_at_once() -> None:
     assert len(caught.value.faults) == 4
 
 
-def test_the_page_of_the_methods_says_every_setting_and_the_literal_forms() -> None:
+def test_the_page_of_the_methods_says_the_literal_forms() -> None:
     page = (Path(__file__).resolve().parents[2] / "docs" / "methods" / "parameter_space.md").read_text()
-    for name in ("parameter-space-2d", "parameter-space-3d"):
-        fields = dataclasses.fields(METHODS[name].settings_type)
-        assert [field.name for field in fields if f"`{field.name}" not in page] == []
     blocks = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     forms = [RunSettings.from_mapping(tomllib.loads(block)["settings"]).building.method for block in blocks]
     assert forms == [ParameterSpace2dSettings.faithful(), ParameterSpace3dSettings.faithful()]

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -108,9 +109,16 @@ def test_a_fault_and_a_cancellation_keep_their_names(start: Start, tmp_path: Pat
 
     with pytest.raises(InputError, match="it broke"):
         start(place, on_event=Once("split", fail))
-    listener = Once("split", lambda: None)
+    asked = threading.Event()
+    listener = Once("split", lambda: asked.wait(60.0))  # the run may be over before it asks again
+
+    def cancelled() -> bool:
+        if listener.done:
+            asked.set()
+        return listener.done
+
     with pytest.raises(RunCancelledError):
-        start(place, on_event=listener, cancelled=lambda: listener.done)
+        start(place, on_event=listener, cancelled=cancelled)
     assert read_manifest(tmp_path / "run").status is RunStatus.CANCELLED
 
 

@@ -18,7 +18,6 @@ from pipeline.io.gps_time import GpsTimeKind
 from pipeline.recipe import ReconstructSettings, reconstruct_building
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages import outline
 from pipeline.runtime.stages.gather import gather, points_of
 from pipeline.runtime.stages.outline import outlined
 from pipeline.runtime.stages.sites import CandidateSite, PointRange, largest_first, object_id
@@ -171,7 +170,7 @@ def test_a_block_that_cannot_be_drawn_costs_only_its_outlines_and_is_reported(
     def broken(*_: object) -> None:
         raise ValueError("a ring of two corners")
 
-    monkeypatch.setattr(outline, "unit_outlines", broken)
+    monkeypatch.setattr("pipeline.roof.unit_outlines.unit_outlines", broken)
     drawn, (warning,) = outlined(units, RoofSettings(), ONE_TILE, scratch)
     assert [unit.building_id for unit in drawn] == [unit.building_id for unit in units]
     assert {unit.outline for unit in drawn} == {None}
