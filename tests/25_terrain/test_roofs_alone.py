@@ -9,6 +9,7 @@ import shapely
 from pipeline.model import BoolArray
 from pipeline.terrain.lattice import NO_DATA, Elevations
 from pipeline.terrain.roofs_alone import SUPPORT_CELLS, roofs_alone
+from pipeline.terrain.support import ROOFS_ALONE_CELLS
 
 SIDE = 420
 
@@ -109,3 +110,7 @@ def test_without_footprints_nothing_is_a_roof_alone() -> None:
     lowest = np.zeros((5, 4), np.int32)
     assert not roofs_alone(lowest, occupied, (0, 0), []).any()
     assert not roofs_alone(lowest, occupied, (0, 0), [shapely.box(50.0, 50.0, 60.0, 60.0)]).any()
+
+
+def test_the_run_gives_the_verdict_all_that_it_looks_at() -> None:
+    assert ROOFS_ALONE_CELLS == SUPPORT_CELLS

@@ -1,5 +1,6 @@
 """What is compiled before a job, and what is said about it; nothing is compiled here."""
 
+import importlib
 import stat
 from collections.abc import Callable, Iterable
 from concurrent.futures.process import BrokenProcessPool
@@ -44,7 +45,7 @@ def compiler(*, fails: Exception | None = None) -> Callable[..., int]:
 
 
 def said(monkeypatch: pytest.MonkeyPatch, groups: tuple[str, ...] = RECONSTRUCT, **options: Any) -> list[Event]:
-    monkeypatch.setattr(compiling, "compile_kernels", compiler(**options))
+    monkeypatch.setattr(warm_up, "compile_kernels", compiler(**options))
     events: list[Event] = []
     compile_first(events.append, groups)
     return events
@@ -72,7 +73,8 @@ def test_nothing_is_said_or_done_where_all_is_compiled(cold: Path, monkeypatch: 
 
 def test_one_kernel_that_is_missing_makes_a_group_incomplete(monkeypatch: pytest.MonkeyPatch) -> None:
     compiled = {one.kernel: True for one in warm_up.listed()}
-    monkeypatch.setattr(compiling, "kernel_named", lambda name: SimpleNamespace(is_compiled=compiled[name]))
+    kernels_by_name = importlib.import_module("pipeline.compiler.kernel")  # the package has a function of its name
+    monkeypatch.setattr(kernels_by_name, "kernel_named", lambda name: SimpleNamespace(is_compiled=compiled[name]))
     kernels = warm_up.listed(["terrain"])
     assert missing_kernels(("terrain", "compare")) == []
     for end in (kernels[0], kernels[-1]):

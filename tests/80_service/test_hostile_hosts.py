@@ -22,9 +22,9 @@ from service.jobs import InputReference, JobRequest
 from service.pace import Pace
 from service.settings import ServiceSettings
 
-SLOW_S = 0.5
+SLOW_S = 1.5
 """Seconds that a share of the bytes may take here."""
-TOO_SLOW = r"the server sends less than 1000 bytes per second over 0\.5 s"
+TOO_SLOW = r"the server sends less than 1000 bytes per second over 1\.5 s"
 
 
 @pytest.fixture

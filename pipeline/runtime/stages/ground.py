@@ -34,9 +34,9 @@ from pipeline.settings import RunSettings
 from pipeline.terrain.flight_strip import Strip
 from pipeline.terrain.ground import ground_on
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
-from pipeline.terrain.roofs_alone import SUPPORT_CELLS, roofs_alone
 from pipeline.terrain.scene_settings import APRON_M, ClassesInUse
 from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.support import ROOFS_ALONE_CELLS
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ _ABOUT_ROOFS_ALONE = (
     "no points lie around given footprints with points on {} m2: the points there count as roof, not ground, and a "
     "floor without terrain beside it is assumed"
 )
-_ROOFS_MM = SUPPORT_CELLS * CELL_MM
+_ROOFS_MM = ROOFS_ALONE_CELLS * CELL_MM
 """How far beyond the filter's reach given footprints are judged."""
 _SLOPE_CELLS = 3
 """Cells beyond a point that its height and slope depend on, with one to spare."""
@@ -238,11 +238,13 @@ def draw_ground(task: GroundTask, settings: GroundSettings) -> tuple[TileGround,
     """
     task.scratch.check_cancelled()
     inside = _around(task.grid, task.tiles)
-    wide = SUPPORT_CELLS if task.outlines else 0
+    wide = ROOFS_ALONE_CELLS if task.outlines else 0
     lowest, occupied, corner = _cells_in(task, inside.grown(task.reach_mm + wide * CELL_MM))
     column0, row0, columns, rows = lattice_of(inside)
     alone = np.zeros_like(occupied)
     if task.outlines:
+        from pipeline.terrain.roofs_alone import roofs_alone
+
         alone = roofs_alone(lowest, occupied, corner, task.outlines)
         lowest[alone] = NO_DATA
         inner = (slice(wide, -wide), slice(wide, -wide))
