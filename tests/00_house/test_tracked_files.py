@@ -124,3 +124,8 @@ def test_the_files_of_tests_that_begin_first_are_there(pytestconfig: pytest.Conf
     assert conftest is not None
     assert [name for name in conftest.LONGEST_FIRST if not (ROOT / "tests" / name).exists()] == []
     assert [name for name in conftest.TOGETHER if not (ROOT / name).is_dir()] == []
+
+
+def test_no_file_holds_both_sides_of_a_conflict() -> None:
+    marks = re.compile(r"^(<{7}|>{7}) ", re.MULTILINE)
+    assert [str(path.relative_to(ROOT)) for path in tracked_files() if marks.search(text_of(path))] == []
