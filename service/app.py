@@ -13,7 +13,7 @@ from pipeline import __version__
 from service import openapi, problems
 from service.arrivals import Arrivals
 from service.compression import Compressed
-from service.features.runs import published_runs
+from service.features.runs import check_published, published_runs
 from service.files import StateFolder
 from service.guard import Guard
 from service.input_policy import check_hosts, check_roots
@@ -144,8 +144,6 @@ def start(settings: ServiceSettings, store: JobStore) -> None:
     check_roots(settings)
     StateFolder(settings.state).prepare()
     if settings.publish:
-        from service.features.tables import check_published  # loads Arrow
-
         check_published(published_runs(settings.publish, settings.state))
     store.migrate()
     store.fill_ballast(settings.reserve_bytes)

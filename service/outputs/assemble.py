@@ -12,21 +12,25 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.export.folders import POINTS_FOLDER
 from pipeline.export.point_files import TILESET
-from service.outputs.catalogue import NAME as CATALOGUE_NAME
-from service.outputs.catalogue import Catalogue, StoredOutput
+from pipeline.io.storage import LocalStorage
+from service.features.index import NAME as INDEX_NAME
+from service.features.index import TABLES, RowIndex
+from service.outputs.catalogue import Catalogue, ResultsCrs, stored_outputs
 from service.outputs.kinds import ON_REQUEST, OUTPUTS, chosen
 
 if TYPE_CHECKING:
-    from service.outputs.building_index import BuildingIndexFile
-    from service.outputs.footprints import FeatureCollectionFile, Wgs84Transformation
+    from service.features.writing import IndexWriter
     from service.outputs.merged_cityjson import MergedCityJson
     from service.outputs.merged_table import MergedTable
-    from service.outputs.report import Tally
 
 Progress = Callable[[int, int], None]
 """Gets the number of finished tiles and of all tiles. An exception from it ends the work and leaves no partial file."""
 
-_TABLES = ("buildings", "planes", "rejected")
+_STRICT: Mapping[str, Any] = {"ensure_ascii": False, "allow_nan": False}
+_UNKNOWN = (
+    "The coordinate reference system of the tiles is unknown or local: these coordinates are theirs, not WGS 84. "
+    "Give `crs` with the job to get degrees."
+)
 
 
 def _nothing(done: int, total: int) -> None:
@@ -52,12 +56,6 @@ class RunTile:
         return f"{name}/tile={self.key}/part-0.parquet"
 
     @property
-    def decisions(self) -> str | None:
-        """Its file of decisions; None in a run that recorded none."""
-        name = self.table("decisions")
-        return name if name in self.files else None
-
-    @property
     def meshes(self) -> list[str]:
         """Its OBJ files, by name."""
         return sorted(name for name in self.files if name.startswith("meshes/"))
@@ -78,8 +76,7 @@ def write_outputs(
     out_dir : Path
         Folder to write into; made if it is missing.
     wanted : sequence of str, optional
-        Ids of `OUTPUTS`; all by default. The file of features and the index are always written: the service needs
-        them for single buildings. Those of `ON_REQUEST` count if their files are there.
+        Ids of `OUTPUTS`; all by default. Those of `ON_REQUEST` count if their files are there.
     on_progress : callable
         Gets the number of finished tiles and of all tiles.
 
@@ -92,26 +89,34 @@ def write_outputs(
     OSError
         The folder cannot be written.
     """
-    from pipeline.io.storage import LocalStorage, sha256_of
-    from service.outputs.footprints import Wgs84Transformation
-    from service.outputs.report import report, report_bytes
+    from pipeline.errors import RunError
+    from pipeline.runtime.manifest import NAME as MANIFEST
+    from pipeline.runtime.manifest import RunStatus
+    from pipeline.runtime.manifest_reading import read_manifest
+    from service.features.coordinates import RunCrs
+    from service.outputs.report import report
 
     names = {kind.output_id for kind in chosen(wanted)}
-    manifest = _manifest(run_dir)
+    status = read_manifest(run_dir).status
+    if status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
+        raise RunError(f"{run_dir} is {status.value}: outputs need a finished run")
+    manifest = json.loads((run_dir / MANIFEST).read_text(encoding="utf-8"))
     tiles, failed_tiles = published_tiles(run_dir)
-    to_wgs84 = Wgs84Transformation.of_run(manifest["crs"])
-    storage = LocalStorage(root=out_dir)
     with contextlib.ExitStack() as stack:
-        sinks = _Sinks(stack, storage, run_dir, tiles, names, to_wgs84)
+        sinks = _Sinks(stack, run_dir, out_dir, tiles, names, manifest)
         for done, tile in enumerate(tiles):
             on_progress(done, len(tiles))
             sinks.add(tile)
-        tally = sinks.tally
     on_progress(len(tiles), len(tiles))
+    index = RowIndex(out_dir / INDEX_NAME)
+    crs = ResultsCrs.of(RunCrs.of_run(manifest["crs"]))
+    if "geojson" in names:
+        _write_geojson(index, out_dir, crs)
     if "report" in names:
-        found = report(manifest, tally, to_wgs84.crs, failed_tiles, run_dir)
-        storage.put(OUTPUTS["report"].filename, report_bytes(found))
-    if tally.modelled and not any(tile.meshes for tile in tiles):
+        found = json.dumps(report(manifest, index, crs, failed_tiles, run_dir), indent=2, **_STRICT)
+        LocalStorage(root=out_dir).put(OUTPUTS["report"].filename, f"{found}\n".encode())
+    has_models = index.figure("SELECT count(*) FROM buildings WHERE lod IS NOT NULL")
+    if has_models and not any(tile.meshes for tile in tiles):
         # the run was requested without meshes
         names.discard("meshes")
         (out_dir / OUTPUTS["meshes"].filename).unlink(missing_ok=True)
@@ -121,12 +126,22 @@ def write_outputs(
         (out_dir / OUTPUTS["tileset"].filename).unlink(missing_ok=True)
     # these were written before, those that the request named
     names -= {name for name in names & ON_REQUEST if not (out_dir / OUTPUTS[name].filename).is_file()}
-    stored = {}
-    for kind in chosen(names):
-        path = out_dir / kind.filename
-        stored[kind.output_id] = StoredOutput(size_bytes=path.stat().st_size, sha256=sha256_of(path))
-    catalogue = Catalogue(outputs=stored, crs=to_wgs84.crs, n_buildings=tally.buildings)
-    storage.put(CATALOGUE_NAME, catalogue.to_json().encode())
+    n_buildings = index.totals("buildings").n
+    Catalogue(outputs=stored_outputs(out_dir, chosen(names)), crs=crs, n_buildings=n_buildings).write(out_dir)
+
+
+def _write_geojson(index: RowIndex, out_dir: Path, crs: ResultsCrs) -> None:
+    """Write the footprints of all buildings, in the order of the tiles; in degrees if their CRS is known."""
+    from service.features.pages import collected, feature_texts
+
+    members = {} if crs.is_known else {"coordRefSys": None, "note": _UNKNOWN}
+    if crs.vertical_unit_m is not None:
+        members["verticalUnitM"] = crs.vertical_unit_m
+    features = feature_texts(
+        index, "buildings", range(index.totals("buildings").n), None if crs.is_known else lambda shapes: shapes
+    )
+    with LocalStorage(root=out_dir).putting(OUTPUTS["geojson"].filename) as path, path.open("wb") as stream:
+        stream.writelines(collected(members, features))
 
 
 def _write_tileset(run_dir: Path, path: Path) -> bool:
@@ -143,25 +158,6 @@ def _write_tileset(run_dir: Path, path: Path) -> bool:
         waiting.extend(node.get("children", ()))
     path.write_text(json.dumps(tileset, separators=(",", ":"), ensure_ascii=False), encoding="utf-8")
     return True
-
-
-def _manifest(run_dir: Path) -> Mapping[str, Any]:
-    """The content of run.json of a finished run.
-
-    Raises
-    ------
-    RunError
-        The run did not end, or does not exist.
-    """
-    from pipeline.errors import RunError
-    from pipeline.runtime.manifest import NAME, RunStatus
-    from pipeline.runtime.manifest_reading import read_manifest
-
-    status = read_manifest(run_dir).status
-    if status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
-        raise RunError(f"{run_dir} is {status.value}: outputs need a finished run")
-    found: Mapping[str, Any] = json.loads((run_dir / NAME).read_text(encoding="utf-8"))
-    return found
 
 
 def published_tiles(run_dir: Path) -> tuple[list[RunTile], dict[str, str]]:
@@ -199,94 +195,63 @@ class _Sinks:
     def __init__(
         self,
         stack: contextlib.ExitStack,
-        storage: Any,
         run_dir: Path,
+        out_dir: Path,
         tiles: Sequence[RunTile],
         names: set[str],
-        to_wgs84: Wgs84Transformation,
+        manifest: Mapping[str, Any],
     ) -> None:
-        from service.outputs.building_index import NAME as INDEX_NAME
-        from service.outputs.building_index import BuildingIndexFile
-        from service.outputs.footprints import FeatureCollectionFile
+        from service.features.coordinates import RunCrs
+        from service.features.writing import IndexWriter
         from service.outputs.merged_cityjson import MergedCityJson, read_header
         from service.outputs.merged_table import MergedTable
-        from service.outputs.report import Tally
+
+        storage = LocalStorage(root=out_dir)
 
         def file(name: str) -> Path:
             path: Path = stack.enter_context(storage.putting(name))
             return path
 
         self._run_dir = run_dir
-        self._to_wgs84 = to_wgs84
-        self.tally: Tally = Tally()
-        self._headers = {tile.key: read_header(run_dir / tile.cityjson) for tile in tiles}
+        crs = RunCrs.of_run(manifest["crs"])
+        projjson = None if crs.whole is None else crs.whole.to_json_dict()
         self._tables: dict[str, MergedTable] = {}
-        for name in _TABLES:
+        for name in TABLES:
             if name in names:
                 sources = [run_dir / tile.table(name) for tile in tiles]
                 self._tables[name] = stack.enter_context(
-                    MergedTable(file(OUTPUTS[name].filename), name, sources, to_wgs84.projjson)
+                    MergedTable(file(OUTPUTS[name].filename), name, sources, projjson)
                 )
         self._city: MergedCityJson | None = None
         if "cityjson" in names:
             stream = stack.enter_context(file(OUTPUTS["cityjson"].filename).open("wb"))
+            self._headers = {tile.key: read_header(run_dir / tile.cityjson) for tile in tiles}
             self._city = MergedCityJson(stream, list(self._headers.values()))
         self._archive: zipfile.ZipFile | None = None
         if "meshes" in names:
             self._archive = stack.enter_context(zipfile.ZipFile(file(OUTPUTS["meshes"].filename), "w"))
-        self._index: BuildingIndexFile = stack.enter_context(BuildingIndexFile(file(INDEX_NAME)))
-        stream = stack.enter_context(file(OUTPUTS["geojson"].filename).open("wb"))
-        self._features: FeatureCollectionFile = stack.enter_context(
-            contextlib.closing(FeatureCollectionFile(stream, to_wgs84.crs))
-        )
+        licence = manifest.get("source_licence") or ""
+        self._index: IndexWriter = stack.enter_context(IndexWriter(file(INDEX_NAME), manifest["crs"], licence))
 
     def add(self, tile: RunTile) -> None:
         """Write one tile to all files."""
         from pipeline.export.folders import TERRAIN_FOLDER
         from pipeline.export.solid_geometry import SHAPE_COLUMNS
-        from service.outputs.footprints import feature_texts
         from service.outputs.merged_table import read_tile
         from service.outputs.meshes import zip_files
 
-        tables = {name: read_tile(self._run_dir / tile.table(name)) for name in _TABLES}
-        for name, table in self._tables.items():
-            table.add(tile.key, tables[name])
+        for name in TABLES:
+            table = read_tile(self._run_dir / tile.table(name))
+            if name in self._tables:
+                self._tables[name].add(tile.key, table)
+            left_out = [column for column in SHAPE_COLUMNS if column in table.column_names]
+            self._index.add(name, tile.key, table.drop_columns(left_out).to_pylist())
         if self._archive is not None:
             terrain = sorted((self._run_dir / TERRAIN_FOLDER / f"tile={tile.key}").glob("part-*"))
             names = [path.relative_to(self._run_dir).as_posix() for path in terrain]
             zip_files(self._archive, self._run_dir, [*tile.meshes, *names])
-        places = self._add_cityjson(tile)
-        planes: dict[str, list[dict[str, Any]]] = {}
-        for plane in tables["planes"].drop_columns(["geometry", "bbox"]).to_pylist():
-            planes.setdefault(plane.pop("building_id"), []).append(plane)
-            self.tally.planes += 1
-        decisions: dict[str, list[dict[str, Any]]] = {}
-        if tile.decisions is not None:
-            for entry in read_tile(self._run_dir / tile.decisions).to_pylist():
-                decisions.setdefault(entry.pop("building_id"), []).append(entry)
-        self.tally.count_rejected(tables["rejected"].column("reason").to_pylist())
-        rows = [{**row, "tile": tile.key} for row in tables["buildings"].drop_columns(list(SHAPE_COLUMNS)).to_pylist()]
-        for feature in feature_texts(rows, self._to_wgs84):
-            start = self._features.add(feature)
-            self._index.add(
-                record=feature.record,
-                feature=(start, len(feature.text), feature.geometry_start, feature.geometry_size),
-                native=feature.native,
-                city=places[feature.building_id],
-                planes=planes.get(feature.building_id, ()),
-                decisions=decisions.get(feature.building_id, ()),
-                bounds=feature.bounds,
-                bounds_deg=feature.bounds_deg,
-            )
-            self.tally.count_building(feature.record, has_geometry=feature.bounds_deg is not None)
-
-    def _add_cityjson(self, tile: RunTile) -> dict[str, tuple[int, int]]:
-        """Write the tile's features; start and size of each building's line in the tile's own file."""
-        from service.outputs.merged_cityjson import features
-
-        places = {}
-        for place, line in features(self._run_dir / tile.cityjson):
-            places[place.building_id] = (place.start, place.size)
-            if self._city is not None:
-                self._city.add(self._headers[tile.key], line)
-        return places
+        if self._city is not None:
+            with (self._run_dir / tile.cityjson).open("rb") as stream:
+                next(stream)
+                for line in stream:
+                    self._city.add(self._headers[tile.key], line.rstrip(b"\n"))

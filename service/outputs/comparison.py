@@ -12,8 +12,7 @@ from markupsafe import escape
 
 from pipeline.ruler.evaluation.markdown import markdown_cell
 from service.outputs.assemble import Progress, published_tiles, write_outputs
-from service.outputs.catalogue import NAME as CATALOGUE_NAME
-from service.outputs.catalogue import Catalogue, StoredOutput, read_catalogue, run_outputs
+from service.outputs.catalogue import Catalogue, read_catalogue, run_outputs, stored_outputs
 from service.outputs.kinds import COMPARISON_OUTPUTS, chosen
 from service.outputs.meshes import zip_files, zip_text
 from service.outputs.report import cleaner
@@ -66,7 +65,7 @@ def write_comparison_outputs(
     OSError
         A file is missing, or the folder cannot be written.
     """
-    from pipeline.io.storage import LocalStorage, sha256_of
+    from pipeline.io.storage import LocalStorage
 
     kinds = chosen(wanted, COMPARISON_OUTPUTS)
     files = sorted(_files(folder))
@@ -90,13 +89,11 @@ def write_comparison_outputs(
             storage.put(kind.filename, _cleaned(source, clean).encode())
         else:
             storage.put(kind.filename, source.read_bytes())
-    stored = {}
-    for kind in kinds:
-        path = out_dir / kind.filename
-        stored[kind.output_id] = StoredOutput(size_bytes=path.stat().st_size, sha256=sha256_of(path))
     first = read_catalogue(run_outputs(out_dir, labels[0]))
-    catalogue = Catalogue(outputs=stored, crs=first.crs, n_buildings=first.n_buildings, runs=tuple(labels))
-    storage.put(CATALOGUE_NAME, catalogue.to_json().encode())
+    catalogue = Catalogue(
+        outputs=stored_outputs(out_dir, kinds), crs=first.crs, n_buildings=first.n_buildings, runs=tuple(labels)
+    )
+    catalogue.write(out_dir)
     on_progress(total, total)
 
 

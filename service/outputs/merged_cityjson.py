@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -21,18 +20,6 @@ _EMPTY: dict[str, Any] = {
 }
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FeaturePlace:
-    """Position of a building's feature in its tile's file."""
-
-    building_id: str
-    """The building."""
-    start: int
-    """First byte of its line."""
-    size: int
-    """Bytes of its line, without the line's end."""
-
-
 def read_header(path: Path) -> dict[str, Any]:
     """The first line of a CityJSONSeq file.
 
@@ -47,18 +34,6 @@ def read_header(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise RunError(f"{path} cannot be read as CityJSONSeq: {error}") from error
     return header
-
-
-def features(path: Path) -> Iterator[tuple[FeaturePlace, bytes]]:
-    """The features of a tile's file: where each lies, and its line without the line's end."""
-    with path.open("rb") as stream:
-        start = len(stream.readline())
-        for line in stream:
-            text = line.rstrip(b"\n")
-            if text:
-                name = json.loads(text)["id"]
-                yield FeaturePlace(building_id=name, start=start, size=len(text)), text
-            start += len(line)
 
 
 class MergedCityJson:

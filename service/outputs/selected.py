@@ -20,6 +20,7 @@ from typing import Any
 from pipeline.model import Status
 from service.disk import FULL_BYTES, MAKE_ROOM, Disk, has_no_space
 from service.errors import NoSpaceError, NoSuchOutputError, SelectionBusyError, UnexpectedError
+from service.features.index import NAME as INDEX
 from service.outputs.catalogue import NAME as CATALOGUE
 from service.outputs.catalogue import read_catalogue
 from service.outputs.kinds import OUTPUTS
@@ -180,6 +181,7 @@ def write_selected(
         shutil.rmtree(made / "3dtiles", ignore_errors=True)  # the zip file has its files
         (made / OUTPUTS["3dtiles"].filename).unlink(missing_ok=True)
         write_outputs(run, made, names)
+        (made / INDEX).unlink()  # no page shows a selection
         try:
             made.rename(place)
         except OSError:

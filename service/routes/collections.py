@@ -19,12 +19,16 @@ from pydantic import AfterValidator
 from service.auth import Principal
 from service.errors import (
     NoSuchCollectionError,
+    NoSuchFeatureError,
     NoSuchJobError,
     NoSuchOutputError,
     RequestError,
     ResultNotReadyError,
 )
-from service.features.runs import ServedRun, split_id
+from service.features.index import NAME as INDEX_NAME
+from service.features.index import TABLES
+from service.features.pages import FeatureQuery, Search, ShapeTest, acquired_in, collected, feature_texts
+from service.features.runs import OpenRun, ServedRun, open_run, split_id
 from service.files import StateFolder, is_id
 from service.jobs import Job, JobStatus
 from service.outputs.kinds import GEOJSON
@@ -47,12 +51,10 @@ from service.wire.features import (
     SpatialExtent,
     TemporalExtent,
 )
-from service.wire.queries import interval
+from service.wire.queries import interval, is_interval, window
 
 if TYPE_CHECKING:
-    from service.features.cql2 import Filter
-    from service.features.pages import FeatureQuery
-    from service.features.tables import Layer, OpenRun
+    from service.features.tables import Layer
 
 FEATURES = "http://www.opengis.net/spec/ogcapi-features-"
 CQL2 = "http://www.opengis.net/spec/cql2/1.0/conf/"
@@ -160,13 +162,12 @@ class Catalogue:
         if not job.request.has_buildings:
             return []
         finished = results_of(job, self.folder)
-        index_dir = self.folder.attempt(job.job_id, job.attempt) / "features"
         runs = [finished.run(label) for label in finished.catalogue.runs] or [finished]
         return [
             ServedRun(
                 name=job.job_id if one.label is None else f"{job.job_id}.{one.label}",
                 place=str(one.run_dir),
-                index_dir=index_dir,
+                index=one.out_dir / INDEX_NAME,
                 is_job=True,
             )
             for one in runs
@@ -198,12 +199,10 @@ def _catalogue(request: Request, store: Store, folder: Folder, caller: Reader) -
 _Runs = Annotated[Catalogue, Depends(_catalogue)]
 
 
-def _opened(runs: Catalogue, collection_id: str) -> tuple[OpenRun, Layer]:
+def _opened(runs: Catalogue, collection_id: str) -> tuple[OpenRun, str]:
     """The run and the table of a collection."""
-    from service.features.tables import LAYERS, open_run
-
     name, table = split_id(collection_id)
-    return open_run(runs.run(name)), LAYERS[table]
+    return open_run(runs.run(name)), table
 
 
 # --- collections -----------------------------------------------------------------------------------------------------
@@ -221,8 +220,6 @@ def collections(
     offset: Annotated[int, Query(ge=0, le=2**31 - 1, description="Number of jobs before the page.")] = 0,
 ) -> Response:
     """List published runs and runs of jobs, each with its tables; a run whose CRS is unknown has no collections."""
-    from service.features.tables import layers, open_run
-
     found, n_jobs = runs.page(limit, offset)
     listed: list[Collection] = []
     for served in found:
@@ -230,7 +227,7 @@ def collections(
             run = open_run(served)
         except _NOT_SHOWN:
             continue
-        listed += [_described(run, layer, base) for layer in layers()]
+        listed += [_described(run, table, base) for table in TABLES]
     links = page_links(f"{base}/collections", [], n_jobs, limit, offset)
     return respond(Collections(links=links, collections=listed))
 
@@ -245,9 +242,11 @@ def collection(runs: _Runs, base: Base, collection_id: _CollectionId) -> Respons
     return respond(_described(*_opened(runs, collection_id), base))
 
 
-def _described(run: OpenRun, layer: Layer, base: str) -> Collection:
-    totals = run.totals(layer.table)
-    place = f"{base}/collections/{run.run.collection_id(layer.table)}"
+def _described(run: OpenRun, table: str, base: str) -> Collection:
+    from service.features.tables import LAYERS
+
+    totals, layer, name = run.index.totals(table), LAYERS[table], run.collection_id(table)
+    place = f"{base}/collections/{name}"
     bounds = None if totals.bounds is None else run.crs.outside(totals.bounds, run.crs.named(None, "crs"))
     spatial = None if bounds is None else SpatialExtent(bbox=[[round(value, 7) for value in bounds]], crs=_CRS84)
     temporal = TemporalExtent(interval=[list(totals.times)]) if totals.times != (None, None) else None
@@ -261,8 +260,8 @@ def _described(run: OpenRun, layer: Layer, base: str) -> Collection:
         links.append(Link(href=str(run.licence), rel="license", title="Licence of the source data"))
     licence = f"; licence of the source data: {run.licence}" if run.licence else ""
     return Collection(
-        id=run.run.collection_id(layer.table),
-        title=f"{run.run.name}: {layer.table}",
+        id=name,
+        title=f"{run.run.name}: {table}",
         description=layer.title + _elevations(run, layer) + licence,
         itemType="feature",
         extent=Extent(spatial=spatial, temporal=temporal) if spatial or temporal else None,
@@ -277,7 +276,7 @@ def _elevations(run: OpenRun, layer: Layer) -> str:
     from pipeline.export.columns import ELEVATIONS
     from pipeline.io.crs_units import unit_name
 
-    unit_m = run.crs.vertical_unit_m
+    unit_m = run.crs.vertical_unit_m or 1.0
     if unit_m == 1.0 or not ELEVATIONS[layer.table]:
         return ""
     return f"; elevations that are properties are in units of {unit_m:.12g} m ({unit_name(unit_m)})"
@@ -312,12 +311,14 @@ def schema(runs: _Runs, base: Base, collection_id: _CollectionId) -> Response:
 
 
 def _schema(runs: Catalogue, base: str, collection_id: str, kind: Literal["queryables", "schema"]) -> Response:
-    run, layer = _opened(runs, collection_id)
-    name = run.run.collection_id(layer.table)
+    from service.features.tables import LAYERS
+
+    run, table = _opened(runs, collection_id)
+    name, layer = run.collection_id(table), LAYERS[table]
     found = JsonSchema(
         **{"$schema": _SCHEMA, "$id": f"{base}/collections/{name}/{kind}"},
         type="object",
-        title=f"{run.run.name}: {layer.table}",
+        title=f"{run.run.name}: {table}",
         additionalProperties=kind == "schema",
         properties=layer.filter_schema(run.crs) if kind == "queryables" else layer.feature_schema(run.crs),
     )
@@ -325,11 +326,6 @@ def _schema(runs: Catalogue, base: str, collection_id: str, kind: Literal["query
 
 
 # --- features --------------------------------------------------------------------------------------------------------
-
-
-def _is_interval(text: str | None) -> str | None:
-    interval(text)
-    return text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -352,7 +348,7 @@ class _Asked:
     crs: _Crs = None
     datetime: Annotated[
         str | None,
-        AfterValidator(_is_interval),
+        AfterValidator(is_interval),
         Query(
             description="Only features whose points were acquired then: an RFC 3339 time, or `a/b`, `../b`, `a/..`. "
             "Features without such times are always there.",
@@ -398,38 +394,49 @@ _PROPERTY_PARAMETERS = {
 }
 
 
-def _query(run: OpenRun, layer: Layer, asked: _Asked, given: Sequence[tuple[str, str]]) -> FeatureQuery:
+def _search(run: OpenRun, table: str, asked: _Asked, given: Sequence[tuple[str, str]]) -> Search:
     """The query for a page; all of it is checked before anything is read."""
-    from service.features.coordinates import parsed_window
     from service.features.cql2 import compiled, equality, parsed
-    from service.features.pages import FeatureQuery
 
     bbox_crs, filter_crs = run.crs.named(asked.bbox_crs, "bbox-crs"), run.crs.named(asked.filter_crs, "filter-crs")
-    unknown = [name for name, _ in given if name not in layer.queryables]
+    queryables = {name: kind for name, kind in run.index.kinds(table).items() if kind != "list"}
+    unknown = [name for name, _ in given if name not in queryables]
     if unknown:
         known = f"{', '.join(sorted(_NAMES))}, or a property of its queryables"
         raise RequestError([f"query {name[:80]!r} is not known: use {known}" for name in dict.fromkeys(unknown)])
     twice = {name: number for name, number in Counter(name for name, _ in given).items() if number > 1}
     if twice:
         raise RequestError([f"query {name} is given {number} times: give it once" for name, number in twice.items()])
-    filters: list[Filter] = [
-        compiled(equality(name, value, layer.queryables), layer.queryables, filter_crs) for name, value in given
-    ]
+    trees = [equality(name, value, queryables) for name, value in given]
     if asked.filter is not None:
-        filters.append(compiled(parsed(asked.filter, asked.filter_lang), layer.queryables, filter_crs))
-    boxes = None if asked.bbox is None else parsed_window(asked.bbox, bbox_crs)
+        trees.append(parsed(asked.filter, asked.filter_lang))
+    shapes: list[ShapeTest] = []
+    filters = [compiled(tree, queryables, filter_crs, shapes) for tree in trees]
+    boxes = None
+    near, near_crs = [one.window for one in filters if one.window is not None][:1], filter_crs
+    if asked.bbox is not None:
+        boxes = window(asked.bbox, in_degrees=bbox_crs.crs.is_geographic, northing_first=bbox_crs.is_northing_first)
+        near, near_crs = boxes, bbox_crs
+    windows = [run.crs.window(box, near_crs) for box in near]
+    times = [] if asked.datetime is None or table != "buildings" else [acquired_in(interval(asked.datetime))]
     selecting = (asked.bbox, bbox_crs.uri, asked.datetime, asked.filter, asked.filter_lang, filter_crs.uri, *given)
-    return FeatureQuery(
-        crs=run.crs.named(asked.crs, "crs"),
+    query = FeatureQuery(
+        conditions=[*filters, *times],
+        shapes=shapes,
         boxes=boxes,
         boxes_crs=bbox_crs,
-        interval=None if asked.datetime is None else interval(asked.datetime),
-        filters=filters,
-        filter_crs=filter_crs,
-        key=json.dumps(selecting),
-        limit=asked.limit,
-        start=asked.start,
+        windows=None if not windows or None in windows else [box for box in windows if box is not None],
     )
+    key = json.dumps(selecting)
+    return Search(version=run.version, table=table, key=key, index=run.index, crs=run.crs, query=query)
+
+
+def _texts(run: OpenRun, table: str, positions: Sequence[int], crs: str | None) -> tuple[Iterator[bytes], str]:
+    """Features as GeoJSON in the CRS of a query parameter, and its URI."""
+    named = run.crs.named(crs, "crs")
+    is_stored = table == "buildings" and named.uri == _CRS84
+    written = None if is_stored else lambda shapes: run.crs.written(shapes, named)
+    return feature_texts(run.index, table, positions, written), named.uri
 
 
 @router.get(
@@ -451,35 +458,31 @@ def items(
     request: Request, runs: _Runs, base: Base, collection_id: _CollectionId, asked: Annotated[_Asked, Depends()]
 ) -> Response:
     """List features by window, time, property and filter, in pages."""
-    from service.features.pages import feature_page
-
     preferred(request.headers.get("accept"), [GEOJSON])
-    run, layer = _opened(runs, collection_id)
+    run, table = _opened(runs, collection_id)
     everything = request.query_params.multi_items()
-    query = _query(run, layer, asked, [(name, value) for name, value in everything if name not in _NAMES])
-    page = feature_page(run, layer, query)
-    place = f"{base}/collections/{run.run.collection_id(layer.table)}"
+    search = _search(run, table, asked, [(name, value) for name, value in everything if name not in _NAMES])
+    run.crs.named(asked.crs, "crs")
+    positions, following = search.page(asked.limit, asked.start)
+    place = f"{base}/collections/{run.collection_id(table)}"
 
     def at(given: Sequence[tuple[str, str]]) -> str:
         return f"{place}/items?{urlencode(given)}" if given else f"{place}/items"
 
     links = [link(at(everything), "self", "These features", GEOJSON), link(place, "collection", "The collection")]
-    if page.following is not None:
+    if following is not None:
         again = [(name, value) for name, value in everything if name not in {"start", "limit"}]
-        again += [("limit", str(asked.limit)), ("start", str(page.following))]
+        again += [("limit", str(asked.limit)), ("start", str(following))]
         links.append(link(at(again), "next", "The next features", GEOJSON))
-    members: dict[str, Any] = {"type": "FeatureCollection", "timeStamp": timestamp(dt.datetime.now(dt.UTC))}
-    if page.matched is not None:
-        members["numberMatched"] = page.matched
-    members |= {"numberReturned": len(page.features), "links": [one.model_dump() for one in links]}
-    body = b"".join(_collected(members, page.features))
-    return Response(body, media_type=GEOJSON, headers=_headers(query.crs.uri))
-
-
-def _collected(members: Mapping[str, Any], features: Sequence[bytes]) -> Iterator[bytes]:
-    yield json.dumps(members, ensure_ascii=False).encode()[:-1] + b',"features":[\n'
-    yield b",\n".join(features)
-    yield b"\n]}\n"
+    matched = search.matched()
+    members: dict[str, Any] = {
+        "timeStamp": timestamp(dt.datetime.now(dt.UTC)),
+        **({} if matched is None else {"numberMatched": matched}),
+        "numberReturned": len(positions),
+        "links": [one.model_dump() for one in links],
+    }
+    texts, uri = _texts(run, table, positions, asked.crs)
+    return Response(b"".join(collected(members, texts)), media_type=GEOJSON, headers=_headers(uri))
 
 
 def _headers(crs: str) -> dict[str, str]:
@@ -508,19 +511,22 @@ def item(
     crs: _Crs = None,
 ) -> Response:
     """One feature by its id."""
-    from service.features.pages import single_feature
-
     preferred(request.headers.get("accept"), [GEOJSON])
-    run, layer = _opened(runs, collection_id)
-    named = run.crs.named(crs, "crs")
-    text = single_feature(run, layer, feature_id, named)
-    place = f"{base}/collections/{run.run.collection_id(layer.table)}"
+    run, table = _opened(runs, collection_id)
+    with run.index.opened() as connection:
+        query = f"SELECT position FROM {table} WHERE id = ?"  # noqa: S608 - our own words
+        row = connection.execute(query, (feature_id,)).fetchone()
+    if row is None:
+        raise NoSuchFeatureError(f"{collection_id} holds no feature {feature_id[:80]!r}")
+    texts, uri = _texts(run, table, row, crs)
+    (text,) = texts
+    place = f"{base}/collections/{collection_id}"
     links = [
         link(f"{place}/items/{feature_id}", "self", "This feature", GEOJSON),
         link(place, "collection", "The collection"),
     ]
-    if run.run.is_job and layer.table == "buildings" and "." not in run.run.name:
+    if run.run.is_job and table == "buildings" and "." not in run.run.name:
         building = f"{base}/jobs/{run.run.name}/buildings/{feature_id}"
         links.append(link(building, "related", "The building with its planes and models", GEOJSON))
     body = text[:-1] + b',"links":' + json.dumps([one.model_dump() for one in links]).encode() + b"}"
-    return Response(body, media_type=GEOJSON, headers=_headers(named.uri))
+    return Response(body, media_type=GEOJSON, headers=_headers(uri))

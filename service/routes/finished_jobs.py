@@ -18,6 +18,9 @@ from fastapi import Depends, Query
 from pipeline.model import Status
 from service.disk import Disk
 from service.errors import NoSuchOutputError, RequestError, ResultNotReadyError, StoreError
+from service.features.index import NAME as INDEX_NAME
+from service.features.index import RowIndex
+from service.features.runs import job_index
 from service.files import StateFolder
 from service.jobs import Job, JobStatus
 from service.outputs import Catalogue, read_catalogue, run_outputs
@@ -58,6 +61,12 @@ class FinishedJob:
     def has_buildings_yet(self) -> bool:
         """Whether there is an index of buildings."""
         return self.catalogue is not NOTHING_YET
+
+    @property
+    def index(self) -> RowIndex:
+        """The rows of its tables."""
+        path = self.out_dir / INDEX_NAME
+        return job_index(path, self.run_dir) if self.is_complete else RowIndex(path)
 
     def run(self, label: str) -> FinishedJob:
         """One run of a comparison, as if it were a job of its own."""

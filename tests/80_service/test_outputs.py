@@ -81,7 +81,7 @@ def test_doing_it_again_gives_the_same_bytes_and_leaves_nothing_beside(
     write_outputs(run_dir, tmp_path)
     assert contents(tmp_path) == first
     made = [kind.filename for name, kind in OUTPUTS.items() if name not in ON_REQUEST]
-    assert set(first) == {"outputs.json", "index.sqlite", *made}
+    assert set(first) == {"outputs.json", "rows.sqlite", *made}
 
 
 def test_only_the_wanted_outputs_are_offered(run_dir: Path, tmp_path: Path) -> None:
