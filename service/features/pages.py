@@ -12,7 +12,7 @@ import functools
 import json
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
@@ -98,43 +98,36 @@ def _joined(conditions: Sequence[Condition]) -> tuple[str, list[Any]]:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FeatureQuery:
-    """The query for features in the order of their collection."""
-
-    conditions: Sequence[Condition] = ()
-    """All that rows must meet, beside the boxes."""
-    shapes: Sequence[ShapeTest] = ()
-    """The tests that the conditions name."""
-    boxes: Sequence[Box] | None = None
-    """Rows whose geometry meets one of these, or that have none; easting first."""
-    boxes_crs: NamedCrs
-    """Their CRS."""
-    windows: Sequence[Box] | None = None
-    """Boxes of the run's CRS in which all wanted geometries lie, beside rows without; None for anywhere."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Search:
-    """A query of a table of a run; equal for queries that select the same rows."""
+    """A search for rows of a table in their order; equal for searches that select the same rows."""
 
     version: str
     """State of the run."""
     table: str
     """Name of the table."""
     key: str
-    """The same for queries that select the same rows."""
+    """The same for requests that select the same rows."""
     index: RowIndex = dataclasses.field(compare=False)
     """Its rows."""
     crs: RunCrs = dataclasses.field(compare=False)
     """The CRS of the run."""
-    query: FeatureQuery = dataclasses.field(compare=False)
-    """The query."""
+    conditions: Sequence[Condition] = dataclasses.field(default=(), compare=False)
+    """All that rows must meet, beside the boxes."""
+    shapes: Sequence[ShapeTest] = dataclasses.field(default=(), compare=False)
+    """The tests that the conditions name."""
+    boxes: Sequence[Box] | None = dataclasses.field(default=None, compare=False)
+    """Rows whose geometry meets one of these, or that have none; easting first."""
+    boxes_crs: NamedCrs = dataclasses.field(compare=False)
+    """Their CRS."""
+    windows: Sequence[Box] | None = dataclasses.field(default=None, compare=False)
+    """Boxes of the run's CRS in which all wanted geometries lie, beside rows without; None for anywhere."""
 
     def page(self, limit: int, start: int) -> tuple[list[int], int | None]:
         """Positions of at most so many rows from `start` on, and the start of the next page; None if there is none."""
         found: list[int] = []
         looked_at = 0
-        with _Rows(self) as rows:
+        with self.index.opened() as connection:
+            rows = _Rows(self, connection)
             for part in rows.parts(start):
                 if found and looked_at >= MAX_READ:
                     return found, part.first
@@ -147,54 +140,45 @@ class Search:
     @functools.lru_cache(maxsize=_KEPT_COUNTS)  # noqa: B019 - the pages of one list share their number
     def matched(self) -> int | None:
         """The number of rows on all pages; None if counting would take too long."""
-        if not self.query.conditions and self.query.boxes is None:
+        if not self.conditions and self.boxes is None:
             return self.index.totals(self.table).n
-        with _Rows(self) as rows:
+        with self.index.opened() as connection:
+            rows = _Rows(self, connection)
             near = rows.parts()
-            looked_at = sum(part.n for part in near if self.query.conditions or not rows.is_inside(part))
+            looked_at = sum(part.n for part in near if self.conditions or not rows.is_inside(part))
             return None if looked_at > MAX_COUNTED else sum(len(rows.selected(part)) for part in near)
 
 
 class _Rows:
-    """The rows of a search, part by part; a context manager."""
+    """The rows of a search, part by part."""
 
-    def __init__(self, search: Search) -> None:
+    def __init__(self, search: Search, connection: sqlite3.Connection) -> None:
         self._search = search
-        self._query = search.query
-        boxes = self._query.boxes
+        self._connection = connection
+        connection.create_function("shape", 2, lambda k, position: self._answers[k][position - self._first])
+        boxes = search.boxes
         self._union = None if boxes is None else shapely.union_all([shapely.box(*box) for box in boxes])
         self._first = 0
         self._answers: list[list[bool | None]] = []
 
-    def __enter__(self) -> Self:
-        """Open the index."""
-        self._opening = self._search.index.opened()
-        self._connection: sqlite3.Connection = self._opening.__enter__()
-        self._connection.create_function("shape", 2, lambda k, position: self._answers[k][position - self._first])
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        """Close the index."""
-        self._opening.__exit__(*raised)
-
     def parts(self, start: int = 0) -> list[Part]:
         """The parts that can hold what is looked for."""
-        return parts(self._connection, self._search.table, self._query.windows, start)
+        return parts(self._connection, self._search.table, self._search.windows, start)
 
     def is_inside(self, part: Part) -> bool:
         """Whether the boxes select all rows of a part."""
         if self._union is None or part.bounds is None:
             return True
-        bounds = self._search.crs.outside(part.bounds, self._query.boxes_crs)
+        bounds = self._search.crs.outside(part.bounds, self._search.boxes_crs)
         return bounds is not None and bool(shapely.covers(self._union, shapely.box(*bounds)))
 
     def selected(self, part: Part) -> Sequence[int]:
         """The positions of the selected rows of a part."""
-        conditions, shapes = list(self._query.conditions), list(self._query.shapes)
+        conditions, shapes = list(self._search.conditions), list(self._search.shapes)
         if not self.is_inside(part):
             conditions.append(Condition(sql=f"(geometry IS NULL OR shape({len(shapes)}, position))"))
             shapes.append(
-                ShapeTest(crs=self._query.boxes_crs, test=lambda found: shapely.intersects(found, self._union))
+                ShapeTest(crs=self._search.boxes_crs, test=lambda found: shapely.intersects(found, self._union))
             )
         ends = (part.first, part.first + part.n)
         if not conditions:
@@ -203,11 +187,10 @@ class _Rows:
         if shapes:
             stored = self._connection.execute(f"SELECT geometry {source} ORDER BY position", ends)
             own = from_wkb([wkb for (wkb,) in stored])
+            answers = [one.test(self._search.crs.moved(own, one.crs)) for one in shapes]
             missing = shapely.is_missing(own)
             self._first = part.first
-            self._answers = [
-                np.where(missing, None, one.test(self._search.crs.moved(own, one.crs))).tolist() for one in shapes
-            ]
+            self._answers = [np.where(missing, np.array(None), answer).tolist() for answer in answers]
         where, values = _joined(conditions)
         rows = self._connection.execute(f"SELECT position {source} AND {where} ORDER BY position", (*ends, *values))
         return [position for (position,) in rows]

@@ -134,7 +134,7 @@ def _write_geojson(index: RowIndex, out_dir: Path, crs: ResultsCrs) -> None:
     """Write the footprints of all buildings, in the order of the tiles; in degrees if their CRS is known."""
     from service.features.pages import collected, feature_texts
 
-    members = {} if crs.is_known else {"coordRefSys": None, "note": _UNKNOWN}
+    members: dict[str, Any] = {} if crs.is_known else {"coordRefSys": None, "note": _UNKNOWN}
     if crs.vertical_unit_m is not None:
         members["verticalUnitM"] = crs.vertical_unit_m
     features = feature_texts(

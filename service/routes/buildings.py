@@ -197,7 +197,8 @@ def buildings(request: Request, finished: ReadableRun, base: Base, asked: Annota
     preferred(request.headers.get("accept"), [GEOJSON])
     known = finished.catalogue.crs
     conditions, native = asked.conditions(known), _is_native(asked.crs, known, "crs")
-    matched, positions, texts = 0, [], iter(())
+    matched, positions = 0, list[int]()
+    texts: Iterator[bytes] = iter(())
     if finished.has_buildings_yet:
         # a list that grows does so at its end
         order = "id" if finished.is_complete else "position"

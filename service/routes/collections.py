@@ -27,7 +27,7 @@ from service.errors import (
 )
 from service.features.index import NAME as INDEX_NAME
 from service.features.index import TABLES
-from service.features.pages import FeatureQuery, Search, ShapeTest, acquired_in, collected, feature_texts
+from service.features.pages import Search, ShapeTest, acquired_in, collected, feature_texts
 from service.features.runs import OpenRun, ServedRun, open_run, split_id
 from service.files import StateFolder, is_id
 from service.jobs import Job, JobStatus
@@ -395,7 +395,7 @@ _PROPERTY_PARAMETERS = {
 
 
 def _search(run: OpenRun, table: str, asked: _Asked, given: Sequence[tuple[str, str]]) -> Search:
-    """The query for a page; all of it is checked before anything is read."""
+    """The search of a request; all of it is checked before anything is read."""
     from service.features.cql2 import compiled, equality, parsed
 
     bbox_crs, filter_crs = run.crs.named(asked.bbox_crs, "bbox-crs"), run.crs.named(asked.filter_crs, "filter-crs")
@@ -420,15 +420,18 @@ def _search(run: OpenRun, table: str, asked: _Asked, given: Sequence[tuple[str, 
     windows = [run.crs.window(box, near_crs) for box in near]
     times = [] if asked.datetime is None or table != "buildings" else [acquired_in(interval(asked.datetime))]
     selecting = (asked.bbox, bbox_crs.uri, asked.datetime, asked.filter, asked.filter_lang, filter_crs.uri, *given)
-    query = FeatureQuery(
+    return Search(
+        version=run.version,
+        table=table,
+        key=json.dumps(selecting),
+        index=run.index,
+        crs=run.crs,
         conditions=[*filters, *times],
         shapes=shapes,
         boxes=boxes,
         boxes_crs=bbox_crs,
         windows=None if not windows or None in windows else [box for box in windows if box is not None],
     )
-    key = json.dumps(selecting)
-    return Search(version=run.version, table=table, key=key, index=run.index, crs=run.crs, query=query)
 
 
 def _texts(run: OpenRun, table: str, positions: Sequence[int], crs: str | None) -> tuple[Iterator[bytes], str]:

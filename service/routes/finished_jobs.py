@@ -26,8 +26,8 @@ from service.jobs import Job, JobStatus
 from service.outputs import Catalogue, read_catalogue, run_outputs
 from service.outputs.catalogue import NOTHING_YET
 from service.outputs.comparison import RUNS
-from service.outputs.kinds import OUTPUTS
-from service.outputs.selected import OFFERED, Selections, refuse_others
+from service.outputs.kinds import SELECTABLE
+from service.outputs.selected import Selections, refuse_others
 from service.problems import JobFailedError
 from service.routes.bound import Folder, Reader, Selecting, Store
 from service.routes.jobs import JobId
@@ -155,7 +155,7 @@ _Only = Annotated[
     Query(
         alias="status",
         description=f"Only buildings of these statuses: {', '.join(Status)}; with commas, or the parameter again. For "
-        f"{', '.join(name for name in OUTPUTS if name in OFFERED)}. These outputs are made when they are first asked "
+        f"{', '.join(SELECTABLE)}. These outputs are made when they are first asked "
         "for; until then the answer is 503 with Retry-After.",
         examples=["ok"],
     ),
