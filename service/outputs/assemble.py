@@ -16,6 +16,7 @@ from pipeline.io.storage import LocalStorage
 from service.features.index import NAME as INDEX_NAME
 from service.features.index import TABLES, RowIndex
 from service.outputs.catalogue import Catalogue, ResultsCrs, stored_outputs
+from service.outputs.files import write_moved_tileset, zip_files
 from service.outputs.kinds import ON_REQUEST, OUTPUTS, chosen
 
 if TYPE_CHECKING:
@@ -120,8 +121,10 @@ def write_outputs(
         # the run was requested without meshes
         names.discard("meshes")
         (out_dir / OUTPUTS["meshes"].filename).unlink(missing_ok=True)
-    if not ("tileset" in names and _write_tileset(run_dir, out_dir / OUTPUTS["tileset"].filename)):
-        # the request left out the points
+    if "tileset" in names and (run_dir / POINTS_FOLDER / TILESET).is_file():
+        # from jobs/ID/results/tileset to jobs/ID/points
+        write_moved_tileset(run_dir / POINTS_FOLDER / TILESET, out_dir / OUTPUTS["tileset"].filename, "../points")
+    else:
         names.discard("tileset")
         (out_dir / OUTPUTS["tileset"].filename).unlink(missing_ok=True)
     # these were written before, those that the request named
@@ -142,22 +145,6 @@ def _write_geojson(index: RowIndex, out_dir: Path, crs: ResultsCrs) -> None:
     )
     with LocalStorage(root=out_dir).putting(OUTPUTS["geojson"].filename) as path, path.open("wb") as stream:
         stream.writelines(collected(members, features))
-
-
-def _write_tileset(run_dir: Path, path: Path) -> bool:
-    """Write the root tileset of the points for its place among the results; False if there is none."""
-    root = run_dir / POINTS_FOLDER / TILESET
-    if not root.is_file():
-        return False
-    tileset = json.loads(root.read_bytes())
-    waiting = [tileset["root"]]
-    for node in waiting:
-        if "content" in node:
-            # from jobs/ID/results/tileset to jobs/ID/points
-            node["content"]["uri"] = f"../points/{node['content']['uri']}"
-        waiting.extend(node.get("children", ()))
-    path.write_text(json.dumps(tileset, separators=(",", ":"), ensure_ascii=False), encoding="utf-8")
-    return True
 
 
 def published_tiles(run_dir: Path) -> tuple[list[RunTile], dict[str, str]]:
@@ -238,7 +225,6 @@ class _Sinks:
         from pipeline.export.folders import TERRAIN_FOLDER
         from pipeline.export.solid_geometry import SHAPE_COLUMNS
         from service.outputs.merged_table import read_tile
-        from service.outputs.meshes import zip_files
 
         for name in TABLES:
             table = read_tile(self._run_dir / tile.table(name))

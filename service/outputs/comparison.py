@@ -13,8 +13,8 @@ from markupsafe import escape
 from pipeline.ruler.evaluation.markdown import markdown_cell
 from service.outputs.assemble import Progress, published_tiles, write_outputs
 from service.outputs.catalogue import Catalogue, read_catalogue, run_outputs, stored_outputs
+from service.outputs.files import zip_files, zip_text
 from service.outputs.kinds import COMPARISON_OUTPUTS, chosen
-from service.outputs.meshes import zip_files, zip_text
 from service.outputs.report import cleaner
 
 RUNS = "runs"
