@@ -11,7 +11,6 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
 from typing import Annotated, Any, Literal
-from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import AfterValidator
@@ -32,13 +31,13 @@ from service.outputs.single_building import (
     points_of_building,
     stored_building,
 )
-from service.routes.answers import JOB_ID, document, header, problems, reference
+from service.routes.answers import FEATURE_EXAMPLE, JOB_ID, document, header, problems, reference
 from service.routes.bound import Base
 from service.routes.finished_jobs import FinishedJob, FinishedRun, ReadableRun
 from service.routes.negotiation import preferred
 from service.routes.results import FAILED
 from service.wire import patterns
-from service.wire.base import link, respond
+from service.wire.base import link, page_links, respond
 from service.wire.buildings import CityJson, Decision, Decisions, Feature, FeaturePage
 from service.wire.queries import Statuses, entry_of, window, words
 
@@ -59,30 +58,13 @@ class CoordinateChoice(StrEnum):
     """Easting and northing of the tiles, in their own units."""
 
 
-_FEATURE_EXAMPLE: dict[str, Any] = {
-    "type": "Feature",
-    "id": "3givd2mvtyerfjxv2yytjbmi",
-    "geometry": {
-        "type": "Polygon",
-        "coordinates": [[[9.9967, 53.5603], [9.9968, 53.5602], [9.9969, 53.5603], [9.9967, 53.5603]]],
-    },
-    "properties": {
-        "building_id": "3givd2mvtyerfjxv2yytjbmi",
-        "status": "ok",
-        "reason": None,
-        "roof_type": "gable",
-        "height_m": 7.618,
-        "volume_m3": 965.377,
-        "tile": "x5660_y59350",
-    },
-}
 _PAGE_EXAMPLE = {
     "type": "FeatureCollection",
     "numberMatched": 154,
     "numberReturned": 1,
     "complete": True,
     "links": [{"href": f"http://127.0.0.1:8000/jobs/{JOB_ID}/buildings?limit=1", "rel": "self", "type": GEOJSON}],
-    "features": [_FEATURE_EXAMPLE],
+    "features": [FEATURE_EXAMPLE],
 }
 _DECISIONS_EXAMPLE = {
     "building_id": "3givd2mvtyerfjxv2yytjbmi",
@@ -162,20 +144,6 @@ class _Asked:
             found.append(bounded_by(window(self.bbox, in_degrees=not native), native=native))
         return found
 
-    def again(self, label: str | None, start: int) -> str:
-        """The same query, starting at another building."""
-        lists = (("status", self.status), ("roof_type", self.roof_type), ("reason", self.reason))
-        given = [
-            ("method", label),
-            ("bbox", self.bbox),
-            ("bbox-crs", None if self.bbox_crs is None else self.bbox_crs.value),
-            ("crs", None if self.crs is None else self.crs.value),
-            *((name, ",".join(values or ()) or None) for name, values in lists),
-            ("limit", self.limit),
-            ("offset", start),
-        ]
-        return urlencode([(name, value) for name, value in given if value is not None])
-
 
 @router.get(
     "/jobs/{jobID}/buildings",
@@ -205,23 +173,18 @@ def buildings(request: Request, finished: ReadableRun, base: Base, asked: Annota
         matched, positions = sorted_page(finished.index, conditions, by=order, limit=asked.limit, offset=asked.offset)
         texts = _texts(finished.index, positions, native=native)
     collection = f"{base}/jobs/{finished.job.job_id}"
-    limit, offset = asked.limit, asked.offset
-
-    def at(start: int, rel: str, title: str) -> dict[str, Any]:
-        href = f"{collection}/buildings?{asked.again(finished.label, start)}"
-        return link(href, rel, title, GEOJSON).model_dump()
-
-    links = [at(offset, "self", "These buildings"), link(collection, "collection", "The job").model_dump()]
-    if positions and offset + len(positions) < matched:
-        links.append(at(offset + limit, "next", "The next buildings"))
-    if offset > 0:
-        links.append(at(max(0, offset - limit), "prev", "The buildings before"))
+    given = [entry for entry in request.query_params.multi_items() if entry[0] not in {"limit", "offset", "method"}]
+    found = matched - asked.offset if positions else 0
+    links = page_links(
+        f"{collection}/buildings", [*given, ("method", finished.label)], found, asked.limit, asked.offset, GEOJSON
+    )
+    links.append(link(collection, "collection", "The job"))
     members = {
         "numberMatched": matched,
         "numberReturned": len(positions),
         **_state(finished),
         **_crs_members(known, native=native),
-        "links": links,
+        "links": [one.model_dump() for one in links],
     }
     headers = _headers(finished, native=native)
     return Response(b"".join(collected(members, texts)), media_type=GEOJSON, headers=headers)
@@ -240,7 +203,7 @@ def _texts(index: RowIndex, positions: Sequence[int], *, native: bool) -> Iterat
         200: {
             "description": "The record with its planes; or its mesh; or a CityJSON document of its own.",
             "content": {
-                GEOJSON: {"schema": reference(Feature), "example": _FEATURE_EXAMPLE},
+                GEOJSON: {"schema": reference(Feature), "example": FEATURE_EXAMPLE},
                 OBJ: {"schema": {"type": "string"}},
                 GLB: {"schema": {"type": "string", "format": "binary"}},
                 CITYJSON: {"schema": reference(CityJson)},

@@ -33,7 +33,7 @@ from service.files import StateFolder, is_id
 from service.jobs import Job, JobStatus
 from service.outputs.kinds import GEOJSON
 from service.problems import JobFailedError
-from service.routes.answers import document, header, problems, reference
+from service.routes.answers import FEATURE_EXAMPLE, document, header, problems, reference
 from service.routes.bound import Base, Folder, Reader, Store
 from service.routes.finished_jobs import results_of
 from service.routes.negotiation import preferred
@@ -101,19 +101,13 @@ _COLLECTION_EXAMPLE: dict[str, Any] = {
     "storageCrs": "http://www.opengis.net/def/crs/EPSG/0/28992",
     "links": [{"href": "http://127.0.0.1:8000/collections/delft.buildings/items", "rel": "items", "type": GEOJSON}],
 }
-_FEATURE_EXAMPLE: dict[str, Any] = {
-    "type": "Feature",
-    "id": "3givd2mvtyerfjxv2yytjbmi",
-    "geometry": {"type": "Polygon", "coordinates": [[[4.36, 52.0], [4.37, 52.0], [4.37, 52.01], [4.36, 52.0]]]},
-    "properties": {"building_id": "3givd2mvtyerfjxv2yytjbmi", "status": "ok", "height_m": 7.618},
-}
 _PAGE_EXAMPLE = {
     "type": "FeatureCollection",
     "timeStamp": "2026-03-01T09:30:00.000Z",
     "numberMatched": 257,
     "numberReturned": 1,
     "links": [{"href": "http://127.0.0.1:8000/collections/delft.buildings/items", "rel": "self", "type": GEOJSON}],
-    "features": [_FEATURE_EXAMPLE],
+    "features": [FEATURE_EXAMPLE],
 }
 
 
@@ -499,7 +493,7 @@ def _headers(crs: str) -> dict[str, str]:
     responses={
         200: {
             "description": "The feature.",
-            "content": {GEOJSON: {"schema": reference(CollectionFeature), "example": _FEATURE_EXAMPLE}},
+            "content": {GEOJSON: {"schema": reference(CollectionFeature), "example": FEATURE_EXAMPLE}},
             "headers": _CRS_HEADER,
         },
         **problems(404, 406),
