@@ -148,18 +148,23 @@ def _locked(key: str) -> threading.Lock:
 
 
 def _write(index: Path, run_dir: str) -> None:
-    import pyarrow as pa
-
     from pipeline.io import arrow_at
     from pipeline.runtime.manifest_reading import read_manifest
-    from service.features.writing import write_index
 
     try:
         filesystem, place = arrow_at(run_dir)
-        manifest = read_manifest(place, filesystem)
-        write_index(index, place, filesystem, manifest.crs, manifest.source_licence or "")
-    except (RunError, OSError, pa.ArrowException) as error:
+        _write_whole(index, place, filesystem, read_manifest(place, filesystem))
+    except (RunError, OSError) as error:
         raise NoSuchOutputError(GONE) from error
+
+
+def _write_whole(index: Path, place: str, filesystem: Any, manifest: Any) -> None:
+    """Write the index of a run; the file appears whole."""
+    from pipeline.io.storage import LocalStorage
+    from service.features.writing import write_index
+
+    with LocalStorage(root=index.parent).putting(index.name) as path:
+        write_index(path, place, filesystem, manifest)
 
 
 def open_run(run: ServedRun) -> OpenRun:
@@ -175,8 +180,6 @@ def open_run(run: ServedRun) -> OpenRun:
     if run.is_job:
         index = job_index(run.index, Path(run.place))
         return _with_place(OpenRun(run=run, version=run.name, index=index))
-    import pyarrow as pa
-
     from pipeline.io import arrow_at, is_url
     from pipeline.runtime.manifest import NAME as MANIFEST_NAME
 
@@ -191,7 +194,7 @@ def open_run(run: ServedRun) -> OpenRun:
             info = filesystem.get_file_info(f"{place.rstrip('/')}/{MANIFEST_NAME}")
             state = (info.mtime_ns, info.size)
             opened = held[2] if held is not None and held[1] == state else _opened(run, filesystem, place, state)
-        except (RunError, OSError, pa.ArrowException) as error:
+        except (RunError, OSError) as error:
             # the log has the cause, since it can name a folder
             _log.warning("run %s at %s cannot be read: %s", run.name, run.place, error)
             problem = f"files of run {run.name} are gone or damaged; the log of the service says which"
@@ -206,7 +209,6 @@ def open_run(run: ServedRun) -> OpenRun:
 def _opened(run: ServedRun, filesystem: Any, place: str, state: tuple[Any, ...]) -> OpenRun:
     from pipeline.runtime.manifest import RunStatus
     from pipeline.runtime.manifest_reading import read_manifest
-    from service.features.writing import write_index
 
     manifest = read_manifest(place, filesystem)
     if manifest.status is not RunStatus.FINISHED:
@@ -217,7 +219,7 @@ def _opened(run: ServedRun, filesystem: Any, place: str, state: tuple[Any, ...])
     version = hashlib.sha256(repr(facts).encode()).hexdigest()[:24]
     path = run.index / f"{run.name}-{version}.sqlite"
     if not path.is_file():
-        write_index(path, place, filesystem, manifest.crs, manifest.source_licence or "")
+        _write_whole(path, place, filesystem, manifest)
         for old in path.parent.glob(f"{run.name}-{'?' * len(version)}.sqlite"):
             if old != path:
                 old.unlink(missing_ok=True)

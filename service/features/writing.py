@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import json
-import os
 import shutil
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.fs as pafs
 import pyarrow.parquet as pq
 import shapely
 
+from pipeline.errors import RunError
 from pipeline.export.geoparquet import table_files
+from pipeline.runtime.manifest import RunManifest
 from service.features.coordinates import CRS84, RunCrs
-from service.features.index import TIMES, stamp
+from service.features.index import TABLES, TIMES, stamp
 from service.features.pages import from_wkb, geojson
 from service.features.tables import GEOMETRY, LAYERS, TILE, Layer
 
+_READERS = 8
+"""Tiles that are read at once: files of an object store take long to arrive."""
 _BOUNDS = ("x_min", "y_min", "x_max", "y_max")
 _DEGREES = ("west", "south", "east", "north")
 _WORDS = ("status", "roof_type", "reason")
@@ -190,39 +195,75 @@ class GrowingIndex(IndexWriter):
 
 
 def write_index(
-    path: Path, place: str, filesystem: pafs.FileSystem, crs: Mapping[str, Any] | None, licence: str = ""
+    path: Path,
+    place: str,
+    filesystem: pafs.FileSystem,
+    manifest: RunManifest,
+    tiles: Iterable[str] | None = None,
 ) -> None:
-    """Write the index of a run; the file appears whole.
+    """Write the index of a run.
 
     Parameters
     ----------
     path : Path
-        The file to write.
+        The file to write; must not exist.
     place : str
         The run directory in the file system.
     filesystem : pyarrow.fs.FileSystem
         Where the run lies.
-    crs : mapping, optional
-        The `crs` entry of its run.json.
-    licence : str
-        Licence of the source data; may be empty.
+    manifest : RunManifest
+        The content of its run.json.
+    tiles : iterable of str, optional
+        Its tiles, which are read one after the other; by default all, a few at a time.
 
     Raises
     ------
     RunError
-        A table is missing.
+        A table is missing or damaged.
     OSError
-        A file cannot be read, or the index cannot be written.
+        The index cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{os.getpid()}-{path.name}")
-    temporary.unlink(missing_ok=True)
-    with IndexWriter(temporary, crs, licence) as writer:
-        for table, layer in LAYERS.items():
-            for file in table_files(place, table, filesystem):
-                tile = file.split("/")[-2].removeprefix("tile=")
-                with filesystem.open_input_file(file) as stream, pq.ParquetFile(stream) as stored:
-                    names = [name for name in (GEOMETRY, *layer.properties) if name in stored.schema_arrow.names]
-                    for batch in stored.iter_batches(columns=names, use_threads=False):
-                        writer.add(table, tile, batch.to_pylist())
-    temporary.replace(path)
+
+    def read(tile: str) -> list[tuple[str, str, pa.Table]]:
+        return [(table, tile, _rows(filesystem, place, table, tile)) for table in TABLES]
+
+    with IndexWriter(path, manifest.crs, manifest.source_licence or "") as writer:
+        if tiles is not None:
+            for tile in tiles:
+                for table, name, rows in read(tile):
+                    writer.add(table, name, rows.to_pylist())
+            return
+        files = table_files(place, "buildings", filesystem)
+        found = in_z_order(file.split("/")[-2].removeprefix("tile=") for file in files)
+        with concurrent.futures.ThreadPoolExecutor(_READERS) as readers:
+            for start in range(0, len(found), _READERS):
+                for entries in readers.map(read, found[start : start + _READERS]):
+                    for table, name, rows in entries:
+                        writer.add(table, name, rows.to_pylist())
+
+
+def _rows(filesystem: pafs.FileSystem, place: str, table: str, tile: str) -> pa.Table:
+    """The rows of a table of one tile, without the columns that features do not have."""
+    (file,) = table_files(place, table, filesystem, [tile])
+    try:
+        with filesystem.open_input_file(file) as stream, pq.ParquetFile(stream) as stored:
+            names = [name for name in (GEOMETRY, *LAYERS[table].properties) if name in stored.schema_arrow.names]
+            return stored.read(columns=names, use_threads=False)
+    except (OSError, pa.ArrowException) as error:
+        raise RunError(f"{file} cannot be read as Parquet: {error}") from error
+
+
+def in_z_order(tiles: Iterable[str]) -> list[str]:
+    """Keys of tiles along a Z-order curve: successive ones are near each other.
+
+    >>> in_z_order(["x0_y1", "x1_y1", "x1_y0", "x0_y0", "x-1_y0"])
+    ['x-1_y0', 'x0_y0', 'x1_y0', 'x0_y1', 'x1_y1']
+    """
+
+    def place(tile: str) -> int:
+        column, _, row = tile.removeprefix("x").partition("_y")
+        # lattices lie far within 2^31 tiles of their origin
+        x, y = int(column) + 2**31, int(row) + 2**31
+        return sum(((x >> bit & 1) << (2 * bit)) | ((y >> bit & 1) << (2 * bit + 1)) for bit in range(33))
+
+    return sorted(tiles, key=lambda tile: (place(tile), tile))
