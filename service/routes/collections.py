@@ -5,6 +5,7 @@ Modules that read Parquet are imported in the functions that need them: the star
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime as dt
 import json
@@ -25,10 +26,9 @@ from service.errors import (
     RequestError,
     ResultNotReadyError,
 )
-from service.features.index import NAME as INDEX_NAME
 from service.features.index import TABLES
 from service.features.pages import Search, ShapeTest, acquired_in, collected, feature_texts
-from service.features.runs import OpenRun, ServedRun, open_run, split_id
+from service.features.runs import OpenRun, PublishedRun, split_id
 from service.files import StateFolder, is_id
 from service.jobs import Job, JobStatus
 from service.outputs.kinds import GEOJSON
@@ -118,7 +118,7 @@ _PAGE_EXAMPLE = {
 class Catalogue:
     """The runs that a caller may read."""
 
-    published: Mapping[str, ServedRun]
+    published: Mapping[str, PublishedRun]
     """Those of the operator."""
     store: JobStore
     """Those of jobs."""
@@ -127,47 +127,37 @@ class Catalogue:
     caller: Principal
     """The caller."""
 
-    def run(self, name: str) -> ServedRun:
-        """The run with a name. Only names of the settings and ids of jobs ever become a path.
+    def opened(self, collection_id: str) -> tuple[OpenRun, str]:
+        """The run and the table of a collection. Only names of the settings and ids of jobs ever become a path.
 
         Raises
         ------
         NoSuchCollectionError
             There is none, or it belongs to another key.
         """
+        name, table = split_id(collection_id)
         if name in self.published:
-            return self.published[name]
+            return self.published[name].opened(), table
         job_id = name.partition(".")[0]
         if is_id(job_id):
-            try:
-                job = self.store.get(job_id, owner=self.caller.owner)
-            except NoSuchJobError:
-                job = None
-            found = [run for run in self.of_job(job) if run.name == name] if job is not None else []
-            if found:
-                return found[0]
+            with contextlib.suppress(NoSuchJobError):
+                for run in self.of_job(self.store.get(job_id, owner=self.caller.owner)):
+                    if run.name == name:
+                        return run, table
         raise NoSuchCollectionError(
             f"there is no run {name[:80]!r} with collections: /collections lists all; those of a job are there when "
             "it is over, those of a comparison are JOB.METHOD"
         )
 
-    def of_job(self, job: Job) -> list[ServedRun]:
+    def of_job(self, job: Job) -> Iterator[OpenRun]:
         """The runs of a job that is over: several of a comparison, none of one without buildings."""
-        if not job.request.has_buildings:
-            return []
-        finished = results_of(job, self.folder)
-        runs = [finished.run(label) for label in finished.catalogue.runs] or [finished]
-        return [
-            ServedRun(
-                name=job.job_id if one.label is None else f"{job.job_id}.{one.label}",
-                place=str(one.run_dir),
-                index=one.out_dir / INDEX_NAME,
-                is_job=True,
-            )
-            for one in runs
-        ]
+        if job.request.has_buildings:
+            finished = results_of(job, self.folder)
+            for one in [finished.run(label) for label in finished.catalogue.runs] or [finished]:
+                name = job.job_id if one.label is None else f"{job.job_id}.{one.label}"
+                yield OpenRun(name=name, version=name, index=one.index, is_job=True)
 
-    def page(self, limit: int, offset: int) -> tuple[list[ServedRun], int]:
+    def page(self, limit: int, offset: int) -> tuple[list[OpenRun], int]:
         """Published runs on the first page, then those of jobs; and the number of jobs found, up to `limit` + 1."""
         criteria = JobFilter(
             owner=self.caller.owner,
@@ -177,12 +167,10 @@ class Catalogue:
             offset=offset,
         )
         jobs = self.store.list(criteria)
-        found = list(self.published.values()) if offset == 0 else []
-        for job in jobs[:limit]:
-            try:
-                found += self.of_job(job)
-            except _NOT_SHOWN:
-                continue  # its files are gone
+        found: list[OpenRun] = []
+        for one in [*(self.published.values() if offset == 0 else ()), *jobs[:limit]]:
+            with contextlib.suppress(*_NOT_SHOWN):  # its files are gone, or its CRS is unknown
+                found += [one.opened()] if isinstance(one, PublishedRun) else self.of_job(one)
         return found, len(jobs)
 
 
@@ -191,12 +179,6 @@ def _catalogue(request: Request, store: Store, folder: Folder, caller: Reader) -
 
 
 _Runs = Annotated[Catalogue, Depends(_catalogue)]
-
-
-def _opened(runs: Catalogue, collection_id: str) -> tuple[OpenRun, str]:
-    """The run and the table of a collection."""
-    name, table = split_id(collection_id)
-    return open_run(runs.run(name)), table
 
 
 # --- collections -----------------------------------------------------------------------------------------------------
@@ -215,13 +197,7 @@ def collections(
 ) -> Response:
     """List published runs and runs of jobs, each with its tables; a run whose CRS is unknown has no collections."""
     found, n_jobs = runs.page(limit, offset)
-    listed: list[Collection] = []
-    for served in found:
-        try:
-            run = open_run(served)
-        except _NOT_SHOWN:
-            continue
-        listed += [_described(run, table, base) for table in TABLES]
+    listed = [_described(run, table, base) for run in found for table in TABLES]
     links = page_links(f"{base}/collections", [], n_jobs, limit, offset)
     return respond(Collections(links=links, collections=listed))
 
@@ -233,7 +209,7 @@ def collections(
 )
 def collection(runs: _Runs, base: Base, collection_id: _CollectionId) -> Response:
     """Describe a collection: its extent, its coordinate reference systems, its links."""
-    return respond(_described(*_opened(runs, collection_id), base))
+    return respond(_described(*runs.opened(collection_id), base))
 
 
 def _described(run: OpenRun, table: str, base: str) -> Collection:
@@ -250,13 +226,14 @@ def _described(run: OpenRun, table: str, base: str) -> Collection:
         link(f"{place}/queryables", f"{RELATIONS}queryables", "The properties for filters", SCHEMA_TYPE),
         link(f"{place}/schema", "describedby", "The JSON schema of the features", SCHEMA_TYPE),
     ]
-    if (run.licence or "").startswith(("http://", "https://")):
-        links.append(Link(href=str(run.licence), rel="license", title="Licence of the source data"))
-    licence = f"; licence of the source data: {run.licence}" if run.licence else ""
+    licence = run.index.facts["licence"]
+    if licence.startswith(("http://", "https://")):
+        links.append(Link(href=licence, rel="license", title="Licence of the source data"))
+    stated = f"; licence of the source data: {licence}" if licence else ""
     return Collection(
         id=name,
-        title=f"{run.run.name}: {table}",
-        description=layer.title + _elevations(run, layer) + licence,
+        title=f"{run.name}: {table}",
+        description=layer.title + _elevations(run, layer) + stated,
         itemType="feature",
         extent=Extent(spatial=spatial, temporal=temporal) if spatial or temporal else None,
         crs=run.crs.uris,
@@ -307,12 +284,12 @@ def schema(runs: _Runs, base: Base, collection_id: _CollectionId) -> Response:
 def _schema(runs: Catalogue, base: str, collection_id: str, kind: Literal["queryables", "schema"]) -> Response:
     from service.features.tables import LAYERS
 
-    run, table = _opened(runs, collection_id)
+    run, table = runs.opened(collection_id)
     name, layer = run.collection_id(table), LAYERS[table]
     found = JsonSchema(
         **{"$schema": _SCHEMA, "$id": f"{base}/collections/{name}/{kind}"},
         type="object",
-        title=f"{run.run.name}: {table}",
+        title=f"{run.name}: {table}",
         additionalProperties=kind == "schema",
         properties=layer.filter_schema(run.crs) if kind == "queryables" else layer.feature_schema(run.crs),
     )
@@ -456,7 +433,7 @@ def items(
 ) -> Response:
     """List features by window, time, property and filter, in pages."""
     preferred(request.headers.get("accept"), [GEOJSON])
-    run, table = _opened(runs, collection_id)
+    run, table = runs.opened(collection_id)
     everything = request.query_params.multi_items()
     search = _search(run, table, asked, [(name, value) for name, value in everything if name not in _NAMES])
     run.crs.named(asked.crs, "crs")
@@ -509,7 +486,7 @@ def item(
 ) -> Response:
     """One feature by its id."""
     preferred(request.headers.get("accept"), [GEOJSON])
-    run, table = _opened(runs, collection_id)
+    run, table = runs.opened(collection_id)
     with run.index.opened() as connection:
         query = f"SELECT position FROM {table} WHERE id = ?"  # noqa: S608 - our own words
         row = connection.execute(query, (feature_id,)).fetchone()
@@ -522,8 +499,8 @@ def item(
         link(f"{place}/items/{feature_id}", "self", "This feature", GEOJSON),
         link(place, "collection", "The collection"),
     ]
-    if run.run.is_job and table == "buildings" and "." not in run.run.name:
-        building = f"{base}/jobs/{run.run.name}/buildings/{feature_id}"
+    if run.is_job and table == "buildings" and "." not in run.name:
+        building = f"{base}/jobs/{run.name}/buildings/{feature_id}"
         links.append(link(building, "related", "The building with its planes and models", GEOJSON))
     body = text[:-1] + b',"links":' + json.dumps([one.model_dump() for one in links]).encode() + b"}"
     return Response(body, media_type=GEOJSON, headers=_headers(uri))
