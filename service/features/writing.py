@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import errno
 import json
 import shutil
 import sqlite3
@@ -136,11 +137,18 @@ class IndexWriter:
         """Open for writing."""
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *raised: object) -> None:
-        """Finish the file, or leave it if there was an exception."""
-        if kind is None:
-            self.connection.execute("COMMIT")
-        self.connection.close()
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """Finish the file, or leave it if there was an exception; raises OSError if it cannot be written."""
+        try:
+            if error is None:
+                self.connection.execute("COMMIT")
+        except sqlite3.OperationalError as fault:
+            error = fault
+        finally:
+            self.connection.close()
+        if isinstance(error, sqlite3.OperationalError):
+            number = errno.ENOSPC if error.sqlite_errorname == "SQLITE_FULL" else errno.EIO
+            raise OSError(number, f"the index cannot be written ({error})") from error
 
 
 def _stored(kind: str, name: str, tile: str, rows: Sequence[Mapping[str, Any]]) -> list[Any]:

@@ -25,10 +25,12 @@ from live_service import serving, settings_in
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import KEYS, SCHEMAS
 from pipeline.runtime.manifest import RunStatus
+from service.disk import has_no_space
 from service.errors import RequestError, StartUpError
 from service.features import cql2, pages
 from service.features.cql2 import MAX_DEPTH, MAX_LENGTH, parsed
 from service.features.runs import check_published, published_runs
+from service.features.writing import IndexWriter
 from service.keys import Scope
 
 TABLES = ("buildings", "planes", "rejected")
@@ -306,6 +308,19 @@ def test_elevations_in_feet_are_stated_and_third_coordinates_are_in_the_unit_of_
             z = shapely.get_coordinates(shapely.from_geojson(json.dumps(feature["geometry"])), include_z=True)[:, 2]
             own = shapely.get_coordinates(shapely.from_wkb(row["geometry"]), include_z=True)[:, 2]
             assert sorted({*z}) == pytest.approx(sorted({*np.round(own * 0.3048, 3)}), abs=1e-3)
+
+
+def test_a_full_disk_is_said_as_one(tmp_path: Path) -> None:
+    def fill() -> None:
+        with IndexWriter(tmp_path / "index", None) as writer:
+            writer.connection.execute("COMMIT")
+            writer.connection.execute("PRAGMA max_page_count = 1")
+            writer.connection.execute("BEGIN")
+            writer.connection.execute("INSERT INTO batch VALUES (zeroblob(100000))")
+
+    with pytest.raises(OSError, match="database or disk is full") as error:
+        fill()
+    assert has_no_space(error.value)
 
 
 def test_a_run_that_is_replaced_is_read_again(starting: Callable[..., Any], tmp_path: Path) -> None:
