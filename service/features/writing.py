@@ -20,8 +20,8 @@ import shapely
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import table_files
 from pipeline.runtime.manifest import RunManifest
-from service.features.coordinates import CRS84, RunCrs
-from service.features.index import TABLES, TIMES, stamp
+from service.features.coordinates import RunCrs
+from service.features.index import CRS84, TABLES, TIMES, stamp
 from service.features.pages import from_wkb, geojson
 from service.features.tables import GEOMETRY, LAYERS, TILE, Layer
 

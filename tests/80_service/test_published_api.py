@@ -38,15 +38,18 @@ def bare(service: runs.Service) -> str:
     return service.finished()
 
 
-def test_further_formats_are_outputs_with_sizes_and_sums(client: TestClient, job_id: str, bare: str) -> None:
+def test_the_document_lists_every_output_by_reference_with_its_size_and_sum(
+    client: TestClient, job_id: str, bare: str
+) -> None:
     found = client.get(f"/jobs/{job_id}/results").json()
     assert list(found) == [name for name in OUTPUTS if name != "solar"]
-    for name in ON_REQUEST - {"solar"}:
-        answer = client.get(found[name]["href"])
-        assert answer.headers["content-type"] == found[name]["type"] == OUTPUTS[name].media_type
-        assert len(answer.content) == found[name]["bytes"]
-        assert hashlib.sha256(answer.content).hexdigest() == found[name]["sha256"]
-    assert set(client.get(f"/jobs/{bare}/results").json()).isdisjoint(ON_REQUEST)
+    for name, entry in found.items():
+        assert entry["href"] == f"http://127.0.0.1/jobs/{job_id}/results/{name}"
+        answer = client.get(entry["href"])
+        assert answer.headers["content-type"] == entry["type"] == OUTPUTS[name].media_type
+        assert len(answer.content) == entry["bytes"] == int(answer.headers["content-length"])
+        assert hashlib.sha256(answer.content).hexdigest() == entry["sha256"]
+    assert list(client.get(f"/jobs/{bare}/results").json()) == [name for name in OUTPUTS if name not in ON_REQUEST]
 
 
 @pytest.mark.parametrize("start", ["results/3dtiles", "results/3dtiles/tileset.json"])

@@ -15,7 +15,6 @@ from starlette.testclient import TestClient
 
 from service.jobs import Fault, JobFailure
 from service.outputs import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, KINDS, OUTPUTS
-from service.outputs.kinds import ON_REQUEST
 
 OGC = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
 
@@ -27,20 +26,6 @@ def job_id(service: runs.Service) -> str:
 
 
 # --- the document ----------------------------------------------------------------------------------------------------
-
-
-def test_the_document_lists_every_output_by_reference(client: TestClient, job_id: str) -> None:
-    answer = client.get(f"/jobs/{job_id}/results")
-    assert answer.status_code == 200
-    found = answer.json()
-    assert list(found) == [name for name in OUTPUTS if name not in ON_REQUEST]
-    for name, entry in found.items():
-        assert entry["href"] == f"http://127.0.0.1/jobs/{job_id}/results/{name}"
-        data = client.get(entry["href"])
-        assert data.status_code == 200
-        assert data.headers["content-type"] == entry["type"] == OUTPUTS[name].media_type
-        assert len(data.content) == entry["bytes"] == int(data.headers["content-length"])
-        assert hashlib.sha256(data.content).hexdigest() == entry["sha256"]
 
 
 def test_a_job_with_raw_response_lists_its_outputs_in_links_alone(service: runs.Service) -> None:
@@ -82,15 +67,6 @@ def test_a_file_has_a_name_to_save_and_its_sha256_as_etag(client: TestClient, jo
     assert answer.headers["etag"] == f'"{sha256}"'
     name = f"gablework-{job_id[:8]}-buildings.city.jsonl"
     assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
-
-
-def test_head_says_the_size_and_sends_nothing(client: TestClient, job_id: str) -> None:
-    whole = client.get(f"/jobs/{job_id}/results/buildings")
-    head = client.head(f"/jobs/{job_id}/results/buildings")
-    assert head.status_code == 200
-    assert head.content == b""
-    for name in ("content-length", "etag", "accept-ranges", "content-type"):
-        assert head.headers[name] == whole.headers[name]
 
 
 def test_a_client_that_has_the_file_gets_304(client: TestClient, job_id: str) -> None:
