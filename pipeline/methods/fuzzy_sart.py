@@ -10,26 +10,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.geometry import (
-    facet_areas_m2,
-    facet_centroids,
-    facet_normals,
-    nearest_neighbours,
-    noise_sigma_m,
-    point_spacing_m,
-)
+from pipeline.geometry import nearest_neighbours, point_spacing_m
 from pipeline.methods.building_tin import check_extent, ground_around
 from pipeline.methods.refinement import planes_of_clusters
 from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import BoolArray, FloatArray, PreparedCloud, Segmentation
 from pipeline.prepared_cloud import require_visible
 from pipeline.segmentation.facet_clusters import connected_parts, labels_of_points
+from pipeline.segmentation.facet_geometry import facet_areas_m2, facet_centroids, facet_normals, noise_sigma_m
 from pipeline.segmentation.fuzzy_sart import (
     centre_of_building,
     cluster,
     facet_vectors,
 )
-from pipeline.segmentation.plane_refinement import describe_planes
+from pipeline.segmentation.plane_regression import describe_planes
 from pipeline.terrain.height_rule import facets_above_z_avg
 from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, insert_greedily
 

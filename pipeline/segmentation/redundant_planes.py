@@ -8,8 +8,7 @@ from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.segmentation.plane_merge import touching_pairs
-from pipeline.segmentation.point_assignment import distance_to_plane
+from pipeline.segmentation.point_assignment import distance_to_plane, touching_pairs
 
 
 @kernel(inline="always")

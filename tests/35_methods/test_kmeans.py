@@ -14,7 +14,6 @@ import shapely
 from candidates_by_hand import Plane, candidate, gable_planes, hip_planes, lowest_of, moved, strewn, turned_plan
 
 from pipeline.errors import BuildingError, SettingsError
-from pipeline.geometry import vertical_residuals_m
 from pipeline.methods import METHODS, ReconstructSettings, kmeans
 from pipeline.methods.kmeans import building_top, cluster_facets
 from pipeline.methods.settings import KMeansSettings
@@ -22,6 +21,7 @@ from pipeline.model import BuildingResult, Candidate, FloatArray, Reason, RoofTy
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
+from pipeline.segmentation.facet_geometry import vertical_residuals_m
 
 PAGE = Path(__file__).parents[2] / "docs" / "methods" / "kmeans.md"
 FAITHFUL = KMeansSettings.faithful()
