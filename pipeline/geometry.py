@@ -11,7 +11,7 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.sorting import counting_sort
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 
 # -------------------------------------------------------------------------------------------------- neighbourhoods

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
-from pipeline.io.locations import is_url
-from pipeline.io.readable import Readable
+from pipeline.io.places import is_url
+from pipeline.io.records import Readable
 
 MAGIC = {b"LASF": "las", b"ply\n": "ply", b"ply\r": "ply"}
 """Formats by their first bytes."""

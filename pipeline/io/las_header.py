@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.io.geotiff_keys import crs_of_keys, keys_of
-from pipeline.io.readable import Readable
+from pipeline.io.records import Readable
 
 if TYPE_CHECKING:
     import laspy

@@ -14,7 +14,7 @@ from pipeline.methods import METHODS, PRESETS, method_named
 from pipeline.parameters import build
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.manifest import NAME as MANIFEST
-from pipeline.runtime.monitoring.events import Listener, ignore, never
+from pipeline.runtime.monitoring.progress import Listener, ignore, never
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.run import RunSummary, RunVariant, run_variants
 from pipeline.settings import RunSettings

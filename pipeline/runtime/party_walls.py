@@ -22,7 +22,7 @@ from pipeline.model import BoolArray, FaceKind
 from pipeline.party_walls.contacts import ROUNDED_M, Contacts, Walls, contacts, wall_areas
 from pipeline.party_walls.settings import PartyWallSettings
 from pipeline.runtime.manifest import RunManifest
-from pipeline.runtime.monitoring.events import Event, Listener, ignore
+from pipeline.runtime.monitoring.progress import Event, Listener, ignore
 from pipeline.runtime.publishing import (
     Published,
     check_complete,

@@ -24,7 +24,7 @@ from pipeline.io.crs import SpatialReference
 from pipeline.io.globe import Geodesy, geodesy
 from pipeline.model import FloatArray
 from pipeline.runtime.manifest_reading import city_unit_m
-from pipeline.runtime.monitoring.events import Event, Listener, ignore
+from pipeline.runtime.monitoring.progress import Event, Listener, ignore
 from pipeline.runtime.publishing import (
     ROWS,
     Published,

@@ -27,20 +27,12 @@ from pipeline.io import LocalStorage
 from pipeline.model import Reason, Status
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.earlier import (
-    Earlier,
-    Record,
-    check_outlines,
-    check_points,
-    earlier_run,
-    request_of,
-)
+from pipeline.runtime.earlier import Earlier, Record, check_outlines, check_points, earlier_run, request_of
 from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.manifest import PAGE, SLOWEST, RunManifest, RunStatus, SlowBuilding, write_manifest
-from pipeline.runtime.monitoring.events import Listener, ignore, never
-from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.monitoring.progress import Listener, Progress, ignore, never
 from pipeline.runtime.overrides.overrides_file import Override, read_overrides
 from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
 from pipeline.runtime.resources import Resources

@@ -23,9 +23,8 @@ from pipeline.methods import ReconstructSettings
 from pipeline.runtime.cluster.serial_executor import Executor, run_alone
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.manifest import NAME, PAGE, InputFile, PointFileFacts, RunManifest, RunStatus, write_manifest
-from pipeline.runtime.monitoring.events import Listener, ignore, never
 from pipeline.runtime.monitoring.measurement import peak_of_process
-from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.monitoring.progress import Listener, Progress, ignore, never
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
 from pipeline.runtime.run_context import RunContext, run_context
@@ -49,7 +48,7 @@ from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import Splits, split
 from pipeline.runtime.stages.stored_sites import joined_of, store_sites
 from pipeline.settings import RunSettings
-from pipeline.terrain.flight_strip import Strip
+from pipeline.terrain.flight_passes import Strip
 from pipeline.tiling import MM
 
 if TYPE_CHECKING:

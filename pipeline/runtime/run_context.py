@@ -15,22 +15,14 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from pipeline.errors import FolderLostError, RunOverError
 from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 from pipeline.runtime.isolation.limits import IsolationLimits
-from pipeline.runtime.monitoring.events import TICK_S, Watch, never
 from pipeline.runtime.monitoring.logs import about
-from pipeline.runtime.monitoring.progress import Progress, span
+from pipeline.runtime.monitoring.progress import TICK_S, Progress, Watch, never, span
 from pipeline.runtime.monitoring.traces import Part
 from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.kept_files import Files, KeptFiles, Promise, damaged_among
-from pipeline.runtime.scratch.outcomes import (
-    DamagedError,
-    OutcomeTask,
-    Place,
-    brief_of,
-    check_outcome,
-    run_and_store,
-)
+from pipeline.runtime.scratch.outcomes import DamagedError, OutcomeTask, Place, brief_of, check_outcome, run_and_store
 
 if TYPE_CHECKING:
     from pipeline.runtime.expected import Expected

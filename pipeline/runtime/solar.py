@@ -16,7 +16,7 @@ from pipeline.export.solar_table import SUFFIX, SolarFile
 from pipeline.io import LocalStorage, SpatialReference
 from pipeline.io.true_north import convergence_deg, longitude_and_latitude
 from pipeline.runtime.manifest import RunManifest
-from pipeline.runtime.monitoring.events import Event, Listener, ignore
+from pipeline.runtime.monitoring.progress import Event, Listener, ignore
 from pipeline.runtime.publishing import (
     Published,
     check_complete,

@@ -1,6 +1,7 @@
 """Facets and the planes of their points, as the papers' methods measure them: normals, slopes, areas, noise.
 
-Planes are z = a x + b y + c. Equations are those of Shorter & Kasparis."""
+Planes are z = a x + b y + c. Equations are those of Shorter & Kasparis.
+"""
 
 from __future__ import annotations
 

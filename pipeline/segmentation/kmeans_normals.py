@@ -19,7 +19,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
-from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.sorting import counting_sort
 from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.segmentation.clustering_settings import NormalClusteringSettings
 

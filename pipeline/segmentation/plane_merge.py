@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
-from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.sorting import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import best_fit_plane, cosine_of_slope, mean_square_residual
 from pipeline.segmentation.point_assignment import ascending_once

@@ -19,12 +19,12 @@ from pipeline.segmentation.plane_merge import merge_planes, parallel_pairs_in_re
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope
 from pipeline.segmentation.plane_settings import PlaneRefinementSettings
 from pipeline.segmentation.point_assignment import (
+    dissolve_redundant,
     distance_to_plane,
     nearest_plane,
     touching_pairs,
     vote_among_neighbours,
 )
-from pipeline.segmentation.redundant_planes import dissolve_redundant
 
 _MIN_SEED_POINTS = 4
 """In the first round a cluster may still be small: its points have not been assigned by planes yet."""

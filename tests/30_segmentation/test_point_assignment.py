@@ -8,12 +8,12 @@ import pytest
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import BoolArray, FloatArray, LabelArray
 from pipeline.segmentation.point_assignment import (
+    dissolve_redundant,
     distance_to_plane,
     nearest_plane,
     touching_pairs,
     vote_among_neighbours,
 )
-from pipeline.segmentation.redundant_planes import dissolve_redundant
 
 
 def scene(seed: int) -> tuple[FloatArray, LabelArray, FloatArray, BoolArray, LabelArray]:

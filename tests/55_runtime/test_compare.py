@@ -21,7 +21,7 @@ from pipeline.runtime.compare import (
     parse_variants,
     settings_of,
 )
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run

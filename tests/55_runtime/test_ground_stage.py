@@ -16,8 +16,7 @@ from pipeline.runtime.stages.surroundings import surroundings_of
 from pipeline.runtime.stages.window_points import PointState, load_window
 from pipeline.scene import WindowPoints, terrain_of
 from pipeline.terrain.lattice import NO_DATA
-from pipeline.terrain.scene_settings import APRON_M, ClassesInUse, SceneSettings
-from pipeline.terrain.settings import GroundSettings, OutlierSettings
+from pipeline.terrain.settings import APRON_M, ClassesInUse, GroundSettings, OutlierSettings, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 SIDE_M = 130

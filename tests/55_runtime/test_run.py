@@ -18,7 +18,7 @@ from pipeline.errors import BuildingError, EmptyInputError, InconsistentInputErr
 from pipeline.model import Reason
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.publishing import publish_stac
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.rerun import RerunRequest, rerun

@@ -20,8 +20,8 @@ from pipeline.export.geoparquet import read_table
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.monitoring.measurement import Measured
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.plan import tiles_per_block
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.rerun import RerunRequest, rerun

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.merge_sort import ascending_order, in_order
+from pipeline.kernels.sorting import ascending_order, in_order
 from pipeline.model import FloatArray, LabelArray
 from pipeline.roof.templates.shapes import CAP_SIGMAS, MAX_PLANES, best_shape, copy_planes, height
 

@@ -9,7 +9,7 @@ from pipeline.quality.self_intersection import shell_intersects_itself
 from pipeline.roof.arrangement.raster_labels import raster_labels
 from pipeline.roof.arrangement.subdivision import subdivide
 from pipeline.segmentation.trial_regions import take_regions
-from pipeline.terrain.binning import points_by_cell
+from pipeline.spatial_hash import points_by_cell
 from pipeline.terrain.facets import classify_facets
 from pipeline.terrain.point_assignment import assign_points
 from pipeline.triangulation.faces import triangulate_rings

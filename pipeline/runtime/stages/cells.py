@@ -30,13 +30,11 @@ from pipeline.runtime.stages.tile_content import content_of_window
 from pipeline.runtime.stages.window_points import FOLDER, PointState, bucket, bucket_paths
 from pipeline.scene import WindowPoints, lattice_of, usable_as_ground
 from pipeline.spatial_hash import first_of_each
-from pipeline.terrain.flight_strip import Strip
+from pipeline.terrain.flight_passes import Strip
 from pipeline.terrain.lattice import NO_DATA, lowest_per_cell
 from pipeline.terrain.outliers import dense_enough
-from pipeline.terrain.scene_settings import ClassesInUse
-from pipeline.terrain.settings import OutlierSettings
-from pipeline.terrain.strip_squares import SQUARE_MM
-from pipeline.terrain.survey_strips import compared_strips
+from pipeline.terrain.settings import ClassesInUse, OutlierSettings
+from pipeline.terrain.survey_strips import SQUARE_MM, compared_strips
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 

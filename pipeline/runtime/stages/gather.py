@@ -16,7 +16,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.compiler import kernel
 from pipeline.export.facts import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
-from pipeline.kernels.radix_sort import radix_order
+from pipeline.kernels.sorting import radix_order
 from pipeline.model import BoolArray, Candidate, FloatArray, GivenHeights, GroundSource, Guide, IntArray
 from pipeline.quality.roof_returns import MAD_TO_SIGMA
 from pipeline.roof.settings import GUIDE_REACH_M, RoofSettings

@@ -31,11 +31,10 @@ from pipeline.runtime.stages.tile_content import ZoneSums, content_of_window, zo
 from pipeline.runtime.stages.window_points import FOLDER as CELLS
 from pipeline.scene import lattice_of
 from pipeline.settings import RunSettings
-from pipeline.terrain.flight_strip import Strip
+from pipeline.terrain.flight_passes import Strip
 from pipeline.terrain.ground import ground_on
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
-from pipeline.terrain.scene_settings import APRON_M, ClassesInUse
-from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.settings import APRON_M, ClassesInUse, GroundSettings
 from pipeline.terrain.support import ROOFS_ALONE_CELLS
 from pipeline.tiling import MM, Tile, TileGrid, Window
 

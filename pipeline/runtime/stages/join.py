@@ -34,8 +34,7 @@ from pipeline.runtime.stages.tile_sites import TileSites, TileSitesFigures, by_o
 from pipeline.runtime.stages.units import BorderSites, find_units
 from pipeline.terrain.candidates import NOWHERE, Surfaces
 from pipeline.terrain.fragment_sums import N_SUMS
-from pipeline.terrain.scene_settings import SceneSettings
-from pipeline.terrain.settings import CandidateSettings
+from pipeline.terrain.settings import CandidateSettings, SceneSettings
 from pipeline.tiling import Tile, TileGrid
 
 if TYPE_CHECKING:

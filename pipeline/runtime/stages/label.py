@@ -25,7 +25,7 @@ from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, VEGETATION_CLASSES, Win
 from pipeline.terrain.ground import ground_points
 from pipeline.terrain.lattice import height_above
 from pipeline.terrain.point_classes import PointClass, PointEvidence, classes_of, index_of_each, support_m
-from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
+from pipeline.terrain.settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 FOLDER = "classes"

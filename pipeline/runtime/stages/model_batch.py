@@ -22,7 +22,7 @@ from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, Guide, Reason, Status
 from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX, IsolationLimits, Loss
 from pipeline.runtime.monitoring.logs import LOG
-from pipeline.runtime.monitoring.tallies import TALLIES
+from pipeline.runtime.monitoring.measurement import TALLIES
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import DamagedError, Place, key_of, result_of
 from pipeline.runtime.stages.batch_figures import LOST, REJECTED, BatchFigures, Modelled

@@ -15,7 +15,7 @@ import shapely
 from pipeline import __version__
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.export.facts import RecordContext, RejectedObject
-from pipeline.export.putting import Put
+from pipeline.export.folders import Put
 from pipeline.io import LocalStorage, Storage, is_url, storage_at
 from pipeline.io.storage import Puts, sha256_of
 from pipeline.model import BuildingResult, Reason, Status

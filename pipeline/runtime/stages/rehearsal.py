@@ -18,7 +18,7 @@ from pipeline.runtime.stages.split_window import SplitTask, split_window
 from pipeline.runtime.stages.tile_content import zone_sums
 from pipeline.runtime.stages.units import UnitTask, divide
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
-from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
+from pipeline.terrain.settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 _SIDE_M = 24

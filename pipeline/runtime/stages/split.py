@@ -20,7 +20,7 @@ from pipeline.runtime.stages.split_window import Split, SplitFigures, SplitTask,
 from pipeline.runtime.stages.tile_content import content_of_window
 from pipeline.runtime.stages.window_points import folders_of
 from pipeline.settings import RunSettings
-from pipeline.terrain.scene_settings import ClassesInUse
+from pipeline.terrain.settings import ClassesInUse
 from pipeline.tiling import Tile, TileGrid
 
 if TYPE_CHECKING:

@@ -10,25 +10,17 @@ import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
 
-from pipeline.kernels.radix_sort import radix_order
+from pipeline.kernels.sorting import radix_order
 from pipeline.model import BoolArray, IntArray
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import key_of
 from pipeline.runtime.stages.open_fragments import TileSurfaces, open_fragments
 from pipeline.runtime.stages.surroundings import surroundings_of, terrain_around
 from pipeline.runtime.stages.window_points import LoadedWindow, load_window
-from pipeline.scene import (
-    BUILDING_CLASS,
-    GROUND_CLASS,
-    SplitTile,
-    WindowPoints,
-    never_roof,
-    split_tile,
-)
+from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, SplitTile, WindowPoints, never_roof, split_tile
 from pipeline.terrain.ground import Terrain, ground_points
 from pipeline.terrain.lattice import CELL_MM
-from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
-from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.settings import ClassesInUse, GroundSettings, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 _PLACE_BITS = 20

@@ -40,7 +40,7 @@ from pipeline.runtime.stages.split_window import Split
 from pipeline.runtime.stages.stored_sites import SitesBrief, scale_of, stored_sites
 from pipeline.runtime.stages.tile_sites import TileSites, TileSitesFigures, sites_of
 from pipeline.runtime.stages.window_points import folders_of
-from pipeline.terrain.scene_settings import SceneSettings
+from pipeline.terrain.settings import SceneSettings
 from pipeline.terrain.units import smallest_points, units_of
 from pipeline.tiling import MM, Tile, TileGrid
 
