@@ -18,11 +18,7 @@ from pipeline.model import BoolArray, FloatArray, PreparedCloud, Segmentation
 from pipeline.prepared_cloud import require_visible
 from pipeline.segmentation.facet_clusters import connected_parts, labels_of_points
 from pipeline.segmentation.facet_geometry import facet_areas_m2, facet_centroids, facet_normals, noise_sigma_m
-from pipeline.segmentation.fuzzy_sart import (
-    centre_of_building,
-    cluster,
-    facet_vectors,
-)
+from pipeline.segmentation.fuzzy_sart import centre_of_building, cluster, facet_vectors
 from pipeline.segmentation.plane_regression import describe_planes
 from pipeline.terrain.height_rule import facets_above_z_avg
 from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, insert_greedily

@@ -17,15 +17,7 @@ from surface_rules import surface_faults
 from pipeline.export.terrain import surfaces_of
 from pipeline.model import IntArray
 from pipeline.terrain.lattice import NO_DATA
-from pipeline.terrain.terrain_tin import (
-    BESIDE_MM,
-    CLEARANCE_MM,
-    GAP_CELLS,
-    REACH_M,
-    Outline,
-    TerrainMesh,
-    terrain_mesh,
-)
+from pipeline.terrain.terrain_tin import BESIDE_MM, CLEARANCE_MM, GAP_CELLS, REACH_M, Outline, TerrainMesh, terrain_mesh
 from pipeline.tiling import Window
 
 Edge = tuple[tuple[int, int, int], tuple[int, int, int]]

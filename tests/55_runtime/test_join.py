@@ -24,7 +24,7 @@ from pipeline.runtime.stages.border_facets import are_beyond, facet_names, share
 from pipeline.runtime.stages.join import join_tiles
 from pipeline.runtime.stages.open_fragments import open_fragments
 from pipeline.runtime.stages.sites import FoundSites
-from pipeline.runtime.stages.split_window import Split, SplitFigures
+from pipeline.runtime.stages.split import Split, SplitFigures
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints
 from pipeline.terrain.candidates import CONNECTING, NOWHERE, SOLID
 from pipeline.terrain.facets import FacetKind, SceneVertices, VertexKind

@@ -21,11 +21,7 @@ from pipeline.runtime.stages.label import LabelTask, SitesNear, label_halo_m, ne
 from pipeline.runtime.stages.reconstruct import Models
 from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import Splits
-from pipeline.runtime.stages.tile_points import (
-    PointsTask,
-    TilePoints,
-    write_tile_points,
-)
+from pipeline.runtime.stages.tile_points import PointsTask, TilePoints, write_tile_points
 from pipeline.runtime.stages.window_points import folders_of
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM

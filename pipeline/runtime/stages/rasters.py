@@ -16,8 +16,7 @@ from pipeline.io import LocalStorage, SpatialReference
 from pipeline.io.crs_units import unit_name
 from pipeline.model import BoolArray
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.stages.surroundings import Surroundings, surroundings_of
-from pipeline.runtime.stages.window_points import load_window
+from pipeline.runtime.stages.window_points import Surroundings, load_window, surroundings_of
 from pipeline.scene import WindowPoints
 from pipeline.terrain.elevation_rasters import FILL_M, closed, columns_of, filled, highest_in_cells, terrain_at
 from pipeline.terrain.ground import slopes_of

@@ -26,8 +26,7 @@ from pipeline.runtime.stages.cleanup import writing_terrain
 from pipeline.runtime.stages.ground import Ground
 from pipeline.runtime.stages.model_batch import stored_results
 from pipeline.runtime.stages.reconstruct import Models
-from pipeline.runtime.stages.surroundings import FOLDER as GROUND
-from pipeline.runtime.stages.surroundings import surroundings_of
+from pipeline.runtime.stages.window_points import GROUND_FOLDER, surroundings_of
 from pipeline.settings import RunSettings
 from pipeline.terrain.terrain_tin import BESIDE_MM, REACH_M, Outline, TerrainMesh, terrain_mesh
 from pipeline.tiling import MM, Tile, TileGrid, Window
@@ -199,7 +198,7 @@ def _task(
 
 def _read(task: TerrainTask) -> set[str]:
     """The folders of scratch with the terrain and the models that a tile's terrain needs."""
-    ground = {f"{GROUND}/{tile.key}" for tile in _around(task.grid, task.tile, REACH_M)}
+    ground = {f"{GROUND_FOLDER}/{tile.key}" for tile in _around(task.grid, task.tile, REACH_M)}
     return ground | {place.folder for place in task.floors}
 
 
