@@ -22,8 +22,7 @@ from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
 from pipeline.runtime.plan import points_bytes
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, key_of, whole
+from pipeline.runtime.scratch.outcomes import Files, Place, key_of, whole
 from pipeline.runtime.stages.cleanup import clear_tiles
 from pipeline.runtime.stages.ingested import Ingested, content_by_tile, points_by_tile
 from pipeline.runtime.stages.tile_content import content_of_window

@@ -21,8 +21,7 @@ from pipeline.model import BoolArray
 from pipeline.runtime.plan import check_windows, ground_bytes, split_grid, tiles_per_block
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, key_of, whole
+from pipeline.runtime.scratch.outcomes import Files, Place, key_of, whole
 from pipeline.runtime.stages.cells import TileCells, digests_of, find_all_cells
 from pipeline.runtime.stages.cleanup import clear_tiles
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile

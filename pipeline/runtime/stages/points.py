@@ -11,8 +11,7 @@ from pipeline.export.point_files import INDEX
 from pipeline.io import storage_at
 from pipeline.runtime.plan import window_bytes
 from pipeline.runtime.run_context import ProgressUnits, RunContext
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, brief_within, drop_outcomes, key_of
+from pipeline.runtime.scratch.outcomes import Files, Place, brief_within, drop_outcomes, key_of
 from pipeline.runtime.stages.cleanup import writing_points
 from pipeline.runtime.stages.coarse_points import coarse_levels, write_coarse_points
 from pipeline.runtime.stages.coarse_terrain import terrain_spacing

@@ -24,8 +24,7 @@ from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import InParts, Place, brief_of, brief_within, drop_outcomes, key_of
+from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_of, brief_within, drop_outcomes, key_of
 from pipeline.runtime.stages.batch_figures import BatchFigures
 from pipeline.runtime.stages.cleanup import publishing
 from pipeline.runtime.stages.content_digest import TABLES

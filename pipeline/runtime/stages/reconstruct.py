@@ -14,8 +14,7 @@ from pipeline.runtime.monitoring.measurement import TALLIES
 from pipeline.runtime.monitoring.traces import Part, slow_building_s
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, keys_of, result_of
+from pipeline.runtime.scratch.outcomes import Files, Place, drop_outcomes, key_of, keys_of, result_of
 from pipeline.runtime.stages.batch_figures import LOST, BatchFigures, Counted, Modelled
 from pipeline.runtime.stages.model_batch import Batch, BatchTask, StoredResult, figures_of, models_here, stored_results
 from pipeline.runtime.stages.sites import Joined, folders_around

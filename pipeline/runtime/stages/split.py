@@ -19,8 +19,7 @@ from pipeline.model import IntArray
 from pipeline.runtime.plan import split_grid, window_bytes
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, key_of, result_of
+from pipeline.runtime.scratch.outcomes import Files, Place, key_of, result_of
 from pipeline.runtime.stages.cleanup import clear_tiles
 from pipeline.runtime.stages.ground import Ground, terrain_of_window, terrain_window
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, content_by_tile, points_by_tile

@@ -20,8 +20,7 @@ from pipeline.model import BuildingResult, FaceKind
 from pipeline.runtime.plan import WINDOW_BASE_BYTES
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import InParts, Place, brief_within, drop_outcomes, key_of, part_of, whole
+from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of, part_of, whole
 from pipeline.runtime.stages.cleanup import writing_terrain
 from pipeline.runtime.stages.ground import Ground
 from pipeline.runtime.stages.model_batch import stored_results

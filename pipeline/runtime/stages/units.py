@@ -20,8 +20,16 @@ from pipeline.model import IntArray, Reason
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, OpenScratch, Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import InParts, Place, brief_within, drop_outcomes, key_of, part_of, result_of
+from pipeline.runtime.scratch.outcomes import (
+    Files,
+    InParts,
+    Place,
+    brief_within,
+    drop_outcomes,
+    key_of,
+    part_of,
+    result_of,
+)
 from pipeline.runtime.stages.cleanup import clear_units
 from pipeline.runtime.stages.gather import canonical_order
 from pipeline.runtime.stages.sites import (
