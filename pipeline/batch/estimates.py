@@ -29,7 +29,7 @@ from pipeline.runtime.monitoring.progress import Progress, ignore
 from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.request import plan_inputs
 from pipeline.runtime.resources import Resources
-from pipeline.runtime.run import check_out
+from pipeline.runtime.run_directory import check_out
 from pipeline.runtime.scratch.folder import POINT
 from pipeline.runtime.scratch.work_folder import refuse_foreign
 from pipeline.runtime.stages.given_footprints import footprints_of_run

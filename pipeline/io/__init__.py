@@ -2,7 +2,8 @@
 
 from pipeline.io.crs import SpatialReference
 from pipeline.io.inputs import find_inputs
-from pipeline.io.places import arrow_at, is_url, place_below, shown, storage_at
+from pipeline.io.locations import is_url, shown
+from pipeline.io.places import arrow_at, place_below, storage_at
 from pipeline.io.source import ReadOptions, Source, SourceInfo, open_source
 from pipeline.io.storage import LocalStorage, Storage, sha256_of
 

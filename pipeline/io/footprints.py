@@ -18,9 +18,9 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.io.crs import LARGEST_COORDINATE, SpatialReference
+from pipeline.io.locations import shown
 from pipeline.io.nearby import AREAS, POLYGONS, Shape
 from pipeline.io.placed_features import NOT_ELSEWHERE, Elsewhere, boxes_around, in_metres
-from pipeline.io.places import shown
 from pipeline.io.repairs import EDGES_LIMIT, LOOKS_OF_FILE, Repairs, crossings
 from pipeline.io.vector_layer import VectorLayer, read_layer
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
-from pipeline.io.places import is_url
+from pipeline.io.locations import is_url
 from pipeline.io.records import Readable
 
 MAGIC = {b"LASF": "las", b"ply\n": "ply", b"ply\r": "ply"}

@@ -15,9 +15,9 @@ from shapely import LineString
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io.crs import LARGEST_COORDINATE, SpatialReference
+from pipeline.io.locations import shown
 from pipeline.io.nearby import Shape
 from pipeline.io.placed_features import Elsewhere, boxes_around, in_metres
-from pipeline.io.places import shown
 from pipeline.io.vector_layer import VectorLayer, read_layer
 from pipeline.model import Guide, GuideKind
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.errors import InputError, UnreadableInputError, all_at_fault
 from pipeline.io.formats import files_in, first_bytes, is_index
-from pipeline.io.places import is_url, shown
+from pipeline.io.locations import is_url, shown
 
 if TYPE_CHECKING:
     from pipeline.io.tile_index import TileIndex

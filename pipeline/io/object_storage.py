@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from pipeline.backoff import Backoff
 from pipeline.errors import RunError
-from pipeline.io.places import shown
+from pipeline.io.locations import shown
 from pipeline.io.retries import GONE, POLICY, GaveUpError, persistently
 from pipeline.io.storage import Puts, parts_of_key
 from pipeline.io.temporary import temporary_folder

@@ -22,7 +22,7 @@ from typing import Any, Literal
 from pipeline.backoff import Backoff
 from pipeline.errors import UnreadableInputError
 from pipeline.io import urls
-from pipeline.io.places import name_in, shown
+from pipeline.io.locations import name_in, shown
 from pipeline.io.reading import moved
 from pipeline.io.retries import POLICY, GaveUpError, ShortReadError, persistently
 from pipeline.io.temporary import temporary_folder

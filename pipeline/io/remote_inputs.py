@@ -8,7 +8,7 @@ from typing import Any
 
 from pipeline.errors import RunError, UnreadableInputError
 from pipeline.io.formats import ASCII_SUFFIXES, POINT_SUFFIXES, VALID, first_bytes, is_index, looks_like_points
-from pipeline.io.places import name_in, shown
+from pipeline.io.locations import name_in, shown
 from pipeline.io.remote_file import RemoteFile
 from pipeline.io.retries import GaveUpError, persistently
 from pipeline.io.tile_index import TileIndex, read_tile_index

@@ -22,8 +22,9 @@ import shapely
 from pipeline.errors import UnreadableInputError
 from pipeline.io.crs import SpatialReference, horizontal_part, parse_crs
 from pipeline.io.formats import POINT_SUFFIXES, VECTOR_SUFFIXES, lines_of, names_points
+from pipeline.io.locations import is_url, name_in, shown
 from pipeline.io.nearby import TILES
-from pipeline.io.places import file_at, is_url, name_in, shown
+from pipeline.io.places import file_at
 from pipeline.io.vector_layer import read_layer
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Any
 
 from pipeline.errors import RunError
-from pipeline.io.places import shown
+from pipeline.io.locations import shown
 
 CONNECT_S = 10.0
 """A server that does not take a connection within so long is not there."""

@@ -18,8 +18,9 @@ import shapely
 from pipeline.errors import InputError, UnreadableInputError
 from pipeline.io.formats import first_bytes
 from pipeline.io.gdal_layer import read_by_gdal
+from pipeline.io.locations import is_url, shown
 from pipeline.io.nearby import POLYGONS, Boxes, Shape
-from pipeline.io.places import is_url, on_this_machine, shown
+from pipeline.io.places import on_this_machine
 from pipeline.io.vector_archive import unpacked
 from pipeline.io.wkb import geometries_of
 

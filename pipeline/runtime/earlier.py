@@ -16,11 +16,11 @@ from pipeline import __version__
 from pipeline.errors import RunError, SettingsError
 from pipeline.export.geoparquet import table_dataset
 from pipeline.export.records import KEYS
-from pipeline.io.places import has_mark, is_url, shown
+from pipeline.io.locations import has_mark, is_url, shown
 from pipeline.runtime.manifest import RunManifest, RunStatus
 from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest, input_file
-from pipeline.runtime.run import OVERRIDES
+from pipeline.runtime.run_directory import OVERRIDES
 from pipeline.runtime.stages.batch_figures import REJECTED
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.settings import RunSettings

@@ -36,8 +36,8 @@ from pipeline.runtime.monitoring.progress import Listener, Progress, ignore, nev
 from pipeline.runtime.overrides.overrides_file import Override, read_overrides
 from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
 from pipeline.runtime.resources import Resources
-from pipeline.runtime.run import OVERRIDES, put_json
 from pipeline.runtime.run_context import RunContext, run_context
+from pipeline.runtime.run_directory import OVERRIDES, put_json
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import run_scratch

@@ -17,7 +17,7 @@ from pathlib import Path
 from uuid import uuid4
 
 from pipeline.errors import FolderLostError, RunError
-from pipeline.io.places import is_url
+from pipeline.io.locations import is_url
 
 _NAME = re.compile(r"\.?[0-9a-f]{32}")
 

@@ -188,7 +188,7 @@ def sites_of_tile(task: UnitTask) -> InParts[SitesBrief]:
     divided, checksums = divide(shares_of(found.candidates, task.shares)[task.share], task)
     warnings: list[str] = []
     if task.outlines:
-        divided = largest_first(divided)
+        divided = list(largest_first(divided))
         if any(site.block is not None for site in divided):
             from pipeline.runtime.stages.outline import outlined
 
