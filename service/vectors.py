@@ -21,14 +21,8 @@ from urllib.parse import quote
 import numpy as np
 
 from pipeline.errors import EmptyInputError, InputError, UnreadableInputError
-from pipeline.io.crs import parse_crs
-from pipeline.io.formats import (
-    ARCHIVE_SUFFIXES,
-    GEOJSON_SUFFIXES,
-    LINES_SUFFIXES,
-    PARQUET_SUFFIXES,
-    XML_SUFFIXES,
-)
+from pipeline.io.crs_given import parse_crs
+from pipeline.io.formats import ARCHIVE_SUFFIXES, GEOJSON_SUFFIXES, LINES_SUFFIXES, PARQUET_SUFFIXES, XML_SUFFIXES
 from pipeline.io.gdal_source import (
     FLATGEOBUF_MAGIC,
     RECORD,

@@ -14,7 +14,8 @@ import shapely
 
 from pipeline.errors import CrsError, InconsistentInputError, SettingsError
 from pipeline.io.area_of_use import Location, location_of
-from pipeline.io.crs import SpatialReference, resolve_reference
+from pipeline.io.crs import SpatialReference
+from pipeline.io.crs_resolution import resolve_reference
 from pipeline.io.formats import recognise_format
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.io.places import file_at

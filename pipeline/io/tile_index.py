@@ -20,7 +20,8 @@ import numpy.typing as npt
 import shapely
 
 from pipeline.errors import UnreadableInputError
-from pipeline.io.crs import SpatialReference, horizontal_part, parse_crs
+from pipeline.io.crs import SpatialReference, horizontal_part
+from pipeline.io.crs_given import parse_crs
 from pipeline.io.formats import POINT_SUFFIXES, VECTOR_SUFFIXES, lines_of, names_points
 from pipeline.io.locations import is_url, name_in, shown
 from pipeline.io.nearby import TILES

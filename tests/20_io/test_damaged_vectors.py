@@ -22,7 +22,9 @@ from shapely import LineString, MultiPolygon, Polygon, affinity, box
 
 from pipeline.errors import CrsError, InconsistentInputError, InputError, UnreadableInputError, causes
 from pipeline.io import nearby
-from pipeline.io.crs import SpatialReference, parse_crs, resolve_reference
+from pipeline.io.crs import SpatialReference
+from pipeline.io.crs_given import parse_crs
+from pipeline.io.crs_resolution import resolve_reference
 from pipeline.io.footprints import read_area, read_footprints
 from pipeline.io.guides import read_guides
 from pipeline.io.library_faults import DAMAGED, TOO_LARGE, in_our_words

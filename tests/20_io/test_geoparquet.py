@@ -15,7 +15,7 @@ from shapely import MultiPolygon, Polygon, box
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io import SpatialReference
-from pipeline.io.crs import resolve_reference
+from pipeline.io.crs_resolution import resolve_reference
 from pipeline.io.footprints import read_footprints
 from pipeline.io.geoparquet import geometry_column
 

@@ -10,7 +10,8 @@ import shapely
 from shapely import LineString, MultiLineString, Point
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
-from pipeline.io.crs import SpatialReference, resolve_reference
+from pipeline.io.crs import SpatialReference
+from pipeline.io.crs_resolution import resolve_reference
 from pipeline.io.guides import GivenLines, read_guides
 from pipeline.model import GuideKind
 

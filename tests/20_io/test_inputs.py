@@ -11,7 +11,7 @@ import shapely
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io import SpatialReference, find_inputs
-from pipeline.io.crs import resolve_reference
+from pipeline.io.crs_resolution import resolve_reference
 from pipeline.io.formats import VECTOR_SUFFIXES
 from pipeline.io.tile_index import COLUMNS, TileIndex, read_tile_index
 from pipeline.io.urls import filesystem_of

@@ -12,7 +12,7 @@ from shapely import LineString, box
 
 from pipeline.errors import CrsError, EmptyInputError, UnreadableInputError
 from pipeline.io import SpatialReference
-from pipeline.io.crs import resolve_reference
+from pipeline.io.crs_resolution import resolve_reference
 from pipeline.io.footprints import read_area, read_footprints
 from pipeline.io.guides import read_guides
 from pipeline.io.placed_features import Elsewhere, off_the_data
