@@ -14,12 +14,12 @@ from pipeline.methods import LODS, METHODS, OVERHANGS, PRESETS, ReconstructSetti
 from pipeline.parameters import Parameters, build, parameter, read_toml
 from pipeline.quality.settings import SupportSettings
 from pipeline.roof.settings import ArrangementSettings, FootprintSettings, GuideSettings, RoofSettings, RoofTypeSettings
-from pipeline.terrain.class_codes import ClassCodeSettings
-from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.terrain.settings import (
     CandidateSettings,
+    ClassCodeSettings,
     GroundSettings,
     OutlierSettings,
+    SceneSettings,
     StripSettings,
     SurfaceSettings,
     UnitSettings,

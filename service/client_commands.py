@@ -454,7 +454,7 @@ def _watched(remote: Remote, job_id: str) -> None:
 
 
 def _show_event(console: Console, event: Event) -> None:
-    from pipeline.runtime.monitoring.events import Event as RunEvent
+    from pipeline.runtime.monitoring.progress import Event as RunEvent
 
     if event.kind in {"stage", "progress", "warning", "waiting"}:
         console.on_event(
@@ -479,7 +479,7 @@ def _shown_job(console: Console, job: Job) -> None:
 
 def _shown(console: Console, stage: str) -> Callable[[Transfer], None]:
     """Shows transfers as progress in megabytes, each figure once."""
-    from pipeline.runtime.monitoring.events import Event as RunEvent
+    from pipeline.runtime.monitoring.progress import Event as RunEvent
 
     last: RunEvent | None = None
 

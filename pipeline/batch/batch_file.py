@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import SettingsError
-from pipeline.export.mesh_kinds import MESHES
+from pipeline.export.folders import MESHES
 from pipeline.io.reading import INPUT_TIMEOUT_S
 from pipeline.parameters import Parameters, build, is_finite_number, parameter, quoted, read_toml
 from pipeline.runtime.cluster.tls import given_tls

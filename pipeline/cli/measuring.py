@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.options import (
-    AsJson,
-    AsSurveyed,
-    Crs,
-    Layer,
-    Points,
-    Quiet,
-    SettingsFile,
-    Truth,
-    VerticalUnit,
-)
+from pipeline.cli.options import AsJson, AsSurveyed, Crs, Layer, Points, Quiet, SettingsFile, Truth, VerticalUnit
 from pipeline.cli.summary import show_statistics
 from pipeline.console import Console
 from pipeline.errors import SettingsError
@@ -42,9 +32,9 @@ def inspect(
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.inspection import inspect as inspect_tile
         from pipeline.io.source import ReadOptions
-        from pipeline.runtime.monitoring.events import Event
+        from pipeline.runtime.monitoring.progress import Event
         from pipeline.settings import RunSettings
-        from pipeline.terrain.class_codes import ClassCodeSettings
+        from pipeline.terrain.settings import ClassCodeSettings
 
         if _is_run(tile):
             from pipeline.report.statistics import run_statistics
@@ -148,7 +138,7 @@ def evaluate(
     """Measure models: against simulated truth, classified points, true roof edges, or alone."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
-        from pipeline.runtime.monitoring.events import Event
+        from pipeline.runtime.monitoring.progress import Event
 
         request = EvaluationRequest(
             models=models,

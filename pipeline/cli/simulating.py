@@ -8,12 +8,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.options import (
-    AsJson,
-    Overwrite,
-    Quiet,
-    Workers,
-)
+from pipeline.cli.options import AsJson, Overwrite, Quiet, Workers
 from pipeline.cli.summary import show_summary
 from pipeline.console import Console
 
@@ -56,7 +51,7 @@ def simulate(
         from pipeline.ruler.simulation.dataset import Output
         from pipeline.ruler.simulation.dataset import simulate as simulate_scene
         from pipeline.ruler.simulation.seeds import seed_of
-        from pipeline.runtime.monitoring.events import Event
+        from pipeline.runtime.monitoring.progress import Event
 
         if split is None and draw != 0:
             raise SettingsError([f"draw is {draw} of no split: give --split dev or --split test with it"])
@@ -144,8 +139,8 @@ def warm_up(
 
         from pipeline.compiler import warm_up
         from pipeline.errors import SettingsError
-        from pipeline.runtime.monitoring.events import Event
-        from pipeline.runtime.monitoring.machine import cores
+        from pipeline.runtime.monitoring.measurement import cores
+        from pipeline.runtime.monitoring.progress import Event
 
         groups = warm_up.groups()
         wanted = what or ["reconstruct"]

@@ -15,10 +15,9 @@ from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.coordinates import one_unit
 from pipeline.export.decisions import decision_rows, decisions_path, decisions_table
 from pipeline.export.facts import RecordContext, RejectedObject
+from pipeline.export.folders import MESHES, Put, put_local
 from pipeline.export.geoparquet import geo_table, parquet_bytes
-from pipeline.export.mesh_kinds import MESHES
 from pipeline.export.obj import obj_text
-from pipeline.export.putting import Put, put_local
 from pipeline.export.records import building_row, plane_rows, rejected_row
 from pipeline.export.solid_geometry import lod_suffix, model_at
 from pipeline.model import BuildingResult

@@ -16,8 +16,7 @@ from pipeline.io.reading import one_input, set_input_timeout
 from pipeline.registry import extra
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.manifest import InputFile
-from pipeline.runtime.monitoring.events import Watch, never
-from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.monitoring.progress import Progress, Watch, never
 from pipeline.runtime.plan import MANY_FILES, Plan, check_places, looked_at, make_plan, without_far_files
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.scratch.location import SCRATCH

@@ -19,7 +19,7 @@ from pipeline.extras.classify.classify import ClassifyRequest, ClassifySummary, 
 from pipeline.extras.compare.compare import CompareRequest, CompareSummary, own_tables, parse_variants
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring import tracing
-from pipeline.runtime.monitoring.events import Event, Listener
+from pipeline.runtime.monitoring.progress import Event, Listener
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run

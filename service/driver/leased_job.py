@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, Protocol, Self
 
 from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from service.driver.job_log import AttemptLog
 from service.driver.messages import Scrubber
 from service.driver.progress import CLASSIFY_WEIGHTS, WEIGHTS, WORDS, percent

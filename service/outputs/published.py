@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from service.outputs.kinds import FORMATS, GEOJSON, GLB, OUTPUTS
 
 if TYPE_CHECKING:
-    from pipeline.runtime.monitoring.events import Listener
+    from pipeline.runtime.monitoring.progress import Listener
 
 _TILE = r"x-?\d{1,9}_y-?\d{1,9}"
 _SQUARE = rf"{_TILE}_\d{{1,9}}"

@@ -23,17 +23,7 @@ from service.jobs import (
     Wishes,
 )
 from service.keys import Key
-from service.store import (
-    changes,
-    claims,
-    idempotency,
-    keys,
-    logs,
-    queries,
-    submissions,
-    uploads,
-    webhook_deliveries,
-)
+from service.store import changes, claims, idempotency, keys, logs, queries, submissions, uploads, webhook_deliveries
 from service.store.database import LOCK_SUBMISSIONS, WAIT_S, Database
 from service.store.delivering import creating
 from service.store.queries import JobFilter

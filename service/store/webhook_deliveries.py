@@ -19,17 +19,7 @@ from service.store import webhook_endpoints as webhooks
 from service.store.outbox import drop
 from service.store.records import storable
 from service.store.tables import WEBHOOK_ATTEMPTS, WEBHOOK_DELIVERIES, WEBHOOK_EVENTS, WEBHOOKS
-from service.webhooks import (
-    ROOM,
-    Attempt,
-    Delivery,
-    DeliveryState,
-    EventType,
-    Parcel,
-    Result,
-    job_of,
-    verdict,
-)
+from service.webhooks import ROOM, Attempt, Delivery, DeliveryState, EventType, Parcel, Result, job_of, verdict
 
 _TABLE = WEBHOOK_DELIVERIES.c
 _LOG = WEBHOOK_ATTEMPTS.c

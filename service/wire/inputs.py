@@ -11,7 +11,8 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, WithJsonSchema, field_validator
 
 from pipeline.errors import CrsError
-from pipeline.io.crs import LARGEST_COORDINATE, UNITS_M, horizontal_unit_of, with_authority
+from pipeline.io.crs import LARGEST_COORDINATE, horizontal_unit_of
+from pipeline.io.crs_given import UNITS_M, with_authority
 from service.drafts import Draft, Inline
 from service.errors import RequestError, within
 from service.input_policy import checked_crs

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, WithJsonSchema
 
-from pipeline.io.crs import UNITS_M
+from pipeline.io.crs_given import UNITS_M
 from service.outputs.kinds import FORMATS
 from service.run_settings import VARIANTS, choices
 from service.wire import patterns

@@ -16,7 +16,7 @@ from benchmarks.city_tiles import make_city, make_row, square_of
 from benchmarks.process_watch import CHILD, DRIVER, FORKING, OTHER, WORKER, Seen, Watcher, role_of
 from benchmarks.traced_run import TracingExecutor
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
-from pipeline.runtime.monitoring.events import Watch
+from pipeline.runtime.monitoring.progress import Watch
 
 
 def test_a_city_is_as_square_as_its_tiles_allow() -> None:

@@ -3,15 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.hofmann_tables import (
-    ALL,
-    KINDS,
-    OUTCOMES,
-    PAPER,
-    Outcomes,
-    counts_table,
-    document,
-)
+from benchmarks.hofmann_tables import ALL, KINDS, OUTCOMES, PAPER, Outcomes, counts_table, document
 
 Counts = dict[str, tuple[int, int, int]]
 

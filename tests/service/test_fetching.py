@@ -24,13 +24,7 @@ from pipeline.runtime.request import plan_inputs
 from service import downloads
 from service.downloads import BACKOFF, PASSING, pause_s
 from service.driver.attempt import run_request
-from service.errors import (
-    InputRefusedError,
-    NoSuchUploadError,
-    RequestError,
-    ServiceError,
-    TooLargeError,
-)
+from service.errors import InputRefusedError, NoSuchUploadError, RequestError, ServiceError, TooLargeError
 from service.fetching import Fetched, JobFiles, gather, materialise, resolve_inputs
 from service.files import StateFolder
 from service.input_policy import checked_path

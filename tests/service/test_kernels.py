@@ -11,7 +11,7 @@ from processes import LONG_S, wait_for
 
 from pipeline.compiler.warm_up import groups
 from pipeline.errors import RunCancelledError
-from pipeline.runtime.monitoring.events import Event, Listener
+from pipeline.runtime.monitoring.progress import Event, Listener
 from service.driver.attempt_process import InOwnProcess
 from service.driver.kernels import Kernels, needs_all_kernels
 from service.jobs import InputReference, JobRequest, JobStatus

@@ -11,7 +11,7 @@ from driver_bench import Bench
 
 from pipeline import __version__
 from pipeline.errors import ClusterError, UnreadableInputError
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from service.driver import job_log
 from service.driver.job_log import AttemptLog
 from service.driver.progress import WORDS

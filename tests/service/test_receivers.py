@@ -4,16 +4,7 @@ from collections import Counter
 
 import pytest
 
-from service.receivers import (
-    LONGEST_REST_S,
-    MAX_PER_KEY,
-    MAX_SLOW,
-    MAX_SLOW_PER_KEY,
-    SENDERS,
-    SLOW_S,
-    Due,
-    Receivers,
-)
+from service.receivers import LONGEST_REST_S, MAX_PER_KEY, MAX_SLOW, MAX_SLOW_PER_KEY, SENDERS, SLOW_S, Due, Receivers
 
 REST_S = 5.0
 

@@ -10,7 +10,7 @@ import pytest
 from driver_bench import Bench
 from processes import wait_for
 
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from service.driver import leased_job, workplace
 from service.driver.janitor import tidy_jobs
 from service.driver.leased_job import LeasedJob, Stop

@@ -12,7 +12,7 @@ from processes import LONG_S, wait_for
 
 from pipeline.errors import RunCancelledError
 from pipeline.extras.compare.compare import CompareRequest, CompareSummary
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.run import RunSummary
 from service.driver.attempt import Tools
 from service.driver.attempt_child import Order

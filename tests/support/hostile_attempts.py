@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.errors import UnreadableInputError
 from pipeline.io.temporary import temporary_folder
 from pipeline.runtime.isolation import child_main
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from service.driver.attempt_child import End, Order
 from service.errors import RequestError
 

@@ -14,7 +14,8 @@ import small_buildings as small
 
 from pipeline.export.records import RecordContext
 from pipeline.export.tile import write_tile
-from pipeline.io.crs import SpatialReference, parse_crs
+from pipeline.io.crs import SpatialReference
+from pipeline.io.crs_given import parse_crs
 from pipeline.model import BuildingResult
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
 from pipeline.triangulation import triangulate_face

@@ -7,18 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import sqlalchemy as sa
 from store_contract import DatabaseContract, claim, happened, submit
-from webhook_store_contract import (
-    POLICY,
-    REFUSED,
-    SUBSCRIBER,
-    TAKEN,
-    endpoint,
-    events,
-    log,
-    send_all,
-    shift,
-    take,
-)
+from webhook_store_contract import POLICY, REFUSED, SUBSCRIBER, TAKEN, endpoint, events, log, send_all, shift, take
 
 from service.errors import NotReplayableError, TooManyWebhooksError
 from service.jobs import Job

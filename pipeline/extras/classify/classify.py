@@ -34,9 +34,8 @@ from pipeline.io import is_url, shown
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.preloading import loads_of
-from pipeline.runtime.monitoring.events import Listener, ignore, never
 from pipeline.runtime.monitoring.measurement import peak_of_process
-from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.monitoring.progress import Listener, Progress, ignore, never
 from pipeline.runtime.request import RunRequest, plan_inputs
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run_context import RunContext, run_context

@@ -20,7 +20,7 @@ from pipeline.io.locations import has_mark, is_url, shown
 from pipeline.runtime.manifest import RunManifest, RunStatus
 from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest, input_file
-from pipeline.runtime.run import OVERRIDES
+from pipeline.runtime.run_directory import OVERRIDES
 from pipeline.runtime.stages.batch_figures import REJECTED
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.settings import RunSettings

@@ -18,7 +18,7 @@ from pipeline.ruler.evaluation.evaluate import Evaluation
 from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files, read_reference
 from pipeline.ruler.report.comparison import ComparedRun, PointFiles, write_comparison
 from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.monitoring.events import Event, Listener, ignore, never
+from pipeline.runtime.monitoring.progress import Event, Listener, ignore, never
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

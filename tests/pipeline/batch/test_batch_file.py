@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.batch.batch_file import read_batch
 from pipeline.errors import SettingsError
-from pipeline.io.crs import parse_crs
+from pipeline.io.crs_given import parse_crs
 
 LEAST = '[inputs]\npaths = ["tiles/*.laz"]\n[output]\npath = "models"\n'
 

@@ -21,7 +21,7 @@ from pipeline.batch.batch_file import Batch, read_batch
 from pipeline.batch.schedule_file import MAX_KEPT, NAME, FileBook, ScheduleRecord, read_schedule
 from pipeline.batch.schedule_process import LOCK, RUN_LOCK, Ending, keep_schedule
 from pipeline.errors import RunError, SettingsError
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.scratch.work_folder import locked_file, locked_work, make_work
 from pipeline.schedule import Entry, Outcome, ScheduleState
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pipeline.batch.remaining_time import StageProgress, remaining_s
 from pipeline.batch.status import NAME, StatusWriter, buildings_before, read_status
 from pipeline.errors import RunError
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, locked_file, locked_work
 
 PLANNED = {"ingest": 10.0, "split": 20.0, "reconstruct": 100.0, "publish": 10.0}

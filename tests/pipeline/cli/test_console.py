@@ -18,7 +18,7 @@ from pipeline.errors import (
     UnreadableInputError,
 )
 from pipeline.model import Reason
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 
 
 class Clock:

@@ -36,7 +36,7 @@ from pipeline.io import SpatialReference, storage_at
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus, write_manifest
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.run_tiles import TILES_IN_MEMORY
 
 TILES = 20

@@ -11,9 +11,8 @@ from small_buildings import Contexts, RejectedObjects
 
 from pipeline.cli.options import Meshes
 from pipeline.errors import RunError
+from pipeline.export.folders import MESHES, put_local
 from pipeline.export.geoparquet import read_table
-from pipeline.export.mesh_kinds import MESHES
-from pipeline.export.putting import put_local
 from pipeline.export.tile import write_tile
 from service.wire.inputs import Meshes as OfferedByTheService
 

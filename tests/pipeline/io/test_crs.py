@@ -13,7 +13,8 @@ from laspy.vlrs.known import GeoDoubleParamsVlr, GeoKeyDirectoryVlr, GeoKeyEntry
 
 from pipeline.errors import CrsError
 from pipeline.io import ReadOptions, open_source
-from pipeline.io.crs import US_SURVEY_FOOT_M, SpatialReference, resolve_reference
+from pipeline.io.crs import US_SURVEY_FOOT_M, SpatialReference
+from pipeline.io.crs_resolution import resolve_reference
 
 FOOT_M = 0.3048
 

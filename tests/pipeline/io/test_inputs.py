@@ -13,7 +13,7 @@ from pipeline.errors import UnreadableInputError
 from pipeline.extras.remote.urls import filesystem_of
 from pipeline.extras.vector_files.tile_index import COLUMNS, TileIndex, read_tile_index
 from pipeline.io import SpatialReference, find_inputs
-from pipeline.io.crs import resolve_reference
+from pipeline.io.crs_resolution import resolve_reference
 from pipeline.io.formats import VECTOR_SUFFIXES
 
 RD = "EPSG:28992"

@@ -15,7 +15,7 @@ from las_files import write_las
 from pipeline.console import ExitCode
 from pipeline.errors import UnreadableInputError
 from pipeline.io import open_source
-from pipeline.io.laz_decoder import decoding
+from pipeline.io.laz_chunks import decoding
 from pipeline.runtime.isolation.start_up import WITHOUT_THREADS
 
 

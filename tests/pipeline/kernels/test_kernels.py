@@ -12,10 +12,8 @@ from hypothesis import strategies as st
 
 from pipeline.compiler import kernel
 from pipeline.kernels.bounds import bounds_of
-from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.exact_sum import exact_sum
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
-from pipeline.kernels.merge_sort import ascending_order, in_order, sort_few
 from pipeline.kernels.normal_equations import moments_of, solve_plane_moments
 from pipeline.kernels.orientation import (
     comes_before,
@@ -26,7 +24,7 @@ from pipeline.kernels.orientation import (
     segments_meet,
     turn_of,
 )
-from pipeline.kernels.radix_sort import radix_order
+from pipeline.kernels.sorting import ascending_order, counting_sort, in_order, radix_order, sort_few
 from pipeline.kernels.union_find import numbered_sets, root_of, unite, united
 from pipeline.model import FloatArray
 

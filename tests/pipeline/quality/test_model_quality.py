@@ -11,13 +11,12 @@ from faces_by_hand import level, partition_of, plane
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.geometry import fit_plane
 from pipeline.model import FloatArray, ModelQuality, Plane
-from pipeline.quality.curved_roof import is_curved_roof
-from pipeline.quality.model_quality import model_quality
+from pipeline.quality.model_quality import is_curved_roof, model_quality
 from pipeline.quality.ridge_height import _weights
 from pipeline.quality.unseen_roof import Raster, _nearest_squares
 from pipeline.roof.solid import SolidPart, solid_parts
+from pipeline.segmentation.facet_geometry import fit_plane
 
 Modelled = tuple[list[SolidPart], list[Plane]]
 

@@ -6,8 +6,7 @@ import shapely
 from faces_by_hand import level, plane
 
 from pipeline.model import FloatArray, Plane, RoofFace
-from pipeline.quality.level_sides import level_side_share
-from pipeline.quality.unseen_sides import unseen_beside_m2
+from pipeline.quality.unseen_sides import level_side_share, unseen_beside_m2
 
 PENT = plane(0.0, 0.5, 3.0)
 """It rises to the north."""

@@ -16,8 +16,8 @@ from pipeline.model import BuildingResult, Candidate
 from pipeline.recipe import reconstruct_building
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
-from pipeline.runtime.monitoring.events import Listener, ignore
 from pipeline.runtime.monitoring.measurement import Measured, measure
+from pipeline.runtime.monitoring.progress import Listener, ignore
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run

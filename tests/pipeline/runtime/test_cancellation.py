@@ -13,8 +13,8 @@ from pipeline.errors import RunCancelledError
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.manifest import RunStatus
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.monitoring.measurement import Measured, measure
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import RunSummary, run

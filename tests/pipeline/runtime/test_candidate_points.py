@@ -12,7 +12,7 @@ from pipeline.model import Candidate
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.run import RunSummary
 from pipeline.runtime.stages.gather import noise_of_ground_m
-from pipeline.runtime.stages.surroundings import Surroundings
+from pipeline.runtime.stages.window_points import Surroundings
 
 WALLS = {"outline": "walls"}
 WALLS_BENEATH = {"wall_outline": True}

@@ -13,17 +13,11 @@ import numpy as np
 import pyproj
 import pytest
 
-from pipeline.errors import (
-    InconsistentInputError,
-    RunCancelledError,
-    RunError,
-    SettingsError,
-    UnreadableInputError,
-)
+from pipeline.errors import InconsistentInputError, RunCancelledError, RunError, SettingsError, UnreadableInputError
 from pipeline.extras.classify.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.extras.classify.las_frame import read_frame
 from pipeline.io import open_source
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
 

@@ -21,12 +21,12 @@ from pipeline.extras.compare.compare import (
     parse_variants,
     settings_of,
 )
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
-from pipeline.runtime.stages import model_batch
-from pipeline.runtime.stages.model_batch import load_once
+from pipeline.runtime.stages import model_batch, rehearsal
+from pipeline.runtime.stages.rehearsal import load_once
 from pipeline.settings import RunSettings
 
 BOTH = parse_variants(["fuzzy-sart,fuzzy-sart:faithful"])
@@ -156,7 +156,7 @@ def test_no_building_is_charged_for_loading_its_method(
     loaded: list[str] = []
     # a clock that stands still but while a method is loaded
     monkeypatch.setattr(model_batch, "time", SimpleNamespace(perf_counter=lambda: 100.0 * len(loaded), time=float))
-    monkeypatch.setattr(model_batch, "load", loaded.append)
+    monkeypatch.setattr(rehearsal, "load", loaded.append)
     load_once.cache_clear()
     try:
         variants = parse_variants(["fuzzy-sart,kmeans,fuzzy-sart:faithful"])
@@ -169,7 +169,7 @@ def test_no_building_is_charged_for_loading_its_method(
 
 def test_a_run_by_one_method_loads_nothing_ahead(suburb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loaded: list[str] = []
-    monkeypatch.setattr(model_batch, "load_once", loaded.append)
+    monkeypatch.setattr(rehearsal, "load_once", loaded.append)
     run(RunRequest(inputs=(str(suburb),), out=str(tmp_path / "out"), resources=SERIAL))
     assert loaded == []
 

@@ -16,7 +16,7 @@ from pipeline.compiler.warm_up import Listed, about_s
 from pipeline.errors import RunError
 from pipeline.runtime import compiling
 from pipeline.runtime.compiling import RECONSTRUCT, compile_first, compiling_s, kernel_groups, missing_kernels
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from pipeline.runtime.run import run
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.sites import CandidateSite
-from pipeline.runtime.stages.surroundings import Surroundings, surroundings_of
+from pipeline.runtime.stages.window_points import Surroundings, surroundings_of
 from pipeline.settings import RunSettings
 from pipeline.tiling import Tile, TileGrid, Window
 

@@ -25,7 +25,7 @@ from pipeline.runtime.isolation import child_main, child_pool
 from pipeline.runtime.isolation.isolated_items import supervise
 from pipeline.runtime.isolation.limits import IsolationLimits, Loss
 from pipeline.runtime.isolation.messages import Frames, frame
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 
 LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
 

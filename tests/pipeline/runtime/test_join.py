@@ -24,14 +24,13 @@ from pipeline.runtime.stages.border_facets import are_beyond, facet_names, share
 from pipeline.runtime.stages.join import join_tiles
 from pipeline.runtime.stages.open_fragments import open_fragments
 from pipeline.runtime.stages.sites import FoundSites
-from pipeline.runtime.stages.split_window import Split, SplitFigures
+from pipeline.runtime.stages.split import Split, SplitFigures
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints
 from pipeline.terrain.candidates import CONNECTING, NOWHERE, SOLID
 from pipeline.terrain.facets import FacetKind, SceneVertices, VertexKind
 from pipeline.terrain.fragment_sums import N_SUMS, Sum
 from pipeline.terrain.point_assignment import ScenePoints
-from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
-from pipeline.terrain.settings import CandidateSettings, SurfaceSettings
+from pipeline.terrain.settings import CandidateSettings, ClassesInUse, SceneSettings, SurfaceSettings
 from pipeline.terrain.surfaces import Fragments, fragments_of
 from pipeline.tiling import Tile, TileGrid
 from pipeline.tin.delaunay import triangulate

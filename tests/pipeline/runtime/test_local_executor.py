@@ -17,8 +17,8 @@ from pipeline.runtime.cluster.local_executor import LocalExecutor
 from pipeline.runtime.cluster.serial_executor import run_alone
 from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.monitoring.measurement import Measured, peak_of_process
+from pipeline.runtime.monitoring.progress import Event, Watch
 
 
 @pytest.fixture(autouse=True)

@@ -16,7 +16,7 @@ from pipeline.extras.classify.classify import ClassifyRequest, classify
 from pipeline.runtime.cluster.local_executor import LocalExecutor
 from pipeline.runtime.manifest import RunStatus
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run

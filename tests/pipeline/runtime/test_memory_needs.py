@@ -22,7 +22,7 @@ from pipeline.runtime.cluster.memory_needs import (
     declared_bytes,
 )
 from pipeline.runtime.isolation.limits import IsolationLimits
-from pipeline.runtime.monitoring.events import Event, Watch
+from pipeline.runtime.monitoring.progress import Event, Watch
 from pipeline.runtime.plan import window_bytes
 from pipeline.runtime.stages.model_batch import BatchTask
 from pipeline.tiling import Tile, TileGrid

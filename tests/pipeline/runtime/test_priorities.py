@@ -10,7 +10,7 @@ from processes import LONG_S, wait_for
 
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.priorities import PRIORITIES, Traffic, priority_of
-from pipeline.runtime.monitoring.events import Watch
+from pipeline.runtime.monitoring.progress import Watch
 
 
 def test_no_wish_leads_out_of_the_kind_of_a_run() -> None:

@@ -20,7 +20,7 @@ from pipeline.extras.publish.publishing import publish_stac
 from pipeline.model import Reason
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run

@@ -18,8 +18,7 @@ from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.engine import Engine
 from pipeline.runtime.expected import RATES, Expected, expected
 from pipeline.runtime.forecast import WORTH_S, forecast
-from pipeline.runtime.monitoring.events import ignore
-from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.monitoring.progress import Progress, ignore
 from pipeline.runtime.plan import Plan, make_plan
 from pipeline.runtime.request import RunRequest, plan_inputs
 from pipeline.runtime.resources import SERIAL, Resources

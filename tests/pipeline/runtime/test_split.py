@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.runtime.stages.split_window import _order_by_owner
+from pipeline.runtime.stages.split import _order_by_owner
 
 
 def points(n: int, side_mm: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

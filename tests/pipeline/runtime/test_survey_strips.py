@@ -14,7 +14,7 @@ from run_tables import rows
 from pipeline.extras.overrides.rerun import RerunRequest, rerun
 from pipeline.model import Reason
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import run

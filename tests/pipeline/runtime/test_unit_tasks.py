@@ -22,11 +22,10 @@ from pipeline.runtime.stages.gather import gather, points_of
 from pipeline.runtime.stages.outline import outlined
 from pipeline.runtime.stages.sites import CandidateSite, PointRange, largest_first, object_id
 from pipeline.runtime.stages.stored_sites import SitesBrief
-from pipeline.runtime.stages.surroundings import NO_GROUND, NO_POINT
 from pipeline.runtime.stages.units import UnitTask, divide, is_intact, shares_of
+from pipeline.runtime.stages.window_points import NO_GROUND, NO_POINT
 from pipeline.terrain.lattice import CELL_MM
-from pipeline.terrain.scene_settings import SceneSettings
-from pipeline.terrain.settings import UnitSettings
+from pipeline.terrain.settings import SceneSettings, UnitSettings
 from pipeline.tiling import Tile, TileGrid
 
 CRS = "EPSG:28992"

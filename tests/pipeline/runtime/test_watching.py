@@ -25,9 +25,8 @@ from pipeline.runtime.cluster.performance_report import BINS, ROWS, PerformanceR
 from pipeline.runtime.cluster.run_metrics import RunMetrics, TallyMetrics, combined, serve_metrics
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.monitoring import log_lines, logs
-from pipeline.runtime.monitoring.events import Event, Watch
-from pipeline.runtime.monitoring.measurement import Measured, measure
-from pipeline.runtime.monitoring.tallies import TALLIES, Tallies
+from pipeline.runtime.monitoring.measurement import TALLIES, Measured, Tallies, measure
+from pipeline.runtime.monitoring.progress import Event, Watch
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.tiling import Tile

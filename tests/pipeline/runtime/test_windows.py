@@ -14,10 +14,9 @@ from pipeline.errors import InputError
 from pipeline.io import ReadOptions
 from pipeline.runtime.plan import Plan, check_windows, make_plan, split_grid
 from pipeline.runtime.stages import split
-from pipeline.runtime.stages.split_window import Split, SplitTask, split_window
+from pipeline.runtime.stages.split import Split, SplitTask, split_window
 from pipeline.settings import RunSettings
-from pipeline.terrain.scene_settings import APRON_M, ClassesInUse, SceneSettings
-from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.settings import APRON_M, ClassesInUse, GroundSettings, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 TRUSTED = ClassesInUse(ground=True, building=True)

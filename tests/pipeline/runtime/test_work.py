@@ -21,8 +21,8 @@ from pipeline.extras.overrides.rerun import RerunRequest, rerun
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.monitoring.measurement import Measured
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.plan import tiles_per_block
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources

@@ -11,8 +11,14 @@ from whole_scene import seen_m, split_alone
 from pipeline.scene import WindowPoints, lattice_of, terrain_of
 from pipeline.settings import RunSettings
 from pipeline.terrain.lattice import NO_DATA, height_above
-from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
-from pipeline.terrain.settings import GroundSettings, OutlierSettings, SurfaceSettings, VegetationSettings
+from pipeline.terrain.settings import (
+    ClassesInUse,
+    GroundSettings,
+    OutlierSettings,
+    SceneSettings,
+    SurfaceSettings,
+    VegetationSettings,
+)
 from pipeline.tiling import Tile, TileGrid, Window
 
 GROUND = 2

@@ -20,11 +20,12 @@ from pipeline.terrain.decks_and_vehicles import shape_figures
 from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.fragment_sums import Sum
 from pipeline.terrain.lattice import NO_DATA
-from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
 from pipeline.terrain.settings import (
     CandidateSettings,
+    ClassesInUse,
     GroundSettings,
     OutlierSettings,
+    SceneSettings,
     SurfaceSettings,
     VegetationSettings,
 )

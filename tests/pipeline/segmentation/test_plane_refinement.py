@@ -10,7 +10,8 @@ from candidates_by_hand import TURNS, Matrix, same_partition
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import FloatArray, LabelArray, Reason
-from pipeline.segmentation.plane_refinement import describe_planes, refine_planes
+from pipeline.segmentation.plane_refinement import refine_planes
+from pipeline.segmentation.plane_regression import describe_planes
 from pipeline.segmentation.plane_settings import PlaneRefinementSettings
 
 

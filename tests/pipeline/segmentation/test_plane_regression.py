@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.model import FloatArray
-from pipeline.segmentation.plane_regression import (
-    best_fit_plane,
-    cluster_sums,
-    cosine_of_slope,
-    mean_square_residual,
-)
+from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope, mean_square_residual
 
 
 def strewn(seed: int, count: int = 40, noise: float = 0.1) -> FloatArray:

@@ -7,9 +7,13 @@ import pytest
 
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import BoolArray, FloatArray, LabelArray
-from pipeline.segmentation.plane_merge import touching_pairs
-from pipeline.segmentation.point_assignment import distance_to_plane, nearest_plane, vote_among_neighbours
-from pipeline.segmentation.redundant_planes import dissolve_redundant
+from pipeline.segmentation.point_assignment import (
+    dissolve_redundant,
+    distance_to_plane,
+    nearest_plane,
+    touching_pairs,
+    vote_among_neighbours,
+)
 
 
 def scene(seed: int) -> tuple[FloatArray, LabelArray, FloatArray, BoolArray, LabelArray]:

@@ -11,9 +11,8 @@ from hypothesis.extra.numpy import arrays
 from scipy.ndimage import binary_dilation, generate_binary_structure, grey_dilation, grey_erosion
 
 from pipeline.terrain.lattice import NO_DATA
-from pipeline.terrain.morphological import closed_gaps, morphological_ground, regrown, without_clumps
+from pipeline.terrain.morphological import closed_gaps, leaning_planes, morphological_ground, regrown, without_clumps
 from pipeline.terrain.openings import cut_off, dilate_back, erode_once, framed
-from pipeline.terrain.planar_fitting import leaning_planes
 from pipeline.terrain.rejoining import rejoined
 from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.wide_objects import wide_objects, with_corners

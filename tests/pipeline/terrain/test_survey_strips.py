@@ -4,8 +4,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from pipeline.terrain.flight_passes import SLICE_S, ids_of, passes_of, slices_of, united_slices
-from pipeline.terrain.flight_strip import Strip, ids_of_timed
+from pipeline.terrain.flight_passes import SLICE_S, Strip, ids_of, ids_of_timed, passes_of, slices_of, united_slices
 from pipeline.terrain.settings import StripSettings
 from pipeline.terrain.strip_moves import moves_of, offsets_of, strips_warning, surfaces_warning
 from pipeline.terrain.survey_strips import Rows, compared_strips, counted

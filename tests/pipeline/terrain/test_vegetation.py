@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.kernels.smallest_eigenvalue import smallest_eigenvalue
+from pipeline.kernels.normal_equations import smallest_eigenvalue
 from pipeline.model import KindArray
 from pipeline.terrain.settings import VegetationSettings
 from pipeline.terrain.vegetation import _is_planar, crowns, planarity

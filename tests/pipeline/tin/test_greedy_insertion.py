@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
-from pipeline.geometry import facet_normals
 from pipeline.model import FloatArray, Tin
+from pipeline.segmentation.facet_geometry import facet_normals
 from pipeline.tin.delaunay import triangulate
 from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, insert_greedily
 

@@ -50,8 +50,8 @@ STAGES = {
     "pipeline.runtime.stages.ingest": ("ingest_file", "ingest"),
     "pipeline.runtime.stages.cells": ("find_cells", "cells"),
     "pipeline.runtime.stages.ground": ("draw_ground", "ground"),
-    "pipeline.runtime.stages.split_window": ("split_window", "split"),
-    "pipeline.runtime.stages.model_batch": ("model_batch", "reconstruct"),
+    "pipeline.runtime.stages.split": ("split_window", "split"),
+    "pipeline.runtime.stages.reconstruct": ("model_batch", "reconstruct"),
     "pipeline.runtime.stages.publish": ("publish_tile", "publish"),
     "service.outputs.assemble": ("write_outputs", "outputs"),
 }

@@ -15,7 +15,7 @@ from shapely.affinity import scale
 from pipeline.errors import CrsError, EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.extras.footprints.footprints_file import read_area, read_footprints
 from pipeline.io import SpatialReference
-from pipeline.io.crs import resolve_reference
+from pipeline.io.crs_resolution import resolve_reference
 
 HOUSES = [box(85_000, 447_000, 85_010, 447_008), box(85_020, 447_000, 85_030, 447_010)]
 

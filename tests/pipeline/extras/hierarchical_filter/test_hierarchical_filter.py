@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial import Delaunay
 
 from pipeline.errors import SettingsError
-from pipeline.extras.hierarchical_filter.hierarchical_filter import _lowest_of_cells, _without_clumps
+from pipeline.extras.hierarchical_filter.hierarchical_filter import _lowest_of_cells, _without_clumps, join_planes
 from pipeline.extras.hierarchical_filter.tin_densification import join_facets
 from pipeline.terrain.ground import Terrain, ground_of
 from pipeline.terrain.lattice import NO_DATA, without_pits
-from pipeline.terrain.planar_fitting import join_planes, plane_around, plane_sums
+from pipeline.terrain.planar_fitting import plane_around, plane_sums
 from pipeline.terrain.settings import GroundSettings
 
 Grid = npt.NDArray[np.int32]

@@ -17,12 +17,12 @@ from pipeline.errors import BuildingError, SettingsError
 from pipeline.extras.papers import kmeans
 from pipeline.extras.papers.kmeans import building_top, cluster_facets
 from pipeline.extras.papers.settings import KMeansSettings
-from pipeline.geometry import vertical_residuals_m
 from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, Reason, RoofType, Segmentation, Status
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
+from pipeline.segmentation.facet_geometry import vertical_residuals_m
 
 PAGE = ROOT / "docs" / "methods" / "kmeans.md"
 FAITHFUL = KMeansSettings.faithful()

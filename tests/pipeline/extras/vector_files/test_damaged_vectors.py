@@ -26,7 +26,9 @@ from pipeline.extras.footprints.repairs import Repairs, crossings
 from pipeline.extras.guides.guides_file import read_guides
 from pipeline.extras.vector_files import nearby
 from pipeline.extras.vector_files.wkb import DEPTH_LIMIT, geometries_of
-from pipeline.io.crs import SpatialReference, parse_crs, resolve_reference
+from pipeline.io.crs import SpatialReference
+from pipeline.io.crs_given import parse_crs
+from pipeline.io.crs_resolution import resolve_reference
 from pipeline.io.library_faults import DAMAGED, TOO_LARGE, in_our_words
 from service.errors import TooLargeError
 from service.vectors import examine_vector

@@ -17,7 +17,7 @@ from pipeline.errors import UnreadableInputError
 from pipeline.extras.footprints.footprints_file import read_footprints
 from pipeline.extras.vector_files.geoparquet_layer import geometry_column
 from pipeline.io import SpatialReference
-from pipeline.io.crs import resolve_reference
+from pipeline.io.crs_resolution import resolve_reference
 
 RING = Polygon(box(85_040, 447_000, 85_050, 447_010).exterior, [box(85_044, 447_004, 85_046, 447_006).exterior])
 HOUSES = [box(85_000, 447_000, 85_010, 447_008), RING]

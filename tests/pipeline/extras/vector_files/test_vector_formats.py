@@ -16,7 +16,7 @@ from pipeline.extras.footprints.placed_features import Elsewhere, off_the_data
 from pipeline.extras.guides.guides_file import read_guides
 from pipeline.extras.vector_files.tile_index import read_tile_index
 from pipeline.io import SpatialReference
-from pipeline.io.crs import resolve_reference
+from pipeline.io.crs_resolution import resolve_reference
 
 HOUSES = [box(85_000, 447_000, 85_010, 447_008), box(85_020, 447_000, 85_030, 447_010)]
 NAMES = ["Müllerstraße 1", "Œuvre"]

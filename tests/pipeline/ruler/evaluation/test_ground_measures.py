@@ -31,7 +31,7 @@ from pipeline.ruler.evaluation.reference_points import read_points_reference
 from pipeline.ruler.evaluation.subsets import subsets
 from pipeline.scene import WindowPoints, terrain_of
 from pipeline.terrain.ground import ground_points
-from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
+from pipeline.terrain.settings import ClassesInUse, SceneSettings
 from pipeline.tiling import Window
 
 SETTINGS = SceneSettings()

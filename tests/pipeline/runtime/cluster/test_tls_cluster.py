@@ -18,7 +18,7 @@ from pipeline.errors import ClusterError
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.tls import VARIABLES, TlsFiles
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.monitoring.events import Watch
+from pipeline.runtime.monitoring.progress import Watch
 
 pytestmark = pytest.mark.slow
 

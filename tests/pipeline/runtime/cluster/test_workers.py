@@ -19,8 +19,8 @@ from pipeline.errors import ClusterError, RunCancelledError, VersionMismatchErro
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.manifest import RunStatus
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.monitoring.measurement import Measured
+from pipeline.runtime.monitoring.progress import Event, Watch
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
