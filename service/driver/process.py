@@ -353,8 +353,6 @@ class Driver:
                 # those of drivers that were killed
                 removed = remove_left_folders()
                 removed += tidy(self._store, self._shop.folder, self._settings)
-                while self._store.webhooks.forget(self._settings.webhook_log_days):
-                    continue
             except (StoreError, OSError) as error:
                 LOG.warning("the state folder could not be tidied: %s", error, extra=self._facts)
             else:

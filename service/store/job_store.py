@@ -32,10 +32,10 @@ from service.store import (
     queries,
     submissions,
     uploads,
-    webhook_deliveries,
 )
 from service.store.database import LOCK_SUBMISSIONS, WAIT_S, Database
 from service.store.delivering import creating
+from service.store.delivery_line import give_up_all
 from service.store.queries import JobFilter
 from service.store.schedule_store import ScheduleStore
 from service.store.webhook_store import WebhookStore
@@ -318,7 +318,7 @@ class JobStore:
         """
         with self._database.write() as connection:
             now = self._database.now(connection)
-            webhook_deliveries.give_up_all(connection, driver)
+            give_up_all(connection, driver)
             return claims.give_up_all(connection, driver, now=now, max_attempts=max_attempts)
 
     def renew(self, job: Job, *, lease_s: float, due_s: float = math.inf) -> bool:
