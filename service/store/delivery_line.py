@@ -13,7 +13,7 @@ from sqlalchemy.engine import Connection
 
 from pipeline.backoff import Backoff
 from service.receivers import Avoided, Due
-from service.store.database import LOCK_SECRETS, Database
+from service.store.database import LOCK_SECRETS, StorePart, lock
 from service.store.outbox import drop
 from service.store.records import delivery_of, storable
 from service.store.tables import WEBHOOK_ATTEMPTS, WEBHOOK_DELIVERIES, WEBHOOK_EVENTS, WEBHOOKS
@@ -30,17 +30,8 @@ _LINE = 512
 _WAITING = DeliveryState.WAITING.value
 
 
-class DeliveryLine:
-    """The deliveries that are due; each method is a transaction.
-
-    Parameters
-    ----------
-    database : Database
-        The store's own.
-    """
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
+class DeliveryLine(StorePart):
+    """The deliveries that are due."""
 
     def claim_some(
         self,
@@ -69,7 +60,7 @@ class DeliveryLine:
         if not chosen:
             return []
         with self._database.write() as connection:
-            self._database.lock(connection, LOCK_SECRETS)
+            lock(connection, LOCK_SECRETS)
             return _take(connection, chosen, driver, now=self._database.now(connection), lease_s=lease_s)
 
     def settle_all(self, ended: Sequence[tuple[Parcel, Result]], policy: Backoff) -> list[DeliveryState | None]:

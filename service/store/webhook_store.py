@@ -15,12 +15,12 @@ from sqlalchemy.engine import Connection
 from service import deliveries as deliveries_of_requests
 from service.errors import NoSuchDeliveryError, NoSuchWebhookError, NotReplayableError, TooManyWebhooksError
 from service.files import is_id
-from service.store.database import LOCK_SECRETS, LOCK_SUBMISSIONS
-from service.store.delivering import creating
+from service.store.database import LOCK_SECRETS, LOCK_SUBMISSIONS, lock
 from service.store.delivery_line import REMOVED, DeliveryLine, closed, endpoints_of
 from service.store.outbox import drop
 from service.store.records import delivery_of, endpoint_of, storable
 from service.store.tables import WEBHOOK_ATTEMPTS, WEBHOOK_DELIVERIES, WEBHOOK_EVENTS, WEBHOOKS
+from service.store.uploads import creating
 from service.store.webhook_secrets import known_secret, own_secret, replace_own_secret
 from service.webhooks import Attempt, Delivery, DeliveryState, Endpoint, EventType, new_secret
 
@@ -98,7 +98,7 @@ class WebhookStore(DeliveryLine):
         """
         with creating(self._database, delivery) as (connection, made):
             # no other process adds one between counting and adding
-            self._database.lock(connection, LOCK_SUBMISSIONS)
+            lock(connection, LOCK_SUBMISSIONS)
             now, secret, endpoint_id = self._database.now(connection), new_secret(), uuid.uuid4().hex
             own = WEBHOOKS.c.owner.is_not_distinct_from(None if owner is None else storable(owner, 64))
             found = connection.execute(sa.select(sa.func.count()).select_from(WEBHOOKS).where(own)).scalar_one()
@@ -184,13 +184,13 @@ class WebhookStore(DeliveryLine):
         if found is not None:
             return found
         with self._database.write() as connection:
-            self._database.lock(connection, LOCK_SECRETS)
+            lock(connection, LOCK_SECRETS)
             return own_secret(connection, owner, self._database.now(connection))
 
     def replace_own_secret(self, owner: str | None) -> str:
         """Give a key a new secret for its subscribers; the one before signs no longer."""
         with self._database.write() as connection:
-            self._database.lock(connection, LOCK_SECRETS)
+            lock(connection, LOCK_SECRETS)
             return replace_own_secret(connection, owner, self._database.now(connection))
 
     # --- the log
