@@ -14,9 +14,8 @@ import time
 from collections.abc import Callable, Mapping
 
 from pipeline import __version__
-from pipeline.backoff import Pauses
 from pipeline.runtime.monitoring import tracing
-from service.driver.attempts import DATABASE
+from service.driver.loops import repeat
 from service.errors import NoSuchOutputError, StoreError, TargetRefusedError
 from service.files import StateFolder
 from service.outputs import read_catalogue
@@ -78,11 +77,12 @@ class Sender:
         self._parcels: queue.SimpleQueue[Parcel] = queue.SimpleQueue()
         self._ended: queue.SimpleQueue[tuple[Parcel, Result]] = queue.SimpleQueue()
         self._unwritten: list[tuple[Parcel, Result]] = []
+        self._began_s = 0.0
         self._stopping = threading.Event()
         self._look_again = threading.Event()
         self.threads = [
             threading.Thread(target=self._work, name="webhooks", daemon=True),
-            threading.Thread(target=self._forget, name="webhooks-log", daemon=True),
+            threading.Thread(target=self._keep_log, name="webhooks-log", daemon=True),
         ]
         """Not started yet."""
 
@@ -94,23 +94,21 @@ class Sender:
     # --- the thread that claims and settles
 
     def _work(self) -> None:
-        pauses = Pauses(DATABASE)
-        while not (self._stopping.is_set() and self._receivers.under_way == 0):
-            began_s = time.monotonic()
-            self._look_again.clear()
-            try:
-                self._settle()
-                wait_s = LOOK_S if self._stopping.is_set() else self._send_what_is_due()
-            except StoreError as error:
-                wait_s = pauses.next_s()
-                LOG.warning("cannot look for webhooks, next try in %g s: %s", wait_s, error, extra=self._facts)
-            except Exception:
-                wait_s = pauses.next_s()
-                LOG.exception("an unexpected fault with webhooks, next try in %g s", wait_s, extra=self._facts)
-            else:
-                pauses.begin_anew()
-            self._look_again.wait(wait_s)
-            self._stopping.wait(max(0.0, began_s + PACE_S - time.monotonic()))
+        def is_over() -> bool:
+            return self._stopping.is_set() and self._receivers.under_way == 0
+
+        repeat(self._round, self._wait, is_over, complaint="cannot look for webhooks", facts=self._facts)
+
+    def _round(self) -> float:
+        """Settle what has ended and claim what is due; seconds until the next round."""
+        self._began_s = time.monotonic()
+        self._look_again.clear()
+        self._settle()
+        return LOOK_S if self._stopping.is_set() else self._send_what_is_due()
+
+    def _wait(self, seconds: float) -> None:
+        self._look_again.wait(seconds)
+        self._stopping.wait(max(0.0, self._began_s + PACE_S - time.monotonic()))
 
     def _settle(self) -> None:
         """Write how attempts ended, all that have ended by now.
@@ -252,17 +250,19 @@ class Sender:
 
     # --- the log
 
-    def _forget(self) -> None:
+    def _keep_log(self) -> None:
+        stopping = self._stopping
+        words = "old deliveries cannot be removed yet"
+        repeat(self._forget, stopping.wait, stopping.is_set, complaint=words, facts=self._facts)
+
+    def _forget(self) -> float:
         """Keep the log within its limits, so that the database does not grow without bound."""
         settings = self._settings
-        while not self._stopping.wait(FORGET_S):
-            try:
-                for _ in range(_ROUNDS):
-                    if not self._store.webhooks.forget(settings.webhook_log_days, most=settings.webhook_log_max):
-                        break
-                    self._stopping.wait(PACE_S)
-            except StoreError as error:
-                LOG.warning("old deliveries cannot be removed yet: %s", error, extra=self._facts)
+        for _ in range(_ROUNDS):
+            if not self._store.webhooks.forget(settings.webhook_log_days, most=settings.webhook_log_max):
+                break
+            self._stopping.wait(PACE_S)
+        return FORGET_S
 
     @property
     def _facts(self) -> Mapping[str, object]:

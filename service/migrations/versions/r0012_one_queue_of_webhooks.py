@@ -21,7 +21,7 @@ depends_on = None
 _TIME = sa.DateTime(timezone=True)
 _SECRETS = (("old_secret", sa.String(64)), ("old_until", _TIME))
 _PLACES = (("sent_until", _TIME), ("paused_at", _TIME))
-_BODIES = (("base", sa.Text), ("body", sa.Text))
+_BODIES = ("base", "body")
 
 
 def upgrade() -> None:
@@ -65,7 +65,7 @@ def upgrade() -> None:
     op.drop_index("webhook_deliveries_by_replay", "webhook_deliveries")
     for name in ("snapshot", "replay_at"):
         op.drop_column("webhook_deliveries", name)
-    for name, _ in _BODIES:
+    for name in _BODIES:
         op.drop_column("webhook_events", name)
     for name in ("is_behind", *(name for name, _ in (*_PLACES, *_SECRETS))):
         op.drop_column("webhooks", name)
@@ -82,8 +82,8 @@ def downgrade() -> None:
         op.add_column("webhooks", sa.Column(name, kind, nullable=True))
     op.add_column("webhooks", sa.Column("is_behind", sa.Boolean, nullable=False, server_default=sa.false()))
     op.execute("UPDATE webhooks SET sent_until = CURRENT_TIMESTAMP")
-    for name, kind in _BODIES:
-        op.add_column("webhook_events", sa.Column(name, kind, nullable=True))
+    for name in _BODIES:
+        op.add_column("webhook_events", sa.Column(name, sa.Text, nullable=True))
     op.add_column("webhook_deliveries", sa.Column("snapshot", sa.JSON, nullable=False, server_default="null"))
     op.add_column("webhook_deliveries", sa.Column("replay_at", _TIME, nullable=True))
     op.create_index("webhook_deliveries_by_replay", "webhook_deliveries", ["replay_at", "endpoint_id"])
