@@ -27,7 +27,6 @@ pytest.register_assert_rewrite(
     "schedule_contract",
     "schedule_store_contract",
     "store_contract",
-    "webhook_backlog_contract",
     "webhook_store_contract",
 )
 

@@ -155,11 +155,7 @@ def test_a_driver_classifies_a_tile_and_writes_it_back_whole(bench: Bench) -> No
         here = ClassifyRequest(**{**vars(request), "resources": Resources(workers=0)})
         return classify(here, on_event, None, cancelled)
 
-    bench.tools |= {
-        "gather": gather,
-        "classify": classify_here,
-        "write_classification": write_classification_outputs,
-    }
+    bench.tools |= {"gather": gather, "classify": classify_here}
     job = bench.submit({"process_id": "classify"})
     bench.driver()
     done = bench.over(job)

@@ -25,7 +25,7 @@ from store_contract import submit
 
 from service.disk import Ballast, Disk
 from service.downloads import _stream_to, _Watch, ignore_bytes
-from service.driver import finished_work
+from service.driver import workplace
 from service.driver.janitor import tidy_jobs
 from service.errors import NoSpaceError, StoreError, StoreFullError
 from service.jobs import Fault, JobStatus
@@ -299,7 +299,7 @@ def test_a_driver_that_cannot_write_the_end_of_a_job_ends_and_the_next_one_write
     driver.stop()
     bench.join()
     assert bench.store.get(job.job_id).status is JobStatus.RUNNING
-    assert finished_work.is_left(bench.folder.attempt(job.job_id, 1))
+    assert workplace.has_end(bench.folder.attempt(job.job_id, 1))
     bench.patch.setattr(JobStore, "succeed", plain)
     bench.end_leases()
     with bench.store._database.write() as connection:

@@ -10,13 +10,13 @@ import pytest
 from html_pages import links_of
 from live_service import POINTS
 from openapi_spec_validator import OpenAPIV30SpecValidator
+from webhook_store_contract import claim_next, settle
 
 from service.driver.webhooks import Sender
 from service.jobs import Fault, JobFailure, JobStatus, Subscriber
 from service.outputs.kinds import ON_REQUEST
 from service.routes.landing import CONFORMANCE
 from service.settings import ServiceSettings
-from service.webhooks import retry_policy
 
 OGC = "http://www.opengis.net/def/rel/ogc/1.0/"
 PROBLEM = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
@@ -371,8 +371,8 @@ def callback(service: runs.Service) -> None:
         return 200, None
 
     sender = Sender(service.store, service.folder, ServiceSettings(state=service.folder.root), name="d", send=send)
-    while (parcel := service.store.webhooks.claim("d", lease_s=60.0)) is not None:
-        service.store.webhooks.settle(parcel, sender.attempt(parcel), retry_policy(1.0, 100.0))
+    while (parcel := claim_next(service.store)) is not None:
+        settle(service.store, parcel, sender.attempt(parcel))
     results = service.client.get(f"/jobs/{CONTEXT['reported']}/results").json()
     assert [body for url, body in sent if url == SUBSCRIBER["success_uri"]] == [results]
     failed = [body for url, body in sent if url == SUBSCRIBER["failed_uri"]]

@@ -11,7 +11,6 @@ from delivery_contract import DeliveryContract
 from migrated import with_tables
 from schedule_store_contract import ScheduleStoreContract
 from store_contract import StoreContract, claim, submit
-from webhook_backlog_contract import WebhookBacklogContract
 from webhook_store_contract import WebhookStoreContract
 
 from service.errors import StartUpError, StoreError
@@ -45,10 +44,6 @@ class TestDeliveriesOnSqlite(OnSqlite, DeliveryContract):
 
 class TestWebhooksOnSqlite(OnSqlite, WebhookStoreContract):
     """All of the contract of webhooks, on a file."""
-
-
-class TestWebhookBacklogOnSqlite(OnSqlite, WebhookBacklogContract):
-    """All of the contract of webhooks that do not keep up, on a file."""
 
 
 class OnceRefused:

@@ -158,7 +158,7 @@ def test_an_end_that_is_not_committed_has_no_span(spans: Spans, bench: Bench, mo
         raise StoreError("the database does not answer")
 
     with monkeypatch.context() as patch:
-        patch.setattr("service.store.queries.get", broken)
+        patch.setattr("service.store.submissions.get", broken)
         with pytest.raises(StoreError):
             bench.store.dismiss(job.job_id)
     assert bench.store.get(job.job_id).status is JobStatus.ACCEPTED

@@ -13,7 +13,7 @@ import pytest
 from driver_bench import Bench
 from processes import LONG_S, wait_for
 from webhook_receiver import Received, Receiver, failing, receiving
-from webhook_store_contract import shift
+from webhook_store_contract import claim_next
 
 from service.driver.webhooks import body_of
 from service.files import StateFolder
@@ -21,7 +21,7 @@ from service.jobs import Fault, Job, JobFailure, JobStatus, Subscriber
 from service.settings import ServiceSettings
 from service.store import DeliveryFilter, JobStore
 from service.store.webhook_store import WebhookStore
-from service.webhooks import ROOM, DeliveryState, EventType
+from service.webhooks import DeliveryState, EventType
 from service.wire.jobs import StatusInfo
 
 BASE = "http://service.example"
@@ -155,7 +155,7 @@ def test_the_public_url_of_the_settings_comes_before_that_of_the_request(
 ) -> None:
     bench.submit({"subscriber": subscriber(receiver)})
     bench.store.claim("elsewhere", lease_s=60.0, max_attempts=3)
-    parcel = bench.store.webhooks.claim("d", lease_s=60.0)
+    parcel = claim_next(bench.store)
     assert parcel is not None
     public = ServiceSettings(state=tmp_path, public_url="https://public.example/")
     body = json.loads(body_of(parcel, StateFolder(tmp_path), public))
@@ -260,32 +260,6 @@ def test_receivers_that_hang_hold_up_no_others(bench: Bench, receiver: Receiver)
     finally:
         free.set()
     assert len(all_are(bench, DeliveryState.DELIVERED)) == 80
-
-
-def test_many_events_wait_in_few_rows_and_all_arrive(bench: Bench, receiver: Receiver) -> None:
-    bench.store.webhooks.create(f"{receiver.url}/ends", events=[EventType.DISMISSED], base=BASE)
-    jobs = [bench.submit() for _ in range(2 * ROOM)]
-    for job in jobs:
-        bench.store.dismiss(job.job_id)
-    assert len(deliveries(bench.store)) == ROOM
-    bench.driver()
-    wait_for(lambda: len(receiver.accepted) == len(jobs), "all messages")
-    assert [message.document["data"]["jobID"] for message in receiver.accepted] == [job.job_id for job in jobs]
-
-
-def test_a_webhook_that_does_not_keep_up_is_paused_with_a_warning(
-    bench: Bench, receiver: Receiver, caplog: pytest.LogCaptureFixture
-) -> None:
-    receiver.answer = lambda _message: 503
-    bench.settings = bench.settings.model_copy(update={"webhook_pause_s": 3600.0, "webhook_max_waiting": 5})
-    made, _ = bench.store.webhooks.create(f"{receiver.url}/ends", events=[EventType.DISMISSED], base=BASE)
-    for _ in range(2 * ROOM):
-        bench.store.dismiss(bench.submit().job_id)
-    shift(bench.store, 1.0)
-    with caplog.at_level(logging.WARNING):
-        bench.driver()
-        wait_for(lambda: bench.store.webhooks.get(made.endpoint_id).paused_at, "the pause")
-        wait_for(lambda: f"webhook {made.endpoint_id} is paused" in caplog.text, "a warning")
 
 
 def test_an_end_that_cannot_be_written_holds_up_no_others(

@@ -4,14 +4,14 @@ import base64
 from typing import Any
 
 import pytest
-from webhook_store_contract import shift
+from webhook_store_contract import settle, take
 
 from service.errors import ServiceError
 from service.jobs import JobStatus, Subscriber
 from service.keys import Scope
 from service.settings import ServiceSettings
 from service.store import DeliveryFilter
-from service.webhooks import ROOM, EventType, Result, retry_policy
+from service.webhooks import EventType, Result, retry_policy
 
 LISTED = "http://127.0.0.1:9"
 HOOK = f"{LISTED}/hook"
@@ -171,10 +171,8 @@ def test_the_form_has_a_subscriber(local_service) -> None:
 def test_the_log_shows_every_attempt_and_replays(local_service) -> None:
     job = execute(local_service, failedUri=HOOK).json()["jobID"]
     local_service.store.dismiss(job)
-    store = local_service.store.webhooks
-    parcel = store.claim("d", lease_s=60.0)
-    assert parcel is not None
-    store.settle(parcel, Result(duration_ms=12, status=500, error="the receiver answered 500", body='{"a": 1}'), POLICY)
+    refused = Result(duration_ms=12, status=500, error="the receiver answered 500", body='{"a": 1}')
+    settle(local_service.store, take(local_service.store), refused)
     (listed,) = local_service.client.get(f"/webhooks/deliveries?job={job}&state=waiting").json()["deliveries"]
     assert "attempts" not in listed
     place = f"/webhooks/deliveries/{listed['deliveryID']}"
@@ -186,8 +184,7 @@ def test_the_log_shows_every_attempt_and_replays(local_service) -> None:
     assert attempt["error"] == shown["reason"] == "the receiver answered 500"
     replayed = local_service.client.post(f"{place}/replay")
     assert (replayed.status_code, replayed.json()["state"]) == (202, "waiting")
-    again = store.claim("d", lease_s=60.0)
-    assert again is not None
+    again = take(local_service.store)
     assert (again.delivery.delivery_id, again.delivery.body) == (listed["deliveryID"], '{"a": 1}')
     busy = local_service.client.post(f"{place}/replay")
     assert (busy.status_code, busy.json()["type"]) == (409, "urn:gablework:problem:not-replayable")
@@ -234,30 +231,18 @@ def test_at_least_a_hundred_webhooks_of_a_key_are_allowed() -> None:
     assert ServiceSettings.model_fields["max_webhooks_per_key"].default >= 100
 
 
-def test_a_webhook_that_does_not_keep_up_is_shown_paused_and_its_owner_replays_it(local_service) -> None:
+def test_a_webhook_is_sent_what_failed_when_its_owner_replays_it(local_service) -> None:
     store = local_service.store
     place = f"/webhooks/{make(local_service, events=['job.dismissed'])['webhookID']}"
-    jobs = [local_service.waiting() for _ in range(ROOM + 5)]
-    for job in jobs:
-        store.dismiss(job.job_id)
-    shown = local_service.client.get(place).json()
-    assert ("pausedSince" in shown, shown["notSent"]) == (False, 5)
-    shift(store, 1.0)
-    store.webhooks.refill(max_waiting=1)
-    (shown,) = local_service.client.get("/webhooks").json()["webhooks"]
-    assert (shown["enabled"], shown["notSent"]) == (True, ROOM + 5)
-    assert shown["pausedSince"].endswith("Z")
-    assert store.webhooks.claim("d", lease_s=60.0) is None
-    replayed = local_service.client.post(f"{place}/replay")
-    assert replayed.status_code == 202
-    assert "pausedSince" not in replayed.json()
-    sent = []
-    while (parcel := store.webhooks.claim("d", lease_s=60.0)) is not None:
-        store.webhooks.settle(parcel, Result(duration_ms=12, status=204, body="{}"), POLICY)
-        sent.append(parcel.delivery.job_id)
-        store.webhooks.refill(max_waiting=1000)
-    assert sorted(sent) == sorted(job.job_id for job in jobs)
-    assert "notSent" not in local_service.client.get(place).json()
+    job = local_service.waiting()
+    store.dismiss(job.job_id)
+    for _ in range(2):
+        parcel = take(store)
+        assert parcel.delivery.job_id == job.job_id
+        refused = Result(duration_ms=12, status=403, error="refused", is_final=True, body="{}")
+        settle(store, parcel, refused)
+        replayed = local_service.client.post(f"{place}/replay")
+        assert (replayed.status_code, replayed.json()["enabled"]) == (202, True)
     assert local_service.client.post(f"/webhooks/{'0' * 32}/replay").status_code == 404
 
 

@@ -14,9 +14,12 @@ from pipeline.errors import RunCancelledError
 from pipeline.extras.compare.compare import CompareRequest, CompareSummary
 from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.run import RunSummary
-from service.driver.attempt import Tools
+from service import traces
+from service.driver import attempt
+from service.driver.attempt import AttemptParts, perform
 from service.driver.attempt_child import Order
-from service.driver.attempt_process import DriverParts, InOwnProcess, InThisProcess, Perform
+from service.driver.attempt_process import DriverParts, InOwnProcess
+from service.driver.leased_job import LeasedJob
 from service.driver.process import Driver
 from service.driver.shared_cluster import SharedCluster
 from service.fetching import Fetched, JobFiles
@@ -25,7 +28,7 @@ from service.jobs import InputReference, Job, JobFailure, JobRequest, JobStatus
 from service.settings import ServiceSettings
 from service.store import JobStore
 
-SCRIPTED = ("gather", "run", "compare", "write_outputs", "write_comparison")
+SCRIPTED = ("gather", "run", "compare", "write_outputs", "write_comparison_outputs")
 """Steps of an attempt that the script replaces; a test may replace others."""
 
 Telling = Callable[[int, int], None]
@@ -107,7 +110,9 @@ class Script:
         (out_dir / "outputs.json").write_text("{}")
         on_progress(1, 1)
 
-    def write_comparison(self, folder: Path, _labels: Any, out_dir: Path, wanted: Any, on_progress: Telling) -> None:
+    def write_comparison_outputs(
+        self, folder: Path, _labels: Any, out_dir: Path, wanted: Any, on_progress: Telling
+    ) -> None:
         self.write_outputs(folder, out_dir, wanted, on_progress)
 
     def raises(self, error: Exception) -> None:
@@ -131,6 +136,34 @@ class Script:
         self.steps.append(step)
 
 
+class InThisProcess(InOwnProcess):
+    """Attempts in the driver's own threads, where tests replace their steps."""
+
+    def preload(self) -> None:
+        """Everything is there."""
+
+    def wait_until_ready(self) -> None:
+        """Everything is there."""
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+    def __call__(self, held: LeasedJob, place: Path) -> tuple[str, dict[str, Any]]:
+        """As `perform`."""
+        parts = self._parts
+
+        def executor() -> Any:
+            parts.cluster.wait_until_there(held)
+            held.engine = parts.cluster.engine()
+            return held.engine.executor(held.job.priority)
+
+        work = AttemptParts(
+            settings=parts.settings, folder=parts.folder, place=place, uploads=parts.store, executor=executor
+        )
+        with traces.attempt(held.job, self._name):
+            return perform(held, work)
+
+
 class Bench:
     """A store, a state folder, and drivers in threads."""
 
@@ -140,7 +173,7 @@ class Bench:
         self.tools: dict[str, Any] = {}
         self.work: Callable[[Order], tuple[str, dict[str, Any]]] | None = None
         """What processes of attempts do in place of the script, which runs in threads of this process."""
-        self.performs: Callable[[DriverParts, str], Perform] | None = None
+        self.performs: Callable[[DriverParts, str], InOwnProcess] | None = None
         """What does the work of attempts, in place of both."""
         self.settings = ServiceSettings(
             state=folder, poll_s=0.02, lease_s=30.0, driver_jobs=1, drain_s=40.0, max_attempts=3
@@ -153,18 +186,19 @@ class Bench:
     def driver(self, *, parent_pipe: int | None = None, **changed: Any) -> Driver:
         settings = self.settings.model_copy(update=changed)
         scripted = {name: getattr(self.script, name) for name in SCRIPTED}
-        tools = Tools(**(scripted | self.tools))
+        for step, replaced in (scripted | self.tools).items():
+            self.patch.setattr(attempt, step, replaced)
         cluster = SharedCluster(settings, Engine)
 
-        def perform(shop: DriverParts, name: str) -> Perform:
+        def performs(parts: DriverParts, name: str) -> InOwnProcess:
             if self.performs is not None:
-                return self.performs(shop, name)
+                return self.performs(parts, name)
             if self.work is not None:
-                return InOwnProcess(shop, name, self.work)
-            return InThisProcess(shop, name, tools)
+                return InOwnProcess(parts, name, self.work)
+            return InThisProcess(parts, name)
 
         name = f"d{len(self._running)}"
-        driver = Driver(settings, name=name, parent_pipe=parent_pipe, perform=perform, cluster=cluster)
+        driver = Driver(settings, name=name, parent_pipe=parent_pipe, perform=performs, cluster=cluster)
         thread = threading.Thread(target=lambda: self.codes.append(driver.run()), daemon=True)
         self._running.append((driver, thread))
         thread.start()

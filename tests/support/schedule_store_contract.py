@@ -106,7 +106,7 @@ class InDatabase:
     @contextlib.contextmanager
     def opened(self) -> Iterator[SlotBook]:
         with self._store._database.write() as connection:
-            yield SlotBook(connection, schedules.lock(connection, self._schedule_id, None))
+            yield SlotBook(connection, schedules.row_of(connection, self._schedule_id, None, locked=True))
 
     def run(self, book: SlotBook, slot: dt.datetime, now: dt.datetime) -> None:
         book.add(Entry(outcome=self.done, slot=slot, at=now), job_id="0" * 32)

@@ -8,6 +8,7 @@ from typing import Any
 
 import finished_runs as runs
 from migrated import with_tables
+from webhook_store_contract import claim_next, settle
 
 from pipeline.schedule import Cron
 from service.files import StateFolder
@@ -16,7 +17,7 @@ from service.outputs import write_comparison_outputs, write_outputs
 from service.schedules import Definition
 from service.settings import ServiceSettings
 from service.store import JobStore
-from service.webhooks import EventType, Result, retry_policy
+from service.webhooks import EventType, Result
 
 HOOK = "https://hooks.example.org/gablework"
 DRIVER = "a driver"
@@ -138,17 +139,15 @@ class Stocking:
 
     def _deliver(self) -> tuple[str, str]:
         """Send all messages that wait; one arrives, the others are refused."""
-        policy = retry_policy(1.0, 100.0)
         sent: list[str] = []
-        while (parcel := self._store.webhooks.claim(DRIVER, lease_s=60.0)) is not None:
+        while (parcel := claim_next(self._store, DRIVER)) is not None:
             delivery_id = parcel.delivery.delivery_id
             body = '{"type": "job.successful", "data": {"status": "successful"}}'
             if sent:
                 result = Result(duration_ms=12, status=403, error="the receiver answered 403", is_final=True, body=body)
             else:
                 result = Result(duration_ms=31, status=204, body=body)
-            self._store.webhooks.settle(parcel, result, policy)
-            self._store.webhooks.refill(max_waiting=1000)
+            settle(self._store, parcel, result)
             sent.append(delivery_id)
         return sent[0], sent[1]
 

@@ -2,6 +2,7 @@
 
 import datetime as dt
 import threading
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -9,11 +10,18 @@ import pytest
 import sqlalchemy as sa
 from store_contract import DatabaseContract, claim, happened, running, submit, until
 
-from service.errors import LeaseLostError, NoSuchDeliveryError, NoSuchWebhookError, NotReplayableError
+from service.errors import (
+    LeaseLostError,
+    NoSuchDeliveryError,
+    NoSuchWebhookError,
+    NotReplayableError,
+    TooManyWebhooksError,
+)
 from service.jobs import Fault, Job, JobFailure, JobStatus, Subscriber
+from service.receivers import Avoided, Receivers
 from service.store import DeliveryFilter, JobStore
 from service.store.tables import WEBHOOK_DELIVERIES, WEBHOOK_EVENTS, WEBHOOK_SECRETS, WEBHOOKS
-from service.webhooks import PROGRESS_S, ROOM, Delivery, DeliveryState, EventType, Parcel, Result, retry_policy
+from service.webhooks import PROGRESS_S, Delivery, DeliveryState, EventType, Parcel, Result, retry_policy
 
 URL = "https://hooks.example.org/a"
 SUBSCRIBER = Subscriber(
@@ -41,8 +49,19 @@ def endpoint(store: JobStore, *wanted: EventType, url: str = URL) -> str:
     return made.endpoint_id
 
 
+def claim_next(store: JobStore, driver: str = "d", *, lease_s: float = 60.0) -> Parcel | None:
+    """The delivery that is due for the longest time; None if nothing is due."""
+    found = store.webhooks.claim_some(driver, lambda line: line[:1], lease_s=lease_s)
+    return found[0] if found else None
+
+
+def settle(store: JobStore, parcel: Parcel, result: Result) -> DeliveryState | None:
+    """Write how an attempt ended."""
+    return store.webhooks.settle_all([(parcel, result)], POLICY)[0]
+
+
 def take(store: JobStore, driver: str = "d", *, lease_s: float = 60.0) -> Parcel:
-    parcel = store.webhooks.claim(driver, lease_s=lease_s)
+    parcel = claim_next(store, driver, lease_s=lease_s)
     assert parcel is not None
     return parcel
 
@@ -50,17 +69,30 @@ def take(store: JobStore, driver: str = "d", *, lease_s: float = 60.0) -> Parcel
 def send_all(store: JobStore, result: Result = TAKEN) -> list[Parcel]:
     """Settle all that is due in the same way."""
     sent = []
-    while (parcel := store.webhooks.claim("d", lease_s=60.0)) is not None:
-        store.webhooks.settle(parcel, result, POLICY)
+    while (parcel := claim_next(store)) is not None:
+        settle(store, parcel, result)
         sent.append(parcel)
     return sent
 
 
+def count(store: JobStore, table: sa.Table) -> int:
+    with store._database.read() as connection:
+        return connection.execute(sa.select(sa.func.count()).select_from(table)).scalar_one()
+
+
+def dismissed(store: JobStore, number: int) -> list[str]:
+    """Jobs that ended at once."""
+    jobs = [submit(store).job_id for _ in range(number)]
+    for job_id in jobs:
+        store.dismiss(job_id)
+    return jobs
+
+
 def shift(store: JobStore, hours: float) -> None:
-    """Let all deliveries and events be older, and the places of the endpoints in the events."""
-    times = ("created_at", "tried_since", "due_at", "finished_at", "lease_until", "at", "sent_until")
+    """Let all deliveries and events be older."""
+    times = ("created_at", "tried_since", "due_at", "finished_at", "lease_until", "at")
     with store._database.write() as connection:
-        for table in (WEBHOOK_DELIVERIES, WEBHOOK_EVENTS, WEBHOOKS):
+        for table in (WEBHOOK_DELIVERIES, WEBHOOK_EVENTS):
             key = next(iter(table.primary_key))
             for row in connection.execute(sa.select(table)).mappings().all():
                 past = {
@@ -144,7 +176,7 @@ class WebhookStoreContract(DatabaseContract):
         for percent in range(50, 90):
             store.record(held, [happened("progress", stage="split", progress=percent)])
         reports = [one for one in log(store) if one.event is EventType.PROGRESS]
-        # those that waited are about the later progress now
+        # those that waited have made room for the later progress
         assert [one.state.value for one in reports] == ["waiting", "waiting"]
         assert {one.job.progress for one in send_all(store) if one.delivery.event is EventType.PROGRESS} == {50}
 
@@ -167,9 +199,9 @@ class WebhookStoreContract(DatabaseContract):
         store.record(held, [happened("progress", stage="split", progress=10)])
         parcel = take(store)
         store.succeed(held, message="", summary={})
-        store.webhooks.settle(parcel, REFUSED, POLICY)
+        settle(store, parcel, REFUSED)
         states = {one.event.value: (one.state.value, one.reason) for one in log(store)}
-        assert states["job.progress"][0] == "dropped"
+        assert states["job.progress"] == ("dropped", "overtaken by job.successful")
         assert states["job.successful"] == ("waiting", None)
 
     # --- sent
@@ -183,7 +215,7 @@ class WebhookStoreContract(DatabaseContract):
         def work(name: str) -> list[str]:
             gate.wait()
             found = []
-            while (parcel := store.webhooks.claim(name, lease_s=60.0)) is not None:
+            while (parcel := claim_next(store, name)) is not None:
                 found.append(parcel.delivery.delivery_id)
             return found
 
@@ -198,19 +230,18 @@ class WebhookStoreContract(DatabaseContract):
         submit(store)
         first, second = take(store), take(store)
         assert {first.delivery.url, second.delivery.url} == {URL, "https://other.example/"}
-        assert store.webhooks.claim("d", lease_s=60.0) is None
-        store.webhooks.settle(first, TAKEN, POLICY)
+        assert claim_next(store) is None
+        settle(store, first, TAKEN)
         assert take(store).delivery.url == first.delivery.url
 
     def test_a_dead_drivers_delivery_is_sent_by_another(self, store: JobStore) -> None:
         endpoint(store, EventType.ACCEPTED)
         submit(store)
         lost = take(store, "first", lease_s=0.02)
-        again = until(lambda: store.webhooks.claim("second", lease_s=60.0))
+        again = until(lambda: claim_next(store, "second"))
         assert again.delivery.delivery_id == lost.delivery.delivery_id
-        with pytest.raises(LeaseLostError):
-            store.webhooks.settle(lost, TAKEN, POLICY)
-        store.webhooks.settle(again, TAKEN, POLICY)
+        assert settle(store, lost, TAKEN) is None
+        settle(store, again, TAKEN)
         found = store.webhooks.delivery(again.delivery.delivery_id)
         assert [(one.driver, one.status, one.error) for one in found.log] == [
             ("first", None, "the driver ended during this attempt"),
@@ -221,7 +252,7 @@ class WebhookStoreContract(DatabaseContract):
         endpoint(store, EventType.ACCEPTED)
         submit(store)
         lost = take(store, "first", lease_s=3600.0)
-        assert store.webhooks.claim("second", lease_s=60.0) is None
+        assert claim_next(store, "second") is None
         store.give_up("first", max_attempts=3)
         assert take(store, "second").delivery.delivery_id == lost.delivery.delivery_id
 
@@ -257,7 +288,7 @@ class WebhookStoreContract(DatabaseContract):
         running(store)
         parcel = take(store)
         gone = Result(duration_ms=1, status=410, error="the receiver answered 410", body="{}")
-        store.webhooks.settle(parcel, gone, POLICY)
+        settle(store, parcel, gone)
         assert [found.state.value for found in log(store)] == ["dropped", "gone"]
         found = store.webhooks.get(one)
         assert (found.is_enabled, found.disabled_reason) == (False, log(store)[0].reason)
@@ -266,7 +297,6 @@ class WebhookStoreContract(DatabaseContract):
         # what happens while it is disabled is not sent; a replay enables it
         assert store.webhooks.replay_all(one).is_enabled
         submit(store)
-        store.webhooks.refill(max_waiting=ROOM)
         assert log(store)[0].state is DeliveryState.WAITING
 
     def test_gone_ends_the_deliveries_of_a_jobs_uri(self, store: JobStore) -> None:
@@ -296,7 +326,7 @@ class WebhookStoreContract(DatabaseContract):
         submit(store)
         with store._database.write() as connection:
             connection.execute(sa.delete(WEBHOOKS).where(WEBHOOKS.c.endpoint_id == one))
-        assert store.webhooks.claim("d", lease_s=60.0) is None
+        assert claim_next(store) is None
         assert [(found.state.value, found.reason) for found in log(store)] == [("dropped", "the webhook was removed")]
 
     # --- secrets
@@ -313,7 +343,7 @@ class WebhookStoreContract(DatabaseContract):
         with store._database.write() as connection:
             connection.execute(sa.update(WEBHOOK_DELIVERIES).values(lease_owner=None, lease_until=None))
         parcels = [take(store)]
-        store.webhooks.settle(parcels[0], TAKEN, POLICY)
+        settle(store, parcels[0], TAKEN)
         parcels.append(take(store))
         by_owner = {one.delivery.owner: one.secret for one in parcels}
         assert by_owner["new"] == store.webhooks.own_secret("new")
@@ -337,14 +367,14 @@ class WebhookStoreContract(DatabaseContract):
         first = take(store)
         with pytest.raises(NotReplayableError, match="is being sent"):
             store.webhooks.replay(first.delivery.delivery_id)
-        store.webhooks.settle(first, result, POLICY)
+        settle(store, first, result)
         shift(store, 100.0)
         replayed = store.webhooks.replay(first.delivery.delivery_id)
         assert (replayed.state, replayed.body) == (DeliveryState.WAITING, "{}")
         again = take(store)
         assert again.delivery.delivery_id == first.delivery.delivery_id
         # its hours count from the replay
-        assert store.webhooks.settle(again, REFUSED, POLICY) is DeliveryState.WAITING
+        assert settle(store, again, REFUSED) is DeliveryState.WAITING
 
     def test_an_owner_sees_the_deliveries_to_its_subscribers_and_an_admin_sees_all(self, store: JobStore) -> None:
         one = endpoint(store, EventType.RUNNING)
@@ -365,7 +395,7 @@ class WebhookStoreContract(DatabaseContract):
     def test_the_log_is_filtered_and_has_pages(self, store: JobStore) -> None:
         endpoint(store, EventType.ACCEPTED)
         jobs = [submit(store) for _ in range(3)]
-        store.webhooks.settle(take(store), TAKEN, POLICY)
+        settle(store, take(store), TAKEN)
         assert [one.job_id for one in log(store, job_id=jobs[1].job_id)] == [jobs[1].job_id]
         assert len(log(store, state=DeliveryState.WAITING)) == 2
         assert len(log(store, state=DeliveryState.DELIVERED)) == 1
@@ -377,7 +407,7 @@ class WebhookStoreContract(DatabaseContract):
         endpoint(store, EventType.ACCEPTED)
         submit(store)
         submit(store)
-        store.webhooks.settle(take(store), TAKEN, POLICY)
+        settle(store, take(store), TAKEN)
         shift(store, 48.0)
         assert store.webhooks.forget(3.0) == 0
         assert store.webhooks.forget(1.0) > 0
@@ -398,6 +428,183 @@ class WebhookStoreContract(DatabaseContract):
                 action(wrong)
         with pytest.raises(NoSuchDeliveryError):
             store.webhooks.delivery(wrong)
+
+    # --- receivers that do not keep up
+
+    def test_ends_beyond_what_may_wait_fail_and_are_sent_in_order_when_the_webhook_is_replayed(
+        self, store: JobStore, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("service.store.outbox.MAX_WAITING", 4)
+        one = endpoint(store, EventType.ACCEPTED, EventType.DISMISSED)
+        jobs = dismissed(store, 6)
+        assert events(store) == ["job.accepted"] * 4 + ["job.dismissed"] * 6
+        failed = log(store, state=DeliveryState.FAILED)
+        assert len(failed) == 6
+        assert "more than 4 messages wait for this receiver: replay it" in str(failed[0].reason)
+        for job_id in jobs:
+            store.remove(job_id)
+        store.webhooks.replay_all(one)
+        sent = send_all(store)
+        assert Counter(parcel.delivery.job_id for parcel in sent if parcel.delivery.event.is_end) == Counter(jobs)
+        times = [parcel.delivery.created_at for parcel in sent]
+        assert times == sorted(times)
+        # and it goes on
+        dismissed(store, 1)
+        assert len(send_all(store)) == 2
+
+    def test_a_replayed_webhook_sends_the_ends_that_failed_with_their_ids_and_no_other_news(
+        self, store: JobStore
+    ) -> None:
+        one = endpoint(store, EventType.ACCEPTED, EventType.DISMISSED)
+        jobs = dismissed(store, 3)
+        final = Result(duration_ms=1, status=403, error="the receiver answered 403", is_final=True, body="{}")
+        first = send_all(store, final)
+        store.webhooks.replay_all(one)
+        again = send_all(store)
+        assert [parcel.delivery.job_id for parcel in again] == jobs
+        ends = [parcel for parcel in first if parcel.delivery.event.is_end]
+        assert [p.delivery.delivery_id for p in again] == [p.delivery.delivery_id for p in ends]
+
+    def test_the_waiting_messages_of_a_keys_subscribers_are_bounded_and_ends_can_be_replayed(
+        self, store: JobStore, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("service.store.outbox.MAX_WAITING", 4)
+        held: list[Job] = []
+        for _ in range(4):
+            submit(store, owner="k", subscriber=SUBSCRIBER)
+            held.append(claim(store))
+        for job in held:
+            store.succeed(job, message="", summary={})
+        assert store.webhooks.counts()[DeliveryState.WAITING] == 4
+        failed = log(store, state=DeliveryState.FAILED)
+        assert {one.event.value for one in failed} == {"job.successful"}
+        # other keys have room
+        submit(store, owner="other", subscriber=SUBSCRIBER)
+        claim(store)
+        assert store.webhooks.counts()[DeliveryState.WAITING] == 5
+        assert store.webhooks.replay(failed[0].delivery_id, owner="k").state is DeliveryState.WAITING
+
+    def test_an_event_is_stored_once_for_all_endpoints(self, store: JobStore) -> None:
+        for number in range(5):
+            endpoint(store, EventType.DISMISSED, url=f"https://h{number}.example/")
+        dismissed(store, 1)
+        assert (len(log(store)), count(store, WEBHOOK_EVENTS)) == (5, 1)
+
+    def test_the_log_has_at_most_so_many_entries_and_their_events_go_with_them(self, store: JobStore) -> None:
+        endpoint(store, EventType.DISMISSED)
+        dismissed(store, 8)
+        newest = [parcel.delivery.job_id for parcel in send_all(store)][-5:]
+        shift(store, 1.0)
+        while store.webhooks.forget(30.0, most=5):
+            continue
+        assert [one.job_id for one in reversed(log(store))] == newest
+        assert count(store, WEBHOOK_EVENTS) == 5
+
+    def test_many_messages_to_one_receiver_leave_room_in_the_line_for_all_others(
+        self, store: JobStore, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("service.store.delivery_line._LINE", 3)
+        endpoint(store, EventType.DISMISSED, url="https://busy.example/")
+        dismissed(store, 5)
+        endpoint(store, EventType.DISMISSED, url="https://late.example/")
+        dismissed(store, 1)
+        lines: list[list[str]] = []
+        store.webhooks.claim_some("d", lambda line: lines.append([due.receiver for due in line]) or [], lease_s=60.0)
+        assert len(lines[0]) == len(set(lines[0])) == 2
+
+    def test_a_key_makes_so_many_webhooks_and_not_more_also_at_once(self, store: JobStore) -> None:
+        def make(number: int) -> bool:
+            url = f"https://h{number}.example/"
+            try:
+                store.webhooks.create(url, events=[EventType.FAILED], base="http://h", owner="k", most=3)
+            except TooManyWebhooksError as error:
+                assert "there are 3 webhooks of this key, the limit is 3: remove one" in str(error)  # noqa: PT017
+                return False
+            return True
+
+        with ThreadPoolExecutor(4) as crew:
+            assert sum(crew.map(make, range(8))) == 3
+        made, _ = store.webhooks.create("https://o.example/", events=[EventType.FAILED], base="http://h", owner="o")
+        assert made.owner == "o"
+        store.webhooks.remove(next(one.endpoint_id for one in store.webhooks.list() if one.owner == "k"))
+        assert make(9)
+
+    def test_slow_receivers_and_keys_with_their_share_are_passed_over(self, store: JobStore) -> None:
+        for owner in ("a", "b"):
+            for number in range(3):
+                url = f"https://{owner}{number}.example/"
+                store.webhooks.create(url, events=[EventType.ACCEPTED], base="http://h", owner=owner)
+        submit(store)
+        first = log(store)[0].endpoint_id
+        assert first is not None
+        owner = store.webhooks.get(first).owner
+        avoided = Avoided(receivers=frozenset({first}), payers=frozenset({"b" if owner == "a" else "a"}))
+        found = store.webhooks.claim_some("d", list, lease_s=60.0, avoided=avoided)
+        assert (len(found), {parcel.payer for parcel in found}) == (2, {owner})
+        assert first not in {parcel.receiver for parcel in found}
+        everything = store.webhooks.claim_some("d", lambda line: Receivers(1.0).chosen(line, 0.0), lease_s=60.0)
+        assert len(everything) == 4
+
+    def test_failed_deliveries_have_a_bound_of_their_own(self, store: JobStore) -> None:
+        submit(store, owner="k", subscriber=SUBSCRIBER)
+        held = claim(store)
+        final = Result(duration_ms=1, error="refused", is_final=True, body="{}")
+        settle(store, take(store), final)
+        store.record(held, [happened("progress", stage="split", progress=10)])
+        store.succeed(held, message="", summary={})
+        send_all(store)
+        assert store.webhooks.forget(30.0, most=1) > 0
+        assert Counter(one.state.value for one in log(store)) == {"failed": 1, "delivered": 1}
+
+    def test_events_that_no_one_wants_are_not_stored(self, store: JobStore) -> None:
+        endpoint(store, EventType.FAILED)
+        dismissed(store, 2)
+        assert count(store, WEBHOOK_EVENTS) == 0
+        assert events(store) == []
+
+    def test_a_delivery_that_was_refused_in_a_batch_is_tried_again(self, store: JobStore) -> None:
+        for number in range(3):
+            endpoint(store, EventType.ACCEPTED, url=f"https://h{number}.example/")
+        submit(store)
+        found = store.webhooks.claim_some("d", list, lease_s=60.0)
+        results = [TAKEN, REFUSED, TAKEN]
+        with store._database.write() as connection:
+            lost = WEBHOOK_DELIVERIES.c.delivery_id == found[2].delivery.delivery_id
+            connection.execute(sa.update(WEBHOOK_DELIVERIES).where(lost).values(lease_owner="other"))
+        states = store.webhooks.settle_all(list(zip(found, results, strict=True)), POLICY)
+        assert states == [DeliveryState.DELIVERED, DeliveryState.WAITING, None]
+        logs = [store.webhooks.delivery(one.delivery.delivery_id).log[0] for one in found]
+        assert [(one.status, one.error) for one in logs] == [(204, None), (500, REFUSED.error), (None, None)]
+
+    def test_what_waited_for_room_before_the_upgrade_is_sent(self, store: JobStore) -> None:
+        """Revision 0011 had events without deliveries, replays that waited, and bodies that endpoints shared."""
+        from alembic import command
+        from schedule_store_contract import migrate
+
+        one = endpoint(store, EventType.ACCEPTED, EventType.DISMISSED)
+        jobs = dismissed(store, 2)
+        sent = take(store)
+        settle(store, sent, TAKEN)
+        with store._database.write() as connection:
+            migrate(connection, command.downgrade, "0011")
+            # as that version left it: the first end was never put in line, the second one waits for its replay
+            words = [
+                "UPDATE webhooks SET sent_until = (SELECT MIN(at) FROM webhook_events), is_behind = (1 = 1)",
+                "UPDATE webhook_events SET body = '{}', base = 'http://h'",
+                "UPDATE webhook_deliveries SET body = NULL",
+                f"DELETE FROM webhook_deliveries WHERE job_id = '{jobs[0]}' AND event = 'job.dismissed'",
+            ]
+            lost = f"job_id = '{jobs[1]}' AND event = 'job.dismissed'"
+            values = "state = 'failed', due_at = NULL, finished_at = created_at, replay_at = created_at"
+            words.append(f"UPDATE webhook_deliveries SET {values} WHERE {lost}")
+            for statement in words:
+                connection.exec_driver_sql(statement)
+        store.migrate()
+        assert store.webhooks.delivery(sent.delivery.delivery_id).body == "{}"
+        assert Counter(events(store, endpoint_id=one)) == {"job.accepted": 2, "job.dismissed": 2}
+        ends = [parcel for parcel in send_all(store) if parcel.delivery.event.is_end]
+        assert Counter(parcel.delivery.job_id for parcel in ends) == Counter(jobs)
+        assert {parcel.job.status for parcel in ends} == {JobStatus.DISMISSED}
 
     def test_jobs_that_were_submitted_before_webhooks_go_on(self, store: JobStore) -> None:
         """The upgrade with a job in flight: its stored request has no subscriber."""

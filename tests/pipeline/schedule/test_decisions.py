@@ -7,14 +7,24 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.schedule import Cron, Decision, Missed, Overlap, PassedSlots, Rules, decide, passed_slots, time_zone
+from pipeline.schedule import (
+    Cron,
+    Missed,
+    Outcome,
+    Overlap,
+    PassedSlots,
+    Rules,
+    ScheduleState,
+    look,
+    passed_slots,
+    time_zone,
+)
 from pipeline.schedule.slots import MAX_COUNTED
 
 HOURLY = Cron("@hourly", "Europe/Amsterdam")
 NIGHTLY = Cron("30 2 * * *", "Europe/Amsterdam")
 NOON = dt.datetime(2026, 1, 1, 12, tzinfo=dt.UTC)
 HOUR = dt.timedelta(hours=1)
-GRACE = dt.timedelta(seconds=Rules.grace_s)
 MOMENT = dt.timedelta(milliseconds=1)
 
 
@@ -70,69 +80,33 @@ def test_a_long_stretch_may_end_long_before_now() -> None:
 # --- what becomes of them
 
 
-def decided(passed: PassedSlots | None, **options: object) -> Decision:
-    values = {"waiting": None, "is_busy": False, "now": NOON} | options
-    policies = {name: values.pop(name) for name in ("missed", "overlap") if name in values}
-    return decide(passed, Rules(cron=HOURLY, **policies), **values)  # type: ignore[arg-type]
-
-
-def test_a_slot_that_is_seen_in_time_is_run() -> None:
-    for missed in Missed:
-        assert decided(PassedSlots(latest=NOON - GRACE), missed=missed) == Decision(run=NOON - GRACE)
-
-
-def test_a_slot_that_is_seen_late_is_run_once_or_missed() -> None:
-    late = PassedSlots(latest=NOON - GRACE - MOMENT, earlier=3)
-    assert decided(late) == Decision(run=late.latest)
-    assert decided(late, missed=Missed.SKIP) == Decision(late=late.latest)
-
-
-def test_how_late_it_is_goes_by_time_and_not_by_the_wall() -> None:
+def test_how_late_a_slot_is_goes_by_time_and_not_by_the_wall() -> None:
     # 02:30 in summer time, seen at 02:34 on the wall: an hour later, in winter time
-    zone = time_zone("Europe/Amsterdam")
-    slot = NIGHTLY.next_time(dt.datetime(2026, 10, 24, 12, tzinfo=dt.UTC))
-    now = dt.datetime(2026, 10, 25, 2, 34, tzinfo=zone, fold=1)
-    assert decided(PassedSlots(latest=slot), now=now, missed=Missed.SKIP).late == slot
-
-
-def test_a_slot_that_comes_while_a_run_is_under_way_is_skipped_or_waits() -> None:
-    now = PassedSlots(latest=NOON)
-    assert decided(now, is_busy=True) == Decision(skipped=NOON)
-    assert decided(now, is_busy=True, overlap=Overlap.WAIT) == Decision(waits=NOON)
-
-
-def test_a_slot_that_waits_is_run_when_the_run_is_over_however_late() -> None:
-    waiting = NOON - 10 * HOUR
-    for missed in Missed:
-        options = {"waiting": waiting, "overlap": Overlap.WAIT, "missed": missed}
-        assert decided(None, is_busy=True, **options) == Decision(waits=waiting)
-        assert decided(None, **options) == Decision(run=waiting)
-
-
-def test_a_later_slot_takes_the_place_of_the_one_that_waits() -> None:
-    options = {"waiting": NOON - HOUR, "overlap": Overlap.WAIT}
-    assert decided(PassedSlots(latest=NOON), **options) == Decision(run=NOON, replaced=NOON - HOUR)
-    assert decided(PassedSlots(latest=NOON), is_busy=True, **options) == Decision(waits=NOON, replaced=NOON - HOUR)
+    before = ScheduleState(decided_until=dt.datetime(2026, 10, 24, 12, tzinfo=dt.UTC))
+    now = dt.datetime(2026, 10, 25, 2, 34, tzinfo=time_zone("Europe/Amsterdam"), fold=1)
+    found = look(before, Rules(cron=NIGHTLY, missed=Missed.SKIP), now, under_way=None)
+    assert [entry.outcome for entry in found.entries] == [Outcome.MISSED]
 
 
 @given(
-    latest=st.none() | st.integers(0, 600),
-    waiting=st.none() | st.integers(601, 900),
+    late_s=st.none() | st.integers(0, 600),
+    waiting=st.booleans(),
     is_busy=st.booleans(),
     missed=st.sampled_from(Missed),
     overlap=st.sampled_from(Overlap),
 )
 def test_nothing_runs_beside_a_run_and_no_slot_is_lost(
-    latest: int | None, waiting: int | None, is_busy: bool, missed: Missed, overlap: Overlap
+    late_s: int | None, waiting: bool, is_busy: bool, missed: Missed, overlap: Overlap
 ) -> None:
-    slot = None if latest is None else NOON - dt.timedelta(seconds=latest)
-    old = None if waiting is None else NOON - dt.timedelta(seconds=waiting)
-    passed = None if slot is None else PassedSlots(latest=slot)
-    found = decided(passed, waiting=old, is_busy=is_busy, missed=missed, overlap=overlap)
-    assert not (is_busy and found.run is not None)
-    fates = [found.run, found.waits, found.skipped, found.replaced, found.late]
-    decided_slots = sorted(at for at in fates if at is not None)
-    assert decided_slots == sorted(at for at in (slot, old) if at is not None)
+    old, slot = NOON - HOUR if waiting else None, None if late_s is None else NOON + HOUR
+    now = NOON + HOUR / 2 if late_s is None else NOON + HOUR + dt.timedelta(seconds=late_s)
+    rules = Rules(cron=HOURLY, missed=missed, overlap=overlap)
+    before = ScheduleState(decided_until=NOON, waiting=old)
+    found = look(before, rules, now, under_way="a run" if is_busy else None)
+    assert not (is_busy and found.due is not None)
+    decided = [entry.slot for entry in found.entries if entry.outcome is not Outcome.WAITING]
+    fates = sorted(at for at in (*decided, found.due, found.state.waiting) if at is not None)
+    assert fates == sorted(at for at in (slot, old) if at is not None)
 
 
 def test_policies_have_the_names_that_documents_use() -> None:

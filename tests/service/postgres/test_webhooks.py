@@ -3,7 +3,6 @@
 import pytest
 from processes import PostgresServer
 from store_contract import claim, happened, submit
-from webhook_backlog_contract import WebhookBacklogContract
 from webhook_store_contract import SUBSCRIBER, WebhookStoreContract, log
 
 from service.store import JobStore
@@ -11,20 +10,12 @@ from service.store import JobStore
 pytestmark = pytest.mark.slow
 
 
-class OnPostgres:
-    """A database of its own."""
+class TestWebhooksOnPostgres(WebhookStoreContract):
+    """All of the contract, on PostgreSQL."""
 
     @pytest.fixture
     def url(self, postgres_server: PostgresServer, request: pytest.FixtureRequest) -> str:
         return postgres_server.create_database(with_tables="store" in request.fixturenames)
-
-
-class TestWebhooksOnPostgres(OnPostgres, WebhookStoreContract):
-    """All of the contract, on PostgreSQL."""
-
-
-class TestWebhookBacklogOnPostgres(OnPostgres, WebhookBacklogContract):
-    """All of the contract of webhooks that do not keep up, on PostgreSQL."""
 
 
 def test_the_end_of_a_job_does_not_wait_for_a_delivery_that_another_holds(postgres_url: str) -> None:
