@@ -7,7 +7,7 @@ from live_service import POINTS, las_bytes
 
 from pipeline.errors import CrsError
 from service.driver.messages import Scrubber
-from service.wording import INPUTS, as_inputs
+from service.wording import as_inputs
 
 WRONG = "EPSG:2193"
 """New Zealand's grid, for points in Delft."""
@@ -78,7 +78,7 @@ def test_messages_of_the_engine_name_inputs_in_place_of_options() -> None:
     fault = CrsError("/srv/a.laz", "no CRS", "Give --crs EPSG:n, or check --bbox and --aoi")
     assert Scrubber()(str(fault)).endswith("a.laz: no CRS. Give the input crs, or check the input bbox")
     assert as_inputs("start it with --crs-file") == "start it with --crs-file"
-    for option, words in INPUTS.items():
+    for option, words in as_inputs.names.items():
         assert as_inputs(f"give {option} if") == f"give {words} if"
 
 

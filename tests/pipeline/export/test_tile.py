@@ -3,18 +3,15 @@
 import dataclasses
 import hashlib
 from pathlib import Path
-from typing import get_args
 
 import pytest
 import small_buildings as small
 from small_buildings import Contexts, RejectedObjects
 
-from pipeline.cli.options import Meshes
 from pipeline.errors import RunError
-from pipeline.export.folders import MESHES, put_local
+from pipeline.export.folders import put_local
 from pipeline.export.geoparquet import read_table
 from pipeline.export.tile import write_tile
-from service.wire.inputs import Meshes as OfferedByTheService
 
 BUILT = (small.gable, small.two_parts, small.failed)
 
@@ -108,11 +105,6 @@ def test_one_building_twice_is_refused(tmp_path: Path, contexts: Contexts) -> No
     again = dataclasses.replace(small.pent(), building_id="gable")
     with pytest.raises(RunError, match="gable more than once"):
         write_tile(tmp_path, "t1", [small.gable(), again], [], contexts["compound"])
-
-
-def test_the_command_line_and_the_service_offer_the_meshes_that_are_written() -> None:
-    choices, _ = get_args(Meshes)
-    assert get_args(choices) == MESHES == get_args(OfferedByTheService)
 
 
 @pytest.mark.parametrize(

@@ -13,13 +13,14 @@ from las_files import write_las
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io import open_source, sha256_of
-from pipeline.io.reading import INPUT_TIMEOUT_S, heard_by, moved, one_input, set_input_timeout, stalled
+from pipeline.io.reading import heard_by, moved, one_input, set_input_timeout, stalled
+from pipeline.options import ResourceOptions
 
 
 @pytest.fixture(autouse=True)
 def usual_limit() -> Iterator[None]:
     yield
-    set_input_timeout(INPUT_TIMEOUT_S)
+    set_input_timeout(ResourceOptions.input_timeout_s)
 
 
 def left_s() -> float:

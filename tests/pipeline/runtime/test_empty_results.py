@@ -1,6 +1,5 @@
 """Empty results and half-understood inputs of a run: an error, or a warning before all figures."""
 
-import dataclasses
 import json
 import struct
 from pathlib import Path
@@ -23,7 +22,6 @@ from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
 from pipeline.runtime.stages.ingested import without_roofs
-from pipeline.settings import RunSettings
 
 
 @pytest.fixture(scope="module")
@@ -254,9 +252,3 @@ def test_a_run_that_was_written_before_there_were_layers_and_first_lines_still_r
     assert read_manifest(summary.run_dir).headline == ""
     name = rows(summary.run_dir)[0]["building_id"]
     assert rerun(RerunRequest(run_dir=summary.run_dir, only=(name,), resources=SERIAL)).digest == summary.digest
-
-
-def test_the_request_has_the_layer_beside_the_file() -> None:
-    names = [field.name for field in dataclasses.fields(RunRequest)]
-    assert names.index("footprints_layer") == names.index("footprints") + 1
-    assert RunSettings()
