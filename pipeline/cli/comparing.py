@@ -86,7 +86,7 @@ def compare(
         from pipeline.model import Status
         from pipeline.ruler.evaluation.chapters import chapters
         from pipeline.ruler.evaluation.files import EvaluationRequest
-        from pipeline.ruler.report.compare_files import compare_files, comparison_facts
+        from pipeline.ruler.report.comparison import compare_files, comparison_facts
         from pipeline.ruler.report.evaluation_page import headline
         from pipeline.runtime.compare import CompareRequest, own_tables, parse_variants
         from pipeline.runtime.compiling import compile_for, kernel_groups
