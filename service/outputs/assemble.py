@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.export.folders import POINTS_FOLDER, TERRAIN_FOLDER
-from pipeline.export.point_files import TILESET
+from pipeline.extras.octree.point_files import TILESET
 from pipeline.io.storage import LocalStorage
 from service.features.index import NAME as INDEX_NAME
 from service.features.index import RowIndex

@@ -15,7 +15,7 @@ from service.outputs.files import zip_files
 from service.outputs.kinds import CLASSIFICATION_OUTPUTS, RASTERS, chosen
 
 if TYPE_CHECKING:
-    from pipeline.runtime.classify import ClassifySummary
+    from pipeline.extras.classify.classify import ClassifySummary
 
 
 def write_classification_outputs(

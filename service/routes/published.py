@@ -9,7 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Request, Response
 
 from pipeline.export.folders import POINTS_FOLDER
-from pipeline.export.point_files import NAMED_FILE, TILESET
+from pipeline.extras.octree.point_files import NAMED_FILE, TILESET
 from service.errors import NoSuchOutputError
 from service.outputs.kinds import CITYJSONSEQ, GEOJSON, GEOPARQUET, GLB, JSON, KINDS, OBJ
 from service.outputs.published import FILES, ROOTS, RUN_FILE
