@@ -103,18 +103,9 @@ def _united_column(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     column = {**parts[0], "geometry_types": sorted(types)}
     column.pop("bbox", None)
     if bounds:
-        column["bbox"] = _united_bounds(bounds)
+        # 2D if one of them is 2D
+        axes = min(len(box) for box in bounds) // 2
+        low = [min(box[axis] for box in bounds) for axis in range(axes)]
+        high = [max(box[len(box) // 2 + axis] for box in bounds) for axis in range(axes)]
+        column["bbox"] = [*low, *high]
     return column
-
-
-def _united_bounds(bounds: Sequence[Sequence[float]]) -> list[float]:
-    """The union of several bounds; 2D if one of them is 2D.
-
-    >>> _united_bounds([[0.0, 0.0, 1.0, 2.0, 2.0, 3.0], [-1.0, 1.0, 0.0, 1.0, 5.0, 9.0]])
-    [-1.0, 0.0, 0.0, 2.0, 5.0, 9.0]
-    """
-    flat = any(len(box) == 4 for box in bounds)
-    axes = 2 if flat else 3
-    low = [min(box[axis] for box in bounds) for axis in range(axes)]
-    high = [max(box[len(box) // 2 + axis] for box in bounds) for axis in range(axes)]
-    return [*low, *high]

@@ -83,16 +83,6 @@ def test_doing_it_again_gives_the_same_bytes_and_leaves_nothing_beside(
     assert set(first) == {"outputs.json", "rows.sqlite", *made}
 
 
-def test_only_the_wanted_outputs_are_offered(run_dir: Path, tmp_path: Path) -> None:
-    write_outputs(run_dir, tmp_path, ("report", "planes"))
-    assert list(read_catalogue(tmp_path).outputs) == ["planes", "report"]
-    with pytest.raises(NoSuchOutputError, match=r"left out geojson.*it has: planes, report"):
-        output_file(tmp_path, "geojson")
-    with pytest.raises(NoSuchOutputError, match=r"no output 'everything'.*planes, report"):
-        output_file(tmp_path, "everything")
-    assert {"meshes.zip", "buildings.parquet", "buildings.city.jsonl"}.isdisjoint(contents(tmp_path))
-
-
 def test_an_unknown_output_is_refused_before_anything_is_written(run_dir: Path, tmp_path: Path) -> None:
     with pytest.raises(NoSuchOutputError, match="no output colours: use buildings, planes"):
         write_outputs(run_dir, tmp_path / "out", ("colours",))

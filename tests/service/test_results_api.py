@@ -56,6 +56,7 @@ def test_the_answer_to_an_output_that_was_not_made_names_those_that_were(service
     assert list(service.client.get(f"/jobs/{job_id}/results").json()) == ["meshes", "report"]
     for path in (f"/jobs/{job_id}/results?outputs=planes", f"/jobs/{job_id}/results/planes"):
         assert "it has: meshes, report" in runs.problem(service.client.get(path), 404, "no-such-output")
+    assert not (service.folder.outputs(job_id, 1) / "planes.parquet").exists()
 
 
 # --- files -----------------------------------------------------------------------------------------------------------
