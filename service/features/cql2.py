@@ -30,6 +30,8 @@ MAX_DEPTH = 7
 """Parentheses within parentheses of a text: the parser of the library takes a time that grows by 2.5 with each."""
 MAX_NODES = 500
 """Largest number of operations in a filter."""
+MAX_NESTED = 25
+"""Conditions within conditions: SQLite's parser has a stack of 100 symbols."""
 
 _COMPARISONS = frozenset({"=", "<>", "<", "<=", ">", ">="})
 _SPATIAL = {
@@ -189,7 +191,7 @@ class _Compiler:
     def condition(self, node: Any, depth: int = 0) -> str:
         """An expression that is true, false or null for each row."""
         self._nodes += 1
-        if self._nodes > MAX_NODES or depth > MAX_NODES // 5:
+        if self._nodes > MAX_NODES or depth > MAX_NESTED:
             raise _fault(f"it has more than {MAX_NODES} operations, or too many within one another")
         if isinstance(node, bool) or (isinstance(node, Mapping) and "property" in node):
             kind, value = self._operand(node)

@@ -28,7 +28,7 @@ from pipeline.runtime.manifest import RunStatus
 from service.disk import has_no_space
 from service.errors import RequestError, StartUpError
 from service.features import cql2, pages
-from service.features.cql2 import MAX_DEPTH, MAX_LENGTH, parsed
+from service.features.cql2 import MAX_DEPTH, MAX_LENGTH, MAX_NESTED, parsed
 from service.features.runs import check_published, published_runs
 from service.features.writing import IndexWriter
 from service.keys import Scope
@@ -395,6 +395,22 @@ def test_filters_that_would_take_the_parser_long_or_end_the_process_are_refused(
         answer = served.service.client.get(f"/collections/{served.name}.buildings/items", params=query)
         runs.problem(answer, 400, "invalid-request")
     assert time.process_time() - began < 10.0
+
+
+def test_a_filter_may_be_nested_as_deep_as_sqlite_takes_it(served: Served) -> None:
+    inner = {"op": "s_intersects", "args": [{"property": "geometry"}, {"bbox": [4.0, 51.0, 5.0, 53.0]}]}
+    for operation in ("not", "and", "or"):
+        tree: Any = inner
+        for _ in range(MAX_NESTED + 1):
+            query = {"filter": json.dumps(tree), "filter-lang": "cql2-json", "bbox": "4,51,4.3679,52.0070"}
+            tree = {"op": operation, "args": [tree] if operation == "not" else [{"property": "valid"}, tree]}
+        assert len(query["filter"]) < MAX_LENGTH
+        # an odd number of negations
+        assert (served.items(**query)["numberMatched"] == 0) == (operation == "not")
+        answer = served.service.client.get(
+            f"/collections/{served.name}.buildings/items", params=query | {"filter": json.dumps(tree)}
+        )
+        assert "too many within one another" in runs.problem(answer, 400, "invalid-request")
 
 
 @given(st.text(alphabet="()'\"=<>,. \tandorotinlike-1x[]", max_size=60))
