@@ -268,7 +268,7 @@ class _Compiler:
             if word in {"timestamp", "date"} and isinstance(text, str):
                 try:
                     return "time", _time(text)
-                except (ValueError, OverflowError):
+                except ValueError:
                     raise _fault(f"{text[:80]!r} is not a time: use one such as 2024-03-01T09:30:00Z") from None
         raise _fault(f"{_shown(node)} is not supported here: use a property, a text, a number, true, false or a time")
 
@@ -315,4 +315,7 @@ class _Compiler:
 
 def _time(text: str) -> str:
     at = dt.datetime.fromisoformat(text)
-    return stamp(at if at.tzinfo is not None else at.replace(tzinfo=dt.UTC))
+    try:
+        return stamp(at if at.tzinfo is not None else at.replace(tzinfo=dt.UTC))
+    except OverflowError as error:
+        raise ValueError(text) from error

@@ -170,6 +170,7 @@ def invalid_parameter(service: runs.Service) -> None:
         {"height_m": "tall"},
         {"valid": "yes"},
         {"acquired_from": "then"},
+        {"acquired_from": "0001-01-01T00:00:00+23:00"},
         {"start": "-1"},
     ]
     for query in faulty:
