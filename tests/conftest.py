@@ -205,7 +205,7 @@ def bucket(s3: FaultyProxy) -> str:
     """The URL of a bucket of its own."""
     from uuid import uuid4
 
-    from pipeline.io.urls import filesystem_of
+    from pipeline.extras.remote.urls import filesystem_of
 
     url = f"s3://tests-{uuid4().hex[:12]}"
     filesystem_of(url).mkdir(url)

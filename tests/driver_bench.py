@@ -11,7 +11,7 @@ from migrated import with_tables
 from processes import LONG_S, wait_for
 
 from pipeline.errors import RunCancelledError
-from pipeline.runtime.compare import CompareRequest, CompareSummary
+from pipeline.extras.compare.compare import CompareRequest, CompareSummary
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.run import RunSummary
 from service.driver.attempt import Tools

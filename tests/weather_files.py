@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.solar.weather import Site, Weather
+from pipeline.extras.solar.weather import Site, Weather
 
 
 def write_epw(path: Path, weather: Weather, site: Site, *, utc_offset_h: int, rows: int = 8760) -> None:

@@ -30,7 +30,7 @@ from pipeline.console import Console
 from pipeline.runtime.isolation.preloading import is_surely_small, start_early
 
 if TYPE_CHECKING:
-    from pipeline.runtime.classify import ClassifySummary
+    from pipeline.extras.classify.classify import ClassifySummary
 
 
 def classify(
@@ -64,8 +64,8 @@ def classify(
 ) -> None:
     """Classify points as ground, building and vegetation, and write them back as LAZ."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.runtime.classify import ClassifyRequest
-        from pipeline.runtime.classify import classify as classify_files
+        from pipeline.extras.classify.classify import ClassifyRequest
+        from pipeline.extras.classify.classify import classify as classify_files
         from pipeline.runtime.compiling import RECONSTRUCT, compile_for
         from pipeline.runtime.resources import Resources
         from pipeline.settings import RunSettings

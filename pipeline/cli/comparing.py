@@ -83,12 +83,12 @@ def compare(
 ) -> None:
     """Model the same candidates by several methods and write one page on what came out."""
     with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.extras.compare.compare import CompareRequest, own_tables, parse_variants
         from pipeline.model import Status
         from pipeline.ruler.evaluation.chapters import chapters
         from pipeline.ruler.evaluation.files import EvaluationRequest
         from pipeline.ruler.report.compare_files import compare_files, comparison_facts
         from pipeline.ruler.report.evaluation_page import headline
-        from pipeline.runtime.compare import CompareRequest, own_tables, parse_variants
         from pipeline.runtime.compiling import compile_for, kernel_groups
         from pipeline.runtime.request import RunRequest
         from pipeline.runtime.resources import Resources

@@ -52,10 +52,10 @@ def rerun(
 ) -> None:
     """Model single buildings of a run again, after other overrides; all others stay untouched."""
     with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.extras.overrides.earlier import earlier_run, request_of
+        from pipeline.extras.overrides.rerun import RerunRequest
+        from pipeline.extras.overrides.rerun import rerun as rerun_buildings
         from pipeline.runtime.compiling import compile_for, kernel_groups
-        from pipeline.runtime.earlier import earlier_run, request_of
-        from pipeline.runtime.rerun import RerunRequest
-        from pipeline.runtime.rerun import rerun as rerun_buildings
         from pipeline.runtime.resources import Resources
 
         request = RerunRequest(

@@ -13,6 +13,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.io import ReadOptions, SourceInfo, SpatialReference, find_inputs, is_url, open_source, sha256_of, shown
 from pipeline.io.places import on_this_machine
 from pipeline.io.reading import one_input, set_input_timeout
+from pipeline.registry import extra
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.manifest import InputFile
 from pipeline.runtime.monitoring.events import Watch, never
@@ -23,7 +24,7 @@ from pipeline.runtime.scratch.location import SCRATCH
 from pipeline.settings import RunSettings
 
 if TYPE_CHECKING:
-    from pipeline.io.tile_index import TileIndex
+    from pipeline.extras.vector_files.tile_index import TileIndex
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,7 +46,7 @@ class RunRequest:
     guides: str | None = None
     """A vector file of lines of roofs."""
     overrides: str | None = None
-    """A TOML file of corrections to single buildings; `pipeline.runtime.overrides.overrides_file`."""
+    """A TOML file of corrections to single buildings; `pipeline.extras.overrides.overrides_file`."""
     crs: str | None = None
     """Overrides the CRS in the headers."""
     vertical_unit: str | None = None
@@ -132,10 +133,8 @@ def plan_inputs(
 
 def _area(path: str, reference: SpatialReference) -> Polygon | MultiPolygon:
     """The area of interest, read within the time limit of an input."""
-    from pipeline.io.footprints import read_area
-
     with one_input(shown(path)):
-        return read_area(path, reference)
+        return extra("read_area")(path, reference)
 
 
 def input_file(name: str) -> InputFile:

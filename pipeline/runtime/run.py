@@ -20,6 +20,7 @@ from pipeline.export.coordinates import one_unit
 from pipeline.export.folders import POINTS_FOLDER, TERRAIN_FOLDER
 from pipeline.io import SourceInfo, SpatialReference, Storage, is_url, shown, storage_at
 from pipeline.methods import ReconstructSettings
+from pipeline.registry import extra
 from pipeline.runtime.cluster.serial_executor import Executor, run_alone
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.manifest import NAME, PAGE, InputFile, PointFileFacts, RunManifest, RunStatus, write_manifest
@@ -53,11 +54,11 @@ from pipeline.terrain.flight_strip import Strip
 from pipeline.tiling import MM
 
 if TYPE_CHECKING:
+    from pipeline.extras.footprints.given_footprints import GivenFootprints
+    from pipeline.extras.guides.given_guides import GivenGuides
+    from pipeline.extras.overrides.overrides_file import Override
+    from pipeline.extras.terrain_tin.terrain_output import TerrainOutcome
     from pipeline.runtime.expected import Expected
-    from pipeline.runtime.overrides.overrides_file import Override
-    from pipeline.runtime.stages.given_footprints import GivenFootprints
-    from pipeline.runtime.stages.given_guides import GivenGuides
-    from pipeline.runtime.stages.terrain import TerrainOutcome
 
 FOOTPRINTS = "footprints.json"
 """File of the run directory with the faults of the given footprints, one by one."""
@@ -317,14 +318,12 @@ def _override(
     runs: Sequence[_VariantRun],
 ) -> _Candidates:
     """The candidates after the overrides; the outcome of each entry goes into the run directories."""
-    from pipeline.runtime.stages.apply_overrides import about_no_effect, apply_overrides
-
     context.check(listed.place.folder for listed in (*found.joined.groups, *found.joined.rejected))
-    applied = apply_overrides(context, settings, found.joined, overrides, found.ingested, found.ground)
+    applied = extra("apply_overrides")(context, settings, found.joined, overrides, found.ingested, found.ground)
     for entry in applied.outcomes:
         if entry.warning:
             context.progress.warn("join", entry.warning)
-    if headline := about_no_effect(applied.outcomes):
+    if headline := extra("about_no_effect")(applied.outcomes):
         context.progress.warn_first("join", headline)
     for one in runs:
         put_json(one.run_dir, OVERRIDES, [entry.as_dict() for entry in applied.outcomes])
@@ -363,19 +362,17 @@ def _write_points(
     context: RunContext, settings: RunSettings, found: _Candidates, one: _VariantRun, *, given: bool
 ) -> tuple[str, ...]:
     """Write the points of a variant over its models; the keys of tiles that failed."""
-    from pipeline.runtime.stages.points import PointsOutput, write_points  # loads kernels, which few drivers need
-
-    output = PointsOutput(run_dir=one.run_dir, splits=found.splits, ingested=found.ingested, given=given)
-    return write_points(context, settings, found.joined, one.models, output)
+    output = extra("PointsOutput")(run_dir=one.run_dir, splits=found.splits, ingested=found.ingested, given=given)
+    failed: tuple[str, ...] = extra("write_points")(context, settings, found.joined, one.models, output)
+    return failed
 
 
 def _write_terrain(
     context: RunContext, settings: RunSettings, found: _Candidates, one: _VariantRun, *, meshes: str
 ) -> TerrainOutcome:
     """Write the terrain around the models of a variant."""
-    from pipeline.runtime.stages.terrain import write_terrain  # loads kernels, which few drivers need
-
-    return write_terrain(context, settings, found.ground, one.models, one.run_dir, meshes)
+    outcome: TerrainOutcome = extra("write_terrain")(context, settings, found.ground, one.models, one.run_dir, meshes)
+    return outcome
 
 
 @dataclasses.dataclass(kw_only=True)

@@ -15,9 +15,9 @@ from typing import Any, Protocol, TypeVar
 
 from pipeline import __version__
 from pipeline.errors import GableworkError, RunCancelledError
-from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
+from pipeline.extras.classify.classify import ClassifyRequest, ClassifySummary, classify
+from pipeline.extras.compare.compare import CompareRequest, CompareSummary, own_tables, parse_variants
 from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables, parse_variants
 from pipeline.runtime.monitoring import tracing
 from pipeline.runtime.monitoring.events import Event, Listener
 from pipeline.runtime.request import RunRequest
@@ -74,7 +74,7 @@ class Compare(Protocol):
 
 
 class Classify(Protocol):
-    """`pipeline.runtime.classify.classify`."""
+    """`pipeline.extras.classify.classify.classify`."""
 
     def __call__(
         self, request: ClassifyRequest, on_event: Listener, executor: Executor | None, cancelled: Callable[[], bool]

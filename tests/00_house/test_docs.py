@@ -13,13 +13,13 @@ import pytest
 from pipeline.batch.batch_file import read_batch
 from pipeline.export.columns import COLUMNS
 from pipeline.export.records import SCHEMAS
+from pipeline.extras.overrides.overrides_file import overrides_of
+from pipeline.extras.papers.settings import FuzzySartSettings
 from pipeline.io import SpatialReference
-from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import REASONS, Reason, RoofType, Status
 from pipeline.parameters import Parameters
 from pipeline.roof.settings import RoofSettings, RoofTypeSettings
 from pipeline.ruler.epochs.settings import DiffSettings, read_settings
-from pipeline.runtime.overrides.overrides_file import overrides_of
 from pipeline.settings import RunSettings
 from service.settings import ServiceSettings
 

@@ -41,10 +41,10 @@ def test_the_sources_keep_all_contracts(copied_house: Path) -> None:
         ("pipeline/kernels/union_find.py", "import pipeline.geometry", "Layers of the pipeline"),
         ("pipeline/terrain/ground.py", "import pipeline.roof", "Layers of the pipeline"),
         ("pipeline/tin/delaunay.py", "import pipeline.io", "The science knows no files"),
-        ("pipeline/segmentation/fuzzy_sart.py", "import dask", "The science knows no files"),
+        ("pipeline/extras/papers/fuzzy_sart_clusters.py", "import dask", "The science knows no files"),
         ("pipeline/recipe.py", "import pandas", "The science knows no files"),
         (
-            "pipeline/segmentation/fuzzy_sart.py",
+            "pipeline/extras/papers/fuzzy_sart_clusters.py",
             "import pipeline.segmentation.plane_refinement",
             "Steps of a segmentation do not import one another",
         ),

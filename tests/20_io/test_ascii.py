@@ -6,8 +6,8 @@ import pytest
 from measured import memory_below
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, SettingsError, UnreadableInputError
+from pipeline.extras.ply_ascii.ascii import looks_like_pulses
 from pipeline.io import ReadOptions, open_source
-from pipeline.io.ascii import looks_like_pulses
 
 ROWS = np.array(
     [[513_000.25, 5_402_000.5, 300.0, 17], [513_001.5, 5_402_001.0, 301.25, 80], [513_002.0, 5_402_003.0, 299.5, 3]]

@@ -21,13 +21,13 @@ import shapely
 from shapely import LineString, MultiPolygon, Polygon, affinity, box
 
 from pipeline.errors import CrsError, InconsistentInputError, InputError, UnreadableInputError, causes
-from pipeline.io import nearby
+from pipeline.extras.footprints.footprints_file import read_area, read_footprints
+from pipeline.extras.footprints.repairs import Repairs, crossings
+from pipeline.extras.guides.guides_file import read_guides
+from pipeline.extras.vector_files import nearby
+from pipeline.extras.vector_files.wkb import DEPTH_LIMIT, geometries_of
 from pipeline.io.crs import SpatialReference, parse_crs, resolve_reference
-from pipeline.io.footprints import read_area, read_footprints
-from pipeline.io.guides import read_guides
 from pipeline.io.library_faults import DAMAGED, TOO_LARGE, in_our_words
-from pipeline.io.repairs import Repairs, crossings
-from pipeline.io.wkb import DEPTH_LIMIT, geometries_of
 from service.errors import TooLargeError
 from service.vectors import examine_vector
 
@@ -442,7 +442,7 @@ def test_an_area_of_interest_that_is_a_thicket_is_refused(tmp_path: Path, monkey
     strips += [box(85_000 + k, 447_000, 85_000.5 + k, 447_100) for k in range(20)]
     path = write(tmp_path / "a.gpkg", strips, naam=["x"] * 40)
     assert read_area(path, reference()).is_valid
-    monkeypatch.setattr("pipeline.io.footprints.AREA_CROSSINGS", 1000)
+    monkeypatch.setattr("pipeline.extras.footprints.footprints_file.AREA_CROSSINGS", 1000)
     with pytest.raises(InconsistentInputError, match=r"40 polygons cross each other in more than 1000.*Dissolve"):
         read_area(path, reference())
 
@@ -450,7 +450,7 @@ def test_an_area_of_interest_that_is_a_thicket_is_refused(tmp_path: Path, monkey
 def test_an_area_of_interest_may_be_large_and_of_many_parts_side_by_side(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.io.footprints.AREA_CROSSINGS", 0)
+    monkeypatch.setattr("pipeline.extras.footprints.footprints_file.AREA_CROSSINGS", 0)
     large = write(
         tmp_path / "large.gpkg", [box(60_000, 420_000, 90_000, 450_000), box(90_000, 420_000, 91_000, 421_000)]
     )
@@ -462,8 +462,8 @@ def test_an_area_of_interest_may_be_large_and_of_many_parts_side_by_side(
 def test_an_area_of_interest_with_a_part_that_cannot_be_repaired_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.io.repairs.PAIRS_LIMIT", 0)
-    monkeypatch.setattr("pipeline.io.footprints.Repairs", lambda: Repairs(pairs=0, simple=0))
+    monkeypatch.setattr("pipeline.extras.footprints.repairs.PAIRS_LIMIT", 0)
+    monkeypatch.setattr("pipeline.extras.footprints.footprints_file.Repairs", lambda: Repairs(pairs=0, simple=0))
     parts = [box(85_000, 447_000, 85_010, 447_010), affinity.translate(star(11), 85_000, 447_000)]
     with pytest.raises(InconsistentInputError, match="feature 2"):
         read_area(write(tmp_path / "a.gpkg", parts), reference())

@@ -13,9 +13,9 @@ from shapely import LineString, MultiPolygon, Point, Polygon, box
 from shapely.affinity import scale
 
 from pipeline.errors import CrsError, EmptyInputError, InconsistentInputError, UnreadableInputError
+from pipeline.extras.footprints.footprints_file import read_area, read_footprints
 from pipeline.io import SpatialReference
 from pipeline.io.crs import resolve_reference
-from pipeline.io.footprints import read_area, read_footprints
 
 HOUSES = [box(85_000, 447_000, 85_010, 447_008), box(85_020, 447_000, 85_030, 447_010)]
 
@@ -280,7 +280,8 @@ def test_of_a_file_of_a_whole_country_only_a_little_is_held(tmp_path, suffix):
     path = write_town(tmp_path / f"a{suffix}", country)
     code = (
         "import re, sys, pyarrow.parquet, pyogrio, pyproj, shapely; "
-        "from pipeline.io import SpatialReference; from pipeline.io.footprints import read_footprints; "
+        "from pipeline.io import SpatialReference; "
+        "from pipeline.extras.footprints.footprints_file import read_footprints; "
         "peak = lambda: int(re.search(r'VmHWM:\\s+(\\d+)', open('/proc/self/status').read())[1]) >> 10; "
         "before = peak(); "
         "area = shapely.box(81_000, 401_000, 81_100, 401_100) if sys.argv[2] == 'near' else None; "

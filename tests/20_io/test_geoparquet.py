@@ -14,10 +14,10 @@ from measured import printed
 from shapely import MultiPolygon, Polygon, box
 
 from pipeline.errors import UnreadableInputError
+from pipeline.extras.footprints.footprints_file import read_footprints
+from pipeline.extras.vector_files.geoparquet_layer import geometry_column
 from pipeline.io import SpatialReference
 from pipeline.io.crs import resolve_reference
-from pipeline.io.footprints import read_footprints
-from pipeline.io.geoparquet import geometry_column
 
 RING = Polygon(box(85_040, 447_000, 85_050, 447_010).exterior, [box(85_044, 447_004, 85_046, 447_006).exterior])
 HOUSES = [box(85_000, 447_000, 85_010, 447_008), RING]
@@ -222,7 +222,8 @@ def test_the_delft_footprints_survive_geoparquet(shared_data, tmp_path):
 def test_reading_a_geopackage_does_not_load_pyarrow(tmp_path):
     frame().to_file(tmp_path / "a.gpkg")
     code = (
-        "import sys; from pipeline.io import SpatialReference; from pipeline.io.footprints import read_footprints; "
+        "import sys; from pipeline.io import SpatialReference; "
+        "from pipeline.extras.footprints.footprints_file import read_footprints; "
         f"read_footprints({str(tmp_path / 'a.gpkg')!r}, SpatialReference()); "
         "print('pyarrow.parquet' in sys.modules)"
     )

@@ -10,8 +10,8 @@ import shapely
 from shapely import LineString, MultiLineString, Point
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
+from pipeline.extras.guides.guides_file import GivenLines, read_guides
 from pipeline.io.crs import SpatialReference, resolve_reference
-from pipeline.io.guides import GivenLines, read_guides
 from pipeline.model import GuideKind
 
 RIDGE = LineString([(85_000.0, 447_004.0, 12.0), (85_010.0, 447_004.0, 12.0)])

@@ -10,11 +10,11 @@ import pytest
 import shapely
 
 from pipeline.errors import UnreadableInputError
+from pipeline.extras.remote.urls import filesystem_of
+from pipeline.extras.vector_files.tile_index import COLUMNS, TileIndex, read_tile_index
 from pipeline.io import SpatialReference, find_inputs
 from pipeline.io.crs import resolve_reference
 from pipeline.io.formats import VECTOR_SUFFIXES
-from pipeline.io.tile_index import COLUMNS, TileIndex, read_tile_index
-from pipeline.io.urls import filesystem_of
 
 RD = "EPSG:28992"
 

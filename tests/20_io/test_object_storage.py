@@ -12,8 +12,9 @@ from processes import LONG_S
 
 from pipeline.backoff import Backoff
 from pipeline.errors import RunError
-from pipeline.io import arrow_at, object_storage, storage_at, urls
-from pipeline.io.object_storage import AT_ONCE, ObjectStorage
+from pipeline.extras.remote import object_storage, urls
+from pipeline.extras.remote.object_storage import AT_ONCE, ObjectStorage
+from pipeline.io import arrow_at, storage_at
 
 QUICK = Backoff(attempts=4, first_s=0.01, longest_s=0.02)
 

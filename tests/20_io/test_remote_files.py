@@ -10,9 +10,10 @@ from one_file_site import CONTENT, one_file_site
 
 from pipeline.backoff import Backoff
 from pipeline.errors import UnreadableInputError
-from pipeline.io import ReadOptions, open_source, urls
+from pipeline.extras.remote import urls
+from pipeline.extras.remote.remote_file import BLOCK_BYTES, BLOCKS_KEPT, RemoteFile
+from pipeline.io import ReadOptions, open_source
 from pipeline.io.places import file_at, on_this_machine
-from pipeline.io.remote_file import BLOCK_BYTES, BLOCKS_KEPT, RemoteFile
 
 QUICK = Backoff(attempts=3, first_s=0.01, longest_s=0.01)
 

@@ -5,7 +5,7 @@ import errno
 import pytest
 
 from pipeline.backoff import Backoff
-from pipeline.io.retries import CODES, POLICY, STATUSES, GaveUpError, cause_of, persistently, without_secrets
+from pipeline.extras.remote.retries import CODES, POLICY, STATUSES, GaveUpError, cause_of, persistently, without_secrets
 
 
 class AnswerError(Exception):

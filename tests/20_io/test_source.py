@@ -9,10 +9,10 @@ import shapely
 from shapely import MultiPolygon, Polygon, box
 
 from pipeline.errors import InputError, SettingsError
+from pipeline.extras.ply_ascii.ascii import AsciiFile
+from pipeline.extras.ply_ascii.ply import PlyFile
 from pipeline.io import ReadOptions, open_source
-from pipeline.io.ascii import AsciiFile
 from pipeline.io.las import LasFile
-from pipeline.io.ply import PlyFile
 
 
 def test_a_bbox_keeps_points_on_its_edge_and_counts_the_others(tmp_path, write_las):

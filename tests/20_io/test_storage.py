@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import RunError
+from pipeline.extras.remote.object_storage import ObjectStorage
 from pipeline.io import LocalStorage, sha256_of, storage_at
-from pipeline.io.object_storage import ObjectStorage
 from pipeline.io.storage import TEMPORARY_SUFFIX
 
 

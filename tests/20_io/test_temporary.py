@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.io.nearby import POLYGONS
+from pipeline.extras.vector_files.nearby import POLYGONS
+from pipeline.extras.vector_files.vector_archive import unpacked
 from pipeline.io.temporary import remove_left_folders, temporary_folder
-from pipeline.io.vector_archive import unpacked
 
 
 @pytest.fixture(autouse=True)

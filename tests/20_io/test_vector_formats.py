@@ -11,12 +11,12 @@ import pytest
 from shapely import LineString, box
 
 from pipeline.errors import CrsError, EmptyInputError, UnreadableInputError
+from pipeline.extras.footprints.footprints_file import read_area, read_footprints
+from pipeline.extras.footprints.placed_features import Elsewhere, off_the_data
+from pipeline.extras.guides.guides_file import read_guides
+from pipeline.extras.vector_files.tile_index import read_tile_index
 from pipeline.io import SpatialReference
 from pipeline.io.crs import resolve_reference
-from pipeline.io.footprints import read_area, read_footprints
-from pipeline.io.guides import read_guides
-from pipeline.io.placed_features import Elsewhere, off_the_data
-from pipeline.io.tile_index import read_tile_index
 
 HOUSES = [box(85_000, 447_000, 85_010, 447_008), box(85_020, 447_000, 85_030, 447_010)]
 NAMES = ["Müllerstraße 1", "Œuvre"]
@@ -218,7 +218,7 @@ def test_archives_that_cannot_be_used_are_refused(tmp_path):
 
 def test_an_archive_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     path = made(tmp_path, "zipped geopackage")
-    monkeypatch.setattr("pipeline.io.vector_archive.UNPACKED_LIMIT", 1000)
+    monkeypatch.setattr("pipeline.extras.vector_files.vector_archive.UNPACKED_LIMIT", 1000)
     monkeypatch.setattr(shutil, "copyfileobj", None)
     with pytest.raises(UnreadableInputError, match=r"it unpacks to \d+ bytes"):
         read_footprints(path, reference())

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import ndimage
 
-from pipeline.terrain.elevation_rasters import closed, columns_of, filled, highest_in_cells, terrain_at
+from pipeline.extras.classify.elevation_rasters import closed, columns_of, filled, highest_in_cells, terrain_at
 from pipeline.terrain.lattice import NO_DATA
 
 

@@ -9,12 +9,12 @@ import pytest
 from scipy.spatial import Delaunay
 
 from pipeline.errors import SettingsError
+from pipeline.extras.hierarchical_filter.hierarchical_filter import _lowest_of_cells, _without_clumps
+from pipeline.extras.hierarchical_filter.tin_densification import join_facets
 from pipeline.terrain.ground import Terrain, ground_of
-from pipeline.terrain.hierarchical_filter import _lowest_of_cells, _without_clumps
 from pipeline.terrain.lattice import NO_DATA, without_pits
 from pipeline.terrain.planar_fitting import join_planes, plane_around, plane_sums
 from pipeline.terrain.settings import GroundSettings
-from pipeline.terrain.tin_densification import join_facets
 
 Grid = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]

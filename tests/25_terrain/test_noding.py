@@ -9,8 +9,8 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.extras.terrain_tin.noding import APART_MM, Lines, noded
 from pipeline.model import IntArray
-from pipeline.terrain.noding import APART_MM, Lines, noded
 
 SIDE, BEYOND = 100, 50
 Ring = list[tuple[int, int]]

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.terrain.lattice import NO_DATA
-from pipeline.terrain.point_classes import (
+from pipeline.extras.classify.point_classes import (
     DEEP_MM,
     ON_ROOF_MM,
     PIT_REACH_MM,
@@ -21,6 +20,7 @@ from pipeline.terrain.point_classes import (
     sums_around,
     tops_nearby,
 )
+from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.settings import VegetationSettings
 
 

@@ -6,9 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.terrain.point_classes import PointClass, PointEvidence, classes_of, support_m
+from pipeline.extras.classify.point_classes import PointClass, PointEvidence, classes_of, support_m
+from pipeline.extras.classify.sparse_points import (
+    PRODUCTS,
+    WEIGHTS,
+    Role,
+    Sign,
+    SparsePoints,
+    likely_building,
+    terms_of,
+)
 from pipeline.terrain.settings import VegetationSettings
-from pipeline.terrain.sparse_points import PRODUCTS, WEIGHTS, Role, Sign, SparsePoints, likely_building, terms_of
 
 
 def random_points(seed: int = 4) -> SparsePoints:

@@ -14,10 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from surface_rules import surface_faults
 
-from pipeline.export.terrain import surfaces_of
-from pipeline.model import IntArray
-from pipeline.terrain.lattice import NO_DATA
-from pipeline.terrain.terrain_tin import (
+from pipeline.extras.terrain_tin.terrain_files import surfaces_of
+from pipeline.extras.terrain_tin.terrain_tin import (
     BESIDE_MM,
     CLEARANCE_MM,
     GAP_CELLS,
@@ -26,6 +24,8 @@ from pipeline.terrain.terrain_tin import (
     TerrainMesh,
     terrain_mesh,
 )
+from pipeline.model import IntArray
+from pipeline.terrain.lattice import NO_DATA
 from pipeline.tiling import Window
 
 Edge = tuple[tuple[int, int, int], tuple[int, int, int]]

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from pipeline.errors import BuildingError
+from pipeline.extras.papers.cluster_membership import may_be_roof, refine_clusters, spreads
+from pipeline.extras.papers.clustering_settings import ClusterMembershipSettings
+from pipeline.extras.papers.facet_parameters import about_barycentre, facet_parameters
 from pipeline.model import FloatArray, Reason
-from pipeline.segmentation.cluster_membership import may_be_roof, refine_clusters, spreads
-from pipeline.segmentation.clustering_settings import ClusterMembershipSettings
-from pipeline.segmentation.facet_parameters import about_barycentre, facet_parameters
 from pipeline.tin.delaunay import triangulate
 
 PAPER = ClusterMembershipSettings(min_members=11)

@@ -7,8 +7,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, cKDTree
 
-from pipeline.segmentation.facet_clusters import connected_parts, labels_of_points
-from pipeline.segmentation.surrounding_ground import far_from
+from pipeline.extras.papers.facet_clusters import connected_parts, labels_of_points
+from pipeline.extras.papers.surrounding_ground import far_from
 
 
 @pytest.mark.parametrize("seed", range(4))

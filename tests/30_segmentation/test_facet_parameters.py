@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from pipeline.extras.papers.facet_parameters import about_barycentre, cluster_means, facet_parameters
 from pipeline.model import FloatArray, LabelArray
-from pipeline.segmentation.facet_parameters import about_barycentre, cluster_means, facet_parameters
 from pipeline.tin.delaunay import triangulate
 
 

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import BuildingError, SettingsError
+from pipeline.extras.papers.clustering_settings import FuzzySartClusteringSettings
+from pipeline.extras.papers.fuzzy_sart_clusters import _degree, centre_of_building, cluster, facet_vectors
 from pipeline.model import FloatArray, Reason
-from pipeline.segmentation.clustering_settings import FuzzySartClusteringSettings
-from pipeline.segmentation.fuzzy_sart import _degree, centre_of_building, cluster, facet_vectors
 
 coordinate = st.floats(-100, 100, allow_nan=False).filter(lambda value: abs(value) > 1e-3)
 vector = st.tuples(coordinate, coordinate, coordinate)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from pipeline.extras.papers.height_rule import facet_z_difference, facet_z_highest, facets_above_z_avg, z_avg
 from pipeline.model import FloatArray, LabelArray
-from pipeline.terrain.height_rule import facet_z_difference, facet_z_highest, facets_above_z_avg, z_avg
 
 
 def box_with_walls() -> tuple[FloatArray, LabelArray]:

@@ -10,10 +10,9 @@ from sklearn.cluster import KMeans
 from sklearn.metrics import silhouette_score
 
 from pipeline.errors import BuildingError
-from pipeline.model import FloatArray, LabelArray, Reason
-from pipeline.segmentation.clustering_settings import NormalClusteringSettings
-from pipeline.segmentation.facet_smoothing import passes_for_noise, smoothed_normals
-from pipeline.segmentation.kmeans_normals import (
+from pipeline.extras.papers.clustering_settings import NormalClusteringSettings
+from pipeline.extras.papers.facet_smoothing import passes_for_noise, smoothed_normals
+from pipeline.extras.papers.kmeans_normals import (
     choose_clusters,
     cluster_normals,
     farthest_point_start,
@@ -21,6 +20,7 @@ from pipeline.segmentation.kmeans_normals import (
     labels_around,
     silhouette,
 )
+from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.tin.delaunay import triangulate
 
 SETTINGS = NormalClusteringSettings()

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from pipeline.extras.papers.leftover_planes import cluster_leftovers
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import FloatArray, LabelArray
-from pipeline.segmentation.leftover_planes import cluster_leftovers
 
 
 def roof_with_dormer(seed: int = 0) -> tuple[FloatArray, LabelArray]:

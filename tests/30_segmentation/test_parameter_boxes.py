@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.errors import BuildingError
+from pipeline.extras.papers.clustering_settings import ParameterBoxSettings
+from pipeline.extras.papers.parameter_boxes import coarse_clusters
 from pipeline.model import FloatArray, Reason
-from pipeline.segmentation.clustering_settings import ParameterBoxSettings
-from pipeline.segmentation.parameter_boxes import coarse_clusters
 
 PAPER = ParameterBoxSettings(dense_box_facets=5)
 

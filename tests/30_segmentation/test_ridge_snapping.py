@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pipeline.extras.papers.ridge_snapping import find_ridges, label_by_ridges
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import FloatArray, LabelArray
-from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
 
 NEAR = {"distance_m": 0.35, "reach_m": 0.8}
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pipeline.extras.papers.clustering_settings import RoofTreeSettings
+from pipeline.extras.papers.roof_trees import classify_2d, classify_3d, opposite_pairs, plausible_slopes
 from pipeline.model import RoofType
-from pipeline.segmentation.clustering_settings import RoofTreeSettings
-from pipeline.segmentation.roof_trees import classify_2d, classify_3d, opposite_pairs, plausible_slopes
 
 TREE = RoofTreeSettings()
 Cluster = tuple[float, float, float]

@@ -6,9 +6,9 @@ from candidates_by_hand import same_partition
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from pipeline.errors import BuildingError, SettingsError
+from pipeline.extras.papers.clustering_settings import SingleLinkageSettings
+from pipeline.extras.papers.single_linkage import cluster_by_linkage, link
 from pipeline.model import FloatArray, Reason
-from pipeline.segmentation.clustering_settings import SingleLinkageSettings
-from pipeline.segmentation.single_linkage import cluster_by_linkage, link
 
 
 def scattered(seed: int, n: int, low: float = 0.0, high: float = 360.0) -> tuple[FloatArray, FloatArray]:

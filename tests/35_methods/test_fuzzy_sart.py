@@ -20,8 +20,8 @@ from candidates_by_hand import (
 )
 
 from pipeline.errors import BuildingError, SettingsError
-from pipeline.methods import fuzzy_sart
-from pipeline.methods.settings import FuzzySartSettings
+from pipeline.extras.papers import fuzzy_sart
+from pipeline.extras.papers.settings import FuzzySartSettings
 from pipeline.model import Candidate, FloatArray, Reason, Segmentation
 from pipeline.prepared_cloud import prepare_cloud
 

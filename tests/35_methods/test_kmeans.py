@@ -14,10 +14,11 @@ import shapely
 from candidates_by_hand import Plane, candidate, gable_planes, hip_planes, lowest_of, moved, strewn, turned_plan
 
 from pipeline.errors import BuildingError, SettingsError
+from pipeline.extras.papers import kmeans
+from pipeline.extras.papers.kmeans import building_top, cluster_facets
+from pipeline.extras.papers.settings import KMeansSettings
 from pipeline.geometry import vertical_residuals_m
-from pipeline.methods import METHODS, ReconstructSettings, kmeans
-from pipeline.methods.kmeans import building_top, cluster_facets
-from pipeline.methods.settings import KMeansSettings
+from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, Reason, RoofType, Segmentation, Status
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.validity import check_solid
@@ -277,7 +278,7 @@ def test_a_rectangle_that_the_points_cannot_fill_is_refused_before_it_is_sampled
     def sampled(*_: object) -> None:
         raise AssertionError("sampled")
 
-    monkeypatch.setattr("pipeline.methods.kmeans.far_from", sampled)
+    monkeypatch.setattr("pipeline.extras.papers.kmeans.far_from", sampled)
     assert segment(cross, ROBUST).faces is None
     with pytest.raises(AssertionError, match="sampled"):
         segment(exact_gable(0.0), ROBUST)

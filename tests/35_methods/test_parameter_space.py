@@ -13,9 +13,9 @@ import pytest
 from candidates_by_hand import TURNS, Matrix, candidate, moved, strewn, turned
 
 from pipeline.errors import BuildingError, SettingsError
+from pipeline.extras.papers.parameter_space import segment_2d, segment_3d
+from pipeline.extras.papers.settings import ParameterSpace2dSettings, ParameterSpace3dSettings
 from pipeline.methods import METHODS
-from pipeline.methods.parameter_space import segment_2d, segment_3d
-from pipeline.methods.settings import ParameterSpace2dSettings, ParameterSpace3dSettings
 from pipeline.model import Candidate, FloatArray, Reason, RoofType, Segmentation
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.settings import RunSettings

@@ -8,8 +8,8 @@ import shapely
 from candidates_by_hand import candidate
 
 from pipeline.errors import SettingsError
+from pipeline.extras.papers.settings import RoofFaceSettings
 from pipeline.methods import METHODS, ReconstructSettings, method_named
-from pipeline.methods.settings import RoofFaceSettings
 from pipeline.model import BuildingResult, Candidate, RoofType, Status
 from pipeline.recipe import reconstruct_building
 from pipeline.settings import RunSettings

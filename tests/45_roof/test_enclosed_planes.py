@@ -4,8 +4,8 @@ import numpy as np
 import shapely
 from shapely import MultiPolygon
 
+from pipeline.extras.guides.enclosed_planes import with_enclosed_planes
 from pipeline.model import FloatArray
-from pipeline.roof.enclosed_planes import with_enclosed_planes
 from pipeline.roof.settings import ArrangementSettings
 
 HOUSE_MM = MultiPolygon([shapely.box(0, 0, 10_000, 6_000)])

@@ -8,11 +8,11 @@ import pytest
 import shapely
 from candidates_by_hand import candidate
 
+from pipeline.extras.lods.facades import Eave, FacadePoints, eave_of, mean_overhang, walls_beneath
 from pipeline.model import FloatArray
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.recipe import ReconstructSettings, reconstruct_building
 from pipeline.roof.block import block_plane
-from pipeline.roof.facades import Eave, FacadePoints, eave_of, mean_overhang, walls_beneath
 from pipeline.roof.plan import partition_roof, roof_points
 from pipeline.roof.settings import RoofSettings
 from pipeline.ruler.simulation.als import scan_all

@@ -10,9 +10,9 @@ from faces_by_hand import plane
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.extras.papers.flush_walls import unite_flush_walls
 from pipeline.model import FaceKind, Solid
 from pipeline.quality.validity import check_solid
-from pipeline.roof.flush_walls import unite_flush_walls
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import SolidPart, solid_parts
 

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import BuildingError
+from pipeline.extras.footprints.given_heights import given_block, given_heights
 from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, GivenHeights, GroundSource, HeightSource, Reason, Status
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
-from pipeline.roof.given_heights import given_block, given_heights
 from pipeline.roof.settings import FootprintSettings
 
 NAMED = FootprintSettings(height="h", roof_elevation="roof", storeys="n", ground_elevation="ground")

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from shapely import LineString, MultiPolygon
 from shapely.affinity import rotate, scale, translate
 
+from pipeline.extras.guides.guide_matching import followed, guided_outline, inner_pieces, pieces_of
+from pipeline.extras.guides.guided_faces import guided_faces, misfits_of
 from pipeline.model import FloatArray, Guide, GuideKind
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.arrangement.candidate_lines import CandidateLines
 from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides, with_guides
 from pipeline.roof.footprint import footprint_in_mm
-from pipeline.roof.guided_faces import guided_faces, misfits_of
-from pipeline.roof.guides import followed, guided_outline, inner_pieces, pieces_of
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import ArrangementSettings
 

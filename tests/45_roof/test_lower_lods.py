@@ -9,9 +9,9 @@ import shapely
 from faces_by_hand import assert_closed, level, partition_of, plane
 from shapely import Polygon
 
+from pipeline.extras.lods.lower_lods import level_forms, lower_lods
 from pipeline.model import FaceKind, FloatArray, Plane, Solid
 from pipeline.quality.validity import check_solid
-from pipeline.roof.lower_lods import level_forms, lower_lods
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.simplification import without_idle_vertices
 from pipeline.roof.solid import LodParts, solid_parts

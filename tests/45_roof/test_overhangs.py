@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import BuildingError
+from pipeline.extras.lods.facades import FacadePoints
+from pipeline.extras.lods.overhangs import UndrawableError, floor_m2, overhanging_solids
+from pipeline.extras.lods.wider_eaves import wider_parts
 from pipeline.model import FaceKind, FloatArray, NoOverhang, Plane, Solid
 from pipeline.quality.validity import check_solid
-from pipeline.roof.facades import FacadePoints
-from pipeline.roof.overhangs import UndrawableError, floor_m2, overhanging_solids
 from pipeline.roof.solid import SolidPart, solid_parts
-from pipeline.roof.wider_eaves import wider_parts
 
 ExactRoofs = Callable[..., Any]
 Volume = Callable[[Solid], float]

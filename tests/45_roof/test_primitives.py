@@ -8,11 +8,11 @@ import shapely
 from candidates_by_hand import turned_plan
 
 from pipeline.errors import BuildingError
+from pipeline.extras.papers.flush_walls import unite_flush_walls
+from pipeline.extras.papers.primitives import BuildingPrimitive, fit_box, fit_gable, primitive_partition
 from pipeline.geometry import fit_plane
 from pipeline.model import FloatArray, LabelArray, Plane, Reason, RoofType
 from pipeline.quality.validity import check_solid
-from pipeline.roof.flush_walls import unite_flush_walls
-from pipeline.roof.primitives import BuildingPrimitive, fit_box, fit_gable, primitive_partition
 from pipeline.roof.solid import solid_parts
 
 

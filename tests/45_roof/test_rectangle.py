@@ -7,8 +7,14 @@ import pytest
 import shapely
 from faces_by_hand import plane
 
+from pipeline.extras.papers.rectangle import (
+    PlanLine,
+    convex_hull,
+    line_of_intersection,
+    minimum_rectangle,
+    rectangle_on_line,
+)
 from pipeline.model import FloatArray
-from pipeline.roof.rectangle import PlanLine, convex_hull, line_of_intersection, minimum_rectangle, rectangle_on_line
 
 
 def line_at(degrees: float, x: float = 0.0, y: float = 0.0) -> PlanLine:

@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 from shapely import Polygon
 
 from pipeline.errors import BuildingError
+from pipeline.extras.templates.fitting import fit_templates, margin_of_templates, parameters_of
+from pipeline.extras.templates.parts import main_direction
+from pipeline.extras.templates.shapes import best_shape, height, misfit, robust_line
+from pipeline.extras.templates.template_drawing import lower_piece
 from pipeline.model import FloatArray, Plane, Reason, Solid
 from pipeline.quality.validity import check_solid
 from pipeline.roof.footprint import footprint_in_mm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import solid_parts
-from pipeline.roof.templates.drawing import lower_piece
-from pipeline.roof.templates.fitting import fit_templates, margin_of_templates, parameters_of
-from pipeline.roof.templates.parts import main_direction
-from pipeline.roof.templates.shapes import best_shape, height, misfit, robust_line
 
 ExactRoofs = Callable[..., Any]
 Volume = Callable[[Solid], float]

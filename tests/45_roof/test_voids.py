@@ -5,10 +5,10 @@ import pytest
 import shapely
 from shapely import MultiPolygon
 
+from pipeline.extras.footprints.voids import without_voids
 from pipeline.model import FloatArray
 from pipeline.roof.footprint import footprint_in_mm
 from pipeline.roof.settings import RoofSettings
-from pipeline.roof.voids import without_voids
 
 SETTINGS = RoofSettings()
 TURN = 23.0

@@ -11,8 +11,8 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.party_walls.contacts import Contacts, Walls, contacts, wall_areas
-from pipeline.party_walls.settings import PartyWallSettings
+from pipeline.extras.party_walls.contacts import Contacts, Walls, contacts, wall_areas
+from pipeline.extras.party_walls.settings import PartyWallSettings
 
 Wall = shapely.Polygon
 Ring = Sequence[tuple[float, float]]

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from weather_files import write_epw, write_pvgis
 
 from pipeline.errors import UnreadableInputError
+from pipeline.extras.solar.sectors import SECTORS
+from pipeline.extras.solar.sky_view import sky_views
+from pipeline.extras.solar.sunlight import light_above, received
+from pipeline.extras.solar.weather import Site, Weather, YearOfLight, clear_sky, weather_of, year_of_light
 from pipeline.model import FloatArray
-from pipeline.solar.sectors import SECTORS
-from pipeline.solar.sky_view import sky_views
-from pipeline.solar.sunlight import light_above, received
-from pipeline.solar.weather import Site, Weather, YearOfLight, clear_sky, weather_of, year_of_light
 
 pvlib = pytest.importorskip("pvlib", reason="the extra solar is not installed")
 

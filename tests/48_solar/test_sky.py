@@ -10,13 +10,13 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.extras.solar.figures import figures
+from pipeline.extras.solar.horizon import horizons, obstacles_of
+from pipeline.extras.solar.roof_planes import LIFT_M, RoofPlanes
+from pipeline.extras.solar.sectors import SECTOR_RAD, SECTORS
+from pipeline.extras.solar.settings import SolarSettings
+from pipeline.extras.solar.sky_view import sky_views
 from pipeline.model import FloatArray
-from pipeline.solar.figures import figures
-from pipeline.solar.horizon import horizons, obstacles_of
-from pipeline.solar.roof_planes import LIFT_M, RoofPlanes
-from pipeline.solar.sectors import SECTOR_RAD, SECTORS
-from pipeline.solar.settings import SolarSettings
-from pipeline.solar.sky_view import sky_views
 
 AZIMUTHS = np.arange(SECTORS) * SECTOR_RAD
 HERE = np.zeros((1, 3))

@@ -8,11 +8,11 @@ import shapely
 from candidates_by_hand import candidate
 
 from pipeline.errors import SettingsError
+from pipeline.extras.lods.overhangs import UndrawableError, floor_m2
 from pipeline.methods import OVERHANGS, ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, FaceKind, FloatArray, NoOverhang, Outcome, OverhangSource, Solid
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
-from pipeline.roof.overhangs import UndrawableError, floor_m2
 from pipeline.roof.settings import RoofSettings
 from pipeline.settings import RunSettings
 
@@ -116,7 +116,7 @@ def test_overhangs_that_cannot_be_drawn_leave_lod22(monkeypatch: pytest.MonkeyPa
     def undrawable(*_: object) -> list[Solid]:
         raise UndrawableError(NoOverhang.INVALID_SOLID, "no form")
 
-    monkeypatch.setattr("pipeline.building.overhang_model.overhanging_solids", undrawable)
+    monkeypatch.setattr("pipeline.extras.lods.overhang_model.overhanging_solids", undrawable)
     result = modelled(house(southern_wall(0.5)))
     assert (result.status, result.lod, len(result.solids)) == ("ok", "2.2", 1)
     assert result.overhangs is not None

@@ -10,11 +10,11 @@ import laspy
 import numpy as np
 import pytest
 
+from pipeline.extras.classify.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate
 from pipeline.recipe import reconstruct_building
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.monitoring.events import Listener, ignore
 from pipeline.runtime.monitoring.measurement import Measured, measure

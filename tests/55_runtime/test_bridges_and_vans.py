@@ -11,9 +11,9 @@ import pytest
 import shapely
 from run_tables import rows, write_footprints
 
+from pipeline.extras.classify.classify import ClassifySummary
 from pipeline.ruler.simulation.bridges_and_vans import BRIDGES, bridges_and_vans
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.classify import ClassifySummary
 from pipeline.runtime.run import RunSummary
 
 pytestmark = pytest.mark.slow

@@ -20,9 +20,9 @@ from pipeline.errors import (
     SettingsError,
     UnreadableInputError,
 )
+from pipeline.extras.classify.classify import ClassifyRequest, ClassifySummary, classify
+from pipeline.extras.classify.las_frame import read_frame
 from pipeline.io import open_source
-from pipeline.io.las_frame import read_frame
-from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
@@ -254,7 +254,7 @@ def test_a_file_that_changes_meanwhile_is_reported(
     path = tmp_path / "changing.laz"
     las = laspy.read(true_suburb)
     las.write(path)
-    from pipeline.runtime import classify as module
+    from pipeline.extras.classify import classify as module
 
     label_all = module._label_all
 
@@ -334,7 +334,7 @@ def test_what_a_killed_command_left_is_removed_and_reported_by_the_next_into_the
 ) -> None:
     out = tmp_path / "out"
     code = (
-        "import os, signal, sys; from pathlib import Path; from pipeline.runtime.classify import *; "
+        "import os, signal, sys; from pathlib import Path; from pipeline.extras.classify.classify import *; "
         "listen = lambda event: event.stage == 'ingest' and os.kill(os.getpid(), signal.SIGKILL); "
         "classify(ClassifyRequest(inputs=(sys.argv[1],), out=sys.argv[2], resources=Resources(workers=0)), listen)"
     )

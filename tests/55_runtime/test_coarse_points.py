@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.export.point_glb import NO_BUILDING, ModelledPoints, points_glb, united
+from pipeline.extras.octree.coarse_points import CoarseTask, write_coarse
+from pipeline.extras.octree.point_glb import NO_BUILDING, ModelledPoints, points_glb, united
+from pipeline.extras.octree.tile_points import TilePoints
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import InParts, OutcomeTask, Place, brief_within, run_and_store
-from pipeline.runtime.stages.coarse_points import CoarseTask, write_coarse
-from pipeline.runtime.stages.tile_points import TilePoints
 from pipeline.tiling import MM, Tile
 
 LEVELS = 7

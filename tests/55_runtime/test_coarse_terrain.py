@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.extras.octree.coarse_terrain import MOST_NODES, terrain_document, terrain_part, terrain_spacing
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.stages.coarse_terrain import MOST_NODES, terrain_document, terrain_part, terrain_spacing
 from pipeline.runtime.stages.surroundings import NO_POINT
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.tiling import MM, Tile, TileGrid, Window

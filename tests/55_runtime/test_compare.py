@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from pipeline.errors import InputError, RunCancelledError, RunError, SettingsError
-from pipeline.runtime.compare import (
+from pipeline.extras.compare.compare import (
     BUILDINGS,
     PAGE,
     REPORT,

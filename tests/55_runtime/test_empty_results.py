@@ -16,10 +16,10 @@ from run_tables import rows, rows_by_id, write_footprints
 from shapely import Polygon
 
 from pipeline.errors import CrsError, EmptyInputError, SettingsError, UnreadableInputError
+from pipeline.extras.overrides.rerun import RerunRequest, rerun
 from pipeline.inspection import inspect
 from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
 from pipeline.runtime.stages.ingested import without_roofs

@@ -11,10 +11,10 @@ from run_tables import rows_by_id
 from shapely import LineString, Point, Polygon
 
 from pipeline.errors import EmptyInputError, InputError, RunError
+from pipeline.extras.overrides.overrides_file import read_overrides
+from pipeline.extras.overrides.rerun import RerunRequest, rerun
 from pipeline.io.crs import SpatialReference
-from pipeline.runtime.overrides.overrides_file import read_overrides
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
 from pipeline.settings import RunSettings

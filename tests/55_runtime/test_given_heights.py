@@ -15,12 +15,12 @@ from run_tables import rows
 from shapely import Polygon
 
 from pipeline.errors import SettingsError, UnreadableInputError
+from pipeline.extras.overrides.rerun import RerunRequest, rerun
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import Candidate, GivenHeights
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.isolation.replay_bundle import Bundle, Incident, read_bundle, write_bundle
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
 from pipeline.runtime.scratch.folder import Scratch

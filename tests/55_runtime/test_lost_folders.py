@@ -12,7 +12,7 @@ from pipeline.batch.batch_file import read_batch
 from pipeline.batch.run import run_batch
 from pipeline.batch.status import read_status
 from pipeline.errors import FolderLostError, InputError, RunCancelledError, RunOverError
-from pipeline.runtime.classify import ClassifyRequest, classify
+from pipeline.extras.classify.classify import ClassifyRequest, classify
 from pipeline.runtime.cluster.local_executor import LocalExecutor
 from pipeline.runtime.manifest import RunStatus
 from pipeline.runtime.manifest_reading import read_manifest

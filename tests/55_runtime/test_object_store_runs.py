@@ -11,19 +11,19 @@ from object_store import SECRET
 
 from pipeline.errors import EmptyInputError, InputError, RunError, UnreadableInputError
 from pipeline.export import tile as tile_files
+from pipeline.extras.classify.classify import ClassifyRequest, classify
+from pipeline.extras.overrides.rerun import RerunRequest, rerun
+from pipeline.extras.remote.retries import persistently
+from pipeline.extras.remote.urls import filesystem_of
 from pipeline.io import storage_at
 from pipeline.io.places import on_this_machine
-from pipeline.io.retries import persistently
-from pipeline.io.urls import filesystem_of
 from pipeline.report.statistics import run_statistics
 from pipeline.ruler.evaluation.reading import read_models
-from pipeline.runtime.classify import ClassifyRequest, classify
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.isolation.replay_bundle import read_bundle
 from pipeline.runtime.manifest import RunStatus
 from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL, Resources
 from pipeline.runtime.run import run
 from pipeline.settings import RunSettings

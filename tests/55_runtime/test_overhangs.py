@@ -10,8 +10,8 @@ import shapely
 
 from pipeline.export.geoparquet import read_table
 from pipeline.export.solid_geometry import OVERHANG_COLUMNS
+from pipeline.extras.overrides.rerun import RerunRequest, rerun
 from pipeline.runtime.digest import ADDED
-from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary
 

@@ -17,17 +17,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from run_tables import rows_by_id, write_footprints
 
+import pipeline.extras.overrides.apply_overrides as applying
+import pipeline.extras.overrides.rerun
 import pipeline.recipe
-import pipeline.runtime.rerun
-import pipeline.runtime.stages.apply_overrides as applying
 from pipeline.errors import RunCancelledError, RunError, SettingsError
+from pipeline.extras.overrides.earlier import Record
+from pipeline.extras.overrides.overrides_file import overrides_of, own_modelling, read_overrides
+from pipeline.extras.overrides.rerun import RerunRequest, rerun
 from pipeline.io import SpatialReference
 from pipeline.io.storage import sha256_of
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.earlier import Record
-from pipeline.runtime.overrides.overrides_file import overrides_of, own_modelling, read_overrides
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
 from pipeline.runtime.stages.sites import CandidateSite
@@ -509,7 +509,7 @@ def test_a_unit_without_a_digest_of_its_inputs_is_sought_in_all_tiles() -> None:
     record = Record(points=5, box=None, source_id=None, status="failed", input_hash=None)
     alone = CandidateSite(building_id="a", owner=Tile(0, 0), ranges=(), points=5)
     search: Any = None
-    same = functools.partial(pipeline.runtime.rerun._Search._same, search, record)
+    same = functools.partial(pipeline.extras.overrides.rerun._Search._same, search, record)
     assert same(alone)
     assert not same(dataclasses.replace(alone, points=6))
     # its outline depends on units that the split tiles may cut off
@@ -522,7 +522,7 @@ def test_a_rerun_holds_the_new_files_of_one_tile_at_a_time_and_touches_the_run_w
 ) -> None:
     first = copied(meshes="tile")
     before = files(first.run_dir)
-    real_update, real_written = pipeline.runtime.rerun.updated_tile, pipeline.runtime.rerun._written
+    real_update, real_written = pipeline.extras.overrides.rerun.updated_tile, pipeline.extras.overrides.rerun._written
     made: list[Any] = []
     prepared: list[str] = []
 
@@ -537,8 +537,8 @@ def test_a_rerun_holds_the_new_files_of_one_tile_at_a_time_and_touches_the_run_w
         prepared.extend(path for path in files(first.run_dir) if "/new/" in path)
         return real_written(*args)
 
-    monkeypatch.setattr("pipeline.runtime.rerun.updated_tile", watched)
-    monkeypatch.setattr("pipeline.runtime.rerun._written", written)
+    monkeypatch.setattr("pipeline.extras.overrides.rerun.updated_tile", watched)
+    monkeypatch.setattr("pipeline.extras.overrides.rerun._written", written)
     done = again(first.run_dir, only=tuple(rows_by_id(first.run_dir)))
     assert len(made) == len(done.tiles) > 1
     assert sum(path.endswith(".city.jsonl") for path in prepared) == len(done.tiles)
@@ -580,7 +580,7 @@ def test_a_rerun_that_is_cancelled_leaves_the_run_as_it_was(plain: Any, copied: 
 def test_a_building_that_the_split_tiles_cut_off_is_sought_in_all_of_them(
     suburb: Path, reconstruct: Any, overridden: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.runtime.rerun.AROUND_M", 0.0)
+    monkeypatch.setattr("pipeline.extras.overrides.rerun.AROUND_M", 0.0)
     size_m = 60.0
     first = reconstruct(suburb, settings={"tile_size_m": size_m})
     outlines = [outline(row) for row in rows_by_id(first.run_dir).values()]
@@ -612,7 +612,7 @@ def test_the_bundle_of_a_building_that_meets_a_fault_comes_with_the_other_files_
     with monkeypatch.context() as patch:
         patch.setattr(pipeline.recipe, "reconstruct_building", faulty)
         with monkeypatch.context() as late:
-            late.setattr("pipeline.runtime.rerun._prepared", called_off)
+            late.setattr("pipeline.extras.overrides.rerun._prepared", called_off)
             with pytest.raises(RunCancelledError):
                 again(first.run_dir, only=(name,))
         assert files(first.run_dir) == before
@@ -630,7 +630,7 @@ def test_a_rerun_that_fails_among_the_files_says_so(copied: Any, monkeypatch: py
         raise OSError("no space left")
 
     with monkeypatch.context() as patch:
-        patch.setattr("pipeline.runtime.rerun._put_state", full)
+        patch.setattr("pipeline.extras.overrides.rerun._put_state", full)
         with pytest.raises(OSError, match="no space left"):
             again(first.run_dir, only=(name,))
     found = json.loads((Path(first.run_dir) / "run.json").read_text())

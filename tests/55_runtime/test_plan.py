@@ -11,9 +11,9 @@ import pyproj
 import pytest
 
 from pipeline.errors import CrsError, InconsistentInputError, InputError, RunCancelledError, UnreadableInputError
+from pipeline.extras.classify.classify import ClassifyRequest, classify
 from pipeline.io import ReadOptions
 from pipeline.runtime import looking, request
-from pipeline.runtime.classify import ClassifyRequest, classify
 from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 from pipeline.runtime.looking import look_at_all
 from pipeline.runtime.monitoring.events import Watch, ignore

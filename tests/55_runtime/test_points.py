@@ -13,18 +13,18 @@ import pyproj
 import pytest
 import scipy.spatial
 
-from pipeline.export.building_points import building_points
-from pipeline.export.point_glb import NO_BUILDING, NO_PLANE, NO_RESIDUAL, ModelledPoints, read_points_glb
+from pipeline.extras.classify.classify import ClassifySummary
+from pipeline.extras.octree import tile_points
+from pipeline.extras.octree.building_points import building_points
+from pipeline.extras.octree.point_glb import NO_BUILDING, NO_PLANE, NO_RESIDUAL, ModelledPoints, read_points_glb
+from pipeline.extras.overrides.rerun import RerunRequest, rerun
 from pipeline.quality.residuals import summarise
 from pipeline.quality.roof_returns import roof_returns
-from pipeline.runtime.classify import ClassifySummary
 from pipeline.runtime.manifest import RunStatus
 from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL, Resources
 from pipeline.runtime.run import RunSummary, run
-from pipeline.runtime.stages import tile_points
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM
 

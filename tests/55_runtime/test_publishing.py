@@ -6,8 +6,8 @@ from pathlib import Path
 import pyogrio
 import pytest
 
+from pipeline.extras.publish.publishing import publish_geopackage
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.publishing import publish_geopackage
 from pipeline.runtime.run import RunSummary
 
 

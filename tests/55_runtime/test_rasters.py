@@ -13,9 +13,9 @@ import rasterio
 from las_files import write_las
 
 from pipeline.errors import SettingsError
-from pipeline.export.raster import NO_VALUE, RasterLattice, write_cog
-from pipeline.runtime.classify import ClassifySummary
-from pipeline.runtime.stages.rasters import RASTERS
+from pipeline.extras.classify.classify import ClassifySummary
+from pipeline.extras.classify.raster_files import NO_VALUE, RasterLattice, write_cog
+from pipeline.extras.classify.rasters import RASTERS
 
 FOOT = 0.3048
 

@@ -16,9 +16,9 @@ from faults.asked import environment
 
 import pipeline.recipe
 from pipeline.errors import SettingsError, UnreadableInputError
+from pipeline.extras.papers.settings import FuzzySartSettings
 from pipeline.io.crs import SpatialReference
 from pipeline.methods import ReconstructSettings
-from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import Candidate, Guide, GuideKind, Status
 from pipeline.recipe import reconstruct_building
 from pipeline.roof.settings import ArrangementSettings, GuideSettings, RoofSettings

@@ -15,13 +15,13 @@ from run_tables import rows, write_footprints
 import pipeline.export.tile
 import pipeline.recipe
 from pipeline.errors import BuildingError, EmptyInputError, InconsistentInputError, InputError, RunError
+from pipeline.extras.overrides.rerun import RerunRequest, rerun
+from pipeline.extras.publish.publishing import publish_stac
 from pipeline.model import Reason
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.monitoring.events import Event
-from pipeline.runtime.publishing import publish_stac
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
 from pipeline.runtime.scratch.folder_lock import locked_results

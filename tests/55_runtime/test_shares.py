@@ -141,7 +141,7 @@ def test_a_window_of_a_remote_octree_is_the_window_of_the_file(
 def test_a_remote_octree_is_fetched_whole_where_no_part_of_it_will_do(
     site: Site, half: Box, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.io.remote_file.BLOCK_BYTES", 4096)
+    monkeypatch.setattr("pipeline.extras.remote.remote_file.BLOCK_BYTES", 4096)
     window = ReadOptions(bbox=half)
     assert is_fetched_by_nodes(open_source(site.url, window).info, window)
     x_min, y_min, _, x_max, y_max, _ = open_source(site.url).info.bounds_m

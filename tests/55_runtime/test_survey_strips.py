@@ -11,11 +11,11 @@ from command_line import invoke
 from plain_houses import AREAS_M2, SIDE_M, houses, write_houses
 from run_tables import rows
 
+from pipeline.extras.overrides.rerun import RerunRequest, rerun
 from pipeline.model import Reason
 from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import run
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.export.terrain import TerrainTriangles, read_terrain
+from pipeline.extras.overrides.rerun import RerunRequest, rerun
+from pipeline.extras.terrain_tin import terrain_output as terrain
+from pipeline.extras.terrain_tin.terrain_files import TerrainTriangles, read_terrain
 from pipeline.runtime.manifest import RunManifest, RunStatus
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import RunSummary
-from pipeline.runtime.stages import terrain
 
 Reconstruct = Callable[..., RunSummary]
 

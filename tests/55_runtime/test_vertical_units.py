@@ -14,14 +14,14 @@ from las_files import write_las
 
 from pipeline.errors import CrsError
 from pipeline.export.geoparquet import read_table
-from pipeline.export.terrain import read_terrain
+from pipeline.extras.publish.publishing import publish_geopackage, publish_pmtiles
+from pipeline.extras.publish_3dtiles.publishing_3dtiles import publish_3dtiles
+from pipeline.extras.terrain_tin.terrain_files import read_terrain
 from pipeline.io import ReadOptions, arrow_at
 from pipeline.io.crs import vertical_unit_of
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.plan import make_plan
-from pipeline.runtime.publishing import publish_geopackage, publish_pmtiles
-from pipeline.runtime.publishing_3dtiles import publish_3dtiles
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run

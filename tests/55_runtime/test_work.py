@@ -17,6 +17,7 @@ import pytest
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
+from pipeline.extras.overrides.rerun import RerunRequest, rerun
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.digest import run_digest
@@ -24,7 +25,6 @@ from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.monitoring.measurement import Measured
 from pipeline.runtime.plan import tiles_per_block
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.scratch.work_folder import is_at_work, locked_work

@@ -9,6 +9,7 @@ import shapely
 from shapely import Polygon, unary_union
 
 from pipeline.export.records import RecordContext, RejectedObject
+from pipeline.extras.lods.overhangs import overhanging_solids
 from pipeline.model import (
     BuildingResult,
     FaceKind,
@@ -25,7 +26,6 @@ from pipeline.model import (
     Status,
 )
 from pipeline.quality.validity import check_solid
-from pipeline.roof.overhangs import overhanging_solids
 from pipeline.roof.solid import SolidPart
 
 ORIGIN = (85_000.0, 447_000.0, 2.0)

@@ -14,11 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.export.cityjson import ATTRIBUTE_TYPES, cityjson_lines, lines_of
-from pipeline.export.cityjson_file import city_of
 from pipeline.export.columns import COLUMNS, KINDS, VERTICAL, Column, kind_of
 from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.records import KEYS, SCHEMAS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
+from pipeline.extras.publish.cityjson_file import city_of
 
 TABLES = list(COLUMNS)
 ALL = [column for columns in COLUMNS.values() for column in columns]

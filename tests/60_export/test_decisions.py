@@ -10,7 +10,7 @@ from small_buildings import Contexts
 
 from pipeline.export.decisions import DECISIONS, decision_rows, decisions_path, decisions_table
 from pipeline.export.tile import write_tile
-from pipeline.export.tile_update import updated_tile
+from pipeline.extras.overrides.tile_update import updated_tile
 from pipeline.model import BuildingResult, Decision, DecisionKind, Outcome
 from pipeline.runtime.digest import run_digest
 

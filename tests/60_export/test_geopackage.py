@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 
 from pipeline.errors import RunError
 from pipeline.export.columns import COLUMNS, HORIZONTAL, KINDS, TILE_COLUMN, VERTICAL, kind_of
-from pipeline.export.geopackage import (
+from pipeline.export.solid_geometry import SOLID_COLUMNS
+from pipeline.extras.publish_gis.geopackage import (
     GEOMETRY,
     LAYERS,
     STORED_TYPES,
@@ -32,8 +33,7 @@ from pipeline.export.geopackage import (
     stored_batch,
     stored_field,
 )
-from pipeline.export.qml import STYLES as ALL_STYLES
-from pipeline.export.solid_geometry import SOLID_COLUMNS
+from pipeline.extras.publish_gis.qml import STYLES as ALL_STYLES
 from pipeline.model import Reason, Status
 from pipeline.terrain.candidates import REASON_OF_FAULT
 

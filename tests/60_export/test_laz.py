@@ -7,7 +7,7 @@ import laspy
 import numpy as np
 import pytest
 
-from pipeline.export.laz import (
+from pipeline.extras.classify.laz_writing import (
     KEEP,
     NEWER_FORMAT,
     SCAN_ANGLE_UNIT_DEG,

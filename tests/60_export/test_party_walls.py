@@ -16,17 +16,17 @@ import small_buildings as small
 from command_line import invoke
 from small_runs import content, moved, restated, write_run
 
-import pipeline.runtime.party_walls as runs
+import pipeline.extras.party_walls.party_walls_of_run as runs
 from pipeline.errors import RunError, SettingsError
 from pipeline.export.geoparquet import read_table
-from pipeline.export.party_wall_tables import BUILDINGS, FACTS, WALLS, PartyWallFile
 from pipeline.export.records import RecordContext
 from pipeline.export.tile import write_tile
+from pipeline.extras.party_walls.party_wall_tables import BUILDINGS, FACTS, WALLS, PartyWallFile
+from pipeline.extras.party_walls.party_walls_of_run import party_walls
+from pipeline.extras.party_walls.settings import PartyWallSettings
 from pipeline.model import BuildingResult, Reason, Status
-from pipeline.party_walls.settings import PartyWallSettings
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus
-from pipeline.runtime.party_walls import party_walls
 from pipeline.runtime.run_tiles import TILES_IN_MEMORY
 
 TILES = 20

@@ -21,12 +21,12 @@ from small_runs import content, restated, write_run, write_whole_run
 from vector_tile import Feature, layers_of
 
 from pipeline.errors import RunError, SettingsError
-from pipeline.export import pmtiles
 from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, kind_of
 from pipeline.export.geoparquet import read_table
 from pipeline.export.projection import projection_to
+from pipeline.extras.publish.publishing import publish_pmtiles
+from pipeline.extras.publish_gis import pmtiles
 from pipeline.runtime.manifest import RunStatus
-from pipeline.runtime.publishing import publish_pmtiles
 
 RD = {"wkt": pyproj.CRS.from_epsg(28992).to_wkt()}
 BUILDINGS = {column.name: column for column in COLUMNS["buildings"]}

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.export.building_points import building_points
-from pipeline.export.point_glb import (
+from pipeline.extras.octree.building_points import building_points
+from pipeline.extras.octree.octree_tileset import TilesetNode, root_tileset
+from pipeline.extras.octree.point_glb import (
     MAX_STEP_MM,
     NO_BUILDING,
     NO_PLANE,
@@ -18,7 +19,6 @@ from pipeline.export.point_glb import (
     read_points_glb,
     united,
 )
-from pipeline.export.tileset import TilesetNode, root_tileset
 
 NAMES = ("ash", "birch", "cedar")
 

@@ -8,8 +8,8 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.export import point_octree
-from pipeline.export.point_octree import CELL_BITS, Cube, Octree, octree_of
+from pipeline.extras.octree import point_octree
+from pipeline.extras.octree.point_octree import CELL_BITS, Cube, Octree, octree_of
 
 pytestmark = pytest.mark.slow
 

@@ -14,17 +14,17 @@ import pytest
 from command_line import invoke
 from small_runs import content, moved, restated, street, write_run, write_whole_run
 
-import pipeline.runtime.publishing as publishing
+import pipeline.extras.publish.publishing as publishing
 from pipeline.errors import RunError, SettingsError
-from pipeline.export.cityjson_file import city_of
-from pipeline.export.geopackage import LAYERS, Layer, stored_batch
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import KEYS
 from pipeline.export.tile import write_tile
+from pipeline.extras.publish.cityjson_file import city_of
+from pipeline.extras.publish.publishing import publish_cityjson, publish_geopackage, publish_pmtiles
+from pipeline.extras.publish_gis.geopackage import LAYERS, Layer, stored_batch
 from pipeline.io import storage_at
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus
-from pipeline.runtime.publishing import publish_cityjson, publish_geopackage, publish_pmtiles
 
 
 @pytest.fixture

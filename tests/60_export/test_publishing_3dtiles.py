@@ -19,19 +19,25 @@ from glb_rules import chunks
 from small_runs import moved, reference_of, street, tiled_run
 
 from pipeline.errors import RunError, SettingsError
-from pipeline.export import globe_tileset
 from pipeline.export.dimensions import volume
 from pipeline.export.geoparquet import read_table
-from pipeline.export.property_table import BLOCK_COLUMNS, COLUMNS, STORED_TYPES, StoredColumn, stored_column
 from pipeline.export.records import SCHEMAS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
+from pipeline.extras.publish_3dtiles import globe_tileset
+from pipeline.extras.publish_3dtiles.globe import geodesy, to_globe
+from pipeline.extras.publish_3dtiles.property_table import (
+    BLOCK_COLUMNS,
+    COLUMNS,
+    STORED_TYPES,
+    StoredColumn,
+    stored_column,
+)
+from pipeline.extras.publish_3dtiles.publishing_3dtiles import publish_3dtiles
 from pipeline.io.crs import SpatialReference
-from pipeline.io.globe import geodesy, to_globe
 from pipeline.model import BuildingResult
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus, write_manifest
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.publishing_3dtiles import publish_3dtiles
 from pipeline.tiling import Tile
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -462,7 +468,7 @@ def test_a_broken_off_run_leaves_the_old_folder(run_dir: Path, tmp_path: Path, m
     def broken(*_: object) -> bytes:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pipeline.runtime.publishing_3dtiles.globe_tileset", broken)
+    monkeypatch.setattr("pipeline.extras.publish_3dtiles.publishing_3dtiles.globe_tileset", broken)
     with pytest.raises(KeyboardInterrupt):
         publish_3dtiles(str(run_dir), str(out), overwrite=True)
     assert files(tmp_path) == before

@@ -21,11 +21,11 @@ from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import RecordContext
 from pipeline.export.tile import write_tile
+from pipeline.extras.publish.selection import run_of, select_run
 from pipeline.io import storage_at
 from pipeline.model import BuildingResult, Doubt, Reason, Status
 from pipeline.runtime.manifest import RunManifest, RunStatus, write_manifest
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.selection import run_of, select_run
 
 DOUBT = Doubt.of(Reason.SCATTERED, "its roof returns scatter by 0.32 m, more than 0.15 m", "scatter_m", 0.32, 0.15)
 

@@ -21,23 +21,23 @@ from command_line import invoke
 from small_runs import moved, street, write_run
 from weather_files import write_epw
 
-import pipeline.runtime.solar as runs
+import pipeline.extras.solar.solar_of_run as runs
 from pipeline.errors import RunError, SettingsError
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import RecordContext
-from pipeline.export.solar_table import COLUMNS, FACTS, SolarFile
 from pipeline.export.tile import write_tile
+from pipeline.extras.solar.roof_planes import RoofPlanes
+from pipeline.extras.solar.settings import SolarSettings
+from pipeline.extras.solar.solar_of_run import solar
+from pipeline.extras.solar.solar_table import COLUMNS, FACTS, SolarFile
+from pipeline.extras.solar.true_north import convergence_deg
+from pipeline.extras.solar.weather import Site, clear_sky
 from pipeline.io import SpatialReference, storage_at
-from pipeline.io.true_north import convergence_deg
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus, write_manifest
 from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.run_tiles import TILES_IN_MEMORY
-from pipeline.runtime.solar import solar
-from pipeline.solar.roof_planes import RoofPlanes
-from pipeline.solar.settings import SolarSettings
-from pipeline.solar.weather import Site, clear_sky
 
 TILES = 20
 ENERGY = ("irradiation_kwh_m2", "irradiation_kwh", "beam_kwh_m2", "sky_kwh_m2", "ground_kwh_m2", "beam_loss")

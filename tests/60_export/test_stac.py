@@ -20,13 +20,13 @@ from pystac.validation.stac_validator import JsonSchemaSTACValidator
 from small_runs import content, restated, write_run, write_whole_run
 
 from pipeline.errors import RunError, SettingsError
-from pipeline.export import stac
 from pipeline.export.columns import COLUMNS
 from pipeline.export.geoparquet import read_table
 from pipeline.export.projection import projection_to
+from pipeline.extras.publish.publishing import publish_stac
+from pipeline.extras.publish_stac import stac
 from pipeline.io import storage_at
 from pipeline.runtime.manifest import InputFile, PointFileFacts, RunStatus
-from pipeline.runtime.publishing import publish_stac
 
 RD = {"wkt": pyproj.CRS.from_epsg(7415).to_wkt(), "epsg": 7415, "horizontal_unit_m": 1.0, "vertical_unit_m": 1.0}
 MADE = dt.datetime(2026, 1, 1, 2, tzinfo=dt.UTC)

@@ -8,8 +8,8 @@ import small_buildings as small
 from cityjson_rules import faults
 from surface_rules import surface_faults
 
-from pipeline.export import terrain
-from pipeline.export.terrain import in_crs, read_terrain, surfaces_of, terrain_lines, terrain_obj
+from pipeline.extras.terrain_tin import terrain_files as terrain
+from pipeline.extras.terrain_tin.terrain_files import in_crs, read_terrain, surfaces_of, terrain_lines, terrain_obj
 from pipeline.model import LabelArray
 
 NAMES = ("compound", "feet and metres", "US feet", "unknown")

@@ -10,7 +10,7 @@ from small_buildings import Contexts, RejectedObjects
 
 from pipeline.errors import RunError
 from pipeline.export.tile import write_tile
-from pipeline.export.tile_update import updated_tile
+from pipeline.extras.overrides.tile_update import updated_tile
 from pipeline.model import BuildingResult
 
 KEY = "x85_y447"

@@ -15,9 +15,9 @@ from pipeline import __version__
 from pipeline.cli.options import worker_count
 from pipeline.cli.party_walls import party_walls
 from pipeline.cli.solar import solar
+from pipeline.extras.party_walls.settings import PartyWallSettings
+from pipeline.extras.solar.settings import SolarSettings
 from pipeline.parameters import Parameters
-from pipeline.party_walls.settings import PartyWallSettings
-from pipeline.solar.settings import SolarSettings
 
 COMMANDS = (
     *("reconstruct", "rerun", "compare", "classify", "inspect", "simulate", "digest"),

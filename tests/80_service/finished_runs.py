@@ -21,11 +21,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "60_export"))
 
 import small_buildings as small
 
-from pipeline.export.point_glb import NO_BUILDING, NO_PLANE, NO_RESIDUAL, ModelledPoints, points_glb
-from pipeline.export.point_octree import OctreeNode
 from pipeline.export.records import RecordContext, RejectedObject
 from pipeline.export.tile import write_tile
-from pipeline.export.tileset import TilesetNode, root_tileset, tile_tileset
+from pipeline.extras.octree.octree_tileset import TilesetNode, root_tileset, tile_tileset
+from pipeline.extras.octree.point_glb import NO_BUILDING, NO_PLANE, NO_RESIDUAL, ModelledPoints, points_glb
+from pipeline.extras.octree.point_octree import OctreeNode
 from pipeline.model import BuildingResult, Reason
 from pipeline.runtime.manifest import InputFile, PointFileFacts, RunManifest, RunStatus, write_manifest
 from service.app import create_app

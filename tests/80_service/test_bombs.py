@@ -27,8 +27,8 @@ from live_service import las_bytes
 from processes import wait_for
 
 from pipeline.errors import EmptyInputError, InputError, UnreadableInputError
+from pipeline.extras.footprints.footprints_file import read_footprints
 from pipeline.io import SpatialReference
-from pipeline.io.footprints import read_footprints
 from service import vectors
 from service.errors import LimitError, TooLargeError
 from service.preflight import CHILD_S, Examiner, examine

@@ -14,9 +14,9 @@ from driver_bench import Bench
 from live_service import las_bytes
 from test_comparisons import execute, faults_of
 
-from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
+from pipeline.extras.classify.classify import ClassifyRequest, ClassifySummary, classify
+from pipeline.extras.classify.write_classified import ClassifiedFile
 from pipeline.runtime.resources import Resources
-from pipeline.runtime.stages.write_classified import ClassifiedFile
 from service.driver.attempt import classify_request
 from service.driver.messages import Scrubber, classification_outcome
 from service.fetching import Fetched, JobFiles

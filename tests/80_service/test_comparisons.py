@@ -17,8 +17,8 @@ from starlette.testclient import TestClient
 
 from pipeline.backoff import Backoff
 from pipeline.errors import ClusterError, SettingsError
+from pipeline.extras.compare import compare
 from pipeline.methods import METHODS
-from pipeline.runtime import compare
 from service.driver.attempt import compare_request
 from service.fetching import JobFiles
 from service.jobs import Fault, InputReference, JobRequest, JobStatus

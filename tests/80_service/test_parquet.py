@@ -16,8 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import CrsError, EmptyInputError, InputError, UnreadableInputError
+from pipeline.extras.footprints.footprints_file import read_footprints
 from pipeline.io import SpatialReference
-from pipeline.io.footprints import read_footprints
 from service import parquet
 from service.errors import LimitError, TooLargeError
 from service.filenames import clean_filename

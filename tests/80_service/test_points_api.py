@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from pipeline.export.point_glb import NO_BUILDING, read_points_glb
+from pipeline.extras.octree.point_glb import NO_BUILDING, read_points_glb
 from service.keys import Scope, new_key
 
 GABLE = runs.ident("gable")

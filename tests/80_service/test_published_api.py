@@ -18,8 +18,8 @@ from starlette.testclient import TestClient
 
 from pipeline.errors import RunCancelledError
 from pipeline.export.glb_container import read_document
+from pipeline.extras.party_walls.party_walls_of_run import party_walls
 from pipeline.runtime.manifest import RunStatus
-from pipeline.runtime.party_walls import party_walls
 from service.keys import Scope, new_key
 from service.outputs import published
 from service.outputs.kinds import FORMATS, ON_REQUEST, OUTPUTS

@@ -16,13 +16,12 @@ import pytest
 from client_site import Site
 from command_line import app
 from processes import wait_for
+from publishing import disk_at
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-import pipeline.runtime.publishing
-import pipeline.runtime.selection
+from pipeline.extras.publish import publishing, selection
 from pipeline.model import Doubt, Reason, Status
-from pipeline.runtime.publishing import disk_at
 from service.errors import SelectionBusyError
 from service.outputs import selected
 
@@ -185,7 +184,11 @@ def test_a_disk_that_fills_up_meanwhile_is_said_and_no_output_stays_missing(
             raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline.runtime.selection if fails == "select_run" else pipeline.runtime.publishing, fails, full)
+        patch.setattr(
+            selection if fails == "select_run" else publishing,
+            fails,
+            full,
+        )
         code = selected.main()
     assert not place.exists()
     assert list(place.parent.iterdir()) == []

@@ -19,7 +19,7 @@ from object_store import environment as environment_of
 from processes import Program, Programs, free_port, program
 from typer.testing import CliRunner
 
-from pipeline.io.urls import filesystem_of
+from pipeline.extras.remote.urls import filesystem_of
 from pipeline.runtime.digest import run_digest
 
 STAGES = ("ingest", "split", "reconstruct", "publish")

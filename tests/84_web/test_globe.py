@@ -17,7 +17,7 @@ from finished_jobs import finished_job
 from processes import missing, program
 
 from pipeline.export.geoparquet import read_table
-from pipeline.export.terrain import read_terrain
+from pipeline.extras.terrain_tin.terrain_files import read_terrain
 
 pytestmark = [pytest.mark.slow]
 

@@ -18,9 +18,9 @@ from benchmarks.entries import (
     sweep_entries,
 )
 from benchmarks.ruler import cell, methods_table
+from pipeline.extras.compare.compare import Variant, settings_of
 from pipeline.methods import METHODS
 from pipeline.ruler.simulation.sweep import CELLS
-from pipeline.runtime.compare import Variant, settings_of
 
 FUZZY = Variant(method="fuzzy-sart")
 

@@ -18,7 +18,7 @@ from benchmarks.run_scores import RunScore, valid_by_val3dity
 from benchmarks.survey_runs import Seconds, candidates_of, run_survey
 from benchmarks.thinned_surveys import kept, place_hash, thinned, write_changed
 from pipeline.export.geoparquet import read_table
-from pipeline.runtime.compare import Variant
+from pipeline.extras.compare.compare import Variant
 
 FUZZY = Variant(method="fuzzy-sart")
 

@@ -60,7 +60,7 @@ STAGES = {
 BUILDINGS = "pipeline.recipe"
 """The module that models one building."""
 
-URLS = "pipeline.io.urls"
+URLS = "pipeline.extras.remote.urls"
 """The module with the time-out of servers."""
 
 

@@ -31,8 +31,8 @@ from pipeline.runtime.stages.sites import CandidateSite, StoredGroup
 from pipeline.tiling import TileGrid
 
 if TYPE_CHECKING:
+    from pipeline.extras.overrides.overrides_file import OwnModelling
     from pipeline.runtime.isolation.replay_bundle import Bundle, Incident
-    from pipeline.runtime.overrides.overrides_file import OwnModelling
 
 _BUNDLE_TIMEOUT_S = 60.0
 _NO_BUNDLE = "there is no bundle, since its points cannot be put together"

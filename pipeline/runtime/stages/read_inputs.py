@@ -30,7 +30,7 @@ from pipeline.terrain.strip_moves import moves_of, offsets_of, strips_warning, s
 from pipeline.terrain.survey_strips import NO_ROWS, Rows, counted, rows_of
 
 if TYPE_CHECKING:
-    from pipeline.runtime.stages.given_footprints import GivenFootprints
+    from pipeline.extras.footprints.given_footprints import GivenFootprints
 
 _STRIPS = "strips"
 """The stage under which it is stored how strips that were moved differ in the files."""

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from pipeline.registry import extra
 from pipeline.runtime.plan import split_grid, window_bytes
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.kept_files import Files
@@ -24,7 +25,7 @@ from pipeline.terrain.scene_settings import ClassesInUse
 from pipeline.tiling import Tile, TileGrid
 
 if TYPE_CHECKING:
-    from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
+    from pipeline.extras.footprints.given_footprints import GivenFootprints, Outline
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -84,10 +85,8 @@ def split(
     polygons: Sequence[Outline] = ()
     numbers: Mapping[Tile, Sequence[int]] = {}
     if footprints is not None:
-        from pipeline.runtime.stages.given_footprints import numbers_by_tile
-
         polygons = footprints.polygons
-        numbers = numbers_by_tile(tiles, plan.grid, polygons)
+        numbers = extra("numbers_by_tile")(tiles, plan.grid, polygons)
     # the fullest first, so that no long task is left for the end
     order = [tile for tile, _ in sorted(tiles.items(), key=lambda item: (-item[1], item[0]))]
     outlines = {tile: None if footprints is None else tuple(polygons[k] for k in numbers[tile]) for tile in order}
