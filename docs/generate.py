@@ -22,6 +22,7 @@ from pipeline.extras.party_walls import party_wall_tables
 from pipeline.extras.publish_gis import geopackage, pmtiles
 from pipeline.extras.solar import solar_table
 from pipeline.methods import METHODS
+from pipeline.model import REASONS, Reason
 from pipeline.parameters import Parameters
 from pipeline.quality import validity as checker
 from pipeline.ruler.epochs import records as changes_of
@@ -29,6 +30,7 @@ from pipeline.ruler.epochs.settings import DiffSettings
 from pipeline.ruler.evaluation.chapters import TITLES
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.settings import SECTIONS, GeneralSettings
+from pipeline.terrain.candidates import REASON_OF_FAULT
 from service.cli import COMMANDS
 
 REFERENCE = Path(__file__).resolve().parent / "reference"
@@ -243,8 +245,20 @@ def service_settings() -> list[list[object]]:
     return rows
 
 
+def outputs() -> list[list[object]]:
+    """Rows of the table of outputs."""
+    from service.outputs.kinds import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, OUTPUTS
+
+    kinds = {"reconstruct": OUTPUTS, "compare": COMPARISON_OUTPUTS, "classify": CLASSIFICATION_OUTPUTS}
+    return [
+        [process, f"`{kind.output_id}`", f"`{kind.media_type}`", f"`{kind.filename}`", kind.title]
+        for process, found in kinds.items()
+        for kind in found.values()
+    ]
+
+
 def service() -> str:
-    """The page of the service: paths, problems, keys, settings."""
+    """The page of the service: paths, outputs, problems, keys, settings."""
     from service.keys import Scope
     from service.problems import FAILURES, FOREIGN, INTERNAL, KINDS
     from service.routes.landing import CLASSES
@@ -267,6 +281,13 @@ def service() -> str:
         "*Key* says whether a key is needed if the service has keys.",
         "",
         *table(["path", "what it does", "key", "answers"], paths()),
+        "",
+        "## Outputs",
+        "",
+        "The results of a job, by process: [how to get them](../how_to/results_by_rest.md). `/processes/{processID}`",
+        "describes each one.",
+        "",
+        *table(["process", "output", "media type", "file", "content"], outputs()),
         "",
         "## Conformance",
         "",
@@ -299,6 +320,36 @@ def service() -> str:
         "Environment variables; options of `gablework serve` and `gablework driver` override them. Lists are JSON.",
         "",
         *table(["variable", "default", "meaning"], service_settings()),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def reasons() -> str:
+    """The page of reasons: those of buildings, then those of rejected objects."""
+    rejected = {*REASON_OF_FAULT.values(), Reason.STRIPS_DISAGREE, Reason.OVERRIDDEN}
+    modelled = {Reason.TOO_FEW_POINTS, *Reason} - (rejected - {Reason.TOO_FEW_POINTS})
+
+    def rows(chosen: set[Reason]) -> list[list[object]]:
+        return [[f"`{reason.value}`", meaning] for reason, meaning in REASONS.items() if reason in chosen]
+
+    lines = [
+        NOTE,
+        "# Reasons",
+        "",
+        "The list is closed; `reason_detail` has the figure and the threshold. [Records](records.md#status) has the",
+        "statuses, [poisonous buildings](../how_to/poisonous_buildings.md) shows how to replay a bundle.",
+        "",
+        "## Buildings",
+        "",
+        "Why a candidate is `doubtful`, `fallback` or `failed`.",
+        "",
+        *table(["reason", "meaning"], rows(modelled)),
+        "",
+        "## Rejected objects",
+        "",
+        "Why an object is not a building.",
+        "",
+        *table(["reason", "meaning"], rows(rejected)),
     ]
     return "\n".join(lines) + "\n"
 
@@ -533,6 +584,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "measures.md": measures,
     "changes.md": changes,
     "columns.md": columns,
+    "reasons.md": reasons,
     "solar.md": solar,
     "party_walls.md": party_walls,
 }
