@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,8 @@ from pipeline.settings import SECTIONS, GeneralSettings
 from pipeline.terrain.candidates import REASON_OF_FAULT
 from service.cli import COMMANDS
 
+USUAL = ("400", "401", "403", "404", "422", "429", "500", "503")
+"""Answers that most paths give, and that the table of paths leaves out."""
 REFERENCE = Path(__file__).resolve().parent / "reference"
 NOTE = "<!-- Written by `make docs` from the code; do not edit. -->"
 
@@ -108,18 +111,36 @@ def commands(group: Any | None = None, prefix: str = "") -> dict[str, Any]:
     return dict(sorted(found.items()))
 
 
+def first_name(row: tuple[str, str, str]) -> str:
+    """The first name of an option, from its row."""
+    return row[0].split()[0].rstrip(",")
+
+
 def command_line() -> str:
     """The page of the command line."""
-    lines = [NOTE, "# The command line", ""]
-    lines += ["`gablework COMMAND --help` prints the same. How commands end: [exit codes](exit_codes.md).", ""]
-    for name, command in commands().items():
-        rows: list[list[object]] = [
-            [option_names(parameter), default_of(parameter), getattr(parameter, "help", "") or ""]
+    header = ["option", "default", "meaning"]
+    rows = {
+        name: [
+            (option_names(parameter), default_of(parameter), getattr(parameter, "help", "") or "")
             for parameter in command.params
             if parameter.name != "help"
         ]
+        for name, command in commands().items()
+    }
+    counts = Counter(row for found in rows.values() for row in found if row[0].startswith("`--"))
+    # of the meanings of one option, only the most frequent is shared
+    often = {first_name(row): row for row, count in sorted(counts.items(), key=lambda item: item[1]) if count > 1}
+    shared = sorted(often.values())
+    lines = [NOTE, "# The command line", ""]
+    lines += ["`gablework COMMAND --help` prints the same. How commands end: [exit codes](exit_codes.md).", ""]
+    for name, command in commands().items():
         lines += [f"## gablework {name}", "", (command.help or "").strip(), ""]
-        lines += [*table(["option", "default", "meaning"], rows), ""]
+        own = [row for row in rows[name] if row not in shared]
+        others = [first_name(row) for row in rows[name] if row in shared]
+        lines += [*table(header, [list(row) for row in own]), ""] if own else []
+        lines += [f"[Shared options](#shared-options): {', '.join(others)}.", ""] if others else []
+    lines += ["## Shared options", "", "Options that mean the same in several commands.", ""]
+    lines += [*table(header, [list(row) for row in shared]), ""]
     return "\n".join(lines)
 
 
@@ -139,6 +160,12 @@ def allowed(field: dataclasses.Field[Any]) -> str:
     return f"up to {high:g}" if low is None else f"{low:g} to {high:g}"
 
 
+def allowed_with_unit(field: dataclasses.Field[Any]) -> str:
+    """The values that a setting accepts, with their unit."""
+    values, unit = allowed(field), field.metadata["unit"]
+    return f"{values} {unit}".rstrip() if values != "any" else ", ".join(filter(None, (values, unit)))
+
+
 def toml(value: object) -> str:
     """A default as TOML writes it."""
     if isinstance(value, tuple):
@@ -156,10 +183,8 @@ def sections() -> dict[str, list[list[object]]]:
             [
                 f"`{field.name}`",
                 toml(field.default),
-                field.metadata["unit"],
-                allowed(field),
-                "yes" if field.metadata["changes_geometry"] else "no",
-                field.metadata["doc"],
+                allowed_with_unit(field),
+                field.metadata["doc"] + ("" if field.metadata["changes_geometry"] else " (not hashed)"),
             ]
             for field in dataclasses.fields(kind)
         ]
@@ -184,10 +209,10 @@ def settings() -> str:
         "min_area_m2 = 15.0",
         "```",
         "",
-        "Values that cannot change results (*no* under *geometry*) are not part of the `settings_hash`.",
+        "*Not hashed* marks values that cannot change geometry; they are not part of the `settings_hash`.",
         "",
     ]
-    header = ["setting", "default", "unit", "allowed", "geometry", "meaning"]
+    header = ["setting", "default", "allowed", "meaning"]
     for name, rows in sections().items():
         lines += [f"## [{name}]", "", *table(header, rows), ""]
     return "\n".join(lines)
@@ -227,7 +252,7 @@ def paths() -> list[list[object]]:
     for path, item in create_app(ServiceSettings()).openapi()["paths"].items():
         for method, operation in item.items():
             needs_key = "yes" if "security" in operation else "no"
-            answers = ", ".join(operation["responses"])
+            answers = ", ".join(status for status in operation["responses"] if status not in USUAL)
             rows.append([f"`{method.upper()} {path}`", operation["summary"], needs_key, answers])
     return rows
 
@@ -278,7 +303,8 @@ def service() -> str:
         "",
         "## Paths",
         "",
-        "*Key* says whether a key is needed if the service has keys.",
+        "*Key* says whether a key is needed if the service has keys. *Answers* leaves out those that most paths give:",
+        f"{', '.join(USUAL)}.",
         "",
         *table(["path", "what it does", "key", "answers"], paths()),
         "",
@@ -377,11 +403,11 @@ def measures() -> str:
     ]
     for group, title in TITLES.items():
         rows: list[list[object]] = [
-            [f"`{one.name}`", one.label, one.unit, str(one.better), one.formula]
+            [f"`{one.name}`", one.label, ", ".join(filter(None, (one.unit, str(one.better)))), one.formula]
             for one in DEFINITIONS.values()
             if one.group is group
         ]
-        lines += [f"## {title}", "", *table(["measure", "what", "unit", "better", "formula"], rows), ""]
+        lines += [f"## {title}", "", *table(["measure", "what", "unit, better", "formula"], rows), ""]
     return "\n".join(lines)
 
 
@@ -397,30 +423,24 @@ def batch_file() -> str:
     ]
     own: dict[str, list[list[object]]] = {
         "inputs": [
-            ["`paths`", "required", "", "a list", "Files, folders or patterns of point clouds."],
-            [
-                "`bbox`",
-                "none",
-                "",
-                "four numbers",
-                "Only this rectangle: x_min, y_min, x_max, y_max in the CRS's units.",
-            ],
+            ["`paths`", "required", "a list", "Files, folders or patterns of point clouds."],
+            ["`bbox`", "none", "four numbers", "Only this rectangle: x_min, y_min, x_max, y_max in the CRS's units."],
         ]
     }
     for name, kind in TABLES.items():
         rows = own.get(name, []) + [
-            [f"`{field.name}`", toml(field.default), field.metadata["unit"], allowed(field), field.metadata["doc"]]
+            [f"`{field.name}`", toml(field.default), allowed_with_unit(field), field.metadata["doc"]]
             for field in dataclasses.fields(kind)
         ]
         about = (kind.__doc__ or "").strip().split(": ", 1)[-1]
         lines += ["", f"## `[{name}]`", "", f"{about[:1].upper()}{about[1:]}", ""]
-        lines += table(["key", "default", "unit", "allowed", "meaning"], rows)
+        lines += table(["key", "default", "allowed", "meaning"], rows)
     return "\n".join(lines) + "\n"
 
 
 def setting_row(field: dataclasses.Field[Any]) -> list[object]:
     """A threshold of `gablework batch diff`."""
-    return [f"`{field.name}`", toml(field.default), field.metadata["unit"], allowed(field), field.metadata["doc"]]
+    return [f"`{field.name}`", toml(field.default), allowed_with_unit(field), field.metadata["doc"]]
 
 
 def changes() -> str:
@@ -477,7 +497,7 @@ def changes() -> str:
         "The table `[diff]` of a `--settings` file; it holds only values that differ.",
         "",
         *table(
-            ["setting", "default", "unit", "allowed", "meaning"],
+            ["setting", "default", "allowed", "meaning"],
             [setting_row(field) for field in dataclasses.fields(DiffSettings)],
         ),
     ]

@@ -86,7 +86,7 @@ def test_the_reference_says_defaults_that_are_words_and_all_values_of_numbers_th
     workers = {line.split(" | ")[1] for line in lines if line.startswith("| `--workers` N\\|auto | ")}
     # commands of the pipeline have a default of their own, those of the service take what the environment says
     assert workers == {"`auto`", ""}
-    assert '| `workers` | `"auto"` |  | `auto`, or 0 to 1024 |' in (DOCS / "reference" / "batch_file.md").read_text()
+    assert '| `workers` | `"auto"` | `auto`, or 0 to 1024 |' in (DOCS / "reference" / "batch_file.md").read_text()
 
 
 def test_every_setting_of_every_stage_is_in_the_reference(generator: ModuleType) -> None:
