@@ -1,4 +1,4 @@
-"""Which strips a survey has: those of its ids, and of an id that several passes share, its passes by GPS time."""
+"""The strips of a survey: one per id, or one per pass (by GPS time) if several passes share an id."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Squares of the lattice, small enough to be level ground or one roof plane: a plane of the points of each strip."""
+"""Fits a plane per strip in squares of the lattice, small enough to be level ground or one roof plane."""
 
 from __future__ import annotations
 

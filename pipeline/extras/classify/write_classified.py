@@ -1,4 +1,4 @@
-"""Classified files: every input read again and written as LAZ 1.4, its points unchanged but for their classes."""
+"""Classified files: every input read again and written as LAZ 1.4, its points unchanged except for their classes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Features of a vector file, placed in the CRS of a run: where to look for them, and their geometries in metres."""
+"""Features of a vector file, placed in the CRS of a run: the area to search, and their geometries in metres."""
 
 from __future__ import annotations
 
