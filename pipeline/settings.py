@@ -33,7 +33,7 @@ class GeneralSettings(Parameters):
     method: str = parameter("arrangement", "The method that models the buildings.", choices=tuple(METHODS))
     preset: str = parameter(
         "robust",
-        "Defaults of the method's settings: those that measured better, or those of its paper.",
+        "Defaults of the method's settings: the ones that measured better, or the paper's.",
         choices=PRESETS,
         changes_geometry=False,
     )

@@ -19,7 +19,7 @@ def worker(
         str, typer.Option(metavar="BYTES", help="Memory of the process, such as 4GiB; auto, or 0 for none.")
     ] = "auto",
     local_directory: Annotated[
-        str | None, typer.Option(metavar="DIR", help="Where the worker keeps its own files; default temporary.")
+        str | None, typer.Option(metavar="DIR", help="Folder of the worker's own files; default temporary.")
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name in the scheduler's lists; default its address.")] = None,
     host: Annotated[

@@ -170,7 +170,7 @@ BUILDINGS = (
         "footprint_share",
         FLOAT64,
         SHARE,
-        "plan area over that of the given footprint: 1 if the model fills it, less if a part without points "
+        "plan area over the area of the given footprint: 1 if the model fills it, less if a part without points "
         "was left out, more only if a block uses its convex hull; null without a given footprint or without a"
         " model",
         page="../methods/solids.md#parts-without-points",
@@ -190,8 +190,8 @@ BUILDINGS = (
         "detection_confidence",
         FLOAT64,
         SHARE,
-        "probability, from 0 to 1, that this object is a building; of a block that of the doubtful "
-        "model that it replaced; null for other blocks, without a model, and if a given "
+        "probability, from 0 to 1, that this object is a building; for a block the confidence of the doubtful model "
+        "that it replaced; null for other blocks, without a model, and if a given "
         "footprint or an override (`accept`, `footprint`) says that it is one",
         page="records.md#confidence-of-a-detection",
     ),
@@ -265,7 +265,7 @@ BUILDINGS = (
         "bic_margin",
         FLOAT64,
         NONE,
-        "information criterion of the other form (templates or arrangement) minus that of the chosen form; "
+        "information criterion of the other form (templates or arrangement) minus the chosen form's; "
         "negative if the better one made no valid solid; null if none competed or a third form was delivered",
     ),
     Column(
@@ -478,7 +478,7 @@ DECISIONS = (
         "bic_margin",
         FLOAT64,
         NONE,
-        "by how much the information criterion is below that of the form it competed with; negative where it is above",
+        "information criterion of the form it competed with minus its own; negative where its own is higher",
     ),
     Column("validity_codes", INT32S, NONE, "codes of the faults of an `invalid` form", required=True),
 )

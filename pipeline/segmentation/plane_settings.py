@@ -118,7 +118,7 @@ class PlaneRefinementSettings(Parameters):
     )
     assignment: str = parameter(
         "neighbours",
-        "Which planes a point chooses among: those of its neighbours, or all planes of the building (the nearest).",
+        "Planes that a point chooses among: its neighbours' planes, or all planes of the building (the nearest).",
         choices=("neighbours", "all_planes"),
     )
     min_area_m2: float = parameter(

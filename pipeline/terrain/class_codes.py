@@ -25,7 +25,7 @@ class ClassCodeSettings(Parameters):
     )
     undecided: tuple[int, ...] = parameter(
         (0, 1, 12, 19),
-        "Codes without information: such points are judged by their own evidence, as are those of codes in no list.",
+        "Codes without information: such points are judged by their own evidence, as are points with codes in no list.",
         minimum=0,
         maximum=255,
     )
