@@ -23,7 +23,7 @@ from pipeline.console import ExitCode
 from pipeline.runtime.isolation.child_pool import ChildPool
 from pipeline.runtime.isolation.messages import Finished
 from pipeline.runtime.isolation.supervision import EndCause
-from pipeline.runtime.monitoring.events import never
+from pipeline.runtime.monitoring.progress import never
 
 OUTCOMES = ("named refusal", "run", "internal", "invalid", "crash", "hang")
 GOOD = OUTCOMES[:2]

@@ -1,6 +1,6 @@
 """Writes the pages of docs/reference/ that can be generated from the code.
 
-`make docs` runs it; tests/00_house/test_docs.py fails if a page differs from the code.
+`make docs` runs it; tests/house/test_docs.py fails if a page differs from the code.
 """
 
 from __future__ import annotations

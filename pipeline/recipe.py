@@ -16,8 +16,7 @@ import numpy as np
 import shapely
 
 from pipeline.building.drawing import Building, blocks, own_model
-from pipeline.building.form_search import first_valid, too_few_points, withdraw
-from pipeline.building.judging import judged
+from pipeline.building.form_search import first_valid, judged, too_few_points, withdraw
 from pipeline.building.record import delivered, failed_building, record_of
 from pipeline.errors import BuildingError
 from pipeline.methods import ReconstructSettings, method_named

@@ -32,14 +32,8 @@ from pipeline.extras.vector_files.gdal_source import (
 )
 from pipeline.extras.vector_files.nearby import POLYGONS as SHAPE_OF_FOOTPRINTS
 from pipeline.extras.vector_files.vector_archive import ZIP_MAGIC, refuse_without_vectors, unpacked, vector_members
-from pipeline.io.crs import parse_crs
-from pipeline.io.formats import (
-    ARCHIVE_SUFFIXES,
-    GEOJSON_SUFFIXES,
-    LINES_SUFFIXES,
-    PARQUET_SUFFIXES,
-    XML_SUFFIXES,
-)
+from pipeline.io.crs_given import parse_crs
+from pipeline.io.formats import ARCHIVE_SUFFIXES, GEOJSON_SUFFIXES, LINES_SUFFIXES, PARQUET_SUFFIXES, XML_SUFFIXES
 from pipeline.io.library_faults import in_our_words, shortened
 from service.errors import TooLargeError
 

@@ -25,13 +25,12 @@ from pipeline.runtime.cluster.performance_report import PerformanceReport
 from pipeline.runtime.engine import Engine, engine_of
 from pipeline.runtime.expected import RATES, expected
 from pipeline.runtime.forecast import WORTH_S, forecast
-from pipeline.runtime.monitoring.events import ignore
-from pipeline.runtime.monitoring.machine import cores, memory_bytes
-from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.monitoring.measurement import cores, memory_bytes
+from pipeline.runtime.monitoring.progress import Progress, ignore
 from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.request import plan_inputs
 from pipeline.runtime.resources import Resources
-from pipeline.runtime.run import check_out
+from pipeline.runtime.run_directory import check_out
 from pipeline.runtime.scratch.folder import POINT
 from pipeline.runtime.scratch.work_folder import refuse_foreign
 from pipeline.tiling import MM

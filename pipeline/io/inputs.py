@@ -9,11 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import InputError, UnreadableInputError, all_at_fault
-from pipeline.io.formats import (
-    files_in,
-    first_bytes,
-    is_index,
-)
+from pipeline.io.formats import files_in, first_bytes, is_index
 from pipeline.io.locations import is_url, shown
 from pipeline.registry import extra
 

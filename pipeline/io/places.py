@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.io.locations import is_url
-from pipeline.io.readable import Readable
+from pipeline.io.records import Readable
 from pipeline.io.storage import LocalStorage, Storage
 from pipeline.io.temporary import temporary_folder
-from pipeline.registry import extra
 
 if TYPE_CHECKING:
     import pyarrow.fs as pafs
+from pipeline.io.locations import is_url
+from pipeline.registry import extra
 
 
 def storage_at(place: str | Path) -> Storage:

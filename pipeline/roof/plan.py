@@ -35,13 +35,7 @@ from pipeline.roof.eaves import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
 from pipeline.roof.footprint import footprint_in_mm, in_footprint, outline
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels, nearest_points
-from pipeline.roof.partition import (
-    OUTSIDE,
-    MinAreas,
-    RoofPartition,
-    absorb_small_regions,
-    march,
-)
+from pipeline.roof.partition import OUTSIDE, MinAreas, RoofPartition, absorb_small_regions, march
 from pipeline.roof.settings import ArrangementSettings, RoofSettings
 from pipeline.tin.delaunay import triangulate
 

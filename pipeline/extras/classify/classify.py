@@ -31,12 +31,12 @@ from pipeline.extras.classify.write_classified import (
 )
 from pipeline.extras.footprints.given_footprints import footprints_of_run
 from pipeline.io import is_url, shown
+from pipeline.options import InputFiles, InputOptions, values_of
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.preloading import loads_of
-from pipeline.runtime.monitoring.events import Listener, ignore, never
 from pipeline.runtime.monitoring.measurement import peak_of_process
-from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.monitoring.progress import Listener, Progress, ignore, never
 from pipeline.runtime.request import RunRequest, plan_inputs
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run_context import RunContext, run_context
@@ -58,7 +58,7 @@ _SCRATCH = "scratch"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ClassifyRequest:
+class ClassifyRequest(InputFiles, InputOptions):
     """What to classify, and how."""
 
     inputs: tuple[str, ...]
@@ -69,16 +69,6 @@ class ClassifyRequest:
     """Whether every input is a point cloud; folders, patterns and tile indexes are then refused."""
     settings: RunSettings = dataclasses.field(default_factory=RunSettings)
     """All settings; those of methods have no effect."""
-    footprints: str | None = None
-    """A vector file of building outlines; then only points inside them become buildings."""
-    footprints_layer: str | None = None
-    """Their layer, where the file has several; None for the only one."""
-    crs: str | None = None
-    """Overrides the CRS in the headers, and is written."""
-    vertical_unit: str | None = None
-    """Overrides the vertical unit in the headers."""
-    allow_outside_area_of_use: bool = False
-    """Accept inputs that lie far outside the area of use of their CRS."""
     rasters: bool = False
     """Also write rasters of terrain, surface and height."""
     raster_cell: float | None = None
@@ -146,10 +136,8 @@ def classify(
         only_files=request.only_files,
         out=request.out,
         settings=request.settings,
-        crs=request.crs,
-        vertical_unit=request.vertical_unit,
-        allow_outside_area_of_use=request.allow_outside_area_of_use,
         resources=request.resources,
+        **values_of(InputOptions, request),
     )
     plan, paths = plan_inputs(run_request, progress, cancelled, executor)
     for path in paths:

@@ -20,12 +20,17 @@ from pipeline.extras.classify.point_classes import PointClass, PointEvidence, cl
 from pipeline.model import BoolArray, ByteArray, IntArray, Reason
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.sites import Joined, PointRange, StoredGroup, StoredRejected
-from pipeline.runtime.stages.surroundings import surroundings_of, terrain_around
-from pipeline.runtime.stages.window_points import LoadedWindow, bucket_paths, load_window
+from pipeline.runtime.stages.window_points import (
+    LoadedWindow,
+    bucket_paths,
+    load_window,
+    surroundings_of,
+    terrain_around,
+)
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, VEGETATION_CLASSES, WindowPoints
 from pipeline.terrain.ground import ground_points
 from pipeline.terrain.lattice import height_above
-from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
+from pipeline.terrain.settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 FOLDER = "classes"

@@ -18,8 +18,7 @@ from pipeline.io import LocalStorage, SpatialReference
 from pipeline.io.crs_units import unit_name
 from pipeline.model import BoolArray
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.stages.surroundings import Surroundings, surroundings_of
-from pipeline.runtime.stages.window_points import load_window
+from pipeline.runtime.stages.window_points import Surroundings, load_window, surroundings_of
 from pipeline.scene import WindowPoints
 from pipeline.terrain.ground import slopes_of
 from pipeline.terrain.lattice import CELL_MM, height_above

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.smallest_eigenvalue import smallest_eigenvalue
+from pipeline.kernels.normal_equations import smallest_eigenvalue
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray
-from pipeline.terrain.binning import points_by_cell
+from pipeline.spatial_hash import points_by_cell
 
 # Not settings: the weights below belong to them.
 NEAR_MM, AROUND_MM, FAR_MM = 3000, 6000, 10_000

@@ -14,9 +14,10 @@ from pipeline.methods import METHODS, PRESETS, method_named
 from pipeline.parameters import build
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.manifest import NAME as MANIFEST
-from pipeline.runtime.monitoring.events import Listener, ignore, never
+from pipeline.runtime.monitoring.progress import Listener, ignore, never
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.run import RunSummary, RunVariant, run_variants
+from pipeline.runtime.run import RunSummary, begin, find_candidates, finish, publish_models, under_way
+from pipeline.runtime.stages.reconstruct import reconstruct
 from pipeline.settings import RunSettings
 
 RUNS = "runs"
@@ -127,30 +128,78 @@ def compare(
 ) -> CompareSummary:
     """Model the candidates of the inputs by several methods; arguments and errors as in `pipeline.runtime.run.run`."""
     out = _checked(request.run)
-    variants = [
-        run_variant(request.run.settings, variant, str(out / RUNS / variant.label), request.tables)
+    ways = {
+        variant: (str(out / RUNS / variant.label), settings_of(request.run.settings, variant, request.tables))
         for variant in request.variants
-    ]
+    }
     # should the new runs fail, the page of an earlier comparison must not pass for theirs
     outdated = [out / name for name in _WRITTEN]
     run_request = dataclasses.replace(request.run, out=str(out))
-    outcomes = run_variants(run_request, variants, on_event, executor, cancelled, outdated)
+    results = run_variants(run_request, ways, on_event, executor, cancelled, outdated)
+    labels = {variant.label for variant in ways}
     for run_dir in (out / RUNS).iterdir():
         # runs of other methods, left by an earlier comparison, are not part of this one
-        if run_dir.name not in {variant.label for variant in variants} and (run_dir / MANIFEST).exists():
+        if run_dir.name not in labels and (run_dir / MANIFEST).exists():
             shutil.rmtree(run_dir)
-    labelled = dict(zip((variant.label for variant in variants), outcomes, strict=True))
     return CompareSummary(
         out=str(out),
-        runs={label: outcome.summary for label, outcome in labelled.items()},
-        seconds={label: outcome.seconds for label, outcome in labelled.items()},
+        runs={variant.label: summary for variant, (summary, _) in results.items()},
+        seconds={variant.label: seconds for variant, (_, seconds) in results.items()},
     )
 
 
-def run_variant(
-    settings: RunSettings, variant: Variant, out: str, tables: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
-) -> RunVariant:
-    """A variant of a run with some settings.
+def run_variants(
+    request: RunRequest,
+    ways: Mapping[Variant, tuple[str, RunSettings]],
+    on_event: Listener = ignore,
+    executor: Executor | None = None,
+    cancelled: Callable[[], bool] = never,
+    outdated: Sequence[Path] = (),
+) -> dict[Variant, tuple[RunSummary, dict[str, float]]]:
+    """Model the same candidates in several ways: all up to the join runs once, the rest once per variant, in order.
+
+    Raises the errors of `pipeline.runtime.run.run`. Returns the summary of each variant, and the wall-clock seconds of
+    each of its buildings by id.
+
+    Parameters
+    ----------
+    request : RunRequest
+        The inputs and how to run. Scratch goes to its `out`; its method has no effect.
+    ways : mapping
+        The run directory of each variant, and its settings.
+    outdated : sequence of Path
+        Files about an earlier comparison, removed together with its results.
+    """
+    outs = dict(ways.values())
+    shared = dataclasses.replace(request, settings=next(iter(outs.values())))
+    begun = begin(shared, outs, on_event, executor, cancelled)
+    with under_way(begun, executor, cancelled) as context:
+        for path in outdated:
+            path.unlink(missing_ok=True)
+        found = find_candidates(context, begun)
+        parts = []
+        for number, (variant, one) in enumerate(zip(ways, begun.directories, strict=True)):
+            one.progress = context.progress.part(number, len(ways), variant.label)
+            parts.append((one, dataclasses.replace(context, progress=one.progress)))
+        models = [reconstruct(part, one.settings, found.joined, begun.guides, compared=True) for one, part in parts]
+        results = [
+            publish_models(part, begun, found, modelled, one)
+            for (one, part), modelled in zip(parts, models, strict=True)
+        ]
+    summaries = [
+        # of the time, each took that of the shared stages and its own
+        finish(begun, found, result, one, sum(one.progress.timings.values()))
+        for one, result in zip(begun.directories, results, strict=True)
+    ]
+    begun.tell_end(summaries[0])
+    seconds = [result.models.counted.seconds for result in results]
+    return dict(zip(ways, zip(summaries, seconds, strict=True), strict=True))
+
+
+def settings_of(
+    settings: RunSettings, variant: Variant, tables: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
+) -> RunSettings:
+    """A run's settings with a variant's method in the place of theirs.
 
     `tables` are values that differ from the presets, by the method's name. Raises SettingsError for all values out of
     range at once.
@@ -161,15 +210,11 @@ def run_variant(
     own = build(entry.settings_type, variant.method, values, faults, entry.preset(variant.preset))
     if faults:
         raise SettingsError(faults)
-    building = dataclasses.replace(settings.building, method=own)
-    return RunVariant(method=variant.method, preset=variant.preset, building=building, out=out, label=variant.label)
-
-
-def settings_of(
-    settings: RunSettings, variant: Variant, tables: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
-) -> RunSettings:
-    """A run's settings with a variant's method in the place of theirs; as in `run_variant`."""
-    return run_variant(settings, variant, "", tables).settings_in(settings)
+    return dataclasses.replace(
+        settings,
+        general=dataclasses.replace(settings.general, method=variant.method, preset=variant.preset),
+        building=dataclasses.replace(settings.building, method=own),
+    )
 
 
 def own_tables(table: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:

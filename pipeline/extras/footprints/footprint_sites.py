@@ -9,7 +9,7 @@ import shapely
 
 from pipeline.extras.footprints.given_footprints import GivenFootprints, Outline
 from pipeline.runtime.stages.sites import CandidateSite, FoundSites, PointRange, largest_first, object_id
-from pipeline.runtime.stages.split_window import Split
+from pipeline.runtime.stages.split import Split
 from pipeline.tiling import MM, Tile, TileGrid
 
 

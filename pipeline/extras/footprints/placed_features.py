@@ -12,7 +12,8 @@ import numpy.typing as npt
 import shapely
 
 from pipeline.errors import CrsError, EmptyInputError, InputError
-from pipeline.io.crs import SpatialReference, horizontal_part, horizontal_unit_of, parse_crs
+from pipeline.io.crs import SpatialReference, horizontal_part, horizontal_unit_of
+from pipeline.io.crs_given import parse_crs
 
 if TYPE_CHECKING:
     import pyproj

@@ -17,7 +17,7 @@ from pipeline.extras.hierarchical_filter.tin_densification import join_facets
 from pipeline.model import BoolArray
 from pipeline.terrain.filter_settings import FoundGround, HierarchicalFilterSettings
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, Part, without_pits
-from pipeline.terrain.planar_fitting import join_planes
+from pipeline.terrain.planar_fitting import plane_around, plane_sums
 from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.support import PIT_CELLS
 
@@ -163,3 +163,42 @@ def hierarchical_ground(
         join_planes(lowest, ground, asked & ~judged, joined, level.reach, (distance, noise, settings.lone_slope))
         ground = ground | joined
     return ground
+
+
+@kernel
+def join_planes(
+    elevation: Elevations,
+    ground: BoolArray,
+    asked: BoolArray,
+    joined: BoolArray,
+    reach: int,
+    limits: tuple[float, float, float],
+) -> None:
+    """Mark in `joined` the asked cells that fit the plane through the ground within reach, or lie below it; all in mm.
+
+    Parameters
+    ----------
+    ground, asked : (rows, columns) bool
+        What the planes go through, and what is judged.
+    reach : int
+        Half side of the squares in cells; nothing farther is looked at.
+    limits : tuple of float
+        Farthest perpendicular distance above a plane in mm; where the ground around carries no plane, highest step
+        above its mean in mm, and rise over run to its centroid.
+    """
+    max_distance, max_step, max_slope = limits
+    sums = plane_sums(elevation, ground)
+    rows, columns = elevation.shape
+    for r in range(rows):
+        for c in range(columns):
+            if not asked[r, c]:
+                continue
+            cells, level, across, along, carries = plane_around(sums, r, c, reach)
+            if cells == 0:
+                continue
+            above = elevation[r, c] - level
+            if carries:
+                joined[r, c] = above <= max_distance * math.sqrt(1.0 + (across * across + along * along) / CELL_MM**2)
+            else:
+                far = math.sqrt(across * across + along * along)
+                joined[r, c] = above <= max_step + max_slope * CELL_MM * far

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable
 import numpy as np
 
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.stages.surroundings import surroundings_of
+from pipeline.runtime.stages.window_points import surroundings_of
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 from pipeline.tiling import MM, Tile, TileGrid, Window
 

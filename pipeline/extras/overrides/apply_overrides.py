@@ -22,7 +22,7 @@ from pipeline.model import Reason
 from pipeline.runtime.plan import split_grid
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages.cleanup import REDRAWN
+from pipeline.runtime.stages.cleanup import OVERRIDDEN, REDRAWN
 from pipeline.runtime.stages.ground import Ground
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
 from pipeline.runtime.stages.sites import (
@@ -35,6 +35,7 @@ from pipeline.runtime.stages.sites import (
     found_sites,
 )
 from pipeline.runtime.stages.split import SplitWindows, split_windows
+from pipeline.runtime.stages.stored_sites import joined_of, store_sites
 from pipeline.settings import RunSettings
 from pipeline.terrain.candidates import Verdict
 from pipeline.tiling import MM, Tile, TileGrid, Window
@@ -127,6 +128,26 @@ def apply_overrides(
     timings = context.progress.timings
     timings["join"] = timings.get("join", 0.0) + time.perf_counter() - started - timings.get("redraw", 0.0)
     return Overridden(before=before, owners=owners, sites=sites, outcomes=outcomes)
+
+
+def overridden(
+    context: RunContext,
+    settings: RunSettings,
+    joined: Joined,
+    overrides: Sequence[Override],
+    ingested: Sequence[Ingested],
+    ground: Ground,
+) -> tuple[Joined, tuple[EntryOutcome, ...]]:
+    """The sites of a run after the overrides, stored; and the outcome of each entry, of which the run warns."""
+    context.check(listed.place.folder for listed in (*joined.groups, *joined.rejected))
+    applied = apply_overrides(context, settings, joined, overrides, ingested, ground)
+    for entry in applied.outcomes:
+        if entry.warning:
+            context.progress.warn("join", entry.warning)
+    if headline := about_no_effect(applied.outcomes):
+        context.progress.warn_first("join", headline)
+    changed = joined_of(store_sites(context, OVERRIDDEN, applied.sites), 0, {})
+    return joined.in_place_of(applied.owners, changed), applied.outcomes
 
 
 def about_no_effect(outcomes: Sequence[EntryOutcome]) -> str:

@@ -17,10 +17,11 @@ from pipeline.errors import RunError, SettingsError
 from pipeline.export.geoparquet import table_dataset
 from pipeline.export.records import KEYS
 from pipeline.io.locations import has_mark, is_url, shown
+from pipeline.options import ModelFiles, ModelOptions, values_of
 from pipeline.runtime.manifest import RunManifest, RunStatus
 from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.runtime.request import RunRequest, input_file
-from pipeline.runtime.run import OVERRIDES
+from pipeline.runtime.run_directory import OVERRIDES
 from pipeline.runtime.stages.batch_figures import REJECTED
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.settings import RunSettings
@@ -137,19 +138,15 @@ def request_of(manifest: RunManifest) -> RunRequest:
     hidden = [entry.path for entry in manifest.inputs if has_mark(entry.path)]
     if hidden:
         raise RunError(f"{hidden[0]}: run.json keeps no queries of URLs, so this cannot be fetched again. {_AGAIN}")
+    values = values_of(ModelFiles, asked) | values_of(ModelOptions, asked)
+    bbox = None if asked["bbox"] is None else tuple(asked["bbox"])
+    # the run itself has decided about places; only what is modelled again is written
+    values |= {"bbox": bbox, "allow_outside_area_of_use": True, "overrides": None, "points": False}
     return RunRequest(
         inputs=tuple(entry.path for entry in manifest.inputs if entry.n_points is not None),
         out="",
         settings=settings,
-        footprints=asked["footprints"],
-        footprints_layer=asked.get("footprints_layer"),
-        guides=asked.get("guides"),
-        crs=asked["crs"],
-        vertical_unit=asked["vertical_unit"],
-        allow_outside_area_of_use=True,  # decided by the run itself
-        bbox=None if asked["bbox"] is None else tuple(asked["bbox"]),
-        aoi=asked["aoi"],
-        meshes=asked["meshes"],
+        **values,
     )
 
 

@@ -25,14 +25,7 @@ from pipeline.export.folders import POINTS_FOLDER, TERRAIN_FOLDER
 from pipeline.extras.footprints.given_footprints import GivenFootprints, footprints_of_run
 from pipeline.extras.guides.given_guides import given_guides
 from pipeline.extras.overrides.apply_overrides import WARNING, EntryOutcome, about_no_effect, apply_overrides
-from pipeline.extras.overrides.earlier import (
-    Earlier,
-    Record,
-    check_outlines,
-    check_points,
-    earlier_run,
-    request_of,
-)
+from pipeline.extras.overrides.earlier import Earlier, Record, check_outlines, check_points, earlier_run, request_of
 from pipeline.extras.overrides.overrides_file import Override, read_overrides
 from pipeline.extras.overrides.tile_update import updated_tile
 from pipeline.io import LocalStorage
@@ -43,12 +36,11 @@ from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.manifest import PAGE, SLOWEST, RunManifest, RunStatus, SlowBuilding, write_manifest
-from pipeline.runtime.monitoring.events import Listener, ignore, never
-from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.monitoring.progress import Listener, Progress, ignore, never
 from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
 from pipeline.runtime.resources import Resources
-from pipeline.runtime.run import OVERRIDES, put_json
 from pipeline.runtime.run_context import RunContext, run_context
+from pipeline.runtime.run_directory import OVERRIDES, put_json
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import run_scratch

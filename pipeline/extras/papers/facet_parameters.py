@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.geometry import aspects_deg, facet_normals, o_distances_m, slopes_deg
 from pipeline.model import FloatArray, LabelArray
+from pipeline.segmentation.facet_geometry import aspects_deg, facet_normals, o_distances_m, slopes_deg
 
 SLOPE, ORIENTATION, O_DISTANCE = 0, 1, 2
 """Columns of the parameters."""

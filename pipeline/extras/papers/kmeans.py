@@ -21,27 +21,16 @@ from pipeline.errors import BuildingError
 from pipeline.extras.papers.building_tin import check_extent
 from pipeline.extras.papers.facet_clusters import connected_parts
 from pipeline.extras.papers.facet_smoothing import passes_for_noise, smoothed_normals
-from pipeline.extras.papers.kmeans_normals import (
-    FacetClusters,
-    choose_clusters,
-    labels_around,
-)
+from pipeline.extras.papers.kmeans_normals import FacetClusters, choose_clusters, labels_around
 from pipeline.extras.papers.primitives import BuildingPrimitive, fit_box, fit_gable
 from pipeline.extras.papers.refinement import planes_of_clusters
 from pipeline.extras.papers.settings import KMeansSettings
 from pipeline.extras.papers.surrounding_ground import far_from
-from pipeline.geometry import (
-    facet_areas_m2,
-    facet_normals,
-    nearest_neighbours,
-    noise_sigma_m,
-    point_spacing_m,
-    vertical_residuals_m,
-)
+from pipeline.geometry import nearest_neighbours, point_spacing_m
 from pipeline.model import FloatArray, LabelArray, Plane, PlanFace, PreparedCloud, Reason, Segmentation, Tin
 from pipeline.prepared_cloud import require_visible
-from pipeline.segmentation.plane_refinement import describe_planes
-from pipeline.segmentation.plane_regression import best_fit_planes
+from pipeline.segmentation.facet_geometry import facet_areas_m2, facet_normals, noise_sigma_m, vertical_residuals_m
+from pipeline.segmentation.plane_regression import best_fit_planes, describe_planes
 from pipeline.tin.delaunay import triangulate
 
 _MIN_FACETS = 3

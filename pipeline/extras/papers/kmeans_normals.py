@@ -20,7 +20,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.extras.papers.clustering_settings import NormalClusteringSettings
-from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.sorting import counting_sort
 from pipeline.model import FloatArray, LabelArray, Reason
 
 _EQUAL_INERTIA = 1e-9

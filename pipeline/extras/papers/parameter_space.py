@@ -21,11 +21,11 @@ from pipeline.extras.papers.region_growing import grow_regions
 from pipeline.extras.papers.roof_trees import classify_2d, classify_3d, plausible_slopes
 from pipeline.extras.papers.settings import ParameterSpace2dSettings, ParameterSpace3dSettings, ParameterSpaceSettings
 from pipeline.extras.papers.single_linkage import cluster_by_linkage
-from pipeline.geometry import facet_areas_m2, nearest_neighbours, noise_sigma_m, point_spacing_m
+from pipeline.geometry import nearest_neighbours, point_spacing_m
 from pipeline.model import BoolArray, FloatArray, LabelArray, PreparedCloud, RoofType, Segmentation, Tin
 from pipeline.prepared_cloud import require_visible
-from pipeline.segmentation.plane_refinement import describe_planes
-from pipeline.segmentation.plane_regression import best_fit_planes, kept_clusters
+from pipeline.segmentation.facet_geometry import facet_areas_m2, noise_sigma_m
+from pipeline.segmentation.plane_regression import best_fit_planes, describe_planes, kept_clusters
 from pipeline.segmentation.point_assignment import vote_among_neighbours
 from pipeline.tin.delaunay import triangulate, unique_xy
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
-from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.sorting import ascending_order
 from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.segmentation.plane_regression import (
     N_SUMS,

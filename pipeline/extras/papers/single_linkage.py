@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.extras.papers.clustering_settings import SingleLinkageSettings
-from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.sorting import counting_sort
 from pipeline.kernels.union_find import numbered_sets, root_of, unite
 from pipeline.model import FloatArray, LabelArray, Reason
 

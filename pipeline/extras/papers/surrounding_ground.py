@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.sorting import counting_sort
 from pipeline.model import BoolArray, FloatArray
 
 

@@ -32,7 +32,7 @@ from pipeline.extras.publish.publishing import (
 from pipeline.io import LocalStorage
 from pipeline.model import BoolArray, FaceKind
 from pipeline.runtime.manifest import RunManifest
-from pipeline.runtime.monitoring.events import Event, Listener, ignore
+from pipeline.runtime.monitoring.progress import Event, Listener, ignore
 from pipeline.runtime.run_tiles import TILES_IN_MEMORY, RunTiles
 
 _TABLE = "buildings"

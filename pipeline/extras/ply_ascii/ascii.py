@@ -18,9 +18,8 @@ import numpy.typing as npt
 from pipeline.errors import EmptyInputError, InconsistentInputError, SettingsError, UnreadableInputError
 from pipeline.extras.ply_ascii.ascii_names import COMMENT, SEPARATORS, columns_of, header_columns, is_complete
 from pipeline.io.gps_time import GpsTimeKind, kind_of
-from pipeline.io.readable import Readable
 from pipeline.io.reading import moved
-from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
+from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Readable, Window
 from pipeline.io.strays import thinned, typical_bounds
 from pipeline.model import FloatArray
 

@@ -16,9 +16,8 @@ import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.io.gps_time import GpsTimeKind, kind_of
-from pipeline.io.readable import Readable
 from pipeline.io.reading import moved
-from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
+from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Readable, Window
 from pipeline.io.strays import thinned, typical_bounds
 
 SCALARS = {

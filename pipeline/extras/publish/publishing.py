@@ -35,7 +35,7 @@ from pipeline.io import LocalStorage, SpatialReference, arrow_at, is_url, storag
 from pipeline.io.crs_units import unit_name
 from pipeline.runtime.manifest import RunManifest, RunStatus
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.monitoring.events import Event, Listener, ignore
+from pipeline.runtime.monitoring.progress import Event, Listener, ignore
 
 ROWS = 8192
 """Largest number of rows in memory at once."""

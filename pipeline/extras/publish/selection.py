@@ -20,9 +20,9 @@ import shapely
 from pipeline.errors import RunError
 from pipeline.export.cityjson import json_line, lines_of
 from pipeline.export.decisions import NAME as DECISIONS
+from pipeline.export.folders import put_local
 from pipeline.export.geoparquet import geo_metadata, parquet_bytes, shape_names, stored_schema, table_batches
 from pipeline.export.glb import glb_bytes
-from pipeline.export.putting import put_local
 from pipeline.extras.publish.obj_parts import lines_of_buildings
 from pipeline.extras.publish.publishing import check_complete, disk_at, terrains_of
 from pipeline.io import arrow_at, storage_at

@@ -51,7 +51,7 @@ from pipeline.io import LocalStorage, arrow_at, storage_at
 from pipeline.io.crs import SpatialReference
 from pipeline.model import FloatArray
 from pipeline.runtime.manifest_reading import city_unit_m
-from pipeline.runtime.monitoring.events import Event, Listener, ignore
+from pipeline.runtime.monitoring.progress import Event, Listener, ignore
 from pipeline.tiling import Tile
 
 NAME = "tileset.json"

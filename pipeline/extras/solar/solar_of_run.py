@@ -31,7 +31,7 @@ from pipeline.extras.solar.true_north import convergence_deg, longitude_and_lati
 from pipeline.extras.solar.weather import Site, Weather, YearOfLight, clear_sky, the_pvlib, weather_of, year_of_light
 from pipeline.io import LocalStorage, SpatialReference
 from pipeline.runtime.manifest import RunManifest
-from pipeline.runtime.monitoring.events import Event, Listener, ignore
+from pipeline.runtime.monitoring.progress import Event, Listener, ignore
 from pipeline.runtime.run_tiles import TILES_IN_MEMORY, RunTiles
 
 _TABLE = "planes"

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.extras.templates.shapes import CAP_SIGMAS, MAX_PLANES, best_shape, copy_planes, height
-from pipeline.kernels.merge_sort import ascending_order, in_order
+from pipeline.kernels.sorting import ascending_order, in_order
 from pipeline.model import FloatArray, LabelArray
 
 MAX_PARTS = 6

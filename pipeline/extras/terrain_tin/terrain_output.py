@@ -21,14 +21,12 @@ from pipeline.model import BuildingResult, FaceKind
 from pipeline.runtime.plan import WINDOW_BASE_BYTES
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import InParts, Place, brief_within, drop_outcomes, key_of, part_of, whole
+from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of, part_of, whole
 from pipeline.runtime.stages.cleanup import writing_terrain
 from pipeline.runtime.stages.ground import Ground
 from pipeline.runtime.stages.model_batch import stored_results
 from pipeline.runtime.stages.reconstruct import Models
-from pipeline.runtime.stages.surroundings import FOLDER as GROUND
-from pipeline.runtime.stages.surroundings import surroundings_of
+from pipeline.runtime.stages.window_points import GROUND_FOLDER, surroundings_of
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
@@ -199,7 +197,7 @@ def _task(
 
 def _read(task: TerrainTask) -> set[str]:
     """The folders of scratch with the terrain and the models that a tile's terrain needs."""
-    ground = {f"{GROUND}/{tile.key}" for tile in _around(task.grid, task.tile, REACH_M)}
+    ground = {f"{GROUND_FOLDER}/{tile.key}" for tile in _around(task.grid, task.tile, REACH_M)}
     return ground | {place.folder for place in task.floors}
 
 

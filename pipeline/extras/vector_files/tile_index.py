@@ -22,7 +22,8 @@ import shapely
 from pipeline.errors import UnreadableInputError
 from pipeline.extras.vector_files.nearby import TILES
 from pipeline.extras.vector_files.vector_layer import read_layer
-from pipeline.io.crs import SpatialReference, horizontal_part, parse_crs
+from pipeline.io.crs import SpatialReference, horizontal_part
+from pipeline.io.crs_given import parse_crs
 from pipeline.io.formats import POINT_SUFFIXES, VECTOR_SUFFIXES, lines_of, names_points
 from pipeline.io.locations import is_url, name_in, shown
 from pipeline.io.places import file_at

@@ -31,13 +31,11 @@ from pipeline.runtime.isolation.limits import IsolationLimits, Loss
 from pipeline.runtime.plan import is_fetched_by_nodes, shares_of
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, key_of, whole
+from pipeline.runtime.scratch.outcomes import Files, Place, key_of, whole
 from pipeline.runtime.stages.cleanup import clear_points
 from pipeline.runtime.stages.ingested import Ingested, of_file, points_by_tile, spread_m
 from pipeline.runtime.stages.tile_content import ZoneSums, zone_sums
-from pipeline.terrain.flight_passes import NO_SLICES, slices_of, united_slices
-from pipeline.terrain.flight_strip import Strip, ids_of_timed
+from pipeline.terrain.flight_passes import NO_SLICES, Strip, ids_of_timed, slices_of, united_slices
 from pipeline.tiling import MM, Tile, TileGrid
 
 _CHUNK_POINTS = 250_000
