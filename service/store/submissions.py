@@ -13,17 +13,14 @@ from sqlalchemy.engine import Connection
 from pipeline.runtime.monitoring import tracing
 from service.deliveries import Delivery
 from service.errors import NoSuchUploadError, QueueFullError, ResultNotReadyError
-from service.jobs import Job, JobRequest, JobStatus, NewLogLine
-from service.store import logs
-from service.store.changes import lock_job, move
+from service.jobs import Job, JobRequest, JobStatus
+from service.store.changes import lock_job, move, note_status
 from service.store.database import LOCK_SUBMISSIONS, lock
-from service.store.outbox import announce
 from service.store.policies import lease_expired
 from service.store.queries import JobQueries, get, no_such_job, seen_by
 from service.store.records import job_of, storable
 from service.store.tables import EVENTS, JOB_UPLOADS, JOBS, LOG_LINES, UPLOADS
 from service.store.uploads import creating
-from service.webhooks import EventType
 
 _WATCH_WAIT_S = 0.2
 
@@ -212,27 +209,11 @@ def insert(
             traceparent=None if (submitted := tracing.current()) is None else submitted.traceparent,
         )
     )
-    connection.execute(
-        sa.insert(EVENTS).values(
-            job_id=job_id,
-            sequence=1,
-            at=now,
-            kind="status",
-            status=JobStatus.ACCEPTED.value,
-            stage="",
-            done=0,
-            total=0,
-            progress=0,
-            message="waits for a driver",
-        )
-    )
     needed = request.upload_ids
     hold_uploads(connection, needed)
     if needed:
         connection.execute(sa.insert(JOB_UPLOADS), [{"job_id": job_id, "upload_id": name} for name in needed])
-    made = connection.execute(sa.select(JOBS).where(JOBS.c.job_id == job_id)).one()
-    logs.append(connection, made, [NewLogLine(message="accepted: waits for a driver")], now, attempt=0)
-    announce(connection, made, EventType.ACCEPTED, now)
+    note_status(connection, connection.execute(sa.select(JOBS).where(JOBS.c.job_id == job_id)).one(), now)
     return job_id
 
 
