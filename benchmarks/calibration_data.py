@@ -28,14 +28,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.export.geoparquet import read_table
 from pipeline.model import BoolArray, FloatArray
-from pipeline.quality.detection import (
-    AT_FLATNESS_1,
-    AT_NO_ROUGH,
-    LEAST_NOISE_M,
-    MOST,
-    PER_LOG_FLATNESS,
-    PER_LOG_ROUGH,
-)
+from pipeline.quality.detection import AT_FLATNESS_1, AT_NO_ROUGH, LEAST_NOISE_M, MOST, PER_LOG_FLATNESS, PER_LOG_ROUGH
 from pipeline.scene import BUILDING_CLASS
 
 ABOVE_FLOOR_M = 1.5

@@ -28,7 +28,7 @@ import numpy as np
 
 from benchmarks.city_tiles import main as make_tiles
 from benchmarks.entries import markdown_table
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run

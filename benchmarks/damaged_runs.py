@@ -23,7 +23,7 @@ from pipeline.console import ExitCode
 from pipeline.runtime.isolation.child_pool import ChildPool
 from pipeline.runtime.isolation.messages import Finished
 from pipeline.runtime.isolation.supervision import EndCause
-from pipeline.runtime.monitoring.events import never
+from pipeline.runtime.monitoring.progress import never
 
 OUTCOMES = ("named refusal", "run", "internal", "invalid", "crash", "hang")
 GOOD = OUTCOMES[:2]
@@ -219,9 +219,9 @@ def load() -> None:
 
     import pipeline.batch.run
     import pipeline.cli
-    import pipeline.io.ascii
+    import pipeline.extras.ply_ascii.ascii
+    import pipeline.extras.ply_ascii.ply
     import pipeline.io.las
-    import pipeline.io.ply
     import pipeline.ruler.evaluation.reading.run  # noqa: F401
     from pipeline.runtime.isolation.fork_server import load_all
     from pipeline.runtime.isolation.preloading import loads_of

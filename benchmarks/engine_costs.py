@@ -28,7 +28,7 @@ import psutil
 from benchmarks.entries import markdown_table
 from pipeline.runtime.cluster import dispatch
 from pipeline.runtime.cluster.dask_executor import Cluster, DaskExecutor
-from pipeline.runtime.monitoring.events import Watch
+from pipeline.runtime.monitoring.progress import Watch
 
 _WAIT_S = 120.0
 _WARM_TASKS = 200

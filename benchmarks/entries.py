@@ -29,6 +29,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from pipeline.extras.compare.compare import Variant, run_variants, settings_of
 from pipeline.io.source import ReadOptions
 from pipeline.methods import METHODS
 from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
@@ -41,10 +42,8 @@ from pipeline.ruler.evaluation.writing import write_tables
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.sweep import CELLS, Cell
-from pipeline.runtime.compare import Variant, run_variant, settings_of
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
-from pipeline.runtime.run import run_variants
 from pipeline.settings import RunSettings
 
 GROUND = "ground."
@@ -190,7 +189,7 @@ def measure_entry(entry: Entry, variants: Sequence[Variant], place: Workplace) -
             resources=SERIAL,
             meshes="none",
         )
-        ways = [run_variant(request.settings, variant, str(place.run(variant, entry))) for variant in to_run]
+        ways = {one: (str(place.run(one, entry)), settings_of(request.settings, one)) for one in to_run}
         for variant in to_run:  # of the measures nothing may be left that is of an earlier run
             shutil.rmtree(place.report(variant, entry), ignore_errors=True)
         run_variants(request, ways)

@@ -24,8 +24,8 @@ from typing import Any, Self
 
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.engine import executor_for
-from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.monitoring.measurement import Measured, Result, Task
+from pipeline.runtime.monitoring.progress import Event, Watch
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import run

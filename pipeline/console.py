@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.progress import Progress, TaskID
 
-    from pipeline.runtime.monitoring.events import Event
+    from pipeline.runtime.monitoring.progress import Event
 
 LOG_INTERVAL_S = 2.0
 """Shortest time between two log lines of progress of one stage."""

@@ -11,7 +11,7 @@ from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
 from pipeline.ruler.evaluation.writing import write_tables
 from pipeline.ruler.report.evaluation_page import write_page
 from pipeline.ruler.simulation.dataset import Output, ScenePaths, simulate
-from pipeline.runtime.monitoring.events import Event, Listener
+from pipeline.runtime.monitoring.progress import Event, Listener
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run

@@ -12,7 +12,6 @@ import dataclasses
 import numpy as np
 
 from pipeline.model import BoolArray, ByteArray, IntArray, KindArray, LabelArray
-from pipeline.terrain.class_codes import ClassCodeSettings
 from pipeline.terrain.facets import SceneVertices, VertexKind
 from pipeline.terrain.glass import glass_of
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
@@ -21,7 +20,7 @@ from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
 from pipeline.terrain.needed_ground import needed_vertices
 from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.point_assignment import Allowed, ScenePoints
-from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
+from pipeline.terrain.settings import ClassCodeSettings, ClassesInUse, SceneSettings
 from pipeline.terrain.surfaces import Fragments, fragments_of
 from pipeline.terrain.thin_objects import are_thin
 from pipeline.terrain.thinning import highest_per_cell, lowest_below

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.normal_equations import moments_of, solve_plane_moments
+from pipeline.kernels.sorting import counting_sort
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 
 # Not settings: they describe the estimate itself, not which offsets count.

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import httpx
 
 from pipeline.errors import CrsError, UnreadableInputError
-from pipeline.io.crs import BARE_CODE, parse_crs
+from pipeline.io.crs_given import BARE_CODE, parse_crs
 from service.errors import InputRefusedError, StartUpError
 from service.settings import ServiceSettings
 

@@ -18,22 +18,21 @@ from pipeline.batch.batch_file import Batch
 from pipeline.batch.keys import as_keys, errors_with_keys
 from pipeline.batch.remaining_time import duration
 from pipeline.errors import EmptyInputError, InputError, RunError
+from pipeline.extras.footprints.given_footprints import footprints_of_run
 from pipeline.io import shown
 from pipeline.runtime.cluster.dask_executor import memory_of_workers
 from pipeline.runtime.cluster.performance_report import PerformanceReport
 from pipeline.runtime.engine import Engine, engine_of
 from pipeline.runtime.expected import RATES, expected
 from pipeline.runtime.forecast import WORTH_S, forecast
-from pipeline.runtime.monitoring.events import ignore
-from pipeline.runtime.monitoring.machine import cores, memory_bytes
-from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.monitoring.measurement import cores, memory_bytes
+from pipeline.runtime.monitoring.progress import Progress, ignore
 from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.request import plan_inputs
 from pipeline.runtime.resources import Resources
-from pipeline.runtime.run import check_out
+from pipeline.runtime.run_directory import check_out
 from pipeline.runtime.scratch.folder import POINT
 from pipeline.runtime.scratch.work_folder import refuse_foreign
-from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.tiling import MM
 
 # Constants of the estimate, measured; they decide nothing in a run, so they are not settings.

@@ -16,7 +16,7 @@ from pipeline.report.run_page import write_run_page
 from pipeline.runtime.cluster.run_metrics import RunMetrics, combined, serve_metrics
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.compiling import compile_for, kernel_groups
-from pipeline.runtime.monitoring.events import Event, Listener, ignore, never
+from pipeline.runtime.monitoring.progress import Event, Listener, ignore, never
 from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, locked_file, make_work, refuse_locked
 

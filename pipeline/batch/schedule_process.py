@@ -19,7 +19,7 @@ from typing import Protocol
 from pipeline.batch.batch_file import Batch, read_batch
 from pipeline.batch.schedule_file import NAME, BatchEntry, FileBook, iso
 from pipeline.errors import RunError, SettingsError
-from pipeline.runtime.monitoring.events import Event, EventKind, Listener, ignore
+from pipeline.runtime.monitoring.progress import Event, EventKind, Listener, ignore
 from pipeline.runtime.scratch.work_folder import is_at_work, is_locked, locked_file, make_work, take_lock
 from pipeline.schedule import Entry, Look, Outcome, Rules, ScheduleState, enter, look, miss_waiting
 

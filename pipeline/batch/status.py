@@ -18,7 +18,7 @@ from typing import Any
 from pipeline.batch.remaining_time import StageProgress, duration, remaining_s
 from pipeline.errors import RunError
 from pipeline.io import LocalStorage
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.scratch.work_folder import is_at_work
 
 NAME = "status.json"

@@ -8,13 +8,18 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from pipeline.building.drawing import Building, DrawnModel
+from pipeline.building.drawing import Building, DrawnModel, blocks
+from pipeline.building.record import record_of
 from pipeline.errors import BuildingError
-from pipeline.model import Decision, DecisionKind, Outcome, RoofFace
+from pipeline.methods import LODS
+from pipeline.model import BuildingResult, Decision, DecisionKind, Outcome, RoofFace
+from pipeline.quality.detection import confidence_of
 from pipeline.quality.residuals import vertical_residuals
+from pipeline.quality.support import NOT_OF_FORM, NOT_OF_ROOF, doubt_of, support_of
 from pipeline.quality.validity import check_solid
 from pipeline.roof.forms import UNDRAWABLE, undrawable
 from pipeline.roof.named_form import NamedForm
+from pipeline.roof.plan import RoofPlan
 from pipeline.roof.unlike_points import stays_near
 
 _FEW_EXPLAINED = 0.75
@@ -121,3 +126,24 @@ def explained_share(building: Building, model: DrawnModel) -> float:
     faces = [RoofFace(plane=face.plane, polygon=face.polygon) for part in model.parts for face in part.faces]
     residuals = vertical_residuals(building.roof.points, faces, model.planes)
     return float(np.mean(np.abs(residuals) <= building.settings.plan.residual_cap_m))
+
+
+def judged(building: Building, record: BuildingResult, plan: RoofPlan | None, model: DrawnModel) -> BuildingResult:
+    """A model as `ok` or `doubtful`, or a block that explains the points as well; a coarser model by its finest."""
+    settings, is_finest = building.settings.support, record.lod == LODS[-1]
+    finest = record if is_finest else record_of(building, model)
+    doubt = model.contradiction if is_finest else None
+    doubt = doubt or doubt_of(support_of(finest, building.candidate), settings)
+    if not is_finest:  # a coarser model does not claim to lie on its points
+        record = dataclasses.replace(record, replaced_confidence=confidence_of(finest))
+    if doubt is None or not (is_finest or doubt.reason in NOT_OF_ROOF):
+        return record
+    if not is_finest or doubt.reason in NOT_OF_FORM:
+        return record.doubted(doubt)
+    withdraw(building)
+    block, _ = first_valid(blocks(building, plan), building)
+    if block is not None:
+        fallback = record_of(building, block, BuildingError(doubt.reason, doubt.words))
+        if fallback.quality.share_within >= record.quality.share_within - settings.block_loss:
+            return dataclasses.replace(fallback, replaced_confidence=confidence_of(record))
+    return record.doubted(doubt)

@@ -49,7 +49,7 @@ def diff(
         from pipeline.ruler.epochs.settings import read_settings
         from pipeline.ruler.report.epochs_map import epochs_map, gathering
         from pipeline.ruler.report.epochs_page import write_page
-        from pipeline.runtime.monitoring.events import Event
+        from pipeline.runtime.monitoring.progress import Event
 
         chosen = read_settings(
             settings,

@@ -11,13 +11,11 @@ import typer
 from pipeline.cli.options import (
     AsJson,
     AsSurveyed,
-    Crs,
-    Layer,
     Points,
     Quiet,
     SettingsFile,
     Truth,
-    VerticalUnit,
+    takes_options,
 )
 from pipeline.cli.summary import show_statistics
 from pipeline.console import Console
@@ -27,30 +25,31 @@ if TYPE_CHECKING:
     from pipeline.ruler.evaluation.evaluate import Evaluation
 
 
+@takes_options("inspect")
 def inspect(
     tile: Annotated[
         str,
         typer.Argument(metavar="TILE", help="A LAS, LAZ, COPC, PLY or ASCII file; or a run directory."),
     ],
-    crs: Crs = None,
-    vertical_unit: VerticalUnit = None,
     settings: SettingsFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    **given: Any,
 ) -> None:
     """Show the facts of a tile and an estimate of time and memory; or the figures and reasons of a run, added up."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.inspection import inspect as inspect_tile
         from pipeline.io.source import ReadOptions
-        from pipeline.runtime.monitoring.events import Event
+        from pipeline.runtime.monitoring.progress import Event
         from pipeline.settings import RunSettings
-        from pipeline.terrain.class_codes import ClassCodeSettings
+        from pipeline.terrain.settings import ClassCodeSettings
 
         if _is_run(tile):
+            from pipeline.options import option_named
             from pipeline.report.statistics import run_statistics
 
-            given = {"--crs": crs, "--vertical-unit": vertical_unit, "--settings": settings}
-            unused = [f"{name} {value}" for name, value in given.items() if value is not None]
+            named = {"--settings": settings} | {option_named(name).flag: value for name, value in given.items()}
+            unused = [f"{flag} {value}" for flag, value in named.items() if value is not None]
             if unused:
                 raise SettingsError([f"{', '.join(unused)}: {tile} is a run, which has its own. Leave them out"])
             statistics = run_statistics(tile)
@@ -61,7 +60,7 @@ def inspect(
         def on_progress(done: int, total: int) -> None:
             console.on_event(Event(kind="progress", stage="read", done=done, total=total))
 
-        options = ReadOptions(crs=crs, vertical_unit=vertical_unit)
+        options = ReadOptions(**given)
         found = inspect_tile(tile, options, on_progress, RunSettings.from_toml(settings, {}))
         for warning in found.warnings:
             console.warn(warning)
@@ -111,6 +110,7 @@ def report(
         console.document({"run": run, "written": written})
 
 
+@takes_options("evaluate")
 def evaluate(
     models: Annotated[
         str, typer.Argument(metavar="MODELS", help="A run directory; CityJSON, CityJSONSeq or OBJ of any program.")
@@ -118,7 +118,6 @@ def evaluate(
     truth: Truth = None,
     points: Points = None,
     footprints: Annotated[str | None, typer.Option(metavar="FILE", help="Building outlines for the points.")] = None,
-    layer: Layer = None,
     ground: Annotated[
         list[str] | None,
         typer.Option(metavar="FILE", help="The same points, classified by another program: judge its ground."),
@@ -129,8 +128,6 @@ def evaluate(
             metavar="FILE", help="True roof edges in metres, as JSON or OBJ lines: judge edges and corners by them."
         ),
     ] = None,
-    crs: Crs = None,
-    vertical_unit: VerticalUnit = None,
     as_surveyed: AsSurveyed = False,
     blocks: Annotated[
         bool | None,
@@ -144,24 +141,23 @@ def evaluate(
     picture: Annotated[str | None, typer.Option(metavar="FILE", help="Draw the run to this PNG file.")] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    **given: Any,
 ) -> None:
     """Measure models: against simulated truth, classified points, true roof edges, or alone."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
-        from pipeline.runtime.monitoring.events import Event
+        from pipeline.runtime.monitoring.progress import Event
 
         request = EvaluationRequest(
             models=models,
             truth=truth,
             points=tuple(points or ()),
             footprints=footprints,
-            footprints_layer=layer,
             ground=tuple(ground or ()),
             wireframes=wireframes,
-            crs=crs,
-            vertical_unit=vertical_unit,
             as_surveyed=as_surveyed,
             blocks=blocks,
+            **given,
         )
 
         def on_step(name: str) -> None:

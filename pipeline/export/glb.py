@@ -21,8 +21,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.export.glb_container import INDICES, VERSION, VERTICES, container
 from pipeline.model import FloatArray, IntArray
-from pipeline.triangulation.faces import DONE, triangulate_rings
-from pipeline.triangulation.projection import area_vector
+from pipeline.triangulation.faces import DONE, area_vector, triangulate_rings
 
 MATERIALS: Mapping[str, tuple[float, float, float]] = {
     "RoofSurface": (0.50, 0.09, 0.06),

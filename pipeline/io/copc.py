@@ -14,7 +14,7 @@ import numpy.typing as npt
 from laspy.copc import CopcInfoVlr
 
 from pipeline.errors import UnreadableInputError
-from pipeline.io.readable import Readable
+from pipeline.io.records import Readable
 
 if TYPE_CHECKING:
     import laspy

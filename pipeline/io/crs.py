@@ -4,47 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import re
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import CrsError
-from pipeline.io.crs_units import (
-    INTERNATIONAL_FOOT_M,
-    US_SURVEY_FOOT_M,
-    same_unit,
-    unit_name,
-    vertical_part,
-    with_vertical,
-    with_vertical_unit,
-)
-from pipeline.io.geotiff_keys import LINEAR_UNITS, by_unit_key
-from pipeline.io.library_faults import words_of
 
 if TYPE_CHECKING:
     import pyproj
 
-UNITS_M = {
-    "m": 1.0,
-    "metre": 1.0,
-    "meter": 1.0,
-    "ft": INTERNATIONAL_FOOT_M,
-    "foot": INTERNATIONAL_FOOT_M,
-    "us-ft": US_SURVEY_FOOT_M,
-    "ftus": US_SURVEY_FOOT_M,
-    "us_survey_foot": US_SURVEY_FOOT_M,
-    "cm": 0.01,
-    "mm": 0.001,
-    "km": 1000.0,
-}
-"""Metres per unit, by the words that `--vertical-unit` understands."""
 
 SMALLEST_UNIT_M, LARGEST_UNIT_M = 1e-4, 1e4
 """Units that a CRS can have: from a tenth of a millimetre to ten kilometres."""
 LARGEST_COORDINATE = 1e12
 """Bound of coordinates, far beyond every CRS; keeps differences finite."""
-BARE_CODE = re.compile(r"[0-9]{4,6}(\+[0-9]{4,6})?")
-"""An EPSG code alone, or those of a horizontal and a vertical CRS."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -102,42 +75,6 @@ class SpatialReference:
 
 UNKNOWN_REFERENCE = SpatialReference()
 """No CRS: metres are assumed."""
-
-
-def unit_in_metres(word: str, *, path: str) -> float:
-    """Metres per unit, from a word of `UNITS_M` such as m, ft or us-ft; raises CrsError for any other."""
-    try:
-        return UNITS_M[word.strip().lower()]
-    except KeyError:
-        raise CrsError(path, f"unit {word!r} is not known", f"Use one of {', '.join(UNITS_M)}") from None
-
-
-def parse_crs(text: str, *, path: str) -> pyproj.CRS:
-    """The CRS that a user names: an EPSG code (with or without `EPSG:`), WKT, PROJJSON or a PROJ string.
-
-    Raises CrsError if PROJ rejects it.
-    """
-    import pyproj
-
-    try:
-        return pyproj.CRS.from_user_input(with_authority(text))
-    except (pyproj.exceptions.ProjError, ValueError, RecursionError) as fault:
-        detail = str(fault)[:120] if isinstance(fault, pyproj.exceptions.ProjError) else words_of(fault)
-        raise CrsError(
-            path,
-            f"coordinate reference system {text[:80]!r} is not understood ({detail})",
-            "Give an EPSG code such as EPSG:28992, or WKT",
-        ) from fault
-
-
-def with_authority(text: str) -> str:
-    """The name of a CRS as PROJ takes it: a bare code is EPSG's.
-
-    >>> with_authority(" 28992 "), with_authority("28992+5709"), with_authority("ESRI:102748")
-    ('EPSG:28992', 'EPSG:28992+5709', 'ESRI:102748')
-    """
-    text = text.strip()
-    return f"EPSG:{text}" if BARE_CODE.fullmatch(text) else text
 
 
 def horizontal_part(crs: pyproj.CRS) -> pyproj.CRS:
@@ -213,72 +150,6 @@ def _epsg_of(text: str) -> int | None:
     return code
 
 
-def resolve_reference(
-    *,
-    path: str,
-    header_crs: pyproj.CRS | None = None,
-    header_horizontal_unit_m: float | None = None,
-    header_vertical_unit_m: float | None = None,
-    crs: str | None = None,
-    vertical_unit: str | None = None,
-) -> tuple[SpatialReference, tuple[str, ...]]:
-    """The reference of a file from its header and the user's overrides, and warnings of one sentence each.
-
-    An override replaces what it states: a horizontal `crs` keeps the vertical CRS, or the unit, of the header. A
-    horizontal unit that the header states without a CRS is that of its coordinates, and stays, too. The vertical unit
-    is the user's, else the CRS's, else the header's, else the horizontal one. The CRS that comes back has a vertical
-    part if its elevations are not in its horizontal unit. Raises CrsError if the CRS is geographic or not understood,
-    or the unit is not known.
-
-    Parameters
-    ----------
-    header_horizontal_unit_m, header_vertical_unit_m : float, optional
-        Metres per unit, if the header has a unit beside the CRS (GeoTIFF keys).
-    crs : str, optional
-        The user's CRS; overrides the header's.
-    vertical_unit : str, optional
-        The user's vertical unit, a word of `UNITS_M`; overrides everything else.
-    """
-    warnings: list[str] = []
-    given = None if crs is None else parse_crs(crs, path=path)
-    if given is not None and header_crs is None:
-        given = _in_unit_of_header(given, header_horizontal_unit_m, path, warnings)
-    given_m = None if vertical_unit is None else unit_in_metres(vertical_unit, path=path)
-    named = header_crs if given is None else given
-    if named is None:
-        return _unknown_reference(header_horizontal_unit_m, header_vertical_unit_m, given_m)
-    if given is not None and header_crs is not None and _differ(given, header_crs):
-        warnings.append(f"the given CRS {given.name!r} replaces the header's {horizontal_part(header_crs).name!r}")
-    horizontal_m = horizontal_unit_of(named, path=path)
-    chosen = named if given is None else _with_vertical_of(given, header_crs)
-    own_m = vertical_unit_of(chosen)
-    stated_m = (None if header_crs is None else vertical_unit_of(header_crs)) or header_vertical_unit_m
-    found_m = next((unit_m for unit_m in (given_m, own_m, stated_m) if unit_m is not None), None)
-    vertical_m = horizontal_m if found_m is None else _usable_unit(found_m, chosen, path)
-    if found_m is None and horizontal_m != 1.0:  # elevations in metres are common beside feet: the user must decide
-        warnings.append(
-            f"no vertical unit in CRS {chosen.name!r}: taken from the horizontal one ({horizontal_m:g} m); "
-            "give --vertical-unit if it differs"
-        )
-    overrides = given_m is not None or (given is not None and vertical_unit_of(given) is not None)
-    if stated_m is not None and overrides:
-        warnings.extend(_of_override(vertical_m, stated_m))
-    elif given is not None and stated_m is not None:
-        warnings.extend(_of_mixture(horizontal_m, vertical_m))
-    if not same_unit(vertical_m, horizontal_m if own_m is None else own_m):
-        chosen = with_vertical_unit(chosen, vertical_m)
-    reference = SpatialReference(
-        wkt=chosen.to_wkt("WKT2_2019"),
-        name=chosen.name,
-        epsg=_epsg_of(chosen.srs),
-        horizontal_unit_m=horizontal_m,
-        vertical_unit_m=vertical_m,
-        vertical_unit_assumed=found_m is None,
-        named=named.name if (code := _epsg_of(named.srs)) is None else f"EPSG:{code}",
-    )
-    return reference, tuple(warnings)
-
-
 def with_one_vertical(references: Sequence[SpatialReference]) -> list[SpatialReference]:
     """References of one given horizontal CRS; where some headers add one vertical CRS and others none, all have it.
 
@@ -291,52 +162,63 @@ def with_one_vertical(references: Sequence[SpatialReference]) -> list[SpatialRef
     return [whole if same_unit(one.vertical_unit_m, whole.vertical_unit_m) else one for one in references]
 
 
-def _unknown_reference(
-    header_horizontal_unit_m: float | None, header_vertical_unit_m: float | None, given_m: float | None
-) -> tuple[SpatialReference, tuple[str, ...]]:
-    """The reference of a file without a usable CRS, whose units may be known."""
-    horizontal_m = 1.0 if header_horizontal_unit_m is None else header_horizontal_unit_m
-    vertical_m = next((unit_m for unit_m in (given_m, header_vertical_unit_m) if unit_m is not None), horizontal_m)
-    warnings = [f"no usable CRS in the file: unknown, horizontal unit taken as {horizontal_m:g} m; give --crs EPSG:n"]
-    if given_m is not None and header_vertical_unit_m is not None:
-        warnings.extend(_of_override(given_m, header_vertical_unit_m))
-    return SpatialReference(horizontal_unit_m=horizontal_m, vertical_unit_m=vertical_m), tuple(warnings)
+INTERNATIONAL_FOOT_M = 0.3048
 
 
-def _differ(one: pyproj.CRS, other: pyproj.CRS) -> bool:
-    """Whether the horizontal parts of two CRS differ, also of 3D ones."""
-    return not horizontal_part(one).to_2d().equals(horizontal_part(other).to_2d(), ignore_axis_order=True)
+US_SURVEY_FOOT_M = 1200.0 / 3937.0
 
 
-def _in_unit_of_header(given: pyproj.CRS, unit_m: float | None, path: str, warnings: list[str]) -> pyproj.CRS:
-    """The user's CRS in the unit that a header without a CRS states for its coordinates, with a warning."""
-    if unit_m is None or same_unit(unit_m, horizontal_unit_of(given, path=path)):
-        return given
-    plane = by_unit_key(horizontal_part(given).to_2d(), unit_m, LINEAR_UNITS, warnings, is_given=True)
-    vertical, vertical_m = vertical_part(given), vertical_unit_of(given)
-    if vertical is not None:
-        return with_vertical(plane, vertical)
-    return plane if vertical_m is None else with_vertical_unit(plane, vertical_m)
+_EQUAL = 1e-9
+"""Relative difference of one unit written twice; the two feet differ by 2e-6."""
 
 
-def _with_vertical_of(given: pyproj.CRS, header_crs: pyproj.CRS | None) -> pyproj.CRS:
-    """The user's CRS, with the vertical part of the header's where it has none of its own."""
-    if header_crs is None or vertical_unit_of(given) is not None:
-        return given
-    vertical = vertical_part(header_crs)
-    return given if vertical is None else with_vertical(given, vertical)
+def same_unit(one_m: float, other_m: float) -> bool:
+    """Whether two units, in metres, are the same but for rounding.
+
+    >>> same_unit(0.304800609601, 1200.0 / 3937.0), same_unit(0.3048, 1200.0 / 3937.0)
+    (True, False)
+    """
+    return math.isclose(one_m, other_m, rel_tol=_EQUAL)
 
 
-def _of_override(vertical_m: float, stated_m: float) -> list[str]:
-    """A warning if a given vertical unit is not that of the header."""
-    if same_unit(vertical_m, stated_m):
-        return []
-    return [f"the given vertical unit, {unit_name(vertical_m)}, replaces the header's {unit_name(stated_m)}"]
+def vertical_part(crs: pyproj.CRS) -> pyproj.CRS | None:
+    """The vertical CRS of a compound one, or a CRS that is vertical itself; None if there is none."""
+    if crs.is_bound and crs.source_crs is not None:
+        return vertical_part(crs.source_crs)
+    if crs.is_compound:
+        return next((part for part in crs.sub_crs_list[1:] if part.is_vertical), None)
+    return crs if crs.is_vertical else None
 
 
-def _of_mixture(horizontal_m: float, vertical_m: float) -> list[str]:
-    """A warning if the header's vertical unit, which stays, is not that of the given horizontal CRS."""
-    if same_unit(vertical_m, horizontal_m):
-        return []
-    mixed = f"units are mixed: elevations stay in the header's {unit_name(vertical_m)} ({vertical_m:.6g} m) beside"
-    return [f"{mixed} coordinates in units of {horizontal_m:.6g} m; give --vertical-unit if that is wrong"]
+def chosen_vertical_unit(
+    crs: pyproj.CRS, horizontal_m: float, found_m: float | None, *, path: str
+) -> tuple[float, list[str]]:
+    """The vertical unit of a file in metres: the one found, else the horizontal one, with a warning where that is odd.
+
+    Raises CrsError for a unit that no coordinates are in.
+    """
+    if found_m is not None:
+        return _usable_unit(found_m, crs, path), []
+    if horizontal_m == 1.0:
+        return horizontal_m, []
+    # elevations in metres are common beside feet: the user must decide
+    warning = (
+        f"no vertical unit in CRS {crs.name!r}: taken from the horizontal one ({horizontal_m:g} m); "
+        "give --vertical-unit if it differs"
+    )
+    return horizontal_m, [warning]
+
+
+def reference_of(
+    crs: pyproj.CRS, named: pyproj.CRS, units_m: tuple[float, float], *, assumed: bool
+) -> SpatialReference:
+    """The reference by a CRS, its horizontal and vertical unit; `named` is the CRS as user or header name it."""
+    return SpatialReference(
+        wkt=crs.to_wkt("WKT2_2019"),
+        name=crs.name,
+        epsg=_epsg_of(crs.srs),
+        horizontal_unit_m=units_m[0],
+        vertical_unit_m=units_m[1],
+        vertical_unit_assumed=assumed,
+        named=named.name if (code := _epsg_of(named.srs)) is None else f"EPSG:{code}",
+    )

@@ -9,28 +9,17 @@ import functools
 import math
 from typing import TYPE_CHECKING, Any
 
+from pipeline.io.crs import INTERNATIONAL_FOOT_M, US_SURVEY_FOOT_M, same_unit, vertical_part
+
 if TYPE_CHECKING:
     import pyproj
 
-INTERNATIONAL_FOOT_M = 0.3048
-US_SURVEY_FOOT_M = 1200.0 / 3937.0
 
 _UNIT_NAMES = {1.0: "metre", INTERNATIONAL_FOOT_M: "foot", US_SURVEY_FOOT_M: "US survey foot"}
 _UNKNOWN = "unknown"
 """Name of a vertical datum that nothing states."""
-_EQUAL = 1e-9
-"""Relative difference of one unit written twice; the two feet differ by 2e-6."""
 _SAME_PLACE_M = 0.01
 """False eastings are rounded in one of the units: North Carolina's differ by 0.8 mm."""
-
-
-def same_unit(one_m: float, other_m: float) -> bool:
-    """Whether two units, in metres, are the same but for rounding.
-
-    >>> same_unit(0.304800609601, 1200.0 / 3937.0), same_unit(0.3048, 1200.0 / 3937.0)
-    (True, False)
-    """
-    return math.isclose(one_m, other_m, rel_tol=_EQUAL)
 
 
 def unit_name(unit_m: float) -> str:
@@ -46,15 +35,6 @@ def unit_name(unit_m: float) -> str:
 def in_unit(crs: pyproj.CRS, unit_m: float) -> pyproj.CRS:
     """A projected or vertical CRS with its axes in another unit; the one of the EPSG registry if it has it."""
     return _in_unit(crs.to_wkt("WKT2_2019"), unit_m)
-
-
-def vertical_part(crs: pyproj.CRS) -> pyproj.CRS | None:
-    """The vertical CRS of a compound one, or a CRS that is vertical itself; None if there is none."""
-    if crs.is_bound and crs.source_crs is not None:
-        return vertical_part(crs.source_crs)
-    if crs.is_compound:
-        return next((part for part in crs.sub_crs_list[1:] if part.is_vertical), None)
-    return crs if crs.is_vertical else None
 
 
 def with_vertical(crs: pyproj.CRS, vertical: pyproj.CRS) -> pyproj.CRS:

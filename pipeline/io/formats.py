@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io.locations import is_url
-from pipeline.io.readable import Readable
+from pipeline.io.records import Readable
 
 MAGIC = {b"LASF": "las", b"ply\n": "ply", b"ply\r": "ply"}
 """Formats by their first bytes."""

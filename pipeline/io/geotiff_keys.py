@@ -13,15 +13,8 @@ import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from pipeline.io.crs_units import (
-    INTERNATIONAL_FOOT_M,
-    US_SURVEY_FOOT_M,
-    in_unit,
-    same_unit,
-    unit_name,
-    vertical_part,
-    with_vertical,
-)
+from pipeline.io.crs import INTERNATIONAL_FOOT_M, US_SURVEY_FOOT_M, same_unit, vertical_part
+from pipeline.io.crs_units import in_unit, unit_name, with_vertical
 
 if TYPE_CHECKING:
     import laspy

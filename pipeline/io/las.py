@@ -24,17 +24,17 @@ from pipeline.io.apart import apart
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.las_header import REWRITE, header_crs, read_header_block
 from pipeline.io.laz_chunks import (
+    DECODING_ERRORS,
     LAYERED_FORMAT,
     ChunkTable,
     check_chunk,
     check_chunks,
     decodable_record,
+    decoding,
     read_chunk_table,
 )
-from pipeline.io.laz_decoder import DECODING_ERRORS, decoding
-from pipeline.io.readable import Readable, bytes_of
 from pipeline.io.reading import moved
-from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Share, Window
+from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Readable, Share, Window, bytes_of
 from pipeline.io.strays import Bounds, header_box_problem, typical_bounds
 from pipeline.model import FloatArray
 

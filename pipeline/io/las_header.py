@@ -11,8 +11,7 @@ import struct
 from typing import TYPE_CHECKING, BinaryIO
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
-from pipeline.io.geotiff_keys import crs_of_keys, keys_of
-from pipeline.io.readable import Readable
+from pipeline.io.records import Readable
 
 if TYPE_CHECKING:
     import laspy
@@ -206,7 +205,6 @@ def header_crs(path: Readable, header: laspy.LasHeader, block: HeaderBlock) -> H
     if block.evlr_count:
         with path.open("rb") as stream:
             texts.append(_wkt_of_extended_records(stream, block) or "")
-    keys = keys_of(header)
     crs = None
     for text in texts:
         if crs is None and text.strip(" \0"):
@@ -214,6 +212,11 @@ def header_crs(path: Readable, header: laspy.LasHeader, block: HeaderBlock) -> H
                 crs = pyproj.CRS.from_wkt(text)
             except pyproj.exceptions.CRSError as fault:
                 warnings.append(f"the header's WKT is not understood ({str(fault)[:120]})")
+    if not header.vlrs.get("GeoKeyDirectoryVlr"):
+        return HeaderCrs(crs=crs, horizontal_unit_m=None, vertical_unit_m=None, warnings=tuple(warnings))
+    from pipeline.io.geotiff_keys import crs_of_keys, keys_of
+
+    keys = keys_of(header)
     if crs is None and keys.codes:
         crs, more = crs_of_keys(header, keys)
         warnings.extend(more)

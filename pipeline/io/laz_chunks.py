@@ -17,12 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import InconsistentInputError, UnreadableInputError
-from pipeline.io.laz_decoder import DECODING_ERRORS, decoding
-from pipeline.io.readable import Readable
 from pipeline.io.reading import moved
+from pipeline.io.records import Readable
 
 if TYPE_CHECKING:
     from pipeline.io.las_header import HeaderBlock
+import contextlib
+from collections.abc import Iterator
+
+import laspy
 
 CHUNK_SIZE_LIMIT = 4_000_000
 """Points a chunk beyond which chunks are not decoded at once: writers use 50,000, COPC some 100,000."""
@@ -260,3 +263,26 @@ def _decodes(chunk: bytes, count: int, laszip_record: bytes, item_size: int) -> 
     except DECODING_ERRORS:
         return False
     return True
+
+
+DECODING_ERRORS = (lazrs.LazrsError, laspy.LaspyException, ArithmeticError, OSError, ValueError, struct.error)
+"""What decoding a damaged file raises within `decoding`."""
+
+
+_BINDINGS = "pyo3_runtime"
+"""Module of the exceptions that stand for panics; it cannot be imported."""
+
+
+@contextlib.contextmanager
+def decoding() -> Iterator[None]:
+    """Raise LazrsError in place of a panic of lazrs, and of memory that it cannot get for what the file claims."""
+    try:
+        yield
+    except MemoryError as fault:
+        raise lazrs.LazrsError("the file asks for more memory than there is") from fault
+    except Exception:
+        raise
+    except BaseException as fault:
+        if type(fault).__module__ != _BINDINGS:
+            raise
+        raise lazrs.LazrsError(f"the decoder met what cannot be: {fault}") from fault

@@ -7,13 +7,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.io.locations import is_url
-from pipeline.io.readable import Readable
+from pipeline.io.records import Readable
 from pipeline.io.storage import LocalStorage, Storage
 from pipeline.io.temporary import temporary_folder
 
 if TYPE_CHECKING:
     import pyarrow.fs as pafs
+from pipeline.io.locations import is_url
+from pipeline.registry import extra
 
 
 def storage_at(place: str | Path) -> Storage:
@@ -23,9 +24,8 @@ def storage_at(place: str | Path) -> Storage:
     's3://bucket/runs/a'
     """
     if isinstance(place, str) and is_url(place):
-        from pipeline.io.object_storage import ObjectStorage
-
-        return ObjectStorage(url=place)
+        storage: Storage = extra("ObjectStorage")(url=place)
+        return storage
     return LocalStorage(root=Path(place).resolve())
 
 
@@ -33,9 +33,8 @@ def file_at(location: str | Path) -> Readable:
     """A file of this machine, or behind a URL."""
     if not is_url(location):
         return Path(location)
-    from pipeline.io.remote_file import RemoteFile
-
-    return RemoteFile(str(location))
+    file: Readable = extra("RemoteFile")(str(location))
+    return file
 
 
 @contextlib.contextmanager
@@ -47,9 +46,7 @@ def on_this_machine(location: str | Path) -> Iterator[Path]:
     if not is_url(location):
         yield Path(location)
         return
-    from pipeline.io.remote_file import RemoteFile
-
-    file = RemoteFile(str(location))
+    file = extra("RemoteFile")(str(location))
     with temporary_folder() as folder:
         path = folder / f"file{file.suffix}"
         file.fetch(path)
@@ -87,8 +84,5 @@ def arrow_at(place: str | Path) -> tuple[pafs.FileSystem, str]:
 
     if not is_url(str(place)):
         return pafs.LocalFileSystem(), str(place)
-    from pipeline.io.arrow_objects import ObjectHandler
-    from pipeline.io.object_storage import ObjectStorage
-
-    storage = ObjectStorage(url=str(place))
-    return pafs.PyFileSystem(ObjectHandler(storage.url)), storage.url.partition("://")[2]
+    storage = extra("ObjectStorage")(url=str(place))
+    return pafs.PyFileSystem(extra("ObjectHandler")(storage.url)), storage.url.partition("://")[2]

@@ -11,7 +11,7 @@ from pipeline.geometry import point_spacing_m
 from pipeline.model import PreparedCloud, Segmentation
 from pipeline.prepared_cloud import require_visible
 from pipeline.segmentation.adaptive_planes import detect_planes
-from pipeline.segmentation.plane_refinement import describe_planes
+from pipeline.segmentation.plane_regression import describe_planes
 from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
 
 

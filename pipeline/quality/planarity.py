@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.sorting import ascending_order
 from pipeline.model import FloatArray, IntArray
 
 _SWEEPS = 12

@@ -12,8 +12,8 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
 from pipeline.geometry import corners_of_rings
-from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.exact_sum import exact_sum
+from pipeline.kernels.sorting import counting_sort
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, RoofFace
 from pipeline.quality.unseen_roof import Raster, middles_of_cells, unseen_cells
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.merge_sort import ascending_order
 from pipeline.kernels.orientation import segments_meet, turn_of
+from pipeline.kernels.sorting import ascending_order
 from pipeline.model import IntArray
 
 _LOW_BITS = 20  # products are split here, so that each half fits into 64 bits

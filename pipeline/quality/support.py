@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.model import BuildingResult, Candidate, Doubt, Reason
 from pipeline.quality.detection import confidence_of
-from pipeline.quality.level_sides import level_side_share
 from pipeline.quality.roof_returns import TOLERANCE_M
-from pipeline.quality.unseen_sides import unseen_beside_m2, unseen_left_out_m2
+from pipeline.quality.unseen_sides import level_side_share, unseen_beside_m2, unseen_left_out_m2
 
 if TYPE_CHECKING:
     from pipeline.quality.settings import SupportSettings

@@ -40,22 +40,22 @@ from itertools import accumulate, chain
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.merge_sort import ascending_order
 from pipeline.kernels.orientation import comes_before
+from pipeline.kernels.sorting import ascending_order
 from pipeline.kernels.union_find import root_of
 from pipeline.model import BoolArray, IntArray, Solid
 from pipeline.parameters import Parameters, parameter
-from pipeline.quality.planarity import (
-    bends_where_it_is_straight,
-    fitted_plane,
-    in_fitted_plane,
-    min_cosine_of_normals,
-)
+from pipeline.quality.planarity import bends_where_it_is_straight, fitted_plane, in_fitted_plane, min_cosine_of_normals
 from pipeline.quality.rings import RING_SELF_INTERSECTION, polygon_code
 from pipeline.quality.self_intersection import shell_intersects_itself
 from pipeline.quality.shell import is_sound_shell, six_volumes
-from pipeline.triangulation.faces import DONE, MILLIMETRES_PER_METRE, triangulate_rings
-from pipeline.triangulation.projection import area_vector, project_along_dominant_axis
+from pipeline.triangulation.faces import (
+    DONE,
+    MILLIMETRES_PER_METRE,
+    area_vector,
+    project_along_dominant_axis,
+    triangulate_rings,
+)
 
 TOO_FEW_POINTS = 101
 CONSECUTIVE_POINTS_SAME = 102

@@ -24,9 +24,8 @@ import shapely
 
 from pipeline.compiler import kernel
 from pipeline.kernels.bounds import bounds_of
-from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.exact_sum import exact_sum
-from pipeline.kernels.merge_sort import in_order, sort_few
+from pipeline.kernels.sorting import counting_sort, in_order, sort_few
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.lines import Run, off_piece
 

@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
-from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.sorting import ascending_order, counting_sort
 from pipeline.kernels.union_find import numbered_sets, unite
 from pipeline.model import FloatArray, IntArray, LabelArray
 

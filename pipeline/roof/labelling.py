@@ -8,8 +8,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.bounds import bounds_of
-from pipeline.kernels.counting_sort import counting_sort
-from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.sorting import ascending_order, counting_sort
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 
 _MAX_CELLS = 4_000_000

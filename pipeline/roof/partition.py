@@ -17,8 +17,7 @@ import shapely
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
-from pipeline.kernels.counting_sort import counting_sort
-from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.sorting import ascending_order, counting_sort
 from pipeline.kernels.union_find import numbered_sets, unite
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason, Tin
 from pipeline.prepared_cloud import SHADING_HEIGHT_M

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled
-from pipeline.runtime.monitoring.events import Event, Listener, never
-from pipeline.runtime.monitoring.machine import cores
+from pipeline.runtime.monitoring.measurement import cores
+from pipeline.runtime.monitoring.progress import Event, Listener, never
 
 if TYPE_CHECKING:
     from pipeline.compiler.warm_up import Listed

@@ -10,7 +10,7 @@ from pipeline.runtime.cluster.priorities import priority_of
 from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 from pipeline.runtime.expected import RATES, Expected
 from pipeline.runtime.isolation.child_pool import kill_children, preload
-from pipeline.runtime.monitoring.machine import cores, memory_bytes
+from pipeline.runtime.monitoring.measurement import cores, memory_bytes
 from pipeline.runtime.resources import Resources
 
 Engine = Literal["serial", "local", "cluster"]

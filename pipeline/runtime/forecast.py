@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pipeline.runtime.compiling import compiling_s, kernel_groups
 from pipeline.runtime.engine import Engine
 from pipeline.runtime.expected import RATES, Expected, expected
-from pipeline.runtime.monitoring.machine import cores
+from pipeline.runtime.monitoring.measurement import cores
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest
 

@@ -14,7 +14,7 @@ from pipeline.errors import InputError, all_at_fault
 from pipeline.io import ReadOptions, SourceInfo, is_url
 from pipeline.io.reading import set_input_timeout
 from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.monitoring.events import Watch
+from pipeline.runtime.monitoring.progress import Watch
 from pipeline.runtime.plan import MANY_FILES, looked_at, usable
 from pipeline.runtime.resources import Resources
 

@@ -19,8 +19,8 @@ from typing import Any
 import shapely
 
 from pipeline.errors import RunError
-from pipeline.export.putting import Put, put_local
-from pipeline.terrain.flight_strip import Strip
+from pipeline.export.folders import Put, put_local
+from pipeline.terrain.flight_passes import Strip
 from pipeline.tiling import MM, Tile, TileGrid
 
 NAME = "run.json"

@@ -27,8 +27,7 @@ from pipeline.io.source import IMPOSSIBLE_DENSITY
 from pipeline.runtime.scratch.folder import POINT
 from pipeline.settings import RunSettings
 from pipeline.terrain.filter_settings import FILTERS
-from pipeline.terrain.scene_settings import APRON_M, ClassesInUse
-from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.settings import APRON_M, ClassesInUse, GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 WINDOW_BASE_BYTES = 300 * 2**20

@@ -20,7 +20,6 @@ from pipeline.recipe import failed_building
 from pipeline.runtime.isolation.isolated_items import supervise
 from pipeline.runtime.isolation.limits import IsolationLimits, Loss
 from pipeline.runtime.isolation.replay_bundle import Bundle
-from pipeline.runtime.stages.model_batch import model_bundle
 
 _OF_THE_RUN = ("geometry", "acquired_from", "acquired_to", "mesh_path", "input_hash", "settings_hash", *SHAPE_COLUMNS)
 
@@ -88,3 +87,10 @@ def write_replay(folder: str, bundle: Bundle, replayed: Replayed) -> tuple[Path,
     except OSError as error:
         raise RunError(f"{folder} cannot be written: {error.strerror or error}. Give another --out") from error
     return tuple(written)
+
+
+def model_bundle(bundle: Bundle) -> BuildingResult:
+    """The building of a bundle, modelled again; raises MemoryError where memory runs out."""
+    from pipeline.recipe import reconstruct_building  # as above
+
+    return reconstruct_building(bundle.candidate, bundle.method, bundle.settings)

@@ -7,41 +7,30 @@ import dataclasses
 import functools
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from pipeline.errors import FolderLostError, RunOverError
 from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 from pipeline.runtime.isolation.limits import IsolationLimits
-from pipeline.runtime.monitoring.events import TICK_S, Watch, never
 from pipeline.runtime.monitoring.logs import about
-from pipeline.runtime.monitoring.progress import Progress, span
+from pipeline.runtime.monitoring.progress import TICK_S, Progress, Watch, never, span
 from pipeline.runtime.monitoring.traces import Part
 from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files, KeptFiles, Promise, damaged_among
-from pipeline.runtime.scratch.outcomes import (
-    DamagedError,
-    OutcomeTask,
-    Place,
-    brief_of,
-    check_outcome,
-    run_and_store,
-)
+from pipeline.runtime.scratch.outcomes import FOLDER as OUTCOMES
+from pipeline.runtime.scratch.outcomes import Files, OutcomeTask, Place, brief_of, run_and_store
 
 if TYPE_CHECKING:
     from pipeline.runtime.expected import Expected
+    from pipeline.runtime.kept_files import KeptFiles
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 Brief = TypeVar("Brief")
-
-_CHECKS_PER_TASK = 16
-_NAMED = 3
-"""Damaged results that a warning names."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,8 +63,8 @@ class RunContext:
     """Limits of the child processes that model buildings; None models buildings in the workers themselves."""
     reading: IsolationLimits | None = None
     """Limits of the child processes that read inputs; None reads them in the workers themselves."""
-    kept: KeptFiles = dataclasses.field(default_factory=KeptFiles)
-    """Files of earlier runs that no task of this one has read yet."""
+    kept: KeptFiles | None = None
+    """Files of earlier runs that no task of this one has read yet; None where scratch is new."""
 
     @contextlib.contextmanager
     def blaming_lost_scratch(self) -> Iterator[None]:
@@ -106,20 +95,6 @@ class RunContext:
                     "each run a folder of its own and leave it in place, then run again"
                 ) from fault
             raise
-
-    def map(self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
-        """The results of a stage's tasks, as they come."""
-        results = []
-        # closed at once where the listener raises, so that no task goes on in vain
-        with (
-            self.progress.stage(stage, len(tasks)) as counter,
-            contextlib.closing(self.executor.map(stage, function, tasks, self.progress.watch)) as running,
-        ):
-            for found in running:
-                results.append(found.result)
-                self.progress.measured(found)
-                counter.add(1)
-        return results
 
     def map_stored(
         self,
@@ -158,12 +133,17 @@ class RunContext:
                 )
                 for place, task in tasks.items()
             }
-            found = self._found(works, files)
+            if self.kept is None:
+                found: dict[Place, Brief] = {
+                    place: brief_of(self.scratch, place) for place in works if self.scratch.has(place.name)
+                }
+            else:
+                found = self.kept.found(works, files, self.progress)
             if found:
                 kept, failed = sum(map(units.done, found.values())), sum(map(units.failed, found.values()))
                 counter.add(kept, failed, kept=kept, message=f"{len(found)} of {len(tasks)} tasks were done before")
             todo = [work for place, work in works.items() if place not in found]
-            if self.kept:
+            if self.kept is not None:
                 self.check(folder for work in todo for folder in files.reads(work.task))
             # closed at once where the listener raises, so that no task goes on in vain
             with contextlib.closing(self.executor.map(stage, run_and_store, todo, self.progress.watch)) as running:
@@ -175,68 +155,10 @@ class RunContext:
                     counter.add(units.done(new.brief), units.failed(new.brief))
         return {place: found[place] for place in tasks}
 
-    def _found(
-        self, works: Mapping[Place, OutcomeTask[Task, Result, Brief]], files: Files[Task, Brief]
-    ) -> dict[Place, Brief]:
-        """The briefs of the outcomes that earlier runs stored; damaged ones are removed."""
-        found: dict[Place, Brief] = {}
-        damaged: list[Place] = []
-        for place in works:
-            if self.scratch.has(place.name):
-                try:
-                    found[place] = brief_of(self.scratch, place)
-                    if files.results:
-                        check_outcome(self.scratch, place)
-                except DamagedError:
-                    damaged.append(place)
-        if files.at_once:
-            damaged += self._damaged([Promise(folder="", work=works[place], files=files) for place in found])
-        for place in damaged:
-            found.pop(place, None)
-        self._forget(damaged)
-        for place, brief in found.items():
-            self.kept.add(works[place], brief, files)
-        return found
-
     def check(self, folders: Iterable[str]) -> None:
         """Check what earlier runs left in some folders of scratch, once per run; what is damaged is made again."""
-        promises = self.kept.take(folders)
-        damaged: dict[Place, Promise[Any, Any]] = {}
-        while promises:
-            by_place = {promise.work.place: promise for promise in promises}
-            new = {place: by_place[place] for place in self._damaged(promises)}
-            self._forget(new)
-            damaged |= new
-            # a task that runs again reads the files of earlier stages, which may be damaged, too
-            promises = self.kept.take(
-                folder for promise in new.values() for folder in promise.files.reads(promise.work.task)
-            )
-        for works in self.kept.in_order(damaged.values()):
-            running = self.executor.map(works[0].stage, run_and_store, works, self.progress.watch)
-            with contextlib.closing(running):
-                for measured in running:
-                    self.progress.measured(measured)
-        self.kept.made(damaged)
-
-    def _damaged(self, promises: Sequence[Promise[Any, Any]]) -> list[Place]:
-        """The outcomes of those promises that do not hold."""
-        checks = [promise.check for promise in promises]
-        groups = [tuple(checks[k : k + _CHECKS_PER_TASK]) for k in range(0, len(checks), _CHECKS_PER_TASK)]
-        if not groups:
-            return []
-        checking = self.executor.map("check", damaged_among, groups, self.progress.watch)
-        with contextlib.closing(checking) as running:
-            return [place for measured in running for place in measured.result]
-
-    def _forget(self, damaged: Collection[Place]) -> None:
-        """Remove damaged outcomes, with a warning."""
-        for place in damaged:
-            Path(self.scratch.root, place.name).unlink(missing_ok=True)
-        if damaged:
-            names = sorted({f"{place.stage}/{place.unit}" for place in damaged})
-            named = ", ".join(names[:_NAMED]) + (" …" if len(names) > _NAMED else "")
-            message = f"{len(damaged)} stored results were damaged and are made again: {named}"
-            self.progress.warn("check", message)
+        if self.kept is not None:
+            self.kept.check(folders, self.progress)
 
 
 @contextlib.contextmanager
@@ -294,6 +216,7 @@ def run_context(
                 scratch=opened,
                 isolation=resources.isolation,
                 reading=resources.reading,
+                kept=_kept_files(opened, engine),
             )
             try:
                 with context.blaming_lost_scratch():
@@ -312,6 +235,15 @@ def _own_executor(
     from pipeline.runtime.engine import executor_for
 
     return executor_for(resources, local_directory=local_directory, work=work(), loads=loads)
+
+
+def _kept_files(scratch: Scratch, executor: Executor) -> KeptFiles | None:
+    """What earlier runs left in scratch."""
+    if not scratch.has(OUTCOMES):
+        return None
+    from pipeline.runtime.kept_files import KeptFiles
+
+    return KeptFiles(scratch, executor)
 
 
 @contextlib.contextmanager

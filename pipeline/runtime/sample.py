@@ -29,12 +29,12 @@ from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.expected import RATES, Expected, around_km2, block_km2, filled_cells
 from pipeline.runtime.isolation.child_pool import preload
 from pipeline.runtime.isolation.preloading import loads_of
-from pipeline.runtime.monitoring.events import Watch, ignore
+from pipeline.runtime.monitoring.progress import Watch, ignore
 from pipeline.runtime.plan import Plan, wanted_bounds_m
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
-from pipeline.terrain.class_codes import ClassCodeSettings
+from pipeline.terrain.settings import ClassCodeSettings
 from pipeline.tiling import MM, TileGrid
 
 # Constants of the estimate, measured; they decide nothing in a run, so they are not settings.

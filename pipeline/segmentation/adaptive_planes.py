@@ -16,13 +16,16 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.geometry import nearest_neighbours
-from pipeline.kernels.merge_sort import ascending_order, in_order
+from pipeline.kernels.sorting import ascending_order, in_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.segmentation.plane_merge import touching_pairs
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope, mean_square_residual
 from pipeline.segmentation.plane_settings import MIN_PLANE_POINTS, AdaptivePlaneSettings
-from pipeline.segmentation.point_assignment import distance_to_plane, vote_among_neighbours
-from pipeline.segmentation.redundant_planes import dissolve_redundant
+from pipeline.segmentation.point_assignment import (
+    dissolve_redundant,
+    distance_to_plane,
+    touching_pairs,
+    vote_among_neighbours,
+)
 from pipeline.segmentation.trial_regions import (
     FITTED_NEIGHBOURS,
     TrialLimits,

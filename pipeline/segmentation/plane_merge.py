@@ -13,67 +13,12 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
-from pipeline.kernels.merge_sort import ascending_order, in_order
+from pipeline.kernels.sorting import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import best_fit_plane, cosine_of_slope, mean_square_residual
+from pipeline.segmentation.point_assignment import ascending_once
 
 _NO_MERGE = 1e30  # a cost above every real one
-
-
-@kernel
-def touching_pairs(neighbours: LabelArray, labels: LabelArray, usable: BoolArray) -> IntArray:
-    """Codes low * n + high of all pairs of usable clusters that occur together among one point and its neighbours.
-
-    They ascend, each pair once, int64. `neighbours` (p, k) of every point are -1 where there are fewer; `labels` (p,)
-    are the clusters of the points, -1 for none: so a gap of unlabelled points one wide is bridged. `usable` (n,)
-    clusters have a plane.
-    """
-    n = usable.size
-    width = neighbours.shape[1]
-    codes = np.empty(64, np.int64)
-    count = 0
-    seen = np.empty(width + 1, np.int64)
-    for i in range(labels.size):
-        first = labels[i]
-        mixed = first < 0
-        if not mixed:
-            for q in range(width):
-                j = neighbours[i, q]
-                if j >= 0 and labels[j] != first:
-                    mixed = True
-                    break
-        if not mixed:
-            continue
-        kinds = 0
-        for q in range(-1, width):
-            j = i if q < 0 else neighbours[i, q]
-            if j < 0 or labels[j] < 0 or not usable[labels[j]]:
-                continue
-            known = False
-            for s in range(kinds):
-                known = known or seen[s] == labels[j]
-            if not known:
-                seen[kinds] = labels[j]
-                kinds += 1
-        for s in range(kinds):
-            for t in range(s):
-                if count == codes.size:
-                    codes = np.concatenate((codes, np.empty(count, np.int64)))
-                codes[count] = min(seen[s], seen[t]) * n + max(seen[s], seen[t])
-                count += 1
-    return _ascending_once(codes[:count])
-
-
-@kernel
-def _ascending_once(codes: IntArray) -> IntArray:
-    """Sorted codes without repetition."""
-    ordered = in_order(codes)
-    kept = 0
-    for i in range(ordered.size):
-        if i == 0 or ordered[i] != ordered[i - 1]:
-            ordered[kept] = ordered[i]
-            kept += 1
-    return ordered[:kept].copy()
 
 
 @kernel
@@ -137,7 +82,7 @@ def parallel_pairs_in_reach(
                 codes = np.concatenate((codes, np.empty(count, np.int64)))
             codes[count] = min(i, j) * n + max(i, j)
             count += 1
-    return _ascending_once(codes[:count]), work
+    return ascending_once(codes[:count]), work
 
 
 @kernel

@@ -14,12 +14,17 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
-from pipeline.model import BoolArray, FloatArray, LabelArray, Plane, Reason
-from pipeline.segmentation.plane_merge import merge_planes, parallel_pairs_in_reach, touching_pairs
-from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope, mean_square_residual
+from pipeline.model import BoolArray, FloatArray, LabelArray, Reason
+from pipeline.segmentation.plane_merge import merge_planes, parallel_pairs_in_reach
+from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope
 from pipeline.segmentation.plane_settings import PlaneRefinementSettings
-from pipeline.segmentation.point_assignment import distance_to_plane, nearest_plane, vote_among_neighbours
-from pipeline.segmentation.redundant_planes import dissolve_redundant
+from pipeline.segmentation.point_assignment import (
+    dissolve_redundant,
+    distance_to_plane,
+    nearest_plane,
+    touching_pairs,
+    vote_among_neighbours,
+)
 
 _MIN_SEED_POINTS = 4
 """In the first round a cluster may still be small: its points have not been assigned by planes yet."""
@@ -93,31 +98,6 @@ def refine_planes(
             f"refinement_work_limit is {settings.refinement_work_limit}",
         )
     return planes, refined
-
-
-def describe_planes(points: FloatArray, planes: FloatArray, labels: LabelArray) -> tuple[Plane, ...]:
-    """Planes with their support: count and root mean square vertical residual of the points that carry their label.
-
-    Points (n, 3) are metres with original elevations, planes (k, 3) their (a, b, c), labels (n,) -1 for none.
-    """
-    planes = np.ascontiguousarray(planes, dtype=np.float64).reshape(-1, 3)
-    support = _support(points, planes, labels).tolist()
-    return tuple(
-        Plane(a=a, b=b, c=c, n_points=int(count), rmse_m=rmse_m)
-        for (a, b, c), (count, rmse_m) in zip(planes.tolist(), support, strict=True)
-    )
-
-
-@kernel
-def _support(points: FloatArray, planes: FloatArray, labels: LabelArray) -> FloatArray:
-    """Number of each plane's points and root mean square of their vertical residuals, 0 of none, (k, 2)."""
-    sums = cluster_sums(points, labels, len(planes))
-    support = np.zeros((len(planes), 2))
-    for k in range(len(planes)):
-        if sums[k, 0] > 0.0:
-            support[k, 0] = sums[k, 0]
-            support[k, 1] = math.sqrt(mean_square_residual(sums[k], planes[k, 0], planes[k, 1], planes[k, 2]))
-    return support
 
 
 class _Rules(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.normal_equations import add_to_sums, solve_plane_moments
-from pipeline.model import BoolArray, FloatArray, LabelArray
+from pipeline.model import BoolArray, FloatArray, LabelArray, Plane
 
 N_SUMS = 10
 """n, x, y, z, xx, xy, yy, xz, yz, zz."""
@@ -125,3 +125,28 @@ def has_company(
 def cosine_of_slope(a: float, b: float) -> float:
     """Turns a vertical distance to the plane into a perpendicular one (Eq. 1)."""
     return 1.0 / math.sqrt(1.0 + a * a + b * b)
+
+
+def describe_planes(points: FloatArray, planes: FloatArray, labels: LabelArray) -> tuple[Plane, ...]:
+    """Planes with their support: count and root mean square vertical residual of the points that carry their label.
+
+    Points (n, 3) are metres with original elevations, planes (k, 3) their (a, b, c), labels (n,) -1 for none.
+    """
+    planes = np.ascontiguousarray(planes, dtype=np.float64).reshape(-1, 3)
+    support = _support(points, planes, labels).tolist()
+    return tuple(
+        Plane(a=a, b=b, c=c, n_points=int(count), rmse_m=rmse_m)
+        for (a, b, c), (count, rmse_m) in zip(planes.tolist(), support, strict=True)
+    )
+
+
+@kernel
+def _support(points: FloatArray, planes: FloatArray, labels: LabelArray) -> FloatArray:
+    """Number of each plane's points and root mean square of their vertical residuals, 0 of none, (k, 2)."""
+    sums = cluster_sums(points, labels, len(planes))
+    support = np.zeros((len(planes), 2))
+    for k in range(len(planes)):
+        if sums[k, 0] > 0.0:
+            support[k, 0] = sums[k, 0]
+            support[k, 1] = math.sqrt(mean_square_residual(sums[k], planes[k, 0], planes[k, 1], planes[k, 2]))
+    return support

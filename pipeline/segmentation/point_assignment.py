@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.model import BoolArray, FloatArray, LabelArray
+from pipeline.kernels.sorting import ascending_order, counting_sort, in_order
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import cosine_of_slope
 
 
@@ -157,3 +158,144 @@ def nearest_plane(points: FloatArray, planes: FloatArray, usable: BoolArray, dis
                 least = distance
                 labels[i] = k
     return labels
+
+
+@kernel
+def touching_pairs(neighbours: LabelArray, labels: LabelArray, usable: BoolArray) -> IntArray:
+    """Codes low * n + high of all pairs of usable clusters that occur together among one point and its neighbours.
+
+    They ascend, each pair once, int64. `neighbours` (p, k) of every point are -1 where there are fewer; `labels` (p,)
+    are the clusters of the points, -1 for none: so a gap of unlabelled points one wide is bridged. `usable` (n,)
+    clusters have a plane.
+    """
+    n = usable.size
+    width = neighbours.shape[1]
+    codes = np.empty(64, np.int64)
+    count = 0
+    seen = np.empty(width + 1, np.int64)
+    for i in range(labels.size):
+        first = labels[i]
+        mixed = first < 0
+        if not mixed:
+            for q in range(width):
+                j = neighbours[i, q]
+                if j >= 0 and labels[j] != first:
+                    mixed = True
+                    break
+        if not mixed:
+            continue
+        kinds = 0
+        for q in range(-1, width):
+            j = i if q < 0 else neighbours[i, q]
+            if j < 0 or labels[j] < 0 or not usable[labels[j]]:
+                continue
+            known = False
+            for s in range(kinds):
+                known = known or seen[s] == labels[j]
+            if not known:
+                seen[kinds] = labels[j]
+                kinds += 1
+        for s in range(kinds):
+            for t in range(s):
+                if count == codes.size:
+                    codes = np.concatenate((codes, np.empty(count, np.int64)))
+                codes[count] = min(seen[s], seen[t]) * n + max(seen[s], seen[t])
+                count += 1
+    return ascending_once(codes[:count])
+
+
+@kernel
+def ascending_once(codes: IntArray) -> IntArray:
+    """Sorted codes without repetition."""
+    ordered = in_order(codes)
+    kept = 0
+    for i in range(ordered.size):
+        if i == 0 or ordered[i] != ordered[i - 1]:
+            ordered[kept] = ordered[i]
+            kept += 1
+    return ordered[:kept].copy()
+
+
+@kernel(inline="always")
+def _partners(pairs: IntArray, n: int) -> tuple[LabelArray, LabelArray]:
+    """Partners of each of n clusters, ascending, from codes low * n + high: where those of each start, and they."""
+    m = pairs.size
+    owners = np.empty(2 * m, np.int32)
+    for p in range(m):
+        owners[p], owners[m + p] = pairs[p] % n, pairs[p] // n
+    first, partner = counting_sort(owners, n)
+    for p in range(2 * m):
+        partner[p] = owners[(partner[p] + m) % (2 * m)]
+    return first, partner
+
+
+@kernel
+def dissolve_redundant(
+    points: FloatArray,
+    neighbours: LabelArray,
+    labels: LabelArray,
+    planes: FloatArray,
+    usable: BoolArray,
+    distance_m: float,
+    plane_cost: float,
+) -> None:
+    """Give up planes whose points the planes around explain nearly as well, the smallest first, in place.
+
+    The noise of a large plane leaves clusters of its outliers, and the edge between two planes a plane across it. The
+    worth of a plane is the sum over its points of (distance / limit)^2 to the nearest touching plane, at most 1, less
+    the same to itself. Points of a plane that is given up take the nearest touching plane, or none.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Original elevations, metres.
+    neighbours : (n, k) int32
+        Nearest neighbours of every point, -1 where there are fewer.
+    labels : (n,) int32
+        Plane of every point, -1 for none; changed.
+    planes : (m, 3) float64
+        (a, b, c).
+    usable : (m,) bool
+        Planes in use; False afterwards for those given up.
+    distance_m : float
+        Largest perpendicular distance of a point to its plane.
+    plane_cost : float
+        Least worth of a plane; 0 gives up none.
+    """
+    n = usable.size
+    pairs = touching_pairs(neighbours, labels, usable)
+    if plane_cost <= 0.0 or pairs.size == 0:
+        return
+    first, partner = _partners(pairs, n)
+    begin, member = counting_sort(labels, n)
+    size = np.empty(n, np.int64)
+    for k in range(n):
+        size[k] = begin[k + 1] - begin[k]
+    for k in ascending_order(size):
+        if not usable[k] or first[k] == first[k + 1]:
+            continue
+        worth = 0.0
+        for m in range(begin[k], begin[k + 1]):
+            i = member[m]
+            least = distance_m
+            for p in range(first[k], first[k + 1]):
+                if usable[partner[p]]:
+                    least = min(least, distance_to_plane(points, i, planes, partner[p]))
+            own = min(distance_m, distance_to_plane(points, i, planes, k))
+            worth += (least * least - own * own) / (distance_m * distance_m)
+            if worth > 4.0 * plane_cost:
+                break
+        if worth >= plane_cost:
+            continue
+        usable[k] = False
+        for m in range(begin[k], begin[k + 1]):
+            i = member[m]
+            least = distance_m
+            labels[i] = -1
+            for p in range(first[k], first[k + 1]):
+                if not usable[partner[p]]:
+                    continue
+                distance = distance_to_plane(points, i, planes, partner[p])
+                if distance < least:
+                    least = distance
+                    labels[i] = partner[p]

@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
-from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.sorting import ascending_order
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import (
     N_SUMS,

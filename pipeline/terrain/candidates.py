@@ -17,13 +17,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray, Reason
-from pipeline.terrain.decks_and_vehicles import (
-    are_decks,
-    are_vehicles,
-    deck_detail,
-    shape_figures,
-    vehicle_detail,
-)
+from pipeline.terrain.decks_and_vehicles import are_decks, are_vehicles, deck_detail, shape_figures, vehicle_detail
 from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.fragment_sums import Sum
 from pipeline.terrain.settings import CandidateSettings

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.normal_equations import solve_plane_moments
+from pipeline.kernels.sorting import counting_sort
 from pipeline.kernels.union_find import numbered_sets, root_of, unite
 from pipeline.model import BoolArray, IntArray, LabelArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations

@@ -17,8 +17,7 @@ from pipeline.model import BoolArray, IntArray
 from pipeline.registry import loaded
 from pipeline.terrain.filter_settings import FILTERS, FoundGround
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, Part, lowest_per_cell, part_around, without_pits
-from pipeline.terrain.planar_fitting import MIN_CELLS, plane_around, plane_sums, sum_within
-from pipeline.terrain.rejoining import FEWEST_SIDES, meeting_sides
+from pipeline.terrain.planar_fitting import FEWEST_SIDES, MIN_CELLS, meeting_sides, plane_around, plane_sums, sum_within
 from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.support import NEAR_CELLS
 

@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.normal_equations import solve_plane_moments
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray
-from pipeline.terrain.binning import points_by_cell
+from pipeline.spatial_hash import points_by_cell
 from pipeline.terrain.settings import VegetationSettings
 from pipeline.terrain.support import PLANARITY_SCALES
 

@@ -21,7 +21,7 @@ from pipeline.terrain.embankments import embankments
 from pipeline.terrain.filter_settings import FoundGround, MorphologicalFilterSettings
 from pipeline.terrain.lattice import NO_DATA, Elevations, Part, part_around
 from pipeline.terrain.openings import cut_off
-from pipeline.terrain.planar_fitting import leaning_planes
+from pipeline.terrain.planar_fitting import plane_around, plane_sums, sum_within
 from pipeline.terrain.rejoining import rejoined
 from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS
@@ -338,3 +338,63 @@ def morphological_ground(
         joined |= embankments(lowest, ground, (houses, wide), place, settings.embankment_m2) & ~decks
     found[late] = regrown(lowest, joined, decks, last, beside)
     return found, steady
+
+
+_BLOCK = 64
+"""Side in cells of the blocks of the trend, which have sums of their own: these stay in the processor's cache."""
+
+
+MAX_LEAN = 0.6
+"""Farthest that the centroid of a trend's square may lie from its middle, in half sides: 0.5 at a straight edge."""
+
+
+@kernel
+def _lean_block(
+    elevation: Elevations,
+    used: BoolArray,
+    halves: tuple[int, int],
+    block: tuple[int, int],
+    out: tuple[Elevations, Elevations],
+) -> None:
+    """Write the trend of a block of cells, by its first row and column; the rest as in `leaning_planes`."""
+    half, widest = halves
+    south, west = max(block[0] - widest, 0), max(block[1] - widest, 0)
+    seen = (slice(south, block[0] + _BLOCK + widest), slice(west, block[1] + _BLOCK + widest))
+    sums = plane_sums(elevation[seen].copy(), used[seen].copy())
+    rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
+    for r in range(block[0] - south, min(block[0] + _BLOCK, elevation.shape[0]) - south):
+        for c in range(block[1] - west, min(block[1] + _BLOCK, elevation.shape[1]) - west):
+            side = half
+            while side < widest:
+                r0, r1 = max(r - side, 0), min(r + side, rows - 1) + 1
+                c0, c1 = max(c - side, 0), min(c + side, columns - 1) + 1
+                n = sum_within(sums, r0, r1, c0, c1, 0)
+                if n >= half:
+                    east = sum_within(sums, r0, r1, c0, c1, 1) - n * c
+                    north = sum_within(sums, r0, r1, c0, c1, 2) - n * r
+                    if max(abs(east), abs(north)) <= MAX_LEAN * side * n:
+                        break
+                side = min(2 * side, widest)
+            n, at, across, along, carries = plane_around(sums, r, c, side)
+            if n > 0:
+                out[0][south + r, west + c] = round(at)
+                if carries:
+                    out[1][south + r, west + c] = round(math.sqrt(across * across + along * along))
+
+
+@kernel
+def leaning_planes(elevation: Elevations, used: BoolArray, half: int, widest: int) -> tuple[Elevations, Elevations]:
+    """The trend at every cell: level and rise of the plane through the used cells of a square around it.
+
+    A square that holds fewer used cells than `half`, or all of them to one side, would carry its plane too far: there
+    the square grows. Half sides go from `half` to `widest` cells. Returns two lattices (rows, columns). The first has
+    the plane's elevation at the cell in mm. It is NO_DATA where the largest square holds nothing. The second has the
+    plane's steepest rise in mm a cell. It is 0 where there is no plane.
+    """
+    rows, columns = elevation.shape
+    level = np.full((rows, columns), NO_DATA, np.int32)
+    slope_mm = np.zeros((rows, columns), np.int32)
+    for r in range(0, rows, _BLOCK):
+        for c in range(0, columns, _BLOCK):
+            _lean_block(elevation, used, (half, widest), (r, c), (level, slope_mm))
+    return level, slope_mm

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from pipeline.compiler import kernel
 from pipeline.kernels.normal_equations import solve_plane_moments
 from pipeline.model import BoolArray
-from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
+from pipeline.terrain.lattice import CELL_MM, Elevations
 
 Sums = npt.NDArray[np.int64]
 """(rows + 1, columns + 1, 9) integral images of 1, x, y, z, xx, xy, yy, xz, yz; x and y are cell indices, z in mm."""
@@ -28,12 +28,6 @@ MIN_CELLS = 5
 
 MIN_SPREAD = 0.05
 """Numerical guard: det(scatter) over trace(scatter)^2 of a plane, 0 for cells in a row and 0.25 at most."""
-
-_BLOCK = 64
-"""Side in cells of the blocks of the trend, which have sums of their own: these stay in the processor's cache."""
-
-MAX_LEAN = 0.6
-"""Farthest that the centroid of a trend's square may lie from its middle, in half sides: 0.5 at a straight edge."""
 
 
 @kernel
@@ -109,92 +103,52 @@ def plane_around(sums: Sums, r: int, c: int, half: int) -> tuple[int, float, flo
     return n, mean, sx / n, sy / n, False
 
 
-@kernel
-def join_planes(
-    elevation: Elevations,
-    ground: BoolArray,
-    asked: BoolArray,
-    joined: BoolArray,
-    reach: int,
-    limits: tuple[float, float, float],
-) -> None:
-    """Mark in `joined` the asked cells that fit the plane through the ground within reach, or lie below it; all in mm.
+_SIDES = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
+"""Directions of the squares beside a cell."""
 
-    Parameters
-    ----------
-    ground, asked : (rows, columns) bool
-        What the planes go through, and what is judged.
-    reach : int
-        Half side of the squares in cells; nothing farther is looked at.
-    limits : tuple of float
-        Farthest perpendicular distance above a plane in mm; where the ground around carries no plane, highest step
-        above its mean in mm, and rise over run to its centroid.
+
+FEWEST_SIDES = 2
+"""Sides whose planes must meet a cell: a ridge that happens to end at the level of the ground meets only one."""
+
+
+_STEEPEST_MM = 1.0 * CELL_MM
+"""Rise per cell of the steepest plane that is drawn on: beyond 45 degrees it says little of the next cell's level."""
+
+
+_ROUNDING_MM = 1.0
+"""Far more than the rounding of a plane's elevation."""
+
+
+@kernel(inline="always")
+def meeting_sides(sums: Sums, cell: tuple[int, int], limits: tuple[int, float], gap: int, level_mm: int) -> int:
+    """Number of squares beside a cell whose planes meet an elevation there, counted up to `FEWEST_SIDES`.
+
+    `cell` is its row and column in `sums`; `limits` as in `rejoined`. The eight squares touch the cell with a gap of 0,
+    and leave it out with a gap of 1.
     """
-    max_distance, max_step, max_slope = limits
-    sums = plane_sums(elevation, ground)
-    rows, columns = elevation.shape
-    for r in range(rows):
-        for c in range(columns):
-            if not asked[r, c]:
-                continue
-            cells, level, across, along, carries = plane_around(sums, r, c, reach)
-            if cells == 0:
-                continue
-            above = elevation[r, c] - level
-            if carries:
-                joined[r, c] = above <= max_distance * math.sqrt(1.0 + (across * across + along * along) / CELL_MM**2)
-            else:
-                far = math.sqrt(across * across + along * along)
-                joined[r, c] = above <= max_step + max_slope * CELL_MM * far
-
-
-@kernel
-def _lean_block(
-    elevation: Elevations,
-    used: BoolArray,
-    halves: tuple[int, int],
-    block: tuple[int, int],
-    out: tuple[Elevations, Elevations],
-) -> None:
-    """Write the trend of a block of cells, by its first row and column; the rest as in `leaning_planes`."""
-    half, widest = halves
-    south, west = max(block[0] - widest, 0), max(block[1] - widest, 0)
-    seen = (slice(south, block[0] + _BLOCK + widest), slice(west, block[1] + _BLOCK + widest))
-    sums = plane_sums(elevation[seen].copy(), used[seen].copy())
+    half, step_mm = limits
     rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
-    for r in range(block[0] - south, min(block[0] + _BLOCK, elevation.shape[0]) - south):
-        for c in range(block[1] - west, min(block[1] + _BLOCK, elevation.shape[1]) - west):
-            side = half
-            while side < widest:
-                r0, r1 = max(r - side, 0), min(r + side, rows - 1) + 1
-                c0, c1 = max(c - side, 0), min(c + side, columns - 1) + 1
-                n = sum_within(sums, r0, r1, c0, c1, 0)
-                if n >= half:
-                    east = sum_within(sums, r0, r1, c0, c1, 1) - n * c
-                    north = sum_within(sums, r0, r1, c0, c1, 2) - n * r
-                    if max(abs(east), abs(north)) <= MAX_LEAN * side * n:
-                        break
-                side = min(2 * side, widest)
-            n, at, across, along, carries = plane_around(sums, r, c, side)
-            if n > 0:
-                out[0][south + r, west + c] = round(at)
-                if carries:
-                    out[1][south + r, west + c] = round(math.sqrt(across * across + along * along))
-
-
-@kernel
-def leaning_planes(elevation: Elevations, used: BoolArray, half: int, widest: int) -> tuple[Elevations, Elevations]:
-    """The trend at every cell: level and rise of the plane through the used cells of a square around it.
-
-    A square that holds fewer used cells than `half`, or all of them to one side, would carry its plane too far: there
-    the square grows. Half sides go from `half` to `widest` cells. Returns two lattices (rows, columns). The first has
-    the plane's elevation at the cell in mm. It is NO_DATA where the largest square holds nothing. The second has the
-    plane's steepest rise in mm a cell. It is 0 where there is no plane.
-    """
-    rows, columns = elevation.shape
-    level = np.full((rows, columns), NO_DATA, np.int32)
-    slope_mm = np.zeros((rows, columns), np.int32)
-    for r in range(0, rows, _BLOCK):
-        for c in range(0, columns, _BLOCK):
-            _lean_block(elevation, used, (half, widest), (r, c), (level, slope_mm))
-    return level, slope_mm
+    met = 0
+    for k in range(len(_SIDES)):
+        down, across = _SIDES[k, 0] * (half + gap), _SIDES[k, 1] * (half + gap)
+        r0, r1 = max(cell[0] + down - half, 0), min(cell[0] + down + half, rows - 1) + 1
+        c0, c1 = max(cell[1] + across - half, 0), min(cell[1] + across + half, columns - 1) + 1
+        n = sum_within(sums, r0, r1, c0, c1, 0)
+        if n < MIN_CELLS:
+            continue
+        east, north = (
+            sum_within(sums, r0, r1, c0, c1, 1) / n - cell[1],
+            sum_within(sums, r0, r1, c0, c1, 2) / n - cell[0],
+        )
+        # from its middle no plane rises or falls more than the steepest
+        most = step_mm + _STEEPEST_MM * math.sqrt(east * east + north * north) + _ROUNDING_MM
+        if abs(level_mm - sum_within(sums, r0, r1, c0, c1, 3) / n) > most:
+            continue
+        _, level, east, north, carries = plane_around(sums, cell[0] + down, cell[1] + across, half)
+        if not carries or math.sqrt(east * east + north * north) > _STEEPEST_MM:
+            continue
+        if abs(level_mm - (level - east * across - north * down)) <= step_mm:
+            met += 1
+            if met == FEWEST_SIDES:
+                break
+    return met

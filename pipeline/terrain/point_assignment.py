@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.sorting import counting_sort
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
 from pipeline.terrain.facets import FacetKind, LabelledTin, SceneVertices, VertexKind, first_corner, stands_up
 from pipeline.terrain.fragment_sums import Sum

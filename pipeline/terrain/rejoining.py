@@ -7,65 +7,16 @@ on, so a bench comes back from the side where it hangs together with the ground.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, LabelArray
-from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
-from pipeline.terrain.planar_fitting import MIN_CELLS, Sums, plane_around, plane_sums, sum_within
-
-_SIDES = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
-"""Directions of the squares beside a cell."""
-
-FEWEST_SIDES = 2
-"""Sides whose planes must meet a cell: a ridge that happens to end at the level of the ground meets only one."""
-
-_STEEPEST_MM = 1.0 * CELL_MM
-"""Rise per cell of the steepest plane that is drawn on: beyond 45 degrees it says little of the next cell's level."""
-
-_ROUNDING_MM = 1.0
-"""Far more than the rounding of a plane's elevation."""
+from pipeline.terrain.lattice import NO_DATA, Elevations
+from pipeline.terrain.planar_fitting import FEWEST_SIDES, meeting_sides, plane_sums, sum_within
 
 _BLOCK = 64
 """Side in cells of the blocks whose planes are summed and tested together; no plane depends on it. Small enough for the
 processor's cache, and most blocks need only one pass."""
-
-
-@kernel(inline="always")
-def meeting_sides(sums: Sums, cell: tuple[int, int], limits: tuple[int, float], gap: int, level_mm: int) -> int:
-    """Number of squares beside a cell whose planes meet an elevation there, counted up to `FEWEST_SIDES`.
-
-    `cell` is its row and column in `sums`; `limits` as in `rejoined`. The eight squares touch the cell with a gap of 0,
-    and leave it out with a gap of 1.
-    """
-    half, step_mm = limits
-    rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
-    met = 0
-    for k in range(len(_SIDES)):
-        down, across = _SIDES[k, 0] * (half + gap), _SIDES[k, 1] * (half + gap)
-        r0, r1 = max(cell[0] + down - half, 0), min(cell[0] + down + half, rows - 1) + 1
-        c0, c1 = max(cell[1] + across - half, 0), min(cell[1] + across + half, columns - 1) + 1
-        n = sum_within(sums, r0, r1, c0, c1, 0)
-        if n < MIN_CELLS:
-            continue
-        east, north = (
-            sum_within(sums, r0, r1, c0, c1, 1) / n - cell[1],
-            sum_within(sums, r0, r1, c0, c1, 2) / n - cell[0],
-        )
-        # from its middle no plane rises or falls more than the steepest
-        most = step_mm + _STEEPEST_MM * math.sqrt(east * east + north * north) + _ROUNDING_MM
-        if abs(level_mm - sum_within(sums, r0, r1, c0, c1, 3) / n) > most:
-            continue
-        _, level, east, north, carries = plane_around(sums, cell[0] + down, cell[1] + across, half)
-        if not carries or math.sqrt(east * east + north * north) > _STEEPEST_MM:
-            continue
-        if abs(level_mm - (level - east * across - north * down)) <= step_mm:
-            met += 1
-            if met == FEWEST_SIDES:
-                break
-    return met
 
 
 @kernel(inline="always")

@@ -14,12 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
-from pipeline.kernels.normal_equations import add_to_sums, solve_plane_moments
-from pipeline.kernels.radix_sort import radix_order
-from pipeline.kernels.smallest_eigenvalue import smallest_eigenvalue
+from pipeline.kernels.normal_equations import add_to_sums, smallest_eigenvalue, solve_plane_moments
+from pipeline.kernels.sorting import counting_sort, radix_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Tin
-from pipeline.terrain.binning import points_by_cell
+from pipeline.spatial_hash import points_by_cell
 
 # Not settings: patches only serve to separate units, and the thresholds of units are settings.
 _MAX_RADIUS_M = 3.0

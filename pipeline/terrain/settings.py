@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.filter_settings import FILTERS, HierarchicalFilterSettings, MorphologicalFilterSettings
 from pipeline.terrain.support import GLASS_M, GLASS_PLANARITY_M, NEAR_CELLS, PLANARITY_SCALES
@@ -406,3 +408,129 @@ class UnitSettings(Parameters):
         minimum=0.0,
         maximum=1.0,
     )
+
+
+OTHER = 255
+"""Replaces a producer's own code for other things, and an ASPRS code that the user took out of its list."""
+
+
+class ClassCodeSettings(Parameters):
+    """Meaning of the codes in the file; points with a code in no list are undecided."""
+
+    ground: tuple[int, ...] = parameter((2,), "Codes that mean ground.", minimum=0, maximum=255)
+    building: tuple[int, ...] = parameter((6,), "Codes that mean building.", minimum=0, maximum=255)
+    vegetation: tuple[int, ...] = parameter((3, 4, 5), "Codes that mean vegetation.", minimum=0, maximum=255)
+    noise: tuple[int, ...] = parameter(
+        (7, 18), "Codes that mean noise: such points are left out for any value of `classes`.", minimum=0, maximum=255
+    )
+    undecided: tuple[int, ...] = parameter(
+        (0, 1, 12, 19),
+        "Codes without information: such points are judged by their own evidence, as are those of codes in no list.",
+        minimum=0,
+        maximum=255,
+    )
+    other: tuple[int, ...] = parameter(
+        (8, 9, 10, 11, 13, 14, 15, 16, 17, 20, 21, 22, 26, OTHER),
+        "Codes of other things, such as water, roads, wires and bridges (26 in the Netherlands), which are never roof.",
+        minimum=0,
+        maximum=255,
+    )
+
+    @classmethod
+    def role(cls, code: int) -> str:
+        """What an ASPRS code means to a run: the name of its list, or `undecided`.
+
+        >>> [ClassCodeSettings.role(code) for code in (2, 6, 9, 28, OTHER)]
+        ['ground', 'building', 'other', 'undecided', 'other']
+        """
+        lists: dict[str, tuple[int, ...]] = dataclasses.asdict(cls())
+        return next((name for name, codes in lists.items() if code in codes), "undecided")
+
+    def cross_faults(self) -> list[str]:
+        """A code means one thing; the default of `other` gives way to other lists."""
+        groups: dict[int, list[str]] = {}
+        for name, codes in dataclasses.asdict(self).items():
+            is_default = name == "other" and codes == type(self).__dataclass_fields__["other"].default
+            for code in dict.fromkeys(codes) if isinstance(codes, tuple) and not is_default else ():
+                groups.setdefault(code, []).append(name)
+        return [
+            f"code {code} is {' and '.join(names)}: give it in one list"
+            for code, names in sorted(groups.items())
+            if len(names) > 1
+        ]
+
+    @property
+    def table(self) -> tuple[int, ...] | None:
+        """The ASPRS code of each of the 256 codes; None if all keep their own meaning.
+
+        >>> ClassCodeSettings().table is None
+        True
+        >>> table = ClassCodeSettings(building=(67,)).table
+        >>> table[67], table[6], table[9], table[28]
+        (6, 255, 9, 28)
+        """
+        asprs: dict[str, tuple[int, ...]] = dataclasses.asdict(ClassCodeSettings())
+        table = list(range(256))
+        for codes in asprs.values():
+            for code in codes:
+                table[code] = OTHER
+        # `other` first, whose default gives way to other lists
+        for name, codes in reversed(asprs.items()):
+            for code in getattr(self, name):
+                table[code] = code if code in codes else OTHER if name == "other" else codes[0]
+        return None if table == list(range(256)) else tuple(table)
+
+
+APRON_M = 6
+"""Width in metres of the terrain that a tile stores beyond its core."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ClassesInUse:
+    """Which of the file's classes are believed, decided once for a run."""
+
+    ground: bool = False
+    """Class 2 is the ground; no filter runs."""
+    building: bool = False
+    """Class 6 is building, classes that exclude buildings are believed, the rest is judged by its own evidence."""
+    vegetation: bool = False
+    """Classes 3 to 5 are vegetation; neither it nor other things, such as water, are ever part of a building."""
+    roofs: bool = False
+    """Class 6 is never ground, although the ground is found in the points."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneSettings:
+    """The settings of the stages between a tile's points and its candidates."""
+
+    outliers: OutlierSettings = dataclasses.field(default_factory=OutlierSettings)
+    ground: GroundSettings = dataclasses.field(default_factory=GroundSettings)
+    vegetation: VegetationSettings = dataclasses.field(default_factory=VegetationSettings)
+    surfaces: SurfaceSettings = dataclasses.field(default_factory=SurfaceSettings)
+    candidates: CandidateSettings = dataclasses.field(default_factory=CandidateSettings)
+    units: UnitSettings = dataclasses.field(default_factory=UnitSettings)
+    strips: StripSettings = dataclasses.field(default_factory=StripSettings)
+
+    @property
+    def support_m(self) -> float:
+        """Farthest in metres that points beyond its core matter to a tile: where it looks, and whether those count."""
+        return self.split_support_m(footprints=False) + self.outliers.support_m
+
+    def split_support_m(self, *, footprints: bool) -> float:
+        """How far in metres the split of a tile looks at points beyond its core.
+
+        A fragment depends on the facets around it, and these on the planarity of their vertices. Points in given
+        footprints are taken one by one, without a TIN.
+        """
+        return 0.0 if footprints else self.surfaces.support_m + self.vegetation.support_m
+
+    def terrain_m(self, *, footprints: bool) -> float:
+        """How far beyond the core the split needs terrain, in metres: at all points that it looks at."""
+        return max(float(APRON_M), self.split_support_m(footprints=footprints))
+
+    def ground_support_m(self, classes: ClassesInUse) -> float:
+        """How far in metres a terrain elevation looks at the lowest points of cells.
+
+        It looks as far as the ground filter. With class 2 as ground no filter runs, only planes are drawn.
+        """
+        return self.ground.trusted_support_m if classes.ground else self.ground.support_m

@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
-from pipeline.terrain.binning import points_by_cell
+from pipeline.spatial_hash import points_by_cell
 from pipeline.terrain.facets import SceneVertices, VertexKind
 from pipeline.terrain.support import GLASS_NEAR as NEAR
 from pipeline.terrain.support import GLASS_SQUARE_MM as SQUARE_MM

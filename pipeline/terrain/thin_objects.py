@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
-from pipeline.terrain.binning import points_by_cell
+from pipeline.spatial_hash import points_by_cell
 from pipeline.terrain.facets import SceneVertices, VertexKind
 
 _MIN_AROUND = 8

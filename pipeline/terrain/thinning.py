@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.radix_sort import radix_order
+from pipeline.kernels.sorting import radix_order
 from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.spatial_hash import slot_of_key
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray, LabelArray
-from pipeline.terrain.binning import points_by_cell
+from pipeline.spatial_hash import points_by_cell
 from pipeline.terrain.settings import VegetationSettings
 from pipeline.terrain.support import PLANARITY_SCALES
 

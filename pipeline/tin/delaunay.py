@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.bounds import bounds_of
-from pipeline.kernels.radix_sort import radix_order
+from pipeline.kernels.sorting import radix_order
 from pipeline.model import FloatArray, IntArray, LabelArray, Tin
 from pipeline.tin.half_edges import canonical_facets, locate, restore_delaunay, split_facet, start_sphere
 from pipeline.tin.predicates import orientation

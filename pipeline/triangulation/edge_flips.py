@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.merge_sort import ascending_order
 from pipeline.kernels.orientation import comes_before, turn_of
+from pipeline.kernels.sorting import ascending_order
 from pipeline.model import IntArray
 
 _TIE = 1e-9

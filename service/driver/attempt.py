@@ -15,11 +15,12 @@ from typing import Any, Protocol, TypeVar
 
 from pipeline import __version__
 from pipeline.errors import GableworkError, RunCancelledError
-from pipeline.runtime.classify import ClassifyRequest, classify
+from pipeline.extras.classify.classify import ClassifyRequest, classify
+from pipeline.extras.compare.compare import CompareRequest, CompareSummary, own_tables, parse_variants
+from pipeline.options import InputOptions, ModelOptions, values_of
 from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables, parse_variants
 from pipeline.runtime.monitoring import tracing
-from pipeline.runtime.monitoring.events import Event, Listener
+from pipeline.runtime.monitoring.progress import Event, Listener
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import run
@@ -359,18 +360,11 @@ def run_request(request: JobRequest, files: JobFiles, out: Path, settings: Servi
         out=str(out),
         settings=RunSettings.from_mapping(request.settings),
         footprints=None if files.footprints is None else str(files.footprints.path),
-        footprints_layer=request.footprints_layer,
         guides=None if files.guides is None else str(files.guides.path),
-        crs=request.crs,
-        vertical_unit=request.vertical_unit,
-        allow_outside_area_of_use=request.allow_outside_area_of_use,
-        bbox=request.bbox,
         resources=_resources(settings),
         # an attempt that was handed back may have begun it; the folder is the attempt's own
         overwrite=True,
-        meshes=request.meshes,
-        points=request.points,
-        licence=request.licence,
+        **values_of(ModelOptions, request),
     )
 
 
@@ -409,15 +403,12 @@ def classify_request(request: JobRequest, files: JobFiles, out: Path, settings: 
         out=str(out),
         settings=RunSettings.from_mapping(request.settings),
         footprints=None if files.footprints is None else str(files.footprints.path),
-        footprints_layer=request.footprints_layer,
-        crs=request.crs,
-        vertical_unit=request.vertical_unit,
-        allow_outside_area_of_use=request.allow_outside_area_of_use,
         rasters=has_rasters,
         raster_cell=request.raster_cell if has_rasters else None,
         resources=_resources(settings),
         # files of an attempt that was handed back
         overwrite=True,
+        **values_of(InputOptions, request),
     )
 
 

@@ -21,7 +21,7 @@ from pipeline.runtime.cluster.dask_executor import Cluster, load_dask
 from pipeline.runtime.isolation import child_main
 from pipeline.runtime.isolation.progress_reports import report_progress
 from pipeline.runtime.monitoring import tracing
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from service import traces
 from service.disk import has_no_space
 from service.driver.attempt import AttemptParts, perform

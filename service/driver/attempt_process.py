@@ -21,7 +21,7 @@ from pipeline.io.temporary import remove_left_folders
 from pipeline.runtime.isolation.child_pool import ChildPool
 from pipeline.runtime.isolation.messages import Finished, OutOfMemory, Progressed
 from pipeline.runtime.isolation.supervision import SupervisedChild, system_kills
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.scratch.folder import PULSE
 from service.disk import has_no_space
 from service.driver.attempt_child import (

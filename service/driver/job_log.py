@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from service.jobs import LogLevel, NewLogLine
 
 MAX_DETAILS = 1000

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.compiling import RECONSTRUCT, STAGE, compile_first
-from pipeline.runtime.monitoring.events import Event, Listener
+from pipeline.runtime.monitoring.progress import Event, Listener
 from service.driver.leased_job import LOG, LeasedJob
 from service.jobs import JobRequest
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.progress import Event
 from service.driver.job_log import AttemptLog
 from service.driver.messages import Scrubber
 from service.driver.progress import CLASSIFY_WEIGHTS, WEIGHTS, WORDS, percent

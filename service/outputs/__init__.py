@@ -9,14 +9,7 @@ from service.outputs.catalogue import Catalogue, output_file, read_catalogue, ru
 from service.outputs.classification import write_classification_outputs
 from service.outputs.comparison import write_comparison_outputs
 from service.outputs.echo import write_echo
-from service.outputs.kinds import (
-    CLASSIFICATION_OUTPUTS,
-    COMPARISON_OUTPUTS,
-    ECHO_OUTPUTS,
-    KINDS,
-    OUTPUTS,
-    OutputKind,
-)
+from service.outputs.kinds import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, ECHO_OUTPUTS, KINDS, OUTPUTS, OutputKind
 
 __all__ = [
     "CLASSIFICATION_OUTPUTS",

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.export.folders import POINTS_FOLDER
-from pipeline.export.point_files import TILESET
+from pipeline.extras.octree.point_files import TILESET
 from service.outputs.catalogue import NAME as CATALOGUE_NAME
 from service.outputs.catalogue import Catalogue, StoredOutput
 from service.outputs.kinds import ON_REQUEST, OUTPUTS, chosen

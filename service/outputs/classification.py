@@ -16,7 +16,7 @@ from service.outputs.kinds import CLASSIFICATION_OUTPUTS, RASTERS, chosen
 from service.outputs.meshes import zip_files
 
 if TYPE_CHECKING:
-    from pipeline.runtime.classify import ClassifySummary
+    from pipeline.extras.classify.classify import ClassifySummary
 
 
 def write_classification_outputs(

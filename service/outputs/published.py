@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from service.outputs.kinds import FORMATS, GEOJSON, GLB, OUTPUTS
 
 if TYPE_CHECKING:
-    from pipeline.runtime.monitoring.events import Listener
+    from pipeline.runtime.monitoring.progress import Listener
 
 _TILE = r"x-?\d{1,9}_y-?\d{1,9}"
 _SQUARE = rf"{_TILE}_\d{{1,9}}"
@@ -132,7 +132,7 @@ _Options = Mapping[str, Any]
 
 
 def _tiles(run_dir: Path, out_dir: Path, options: _Options, on_event: Listener) -> None:
-    from pipeline.runtime.publishing_3dtiles import publish_3dtiles
+    from pipeline.extras.publish_3dtiles.publishing_3dtiles import publish_3dtiles
 
     place = out_dir / "3dtiles"
     publish_3dtiles(str(run_dir), str(place), geoid_height_m=options["geoid_height_m"], on_event=on_event)
@@ -147,19 +147,19 @@ def _tiles(run_dir: Path, out_dir: Path, options: _Options, on_event: Listener) 
 
 
 def _geopackage(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.runtime.publishing import publish_geopackage
+    from pipeline.extras.publish.publishing import publish_geopackage
 
     publish_geopackage(str(run_dir), str(out_dir / OUTPUTS["geopackage"].filename), on_event=on_event)
 
 
 def _pmtiles(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.runtime.publishing import publish_pmtiles
+    from pipeline.extras.publish.publishing import publish_pmtiles
 
     publish_pmtiles(str(run_dir), str(out_dir / OUTPUTS["pmtiles"].filename), on_event=on_event)
 
 
 def _cityjson(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.runtime.publishing import publish_cityjson
+    from pipeline.extras.publish.publishing import publish_cityjson
 
     place = out_dir / "cityjson"
     publish_cityjson(str(run_dir), str(place), on_event=on_event)
@@ -168,7 +168,7 @@ def _cityjson(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> 
 
 
 def _stac(run_dir: Path, out_dir: Path, options: _Options, on_event: Listener) -> None:
-    from pipeline.runtime.publishing import publish_stac
+    from pipeline.extras.publish.publishing import publish_stac
 
     place = out_dir / "stac"
     # what is about the run as a whole names folders of the server
@@ -182,8 +182,8 @@ def _stac(run_dir: Path, out_dir: Path, options: _Options, on_event: Listener) -
 
 def _solar(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
     from pipeline.errors import RunError
+    from pipeline.extras.solar.solar_of_run import solar
     from pipeline.runtime.manifest_reading import read_manifest
-    from pipeline.runtime.solar import solar
 
     if not (read_manifest(str(run_dir)).crs or {}).get("wkt"):
         raise RunError("the CRS of the tiles is unknown, so the sun's place is, too: submit again with --crs EPSG:n")
@@ -191,7 +191,7 @@ def _solar(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> Non
 
 
 def _party_walls(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.runtime.party_walls import party_walls
+    from pipeline.extras.party_walls.party_walls_of_run import party_walls
 
     walls, areas = (str(out_dir / OUTPUTS[name].filename) for name in FORMATS["party-walls"])
     party_walls(str(run_dir), walls, buildings=areas, on_event=on_event)

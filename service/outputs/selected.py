@@ -163,7 +163,7 @@ def write_selected(
         The folder cannot be written.
     """
     from pipeline.errors import NothingToShowError
-    from pipeline.runtime.selection import select_run
+    from pipeline.extras.publish.selection import select_run
     from service.outputs.assemble import write_outputs
     from service.outputs.published import formats_of, publish
 

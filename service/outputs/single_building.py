@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.export.building_points import building_points
 from pipeline.export.folders import POINTS_FOLDER
-from pipeline.export.obj_parts import lines_of_buildings
-from pipeline.export.point_files import TILESET
 from pipeline.export.solid_geometry import OVERHANGS
+from pipeline.extras.octree.building_points import building_points
+from pipeline.extras.octree.point_files import TILESET
+from pipeline.extras.publish.obj_parts import lines_of_buildings
 from service.errors import NoSuchBuildingError, NoSuchOutputError
 from service.outputs.building_index import FEATURES_NAME
 from service.outputs.building_pages import GONE, opened_index

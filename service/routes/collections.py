@@ -17,13 +17,7 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import AfterValidator
 
 from service.auth import Principal
-from service.errors import (
-    NoSuchCollectionError,
-    NoSuchJobError,
-    NoSuchOutputError,
-    RequestError,
-    ResultNotReadyError,
-)
+from service.errors import NoSuchCollectionError, NoSuchJobError, NoSuchOutputError, RequestError, ResultNotReadyError
 from service.features.runs import ServedRun, split_id
 from service.files import StateFolder, is_id
 from service.jobs import Job, JobStatus

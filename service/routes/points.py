@@ -8,7 +8,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Request, Response
 
 from pipeline.export.folders import POINTS_FOLDER
-from pipeline.export.point_files import NAMED_FILE, TILESET
+from pipeline.extras.octree.point_files import NAMED_FILE, TILESET
 from service.errors import NoSuchOutputError
 from service.outputs.kinds import GLB
 from service.routes.finished_jobs import FinishedJob, FinishedRun

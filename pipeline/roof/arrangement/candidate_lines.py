@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.merge_sort import ascending_order, in_order
+from pipeline.kernels.sorting import ascending_order, in_order
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import Raster, vertical_distance_m
 

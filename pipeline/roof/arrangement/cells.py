@@ -14,8 +14,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
-from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.sorting import ascending_order, counting_sort
 from pipeline.kernels.union_find import numbered_sets, unite
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.guide_lines import length_on_guide

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.orientation import turn_of
+from pipeline.kernels.sorting import counting_sort
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.cells import cell_borders, connected_faces
 from pipeline.roof.arrangement.subdivision import (

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.sorting import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.limits import Limits
 from pipeline.roof.arrangement.movable_borders import Borders

@@ -12,9 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
-from pipeline.kernels.merge_sort import ascending_order
 from pipeline.kernels.orientation import same_ray, segments_meet, turn_of
+from pipeline.kernels.sorting import ascending_order, counting_sort
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import vertical_distance_m
 

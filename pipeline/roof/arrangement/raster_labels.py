@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
-from pipeline.kernels.merge_sort import sort_few
+from pipeline.kernels.sorting import counting_sort, sort_few
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.minimum_cut import Allowed, Costs, Neighbours, cost_of, expand_labels
 

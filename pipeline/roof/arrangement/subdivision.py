@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.kernels.orientation import lies_between, same_ray, segments_meet, turn_of
+from pipeline.kernels.sorting import ascending_order, in_order
 from pipeline.model import FloatArray, IntArray
 from pipeline.roof.arrangement.candidate_lines import CandidateLines
 

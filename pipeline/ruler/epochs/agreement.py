@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from pipeline.errors import CrsError
-from pipeline.io.crs import horizontal_part
-from pipeline.io.crs_units import states_unit_alone, vertical_part
+from pipeline.io.crs import horizontal_part, vertical_part
+from pipeline.io.crs_units import states_unit_alone
 from pipeline.ruler.epochs.epoch import Epoch
 
 

@@ -19,14 +19,7 @@ from shapely import Polygon
 
 from pipeline.model import BoolArray, FloatArray
 from pipeline.ruler.evaluation.bootstrap import Share, Statistic, Sums, quality, share
-from pipeline.ruler.evaluation.building_raster import (
-    CELL_M,
-    CellWindow,
-    PlanRaster,
-    PointRaster,
-    edge_ring,
-    windows_of,
-)
+from pipeline.ruler.evaluation.building_raster import CELL_M, CellWindow, PlanRaster, PointRaster, edge_ring, windows_of
 from pipeline.ruler.evaluation.matching import (
     excused_models,
     mostly_on,

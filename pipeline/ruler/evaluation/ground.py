@@ -29,8 +29,7 @@ from pipeline.scene import GROUND_CLASS
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, lowest_per_cell
 from pipeline.terrain.outliers import dense_enough
-from pipeline.terrain.scene_settings import SceneSettings
-from pipeline.terrain.settings import OutlierSettings
+from pipeline.terrain.settings import OutlierSettings, SceneSettings
 
 NOT_JUDGED = (7, 9, 18)
 """Reference classes that are neither ground nor object: low noise, water, high noise."""

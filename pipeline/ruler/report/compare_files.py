@@ -12,13 +12,13 @@ import numpy as np
 
 from pipeline import __version__
 from pipeline.errors import RunCancelledError
+from pipeline.extras.compare.compare import SUMMARY, CompareRequest, CompareSummary, compare, settings_of
 from pipeline.io import LocalStorage, ReadOptions, find_inputs
 from pipeline.ruler.evaluation.evaluate import Evaluation
 from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files, read_reference
 from pipeline.ruler.report.comparison import ComparedRun, PointFiles, write_comparison
 from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.compare import SUMMARY, CompareRequest, CompareSummary, compare, settings_of
-from pipeline.runtime.monitoring.events import Event, Listener, ignore, never
+from pipeline.runtime.monitoring.progress import Event, Listener, ignore, never
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pipeline.errors import SettingsError
 from pipeline.export.geoparquet import parquet_bytes
+from pipeline.extras.compare.compare import BUILDINGS, PAGE, REPORT
 from pipeline.io.storage import LocalStorage
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
 from pipeline.ruler.evaluation.reading import read_models
@@ -17,7 +18,6 @@ from pipeline.ruler.report.comparison_page import Comparison, ComparisonCase, ma
 from pipeline.ruler.report.comparison_pictures import draw_building, place_of
 from pipeline.ruler.report.comparison_points import PointFiles, points_within
 from pipeline.ruler.report.comparison_records import buildings_table, projjson_of, read_buildings
-from pipeline.runtime.compare import BUILDINGS, PAGE, REPORT
 from pipeline.runtime.manifest_reading import read_manifest
 
 __all__ = ["BUILDINGS", "PAGE", "REPORT", "ComparedRun", "PointFiles", "write_comparison"]

@@ -9,7 +9,7 @@ from pipeline.quality.self_intersection import shell_intersects_itself
 from pipeline.roof.arrangement.raster_labels import raster_labels
 from pipeline.roof.arrangement.subdivision import subdivide
 from pipeline.segmentation.trial_regions import take_regions
-from pipeline.terrain.binning import points_by_cell
+from pipeline.spatial_hash import points_by_cell
 from pipeline.terrain.facets import classify_facets
 from pipeline.terrain.point_assignment import assign_points
 from pipeline.triangulation.faces import triangulate_rings
@@ -18,7 +18,7 @@ GROUND = (points_by_cell, classify_facets, assign_points)
 """Kernels of every run that finds ground and buildings in the points alone."""
 MODELLING = (take_regions, raster_labels, subdivide, triangulate_rings, shell_intersects_itself)
 """Kernels of every process that models by the default method, in the order of their calls
-(`pipeline.runtime.stages.model_batch.load`). A kernel is stored after its callees."""
+(`pipeline.runtime.stages.rehearsal.load`). A kernel is stored after its callees."""
 
 
 def kernels_are_compiled(kernels: Iterable[Any] = (*GROUND, *MODELLING)) -> bool:

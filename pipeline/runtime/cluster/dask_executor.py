@@ -20,8 +20,8 @@ from pipeline.runtime.cluster.priorities import Traffic, priority_of
 from pipeline.runtime.cluster.tls import TlsFiles, check_address, explain_failure, given_tls
 from pipeline.runtime.cluster.worker_fork_server import forked_workers
 from pipeline.runtime.isolation.spawned_child import environment_with_this_package
-from pipeline.runtime.monitoring.events import TICK_S, Watch
 from pipeline.runtime.monitoring.measurement import Measured, Result, Task, mismatch_message
+from pipeline.runtime.monitoring.progress import TICK_S, Watch
 from pipeline.runtime.monitoring.versions import ENGINE, TALKING, WORKING, differences
 
 CONNECT_S = 20.0

@@ -29,11 +29,18 @@ from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.cluster.dispatch import SETTLE_INTERRUPTED_S, blame, tried_alone
 from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, borrowed_child, start_failure
 from pipeline.runtime.isolation.supervision import ChildEnd
-from pipeline.runtime.monitoring.events import TICK_S, Watch
 from pipeline.runtime.monitoring.logs import LOG, facts_of_task
-from pipeline.runtime.monitoring.machine import cores, memory_bytes
-from pipeline.runtime.monitoring.measurement import Measured, Result, Task, measure, measure_in_child
-from pipeline.runtime.monitoring.tallies import TALLIES
+from pipeline.runtime.monitoring.measurement import (
+    TALLIES,
+    Measured,
+    Result,
+    Task,
+    cores,
+    measure,
+    measure_in_child,
+    memory_bytes,
+)
+from pipeline.runtime.monitoring.progress import TICK_S, Watch
 
 _WORN_BYTES = 2**30
 """A child that holds more than this between tasks is not used again; buildings have their own limits."""

@@ -19,9 +19,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from pipeline.errors import SettingsError
-from pipeline.runtime.monitoring.events import Event, Listener
-from pipeline.runtime.monitoring.measurement import peak_of_process
-from pipeline.runtime.monitoring.tallies import TALLIES, Tallies
+from pipeline.runtime.monitoring.measurement import TALLIES, Tallies, peak_of_process
+from pipeline.runtime.monitoring.progress import Event, Listener
 
 UNITS = {
     "plan": "files",

@@ -11,8 +11,8 @@ from collections.abc import Callable, Generator, Sequence
 from types import TracebackType
 from typing import Protocol, Self
 
-from pipeline.runtime.monitoring.events import Watch
 from pipeline.runtime.monitoring.measurement import Measured, Result, Task, measure
+from pipeline.runtime.monitoring.progress import Watch
 
 
 class Executor(Protocol):

@@ -25,7 +25,7 @@ def _prepare() -> None:
     signal.signal(signal.SIGTERM, ignore_signal)
     loads = list(STAGES)
     if kernels_are_compiled():  # otherwise each worker compiles what it needs, and the run says so
-        loads.append(f"pipeline.runtime.stages.model_batch:load_once:{_METHOD}")
+        loads.append(f"pipeline.runtime.stages.rehearsal:load_once:{_METHOD}")
     fork_server.load_all(loads)
     gc.freeze()  # a collection would write to all objects and thus copy the shared memory
     server = os.getpid()

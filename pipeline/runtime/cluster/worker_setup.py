@@ -17,7 +17,7 @@ from pipeline.runtime.monitoring import log_lines, logs
 STAGES = (
     *(
         f"pipeline.runtime.stages.{name}"
-        for name in ("ingest", "ground", "split_window", "join", "model_batch", "publish")
+        for name in ("ingest", "ground", "split", "join", "reconstruct", "child_batch", "publish")
     ),
     "pipeline.strip_alignment",
     "pipeline.recipe",

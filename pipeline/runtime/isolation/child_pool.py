@@ -26,7 +26,7 @@ from pipeline.runtime.monitoring.measurement import charge
 FRUITLESS_STARTS = 3
 """Children that die in a row before they begin an item; then no building is to blame."""
 
-_LOADS = ("pipeline.runtime.stages.model_batch:load",)
+_LOADS = ("pipeline.runtime.stages.rehearsal:load",)
 _START_TIMEOUT_S = 900.0
 """A child takes two seconds with compiled kernels; without them it compiles them first."""
 

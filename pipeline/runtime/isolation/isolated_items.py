@@ -16,7 +16,7 @@ from pipeline.model import Reason
 from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, borrowed_child, start_failure
 from pipeline.runtime.isolation.limits import IsolationLimits, Loss
 from pipeline.runtime.isolation.supervision import ChildEnd, EndCause
-from pipeline.runtime.monitoring.events import never
+from pipeline.runtime.monitoring.progress import never
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -19,12 +19,12 @@ _STAGES = (
     "pipeline.runtime.isolation.isolated_items",
     "pipeline.runtime.stages.ingest",
     "pipeline.runtime.stages.ground",
-    "pipeline.runtime.stages.split_window",
+    "pipeline.runtime.stages.split",
     "pipeline.strip_alignment",
 )
 _LOADS = {
     "reconstruct": ("pipeline.runtime.stages.publish", "pipeline.export.tile", "pipeline.runtime.digest"),
-    "classify": ("pipeline.runtime.stages.label", "pipeline.runtime.stages.write_classified"),
+    "classify": ("pipeline.extras.classify.label", "pipeline.extras.classify.write_classified"),
 }
 _SCENE = "pipeline.runtime.stages.rehearsal:rehearse_scene"
 
@@ -43,7 +43,7 @@ def loads_of(job: Job, *, footprints: bool, method: str | None = None) -> list[s
     """Loads of the children of a job, as in `isolation.child_main`; `footprints` and `method` as in `start_early`."""
     loads = [*_STAGES, *_LOADS[job], f"{_SCENE}:given" if footprints else _SCENE]
     if job == "reconstruct":
-        loads.append(f"pipeline.runtime.stages.model_batch:load_once:{method or _METHOD}")
+        loads.append(f"pipeline.runtime.stages.rehearsal:load_once:{method or _METHOD}")
     return loads
 
 

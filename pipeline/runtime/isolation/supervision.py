@@ -31,7 +31,7 @@ from pipeline.runtime.isolation.messages import (
     frame,
 )
 from pipeline.runtime.isolation.spawned_child import ChildProcess
-from pipeline.runtime.monitoring.events import never
+from pipeline.runtime.monitoring.progress import never
 
 _PIECE = 2**20
 _TICK_S = 0.05

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import pickle
 import resource
@@ -10,12 +11,13 @@ import socket
 import threading
 import time
 import traceback
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from pipeline.errors import GableworkError, RunCancelledError, VersionMismatchError
 from pipeline.runtime.monitoring.logs import LOG, about, facts_of_task, wants_json
-from pipeline.runtime.monitoring.tallies import TALLIES
 from pipeline.runtime.monitoring.versions import differences, fingerprint, versions_here, versions_of
 
 Task = TypeVar("Task")
@@ -141,3 +143,90 @@ def mismatch_message(faults: list[str]) -> str:
         f"the processes do not run the same versions: {'; '.join(faults)}. "
         "Install the same gablework with the same locks everywhere (one image), then start again"
     )
+
+
+_CGROUP = Path("/sys/fs/cgroup")
+
+
+def cores(cgroup: Path = _CGROUP) -> int:
+    """Cores that this process may use, at least one.
+
+    The folder `cgroup` has the limits of the control group (version 2); a quota of two and a half cores counts as two.
+    """
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota, _, period = _text(cgroup / "cpu.max").partition(" ")
+    if quota.isdigit() and period.isdigit() and int(period):
+        count = min(count, math.floor(int(quota) / int(period)))
+    return max(1, count)
+
+
+def memory_bytes(cgroup: Path = _CGROUP) -> int:
+    """Memory that this process may use: the machine's, or the limit of its control group."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    limits = [_text(cgroup / name) for name in ("memory.max", "memory.high", "memory/memory.limit_in_bytes")]
+    return min([total, *(int(limit) for limit in limits if limit.isdigit() and int(limit))])
+
+
+def _text(path: Path) -> str:
+    """The text of a system file; empty if it does not exist."""
+    try:
+        return path.read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
+
+class Tallies:
+    """Counts of one process; all except `in_flight` and `busy` only grow."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.sent: Counter[str] = Counter()
+        """Tasks sent to a cluster, by stage; a task that is sent again counts again."""
+        self.sent_bytes: Counter[str] = Counter()
+        """Their sizes in bytes, by stage."""
+        self.in_flight: Counter[str] = Counter()
+        """Tasks on a cluster now, by stage."""
+        self.landed: Counter[tuple[str, str]] = Counter()
+        """Tasks that came back, by stage and outcome: done, suspect (its workers died), sent again, taken back."""
+        self.worked: Counter[tuple[str, str]] = Counter()
+        """Tasks run in this process, by stage and outcome: done, failed, cancelled."""
+        self.seconds: defaultdict[str, float] = defaultdict(float)
+        """Their wall-clock seconds, by stage."""
+        self.busy = 0
+        """Tasks that run in this process now."""
+        self.buildings: Counter[tuple[str, str]] = Counter()
+        """Buildings modelled by tasks of this process, by status and reason."""
+
+    def send(self, stage: str, tasks: int, size_bytes: int) -> None:
+        """Count tasks sent to the cluster together."""
+        with self._lock:
+            self.sent[stage] += tasks
+            self.sent_bytes[stage] += size_bytes
+            self.in_flight[stage] += tasks
+
+    def land(self, stage: str, outcome: str, tasks: int) -> None:
+        """Count tasks that came back from the cluster together."""
+        with self._lock:
+            self.in_flight[stage] -= tasks
+            self.landed[stage, outcome] += tasks
+
+    def begin(self) -> None:
+        """Count the start of a task in this process."""
+        with self._lock:
+            self.busy += 1
+
+    def end(self, stage: str, outcome: str, seconds: float) -> None:
+        """Count the end of a task in this process."""
+        with self._lock:
+            self.busy -= 1
+            self.worked[stage, outcome] += 1
+            self.seconds[stage] += seconds
+
+    def building(self, status: str, reason: str | None) -> None:
+        """Count a modelled building."""
+        with self._lock:
+            self.buildings[status, reason or ""] += 1
+
+
+TALLIES = Tallies()
+"""Tallies of this process."""

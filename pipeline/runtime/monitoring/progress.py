@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import time
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, Literal
 
-from pipeline.runtime.monitoring import traces
-from pipeline.runtime.monitoring.events import Event, EventKind, Listener, Watch
+from pipeline.errors import RunCancelledError
 from pipeline.runtime.monitoring.measurement import Measured
-from pipeline.runtime.monitoring.traces import Part
+from pipeline.runtime.monitoring.traces import Part, are_wanted
 
 
 def span(name: str, *, first: bool = False, **facts: Any) -> contextlib.AbstractContextManager[Any]:
     """A span around a block while traces are on; the `first` one only if there is none around it."""
-    if not traces.are_wanted():
+    if not are_wanted():
         return contextlib.nullcontext()
     from pipeline.runtime.monitoring import tracing
 
@@ -77,7 +77,7 @@ class Progress:
     def measured(self, found: Measured[Any], parts: Callable[[], Iterable[Part]] = tuple) -> None:
         """Note the peak memory of the process that ran a task, and the spans of the task and of its parts."""
         self.peaks[found.process] = max(self.peaks.get(found.process, 0), found.peak_bytes)
-        if not traces.are_wanted():
+        if not are_wanted():
             return
         from pipeline.runtime.monitoring import tracing
 
@@ -117,3 +117,68 @@ class StageProgress:
         if not self._quiet:
             counts = {"done": self.done, "total": self.total, "kept": kept, "failed": self.failed}
             self._progress.tell("progress", self._name, message, **counts)
+
+
+TICK_S = 0.2
+"""Seconds between two checks of the cluster and of the run's cancellation."""
+
+
+EventKind = Literal["run", "stage", "progress", "warning", "waiting", "detail", "finished"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Event:
+    """Something that happened; has no object of the engine, so it can be logged, stored or sent."""
+
+    kind: EventKind
+    """Kind of the event; `waiting` means that no worker is there, `detail` is for logs: about one building or task."""
+    stage: str = ""
+    """The name of a stage, such as ingest or reconstruct; empty for the run as a whole."""
+    done: int = 0
+    """Finished units of this stage (files, tiles or candidates)."""
+    total: int = 0
+    """Units of this stage; 0 where unknown."""
+    message: str = ""
+    """One sentence of text; empty for mere progress."""
+    kept: int = 0
+    """Finished units taken from an earlier run; sent once, when the stage begins."""
+    failed: int = 0
+    """Failed units, which are among the finished ones."""
+    facts: Mapping[str, str | float] = dataclasses.field(default_factory=dict)
+    """What a detail is about: tile, building, reason, seconds. A warning that comes before all others has a place."""
+
+
+Listener = Callable[[Event], None]
+
+
+def ignore(event: Event) -> None:
+    """Listen to nothing."""
+    del event
+
+
+def never() -> bool:
+    """Never cancel."""
+    return False
+
+
+def nothing() -> None:
+    """Stop nothing, miss nothing."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Watch:
+    """What an executor polls, calls and sends events to while the tasks of a run are in progress."""
+
+    cancelled: Callable[[], bool] = never
+    """Whether the run was cancelled; polled several times a second."""
+    check_scratch: Callable[[], None] = nothing
+    """Raises RunOverError where this process misses the run's scratch, too, when a task did."""
+    stop: Callable[[], None] = nothing
+    """Asks the tasks in flight to end, because their results are not needed any more."""
+    listener: Listener = ignore
+    """Gets events that do not come with a result: workers are missing or back."""
+
+    def check_cancelled(self) -> None:
+        """Raise RunCancelledError if the run was cancelled."""
+        if self.cancelled():
+            raise RunCancelledError("the run was cancelled")

@@ -43,7 +43,7 @@ Brief = TypeVar("Brief")
 
 FOLDER = "kept"
 """Folder of scratch for all outcomes."""
-_FORMAT = 10
+_FORMAT = 11
 """Part of every key, to be raised when the class of an outcome moves or gets another content: the pickles of an older
 checkout of the same version are then not read."""
 _MARSHAL = 2
@@ -353,3 +353,28 @@ def _names(scratch: Scratch, folder: str) -> list[str]:
         return sorted(entry.name for entry in Path(scratch.root, folder).iterdir())
     except FileNotFoundError:
         return []
+
+
+def _nothing(*_: object) -> tuple[str, ...]:
+    return ()
+
+
+def all_there(*_: object) -> bool:
+    """Files that need no check."""
+    return True
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Files(Generic[Task, Brief]):
+    """What the tasks of a stage read and leave in scratch, by folders there; the functions see one task at a time."""
+
+    reads: Callable[[Task], Iterable[str]] = _nothing
+    """Folders with files of earlier stages that a task reads."""
+    leaves: Callable[[Task, Brief], Iterable[str]] = _nothing
+    """Folders in which later stages read what a task left; that of its outcome need not be named."""
+    intact: Callable[[Task, Brief, str], bool] = all_there
+    """Whether the files in one of these folders are as the task left them, by its brief. Runs in a worker."""
+    results: bool = False
+    """Whether every run reads the results of all tasks: outcomes of earlier runs are then checked to their end."""
+    at_once: bool = False
+    """Whether the files of earlier runs are checked when the stage begins, since every run relies on all of them."""

@@ -22,21 +22,18 @@ from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
 from pipeline.runtime.plan import points_bytes
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, key_of, whole
+from pipeline.runtime.scratch.outcomes import Files, Place, key_of, whole
 from pipeline.runtime.stages.cleanup import clear_tiles
 from pipeline.runtime.stages.ingested import Ingested, content_by_tile, points_by_tile
 from pipeline.runtime.stages.tile_content import content_of_window
-from pipeline.runtime.stages.window_points import FOLDER, PointState, bucket, bucket_paths
+from pipeline.runtime.stages.window_points import CELLS_FOLDER, PointState, bucket, bucket_paths
 from pipeline.scene import WindowPoints, lattice_of, usable_as_ground
 from pipeline.spatial_hash import first_of_each
-from pipeline.terrain.flight_strip import Strip
+from pipeline.terrain.flight_passes import Strip
 from pipeline.terrain.lattice import NO_DATA, lowest_per_cell
 from pipeline.terrain.outliers import dense_enough
-from pipeline.terrain.scene_settings import ClassesInUse
-from pipeline.terrain.settings import OutlierSettings
-from pipeline.terrain.strip_squares import SQUARE_MM
-from pipeline.terrain.survey_strips import compared_strips
+from pipeline.terrain.settings import ClassesInUse, OutlierSettings
+from pipeline.terrain.survey_strips import SQUARE_MM, compared_strips
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 
@@ -96,7 +93,7 @@ def find_all_cells(
     for tile in sorted(tiles, key=lambda tile: (-points[tile], tile)):
         seen = content_of_window(content, grid, grid.window(tile), tile)
         key = key_of(alike, tile, sorted(files[tile]), seen)
-        tasks[Place(FOLDER, tile.key, key)] = CellsTask(
+        tasks[Place(CELLS_FOLDER, tile.key, key)] = CellsTask(
             tile=tile,
             grid=grid,
             classes=classes,
@@ -104,7 +101,7 @@ def find_all_cells(
             passes=passes,
             memory_bytes=points_bytes(points[tile], max(points[other] for other in grid.tiles_over(grid.window(tile)))),
         )
-    clear_tiles(context.scratch, FOLDER, tasks)
+    clear_tiles(context.scratch, CELLS_FOLDER, tasks)
     function = functools.partial(find_cells, settings=settings)
     stored: Files[CellsTask, TileCells] = Files(reads=_read, leaves=_left, intact=is_intact)
     found_cells = context.map_stored("cells", function, tasks, whole, files=stored)
@@ -118,7 +115,7 @@ def _read(task: CellsTask) -> list[str]:
 
 def _left(task: CellsTask, _: TileCells) -> list[str]:
     """The folder of scratch with a tile's cells."""
-    return [f"{FOLDER}/{task.tile.key}"]
+    return [f"{CELLS_FOLDER}/{task.tile.key}"]
 
 
 def find_cells(task: CellsTask, settings: OutlierSettings) -> TileCells:
@@ -151,7 +148,7 @@ def find_cells(task: CellsTask, settings: OutlierSettings) -> TileCells:
         "lowest": lowest_per_cell(points.x_mm, points.y_mm, points.z_mm, usable, *lattice),
         "occupied": lowest_per_cell(points.x_mm, points.y_mm, points.z_mm, kept, *lattice) != NO_DATA,
     }
-    scratch.put_arrays(f"{FOLDER}/{task.tile.key}", {"states": states, **rasters})
+    scratch.put_arrays(f"{CELLS_FOLDER}/{task.tile.key}", {"states": states, **rasters})
     return TileCells(
         tile=task.tile,
         duplicates=len(first) - n,

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pipeline.runtime.cluster.serial_executor import Executor, run_alone
-from pipeline.runtime.monitoring.events import Watch
+from pipeline.runtime.monitoring.progress import Watch
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import (
     InParts,

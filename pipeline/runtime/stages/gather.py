@@ -16,14 +16,13 @@ from shapely import MultiPolygon, Polygon
 from pipeline.compiler import kernel
 from pipeline.export.facts import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
-from pipeline.kernels.radix_sort import radix_order
+from pipeline.kernels.sorting import radix_order
 from pipeline.model import BoolArray, Candidate, FloatArray, GivenHeights, GroundSource, Guide, IntArray
 from pipeline.quality.roof_returns import MAD_TO_SIGMA
-from pipeline.roof.settings import GUIDE_REACH_M, RoofSettings
+from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.sites import CandidateSite, PointRange
-from pipeline.runtime.stages.surroundings import NO_GROUND, NO_POINT, Surroundings, surroundings_of
-from pipeline.runtime.stages.window_points import bucket_paths
+from pipeline.runtime.stages.window_points import NO_GROUND, NO_POINT, Surroundings, surroundings_of
 from pipeline.terrain.lattice import CELL_MM, HALF_DIAGONAL_M, NO_DATA
 from pipeline.tiling import MM, TileGrid, Window
 
@@ -282,7 +281,9 @@ def gather(
     beside_mm = later_mm = np.empty((0, 3), np.int64)
     is_drawn, is_given = site.outline is not None, footprint is not None
     if roof is not None and roof.needs_facades(is_drawn=is_drawn, is_given=is_given):
-        beside_mm, later_mm = _beside(scratch, grid, xyz_mm, _grown(cells, _BESIDE_CELLS), around)
+        from pipeline.runtime.stages.beside import points_beside
+
+        beside_mm, later_mm = points_beside(scratch, grid, xyz_mm, _grown(cells, _BESIDE_CELLS), around)
         digest.update(beside_mm.tobytes())
         digest.update(later_mm.tobytes())
     elsewhere_mm = _elsewhere(footprint, cells, around)
@@ -302,6 +303,11 @@ def gather(
         from pipeline.strip_alignment import aligned_mm
 
         xyz_mm, is_split, strip_offset_m = aligned_mm(xyz_mm, own.strip, is_split, roof.min_strip_offset_m)
+    near: tuple[Guide, ...] = ()
+    if guides and len(points):
+        from pipeline.runtime.stages.beside import guides_near
+
+        near = guides_near(guides, low, high, origin_mm)
     points_m = _in_metres(xyz_mm, origin_mm)
     candidate = Candidate(
         building_id=site.building_id,
@@ -323,7 +329,7 @@ def gather(
         is_known=is_given or (site.override is not None and site.override.says_building),
         strip_offset_m=strip_offset_m,
         ground_noise_m=ground_noise_m,
-        guides=_near(guides, low, high, origin_mm) if guides and len(points) else (),
+        guides=near,
     )
     is_dated = gps_kind is GpsTimeKind.ADJUSTED and len(points) > 0
     facts = CandidateFacts(
@@ -412,6 +418,15 @@ def _elsewhere(footprint: Polygon | MultiPolygon | None, own: BoolArray, around:
     return elsewhere_mm
 
 
+def _moved(area: Area, origin_mm: IntArray) -> Area:
+    """An area in metres, from the CRS into a local frame."""
+    if area.is_empty:
+        return area
+    shift_m = np.array((*origin_mm[:2] // MM, 0), np.float64)
+    moved: Area = shapely.transform(area, lambda xyz: xyz - shift_m[: xyz.shape[1]], include_z=bool(area.has_z))
+    return moved
+
+
 def _local(
     given: GivenHeights, footprint: Polygon | MultiPolygon | None, around: Surroundings, origin_z_mm: int
 ) -> GivenHeights:
@@ -430,58 +445,3 @@ def _local(
         ground_z_m=given.ground_z_m - origin_z_mm / MM,
         terrain_z_m=math.nan if terrain_mm is None else (terrain_mm - origin_z_mm) / MM,
     )
-
-
-def _beside(
-    scratch: Scratch, grid: TileGrid, own_mm: IntArray, cells: BoolArray, around: Surroundings
-) -> tuple[IntArray, IntArray]:
-    """Points in some cells of the surroundings that do not belong to a candidate: each (n, 3) int64, sorted.
-
-    The first come from pulses with one return; the second are the last of several returns.
-    """
-    rows, columns = np.nonzero(cells)
-    single, later = [own_mm], [own_mm]
-    if len(rows):
-        view = Window(
-            x0_mm=(around.column0 + int(columns.min())) * CELL_MM,
-            y0_mm=(around.row0 + int(rows.min())) * CELL_MM,
-            x1_mm=(around.column0 + int(columns.max()) + 1) * CELL_MM,
-            y1_mm=(around.row0 + int(rows.max()) + 1) * CELL_MM,
-        )
-        for path in (path for tile in grid.tiles_over(view) for path in bucket_paths(scratch, tile)):
-            if path.stat().st_size == 0:
-                continue
-            stored = np.memmap(path, POINT, mode="r")
-            near = np.array(stored[view.contains(stored["x"], stored["y"])])
-            near = near[cells[near["y"] // CELL_MM - around.row0, near["x"] // CELL_MM - around.column0]]
-            xyz = np.column_stack((near["x"], near["y"], near["z"].astype(np.int64)))
-            single.append(xyz[near["return_count"] <= 1])
-            later.append(xyz[(near["return_count"] > 1) & (near["return_number"] >= near["return_count"])])
-    return _others(single, len(own_mm)), _others(later, len(own_mm))
-
-
-def _near(guides: Sequence[Guide], low_mm: IntArray, high_mm: IntArray, origin_mm: IntArray) -> tuple[Guide, ...]:
-    """The guides within reach of the box of a candidate's points, in its frame."""
-    reach_mm = round(GUIDE_REACH_M * MM)
-    box = shapely.box(*((low_mm[:2] - reach_mm) / MM), *((high_mm[:2] + reach_mm) / MM))
-    return tuple(
-        Guide(kind=guide.kind, line=shapely.transform(guide.line, lambda xy: np.rint(xy * MM - origin_mm[:2]) / MM))
-        for guide in guides
-        if box.intersects(guide.line)
-    )
-
-
-def _others(pieces: Sequence[IntArray], own: int) -> IntArray:
-    """Places of the pieces, one of each, without those of the first `own` rows: (n, 3) int64, sorted."""
-    places, index = np.unique(np.concatenate(pieces), axis=0, return_index=True)
-    others: IntArray = places[index >= own]
-    return others
-
-
-def _moved(area: Area, origin_mm: IntArray) -> Area:
-    """An area in metres, from the CRS into a local frame."""
-    if area.is_empty:
-        return area
-    shift_m = np.array((*origin_mm[:2] // MM, 0), np.float64)
-    moved: Area = shapely.transform(area, lambda xyz: xyz - shift_m[: xyz.shape[1]], include_z=bool(area.has_z))
-    return moved

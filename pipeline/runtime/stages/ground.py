@@ -18,29 +18,27 @@ import numpy.typing as npt
 import shapely
 
 from pipeline.model import BoolArray
+from pipeline.registry import extra
 from pipeline.runtime.plan import check_windows, ground_bytes, split_grid, tiles_per_block
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, key_of, whole
+from pipeline.runtime.scratch.outcomes import Files, Place, key_of, whole
 from pipeline.runtime.stages.cells import TileCells, digests_of, find_all_cells
 from pipeline.runtime.stages.cleanup import clear_tiles
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
-from pipeline.runtime.stages.surroundings import FOLDER, NO_POINT, distances_to_terrain
 from pipeline.runtime.stages.tile_content import ZoneSums, content_of_window, zone_sums_of
-from pipeline.runtime.stages.window_points import FOLDER as CELLS
+from pipeline.runtime.stages.window_points import CELLS_FOLDER, GROUND_FOLDER, NO_POINT, distances_to_terrain
 from pipeline.scene import lattice_of
 from pipeline.settings import RunSettings
-from pipeline.terrain.flight_strip import Strip
+from pipeline.terrain.flight_passes import Strip
 from pipeline.terrain.ground import ground_on
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
-from pipeline.terrain.scene_settings import APRON_M, ClassesInUse
-from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.settings import APRON_M, ClassesInUse, GroundSettings
 from pipeline.terrain.support import ROOFS_ALONE_CELLS
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 if TYPE_CHECKING:
-    from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
+    from pipeline.extras.footprints.given_footprints import GivenFootprints, Outline
 
 _ABOUT_ROOFS_ALONE = (
     "no points lie around given footprints with points on {} m2: the points there count as roof, not ground, and a "
@@ -173,7 +171,7 @@ def find_ground(context: RunContext, settings: RunSettings, found: BlockCells) -
         edges_m = (edge / MM for edge in (wide.x0_mm, wide.y0_mm, wide.x1_mm, wide.y1_mm))
         outlines = tuple(found.outlines[k] for k in sorted(tree.query(shapely.box(*edges_m)).tolist()))
         key = key_of(alike, [tile.key for tile in tiles], digests_of(cells, around), outlines)
-        tasks[Place(FOLDER, f"x{column}_y{row}", key)] = GroundTask(
+        tasks[Place(GROUND_FOLDER, f"x{column}_y{row}", key)] = GroundTask(
             tiles=tuple(tiles),
             seen=around,
             grid=grid,
@@ -183,7 +181,7 @@ def find_ground(context: RunContext, settings: RunSettings, found: BlockCells) -
             outlines=outlines,
             memory_bytes=ground_bytes(window, scene.ground),
         )
-    clear_tiles(context.scratch, FOLDER, tasks, {tile.key for tile in found.drawn})
+    clear_tiles(context.scratch, GROUND_FOLDER, tasks, {tile.key for tile in found.drawn})
     function = functools.partial(draw_ground, settings=scene.ground)
     files: Files[GroundTask, tuple[TileGround, ...]] = Files(reads=_read, leaves=_left, intact=is_intact)
     drawn = context.map_stored("ground", function, tasks, whole, files=files)
@@ -195,17 +193,17 @@ def find_ground(context: RunContext, settings: RunSettings, found: BlockCells) -
 
 def _read(task: GroundTask) -> list[str]:
     """The folders of scratch with the cells that a block sees."""
-    return [f"{CELLS}/{tile.key}" for tile in task.seen]
+    return [f"{CELLS_FOLDER}/{tile.key}" for tile in task.seen]
 
 
 def _left(task: GroundTask, _: Sequence[TileGround]) -> list[str]:
     """The folders of scratch with the terrain of a block."""
-    return [f"{FOLDER}/{tile.key}" for tile in task.tiles]
+    return [f"{GROUND_FOLDER}/{tile.key}" for tile in task.tiles]
 
 
 def is_intact(task: GroundTask, found: Sequence[TileGround], folder: str) -> bool:
     """Whether the terrain of a tile in a folder of scratch is as it was stored."""
-    (zones,) = (one.zones for one in found if f"{FOLDER}/{one.tile.key}" == folder)
+    (zones,) = (one.zones for one in found if f"{GROUND_FOLDER}/{one.tile.key}" == folder)
     tile = Tile.from_key(folder.rpartition("/")[2])
     elevations, off_mm, corner = (task.scratch.array(folder, name) for name in ("terrain", "off", "corner"))
     column0, row0, columns, rows = lattice_of(task.grid.core(tile).grown(APRON_M * MM))
@@ -243,9 +241,7 @@ def draw_ground(task: GroundTask, settings: GroundSettings) -> tuple[TileGround,
     column0, row0, columns, rows = lattice_of(inside)
     alone = np.zeros_like(occupied)
     if task.outlines:
-        from pipeline.terrain.roofs_alone import roofs_alone
-
-        alone = roofs_alone(lowest, occupied, corner, task.outlines)
+        alone = extra("roofs_alone")(lowest, occupied, corner, task.outlines)
         lowest[alone] = NO_DATA
         inner = (slice(wide, -wide), slice(wide, -wide))
         lowest, occupied, alone = lowest[inner], occupied[inner], alone[inner]
@@ -271,7 +267,7 @@ def _cells_in(task: GroundTask, window: Window) -> tuple[Elevations, BoolArray, 
         if left >= right or low >= top:
             continue
         ours, theirs = (slice(low, top), slice(left, right)), (slice(low - r, top - r), slice(left - c, right - c))
-        name = f"{CELLS}/{tile.key}"
+        name = f"{CELLS_FOLDER}/{tile.key}"
         # tiles share the cells across their border
         np.minimum(lowest[ours], task.scratch.array(name, "lowest", mapped=True)[theirs], out=lowest[ours])
         occupied[ours] |= task.scratch.array(name, "occupied", mapped=True)[theirs]
@@ -291,7 +287,7 @@ def _stored(
     elevations = np.ascontiguousarray(terrain[part])
     off_mm = distances_to_terrain(lowest[part], occupied[part], elevations)
     place = np.array([column0, row0], np.int64)
-    task.scratch.put_arrays(f"{FOLDER}/{tile.key}", {"terrain": elevations, "off": off_mm, "corner": place})
+    task.scratch.put_arrays(f"{GROUND_FOLDER}/{tile.key}", {"terrain": elevations, "off": off_mm, "corner": place})
     core = task.grid.core(tile)
     # of the cells that tiles share, the south-western corner says whose they are
     own = tuple(

@@ -26,17 +26,16 @@ from pipeline.io.records import Share
 from pipeline.io.storage import sha256_of
 from pipeline.io.strays import MOST_STRAYS
 from pipeline.model import IntArray, PointCloud, Reason
+from pipeline.registry import extra
 from pipeline.runtime.isolation.limits import IsolationLimits, Loss
 from pipeline.runtime.plan import is_fetched_by_nodes, shares_of
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, key_of, whole
+from pipeline.runtime.scratch.outcomes import Files, Place, key_of, whole
 from pipeline.runtime.stages.cleanup import clear_points
 from pipeline.runtime.stages.ingested import Ingested, of_file, points_by_tile, spread_m
 from pipeline.runtime.stages.tile_content import ZoneSums, zone_sums
-from pipeline.terrain.flight_passes import NO_SLICES, slices_of, united_slices
-from pipeline.terrain.flight_strip import Strip, ids_of_timed
+from pipeline.terrain.flight_passes import NO_SLICES, Strip, ids_of_timed, slices_of, united_slices
 from pipeline.tiling import MM, Tile, TileGrid
 
 _CHUNK_POINTS = 250_000
@@ -235,9 +234,7 @@ def _ingest_here(task: IngestTask) -> Ingested:
         return _ingested(task)
     if task.known is not None and is_fetched_by_nodes(task.known, task.options):
         return dataclasses.replace(_ingested(task), path=shown(task.path))
-    from pipeline.io.remote_file import RemoteFile
-
-    file = RemoteFile(task.path)
+    file = extra("RemoteFile")(task.path)
     copy = task.scratch.path("fetched", uuid4().hex, f"points{file.suffix}")
     try:
         known = task.known if task.known is not None and task.known.is_of(file) else None

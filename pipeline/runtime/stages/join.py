@@ -17,29 +17,35 @@ import numpy.typing as npt
 
 from pipeline.kernels.union_find import united
 from pipeline.model import BoolArray, IntArray
+from pipeline.registry import extra
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import InParts, Place, brief_within, drop_outcomes, key_of, part_of, result_of
+from pipeline.runtime.scratch.outcomes import (
+    Files,
+    InParts,
+    Place,
+    brief_within,
+    drop_outcomes,
+    key_of,
+    part_of,
+    result_of,
+)
 from pipeline.runtime.stages.border_facets import are_beyond, united_by_name
 from pipeline.runtime.stages.cleanup import clear_units
-from pipeline.runtime.stages.finished_surfaces import Finished, finished
-from pipeline.runtime.stages.open_fragments import BorderFacets, OpenSurfaces
+from pipeline.runtime.stages.open_fragments import BorderFacets, Finished, OpenSurfaces, finished
 from pipeline.runtime.stages.sites import UNITS, FoundSites, Joined
-from pipeline.runtime.stages.split import Splits
-from pipeline.runtime.stages.split_window import Split
+from pipeline.runtime.stages.split import Split, Splits
 from pipeline.runtime.stages.stored_sites import joined_of, store_sites
 from pipeline.runtime.stages.tile_sites import TileSites, TileSitesFigures, by_owner, figures_of, sites_of
 from pipeline.runtime.stages.units import BorderSites, find_units
 from pipeline.terrain.candidates import NOWHERE, Surfaces
 from pipeline.terrain.fragment_sums import N_SUMS
-from pipeline.terrain.scene_settings import SceneSettings
-from pipeline.terrain.settings import CandidateSettings
+from pipeline.terrain.settings import CandidateSettings, SceneSettings
 from pipeline.tiling import Tile, TileGrid
 
 if TYPE_CHECKING:
-    from pipeline.runtime.stages.given_footprints import GivenFootprints
+    from pipeline.extras.footprints.given_footprints import GivenFootprints
 
 _STAGE = "join"
 _TILES_ACROSS = 8
@@ -270,10 +276,8 @@ def join(
     plan = context.plan
     crs_name = plan.reference.named
     if footprints is not None:
-        from pipeline.runtime.stages.footprint_sites import join_footprints
-
         with context.progress.stage(_STAGE, 1) as counter:
-            found = join_footprints(
+            found = extra("join_footprints")(
                 splits.stored(context),
                 plan.grid,
                 splits.numbers,

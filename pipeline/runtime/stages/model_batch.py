@@ -7,35 +7,27 @@ import functools
 import math
 import pickle
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-import shapely
-
-from pipeline.errors import GableworkError, RunCancelledError, RunError
+from pipeline.errors import GableworkError, RunCancelledError
 from pipeline.export.facts import CandidateFacts
 from pipeline.io.crs import SpatialReference
 from pipeline.io.gps_time import GpsTimeKind
-from pipeline.methods import METHODS, ReconstructSettings
+from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, Guide, Reason, Status
-from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX, IsolationLimits, Loss
+from pipeline.runtime.isolation.limits import IsolationLimits
 from pipeline.runtime.monitoring.logs import LOG
-from pipeline.runtime.monitoring.tallies import TALLIES
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import DamagedError, Place, key_of, result_of
-from pipeline.runtime.stages.batch_figures import LOST, REJECTED, BatchFigures, Modelled
+from pipeline.runtime.stages.batch_figures import REJECTED, BatchFigures, Modelled
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.sites import CandidateSite, StoredGroup
 from pipeline.tiling import TileGrid
 
 if TYPE_CHECKING:
+    from pipeline.extras.overrides.overrides_file import OwnModelling
     from pipeline.runtime.isolation.replay_bundle import Bundle, Incident
-    from pipeline.runtime.overrides.overrides_file import OwnModelling
-
-_BUNDLE_TIMEOUT_S = 60.0
-_NO_BUNDLE = "there is no bundle, since its points cannot be put together"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -81,6 +73,18 @@ class BatchTask:
     def supervises(self) -> bool:
         """Whether buildings are modelled in child processes of the process that runs the task."""
         return self.isolation is not None
+
+    def bundle_of(self, candidate: Candidate, incident: Incident) -> Bundle:
+        """What modelling a candidate of the task again needs."""
+        from pipeline.runtime.isolation.replay_bundle import Bundle
+
+        return Bundle(
+            candidate=candidate,
+            method=self.method,
+            settings=self.settings,
+            incident=incident,
+            reference=self.reference,
+        )
 
     @functools.cached_property
     def way_key(self) -> str:
@@ -130,41 +134,9 @@ class Packed:
     """Digest of candidate, method and settings; empty where the model must not be used again."""
 
 
-def model_batch(task: BatchTask) -> Batch:
-    """Model a batch; raises OSError if scratch cannot be read or written, RunError if children cannot be started."""
-    try:
-        sites = task.group.sites(task.scratch)
-        packed = dict(_here(task, sites) if task.isolation is None else _in_child(task, sites, task.isolation))
-    except OSError:
-        task.scratch.check_cancelled()  # the scratch of a run that is over is gone
-        raise
-    each = [packed[index] for index in range(len(sites))]
-    for model in each:
-        building = model.modelled
-        TALLIES.building(building.status, building.reason)
-        if building.reason in LOST:
-            facts = {"building": building.building_id, "tile": building.owner.key, "reason": building.reason}
-            LOG.warning("a building is lost", extra={**facts, "seconds": round(building.seconds, 3)})
-    return Batch(
-        modelled=tuple(model.modelled for model in each),
-        stored={model.modelled.building_id: (model.made_from, model.stored) for model in each},
-        compared=task.compared,
-        slow_s=task.slow_s,
-    )
-
-
 def figures_of(batch: Batch) -> BatchFigures:
     """The figures of a batch, which travel to the driver."""
     return BatchFigures.of(batch.modelled, batch.slow_s, each=batch.compared)
-
-
-def bundles_are_whole(task: BatchTask, figures: BatchFigures, _: str) -> bool:
-    """Whether the bundles that a batch left in the quarantine are whole; not each loss has one."""
-    from pipeline.runtime.isolation.replay_bundle import is_whole
-
-    lost = (model.building_id for model in figures.notable if model.reason in LOST)
-    bundles = [Path(task.quarantine, f"{building_id}{BUNDLE_SUFFIX}") for building_id in lost]
-    return all(is_whole(bundle) for bundle in bundles if bundle.is_file())
 
 
 def stored_results(scratch: Scratch, place: Place, only: Collection[str] | None = None) -> list[StoredResult]:
@@ -174,7 +146,7 @@ def stored_results(scratch: Scratch, place: Place, only: Collection[str] | None 
     return [pickle.loads(batch.stored[name][1]) for name in wanted]  # noqa: S301
 
 
-def _packed(
+def packed_model(
     task: BatchTask,
     site: CandidateSite,
     result: BuildingResult,
@@ -184,6 +156,7 @@ def _packed(
     *,
     reused: bool = False,
 ) -> Packed:
+    """A model with its figures, on its way to scratch."""
     is_rejected = _is_rejected(task, site, result)
     own = task.own.get(site.building_id)
     facts = dataclasses.replace(
@@ -222,7 +195,7 @@ def _is_rejected(task: BatchTask, site: CandidateSite, result: BuildingResult) -
     return result.reason is Reason.TOO_FEW_POINTS and not known and not task.compared
 
 
-def _here(task: BatchTask, sites: Sequence[CandidateSite]) -> Iterator[tuple[int, Packed]]:
+def models_here(task: BatchTask, sites: Sequence[CandidateSite]) -> Iterator[tuple[int, Packed]]:
     """Models made in this process: one that runs out of memory becomes a record, one that crashes ends all."""
     task = opened(task)
     for index, site in enumerate(sites):
@@ -230,44 +203,17 @@ def _here(task: BatchTask, sites: Sequence[CandidateSite]) -> Iterator[tuple[int
         try:
             packed = model_site(task, site)
         except MemoryError as error:
+            from pipeline.runtime.stages.lost_buildings import failed_site
+
             detail = f"memory ran out: {error}".removesuffix(": ")
             result = failed_site(site, task.way_of(site).method, Reason.OUT_OF_MEMORY, detail)
-            packed = _packed(task, site, result, CandidateFacts(), 0.0)
+            packed = packed_model(task, site, result, CandidateFacts(), 0.0)
         yield index, packed
-
-
-def _in_child(task: BatchTask, sites: Sequence[CandidateSite], limits: IsolationLimits) -> Iterator[tuple[int, Packed]]:
-    """Models made in a supervised child process, so that a building can only harm itself."""
-    from pipeline.runtime.isolation.isolated_items import supervise
-
-    common = opened(task)
-    cancelled = functools.partial(_cancelled, task)
-    work = functools.partial(model_site, common)
-    retried: dict[int, str] = {}
-    for index, model in supervise(
-        work, sites, limits, cancelled, on_second_chance=retried.__setitem__, loads=_loads(task)
-    ):
-        found = _lost(common, sites[index], model, limits, cancelled) if isinstance(model, Loss) else model
-        if index in retried:
-            found = dataclasses.replace(found, modelled=dataclasses.replace(found.modelled, retried=retried[index]))
-        task.scratch.beat()
-        yield index, found
 
 
 def opened(task: BatchTask) -> BatchTask:
     """The task with a scratch whose arrays stay open from building to building: neighbours share tiles."""
     return dataclasses.replace(task, scratch=OpenScratch(task.scratch.root, task.scratch.attempt))
-
-
-def _loads(task: BatchTask) -> tuple[str, ...]:
-    """What a child loads before it works on the task: only its methods, since each costs a tenth of a second."""
-    methods = dict.fromkeys((task.method, *(own.method for own in task.own.values())))
-    return tuple(f"{__name__}:load_once:{method}" for method in methods)
-
-
-def _cancelled(task: BatchTask) -> bool:
-    task.scratch.check_mark()  # its error says more than a yes would; waiting for a building is not progress
-    return False
 
 
 def model_site(task: BatchTask, site: CandidateSite) -> Packed:
@@ -285,6 +231,8 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     task = task.way_of(site)
     if task.compared:
         # a child that used another method has not loaded this one, which would count as time of its first building
+        from pipeline.runtime.stages.rehearsal import load_once
+
         load_once(task.method)
     started = time.perf_counter()
     candidate: Candidate | None = None
@@ -300,15 +248,19 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     except (MemoryError, OSError, GableworkError):
         raise
     except Exception as error:  # noqa: BLE001 - becomes the record
+        from pipeline.runtime.stages.lost_buildings import failed_site
+
         result = failed_site(site, task.method, Reason.INTERNAL_ERROR, f"{type(error).__name__}: {error}")
     seconds = time.perf_counter() - started
     if result.reason is Reason.INTERNAL_ERROR:
         from pipeline.runtime.isolation.replay_bundle import Incident
+        from pipeline.runtime.stages.lost_buildings import quarantined
 
         incident = Incident(reason=result.reason.value, detail=result.reason_detail, seconds=seconds)
-        result = _quarantined(task, candidate, result, incident)
+        bundle = None if candidate is None else task.bundle_of(candidate, incident)
+        result = quarantined(task.quarantine, result, bundle)
         made_from = ""
-    return _packed(task, site, result, facts, seconds, made_from, reused=reused)
+    return packed_model(task, site, result, facts, seconds, made_from, reused=reused)
 
 
 def _with_overlap(site: CandidateSite, result: BuildingResult) -> BuildingResult:
@@ -340,116 +292,3 @@ def _batch_of(scratch: Scratch, place: Place) -> Mapping[str, tuple[str, bytes]]
         LOG.warning("models of an earlier run are made again", extra={"tile": place.unit, "reason": str(fault)})
         return {}
     return batch.stored
-
-
-def _lost(
-    task: BatchTask, site: CandidateSite, loss: Loss, limits: IsolationLimits, cancelled: Callable[[], bool]
-) -> Packed:
-    """The record and the bundle of a building that ended its process; also made in a child."""
-    from pipeline.runtime.isolation.isolated_items import supervise
-
-    patient = dataclasses.replace(limits, timeout_s=max(limits.timeout_s, _BUNDLE_TIMEOUT_S))
-    describe = functools.partial(lost_site, task, loss)
-    ((_, described),) = supervise(describe, [site], patient, cancelled, second_chance=False, loads=_loads(task))
-    if not isinstance(described, Loss):
-        return described
-    detail = f"{loss.detail}; {_NO_BUNDLE}: {described.detail}"
-    result = failed_site(site, task.way_of(site).method, loss.reason, detail)
-    return _packed(task, site, result, CandidateFacts(), loss.seconds)
-
-
-def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
-    """The record of a building that ended its process, and its bundle in the quarantine."""
-    from pipeline.recipe import failed_building  # as above
-    from pipeline.runtime.isolation.replay_bundle import Incident
-
-    task = task.way_of(site)
-    candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, task.settings.roof, task.guides)
-    result = failed_building(candidate, task.method, loss.reason, loss.detail)
-    incident = Incident(
-        reason=loss.reason.value,
-        detail=loss.detail,
-        seconds=loss.seconds,
-        memory_bytes=loss.memory_bytes,
-        stderr=loss.stderr,
-    )
-    return _packed(task, site, _quarantined(task, candidate, result, incident), facts, loss.seconds)
-
-
-def _quarantined(
-    task: BatchTask, candidate: Candidate | None, result: BuildingResult, incident: Incident
-) -> BuildingResult:
-    """Write the bundle of a building; its result, which mentions a bundle that could not be written."""
-    if not task.quarantine:
-        return result
-    if candidate is None:
-        return dataclasses.replace(result, reason_detail=f"{result.reason_detail}; {_NO_BUNDLE}")
-    from pipeline.runtime.isolation.replay_bundle import Bundle, write_bundle
-
-    bundle = Bundle(
-        candidate=candidate,
-        method=task.method,
-        settings=task.settings,
-        incident=incident,
-        reference=task.reference,
-    )
-    try:
-        write_bundle(task.quarantine, bundle)
-    except (OSError, RunError) as error:
-        why = (error.strerror if isinstance(error, OSError) else None) or error
-        detail = f"{result.reason_detail}; there is no bundle: {why}"
-        return dataclasses.replace(result, reason_detail=detail)
-    return result
-
-
-def failed_site(site: CandidateSite, method: str, reason: Reason, detail: str) -> BuildingResult:
-    """The record of a candidate whose points could not be gathered."""
-    return BuildingResult(
-        building_id=site.building_id,
-        origin=(0.0, 0.0, 0.0),
-        source_id=site.source_id,
-        status=Status.FAILED,
-        reason=reason,
-        reason_detail=detail,
-        method=method,
-        footprint=site.footprint,
-        ground_z_m=math.nan,
-        n_points=site.points,
-        density_per_m2=math.nan,
-        touches_data_edge=False,
-    )
-
-
-def model_bundle(bundle: Bundle) -> BuildingResult:
-    """The building of a bundle, modelled again; raises MemoryError where memory runs out."""
-    from pipeline.recipe import reconstruct_building  # as above
-
-    return reconstruct_building(bundle.candidate, bundle.method, bundle.settings)
-
-
-@functools.cache
-def load_once(method: str) -> None:
-    """Load what modelling by one method needs, once per process."""
-    load(method)
-
-
-def load(*methods: str) -> None:
-    """Load the libraries and compiled kernels for modelling, by modelling roofs of many and of few points."""
-    from pipeline.recipe import reconstruct_building  # as above
-
-    lattice = np.arange(-4.5, 15.0)
-    east, north = (axis.ravel() for axis in np.meshgrid(lattice, lattice, indexing="ij"))
-    outline = shapely.box(0.0, 0.0, 16.0, 10.0)  # partly without points, which only given outlines can be
-    for spacing_m, slope, footprint in ((0.5, 0.6, None), (0.5, 0.0, outline), (1.0, 0.6, None)):
-        places = np.arange(0.5 * spacing_m, 10.0, spacing_m)
-        x, y = (axis.ravel() for axis in np.meshgrid(places, places, indexing="ij"))
-        candidate = Candidate(
-            building_id="",
-            origin=(0.0, 0.0, 0.0),
-            points=np.rint(np.column_stack((x, y, 9.0 - slope * np.abs(y - 5.0))) * 1e3) / 1e3,
-            ground=np.column_stack((east, north, np.zeros(len(east)))),
-            ground_z_m=0.0,
-            footprint=footprint,
-        )
-        for method in methods or METHODS:
-            reconstruct_building(candidate, method, ReconstructSettings())

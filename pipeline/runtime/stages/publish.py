@@ -15,7 +15,7 @@ import shapely
 from pipeline import __version__
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.export.facts import RecordContext, RejectedObject
-from pipeline.export.putting import Put
+from pipeline.export.folders import Put
 from pipeline.io import LocalStorage, Storage, is_url, storage_at
 from pipeline.io.storage import Puts, sha256_of
 from pipeline.model import BuildingResult, Reason, Status
@@ -24,8 +24,7 @@ from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import InParts, Place, brief_of, brief_within, drop_outcomes, key_of
+from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_of, brief_within, drop_outcomes, key_of
 from pipeline.runtime.stages.batch_figures import BatchFigures
 from pipeline.runtime.stages.cleanup import publishing
 from pipeline.runtime.stages.content_digest import TABLES

@@ -9,28 +9,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.model import Status
+from pipeline.registry import extra
+from pipeline.runtime.monitoring.logs import LOG
+from pipeline.runtime.monitoring.measurement import TALLIES
 from pipeline.runtime.monitoring.traces import Part, slow_building_s
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, keys_of, result_of
+from pipeline.runtime.scratch.outcomes import Files, Place, drop_outcomes, key_of, keys_of, result_of
 from pipeline.runtime.stages.batch_figures import LOST, BatchFigures, Counted, Modelled
-from pipeline.runtime.stages.model_batch import (
-    Batch,
-    BatchTask,
-    StoredResult,
-    bundles_are_whole,
-    figures_of,
-    model_batch,
-    stored_results,
-)
+from pipeline.runtime.stages.model_batch import Batch, BatchTask, StoredResult, figures_of, models_here, stored_results
 from pipeline.runtime.stages.sites import Joined, folders_around
 from pipeline.settings import RunSettings
 from pipeline.tiling import Tile
 
 if TYPE_CHECKING:
-    from pipeline.runtime.overrides.overrides_file import Override, OwnModelling
-    from pipeline.runtime.stages.given_guides import GivenGuides
+    from pipeline.extras.guides.given_guides import GivenGuides
+    from pipeline.extras.overrides.overrides_file import Override, OwnModelling
 
 QUARANTINE = "quarantine"
 """Folder of a run directory, and of scratch, for the bundles of buildings that ended their process."""
@@ -133,7 +127,7 @@ def reconstruct(
     files: Files[BatchTask, BatchFigures] = Files(
         reads=lambda task: folders_around(task.group, task.grid),
         leaves=lambda task, _: [Place(stage, task.group.figures.owner.key, "").folder],
-        intact=bundles_are_whole,
+        intact=_is_intact,
     )
     found = context.map_stored("reconstruct", model_batch, dict(largest_first), figures_of, units, tell, files)
     contents: dict[Tile, str] = {}
@@ -147,13 +141,18 @@ def reconstruct(
     return Models(places=dict(sorted(places.items())), scratch=scratch, contents=contents, counted=counted)
 
 
+def _is_intact(task: BatchTask, figures: BatchFigures, _: str) -> bool:
+    """Whether the bundles that a batch left in the quarantine are whole."""
+    from pipeline.runtime.stages.lost_buildings import bundles_are_whole
+
+    return bundles_are_whole(task.quarantine, figures)
+
+
 def _own(overridden: Sequence[tuple[str, Override]], settings: RunSettings) -> dict[str, OwnModelling]:
     """Method and settings of the buildings that have their own, by building_id."""
     if not overridden:
         return {}
-    from pipeline.runtime.overrides.overrides_file import own_modelling
-
-    return {building_id: own_modelling(override, settings) for building_id, override in overridden}
+    return {building_id: extra("own_modelling")(override, settings) for building_id, override in overridden}
 
 
 def _tell(context: RunContext, model: Modelled) -> None:
@@ -183,3 +182,31 @@ def _traced(models: Sequence[Modelled]) -> Iterator[Part]:
                 error=model.reason if is_lost else None,
                 facts=facts | {"points": model.points, "faces": model.faces},
             )
+
+
+def model_batch(task: BatchTask) -> Batch:
+    """Model a batch; raises OSError if scratch cannot be read or written, RunError if children cannot be started."""
+    try:
+        sites = task.group.sites(task.scratch)
+        if task.isolation is None:
+            packed = dict(models_here(task, sites))
+        else:
+            from pipeline.runtime.stages.child_batch import models_in_child
+
+            packed = dict(models_in_child(task, sites, task.isolation))
+    except OSError:
+        task.scratch.check_cancelled()  # the scratch of a run that is over is gone
+        raise
+    each = [packed[index] for index in range(len(sites))]
+    for model in each:
+        building = model.modelled
+        TALLIES.building(building.status, building.reason)
+        if building.reason in LOST:
+            facts = {"building": building.building_id, "tile": building.owner.key, "reason": building.reason}
+            LOG.warning("a building is lost", extra={**facts, "seconds": round(building.seconds, 3)})
+    return Batch(
+        modelled=tuple(model.modelled for model in each),
+        stored={model.modelled.building_id: (model.made_from, model.stored) for model in each},
+        compared=task.compared,
+        slow_s=task.slow_s,
+    )

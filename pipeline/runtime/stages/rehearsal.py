@@ -5,20 +5,24 @@ For a process from which others are forked: it loads them once for all of them.
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import shapely
 
 from pipeline.io.temporary import temporary_folder
+from pipeline.methods import METHODS, ReconstructSettings
+from pipeline.model import Candidate
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.cells import CellsTask, find_cells
 from pipeline.runtime.stages.ground import GroundTask, draw_ground
 from pipeline.runtime.stages.join import join_tiles
-from pipeline.runtime.stages.split_window import SplitTask, split_window
+from pipeline.runtime.stages.split import SplitTask, split_window
 from pipeline.runtime.stages.tile_content import zone_sums
 from pipeline.runtime.stages.units import UnitTask, divide
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
-from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
+from pipeline.terrain.settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 _SIDE_M = 24
@@ -76,3 +80,31 @@ def rehearse_scene(outlines: str = "") -> None:
             folder="units/made-up",
         )
         divide(joined.candidates, units)
+
+
+@functools.cache
+def load_once(method: str) -> None:
+    """Load what modelling by one method needs, once per process."""
+    load(method)
+
+
+def load(*methods: str) -> None:
+    """Load the libraries and compiled kernels for modelling, by modelling roofs of many and of few points."""
+    from pipeline.recipe import reconstruct_building  # as above
+
+    lattice = np.arange(-4.5, 15.0)
+    east, north = (axis.ravel() for axis in np.meshgrid(lattice, lattice, indexing="ij"))
+    outline = shapely.box(0.0, 0.0, 16.0, 10.0)  # partly without points, which only given outlines can be
+    for spacing_m, slope, footprint in ((0.5, 0.6, None), (0.5, 0.0, outline), (1.0, 0.6, None)):
+        places = np.arange(0.5 * spacing_m, 10.0, spacing_m)
+        x, y = (axis.ravel() for axis in np.meshgrid(places, places, indexing="ij"))
+        candidate = Candidate(
+            building_id="",
+            origin=(0.0, 0.0, 0.0),
+            points=np.rint(np.column_stack((x, y, 9.0 - slope * np.abs(y - 5.0))) * 1e3) / 1e3,
+            ground=np.column_stack((east, north, np.zeros(len(east)))),
+            ground_z_m=0.0,
+            footprint=footprint,
+        )
+        for method in methods or METHODS:
+            reconstruct_building(candidate, method, ReconstructSettings())

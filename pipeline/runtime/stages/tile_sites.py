@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.model import IntArray
 from pipeline.runtime.scratch.outcomes import key_of
-from pipeline.runtime.stages.finished_surfaces import Finished
+from pipeline.runtime.stages.open_fragments import Finished
 from pipeline.runtime.stages.sites import CandidateSite, FoundSites, PointRange, RejectedSite, largest_first, object_id
 from pipeline.terrain.candidates import verdicts
 from pipeline.terrain.fragment_sums import Sum

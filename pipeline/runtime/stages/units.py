@@ -9,38 +9,46 @@ from __future__ import annotations
 import collections
 import dataclasses
 import itertools
+import math
 import zlib
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.model import IntArray
+from pipeline.model import IntArray, Reason
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, OpenScratch, Scratch
-from pipeline.runtime.scratch.kept_files import Files
-from pipeline.runtime.scratch.outcomes import InParts, Place, brief_within, drop_outcomes, key_of, part_of, result_of
+from pipeline.runtime.scratch.outcomes import (
+    Files,
+    InParts,
+    Place,
+    brief_within,
+    drop_outcomes,
+    key_of,
+    part_of,
+    result_of,
+)
 from pipeline.runtime.stages.cleanup import clear_units
 from pipeline.runtime.stages.gather import canonical_order
-from pipeline.runtime.stages.outline import outlined
-from pipeline.runtime.stages.rejected_strips import with_strips_that_disagree
 from pipeline.runtime.stages.sites import (
     UNITS,
     CandidateSite,
     FoundSites,
     PointRange,
+    RejectedSite,
     folders_with_points,
     largest_first,
     near_tiles,
     object_id,
 )
-from pipeline.runtime.stages.split import Splits
-from pipeline.runtime.stages.split_window import Split
+from pipeline.runtime.stages.split import Split, Splits
 from pipeline.runtime.stages.stored_sites import SitesBrief, scale_of, stored_sites
 from pipeline.runtime.stages.tile_sites import TileSites, TileSitesFigures, sites_of
 from pipeline.runtime.stages.window_points import folders_of
-from pipeline.terrain.scene_settings import SceneSettings
+from pipeline.terrain.candidates import Verdict
+from pipeline.terrain.settings import SceneSettings
 from pipeline.terrain.units import smallest_points, units_of
 from pipeline.tiling import MM, Tile, TileGrid
 
@@ -180,7 +188,11 @@ def sites_of_tile(task: UnitTask) -> InParts[SitesBrief]:
     divided, checksums = divide(shares_of(found.candidates, task.shares)[task.share], task)
     warnings: list[str] = []
     if task.outlines:
-        divided, warnings = outlined(largest_first(divided), task.roof, task.grid, task.scratch)
+        divided = list(largest_first(divided))
+        if any(site.block is not None for site in divided):
+            from pipeline.runtime.stages.outline import outlined
+
+            divided, warnings = outlined(divided, task.roof, task.grid, task.scratch)
     least_m = task.roof.min_strip_offset_m
     rejected = with_strips_that_disagree(found.rejected, task.scratch, least_m) if task.share == 0 else ()
     return stored_sites(divided, rejected, task.grid, task.scale, checksums, warnings)
@@ -310,3 +322,31 @@ def _units_of_site(site: CandidateSite, task: UnitTask, restored: _Restored) -> 
         )
         for k, first in enumerate(firsts.tolist())
     ]
+
+
+def with_strips_that_disagree(
+    rejected: Iterable[RejectedSite], scratch: Scratch, min_offset_m: float
+) -> tuple[RejectedSite, ...]:
+    """Rejected objects; rough ones whose strips lie farther than `min_offset_m` above one another have that reason."""
+    return tuple(_judged(site, scratch, min_offset_m) for site in rejected)
+
+
+def _judged(site: RejectedSite, scratch: Scratch, min_offset_m: float) -> RejectedSite:
+    if site.verdict.reason is not Reason.VEGETATION or not site.ranges:
+        return site
+    pieces = []
+    for part in site.ranges:
+        stored = scratch.array(f"{part.folder}/{part.tile.key}", "points", mapped=True).view(POINT)
+        pieces.append(np.array(stored[part.start : part.stop]))
+    points = np.concatenate(pieces)
+    if (points["source"] == points["source"][0]).all():
+        return site
+    from pipeline.strip_alignment import disagreement_m
+
+    points = points[canonical_order(points)]
+    places = np.column_stack([points[axis].astype(np.int64) - int(points[axis][0]) for axis in "xyz"]) / MM
+    apart_m = disagreement_m(places, points["source"], min_offset_m)
+    if math.isnan(apart_m):
+        return site
+    detail = f"strips lie {apart_m:.2f} m apart, at most {min_offset_m:g}; {site.verdict.reason}: {site.verdict.detail}"
+    return dataclasses.replace(site, verdict=Verdict(reason=Reason.STRIPS_DISAGREE, detail=detail))

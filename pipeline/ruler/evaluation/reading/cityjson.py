@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import InputError, UnreadableInputError
-from pipeline.io.crs import SpatialReference, parse_crs, resolve_reference
-from pipeline.io.readable import Readable
+from pipeline.io.crs import SpatialReference
+from pipeline.io.crs_given import parse_crs
+from pipeline.io.crs_resolution import resolve_reference
+from pipeline.io.records import Readable
 from pipeline.model import FloatArray, RoofType, Status
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reading.cityjson_geometry import Object, Places, chosen, has_inner_shells, parts_of

@@ -7,9 +7,8 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.counting_sort import counting_sort
-from pipeline.kernels.merge_sort import ascending_order
 from pipeline.kernels.normal_equations import solve_plane_moments
+from pipeline.kernels.sorting import ascending_order, counting_sort
 from pipeline.model import FloatArray, IntArray, LabelArray
 
 DISTANCE_M = 0.01

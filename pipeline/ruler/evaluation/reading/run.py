@@ -18,7 +18,7 @@ from pipeline.errors import RunError, UnreadableInputError
 from pipeline.export.coordinates import one_unit
 from pipeline.export.geoparquet import read_table
 from pipeline.io import arrow_at, is_url, place_below, storage_at
-from pipeline.io.crs import resolve_reference
+from pipeline.io.crs_resolution import resolve_reference
 from pipeline.io.places import file_at
 from pipeline.model import FaceKind, RoofType, Solid, SolidFace, Status
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel, RoofSurface

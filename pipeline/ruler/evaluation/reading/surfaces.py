@@ -17,11 +17,11 @@ import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
 
-from pipeline.geometry import fit_plane_coefficients
 from pipeline.model import BoolArray, FaceKind, FloatArray, IntArray, Solid, SolidFace
 from pipeline.ruler.evaluation.models import RoofSurface
 from pipeline.ruler.evaluation.reading.coplanar import ANGLE_DEG, DISTANCE_M, coplanar_regions, face_vectors
 from pipeline.ruler.evaluation.reading.raw import MILLIMETRES_PER_METRE, RawPart
+from pipeline.segmentation.facet_geometry import fit_plane_coefficients
 
 GRID_M = 0.001
 """Coordinates in plan are whole multiples of it."""
