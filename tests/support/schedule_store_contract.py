@@ -344,11 +344,6 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         assert found.counts[Outcome.SUBMITTED] == 1
         assert claim(store).job_id == job.job_id
 
-    def test_a_job_without_a_schedule_names_none(self, store: JobStore) -> None:
-        job = submit(store)
-        assert job.schedule_id is None
-        assert store.list(JobFilter(schedule_id="a\0b")) == []
-
     def test_each_run_is_a_job_of_its_own(self, store: JobStore) -> None:
         made = make(store)
         for hours in range(1, 6):
@@ -405,18 +400,6 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         assert (missed.outcome, missed.slot) == (Outcome.MISSED, NOON + 2 * HOUR)
         assert "paused" in missed.message
         assert store.schedules.get(made.schedule_id).counts[Outcome.MISSED] == 1
-
-    def test_slots_without_a_driver_are_missed_and_the_latest_is_run_once(self, store: JobStore) -> None:
-        made = make(store)
-        assert tick(store, NOON + 30 * HOUR + 20 * MINUTE) == [
-            (Outcome.MISSED, NOON + 29 * HOUR, 29),
-            (Outcome.SUBMITTED, NOON + 30 * HOUR, 1),
-        ]
-        submitted, missed = runs_of(store, made)
-        assert (missed.first_slot, missed.is_counted) == (NOON + HOUR, True)
-        assert "the clock was not looked at" in missed.message
-        assert submitted.message == "1200 s after its time"
-        assert store.schedules.get(made.schedule_id).counts[Outcome.MISSED] == 29
 
     def test_a_full_queue_is_reported_and_leaves_no_half_a_job(self, store: JobStore) -> None:
         made = make(store, owner="k")

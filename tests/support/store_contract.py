@@ -219,14 +219,6 @@ class StoreContract(DatabaseContract):
         claim(store)
         create("a")
 
-    def test_fifty_submissions_at_once_lose_none(self, store: JobStore) -> None:
-        with ThreadPoolExecutor(25) as crew:
-            jobs = list(crew.map(lambda n: submit(store, title=str(n)), range(50)))
-        assert len({job.job_id for job in jobs}) == 50
-        found = store.list(JobFilter(limit=1000))
-        assert sorted(job.request.title or "" for job in found) == sorted(map(str, range(50)))
-        assert store.counts()[JobStatus.ACCEPTED] == 50
-
     def test_the_limit_holds_when_many_submit_at_once(self, store: JobStore) -> None:
         def create(number: int) -> bool:
             del number
