@@ -10,20 +10,19 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 import sqlalchemy as sa
-from alembic import command
+from migrated import add_old_job, at_revision
 from schedule_contract import DAY, HOUR, MINUTE, NOON, ScheduleContract, StoredSchedule
 from store_contract import DatabaseContract, claim, request, submit, upload
 
 from pipeline.errors import SettingsError
 from pipeline.schedule import Cron, Entry, Missed, Outcome, Overlap, passed_slots
-from service import migrations
 from service.errors import (
     ChangedMeanwhileError,
     NoSuchScheduleError,
@@ -87,13 +86,6 @@ def assert_not_there(store: JobStore, schedule_id: str, **owner: str) -> None:
             ask(schedule_id, **owner)
 
 
-def migrate(connection: sa.Connection, step: Callable[..., None], revision: str) -> None:
-    """Bring a database to a revision, by one of Alembic's commands."""
-    config = migrations._config()
-    config.attributes["connection"] = connection
-    step(config, revision)
-
-
 class InDatabase:
     """A schedule of a store, for the contract that all storages of schedules meet."""
 
@@ -130,41 +122,24 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
 
     def test_a_database_of_the_first_revision_is_brought_on_with_its_jobs(self, url: str) -> None:
         with JobStore(url) as store:
-            if store._database.is_sqlite:
-                Path(store._database._url.database or "").parent.mkdir(parents=True)
-            with store._database.write() as connection:
-                migrate(connection, command.upgrade, "0001")
-                job_id, at = "a" * 32, dt.datetime(2026, 1, 1, tzinfo=dt.UTC)
-                values = {"job_id": job_id, "process_id": "reconstruct", "status": "accepted", "priority": 0}
-                values |= {"request": request().as_dict(), "message": "waits", "progress": 0, "stage": ""}
-                values |= {"created_at": at, "updated_at": at, "dismiss_requested": False, "attempt": 0}
-                values |= {"lost_attempts": 0, "last_event": 1}
-                table = sa.Table("jobs", sa.MetaData(), autoload_with=connection)
-                assert "schedule_id" not in table.c
-                connection.execute(sa.insert(table).values(**values))
+            with at_revision(store, "0001") as connection:
+                job_id = add_old_job(connection, request())
             with pytest.raises(StoreError, match="revision 0001, this version needs"):
                 store.check()
             store.migrate()
             store.check()
             found = store.get(job_id)
-            assert (found.schedule_id, found.created_at, found.request) == (None, at, request())
+            assert (found.schedule_id, found.created_at.year, found.request) == (None, 2026, request())
             assert claim(store).job_id == job_id
-            with store._database.write() as connection:
-                migrate(connection, command.downgrade, "0001")
-                assert "schedules" not in sa.inspect(connection).get_table_names()
-                assert connection.execute(sa.select(table.c.job_id)).scalar_one() == job_id
 
-    def test_stored_requests_get_the_new_names_of_settings(self, store: JobStore) -> None:
+    def test_stored_requests_get_the_new_names_of_settings(self, url: str) -> None:
         old = {"method": "kmeans", "roof": {"minimum_points": 7, "flat_below_deg": 4.0}, "kmeans": {"least_points": 9}}
         new = {"method": "kmeans", "roof": {"min_points": 7, "flat_below_deg": 4.0}, "kmeans": {"min_points": 9}}
-        stored = dataclasses.replace(request(), settings=old)
-        job_id = submit(store, settings=old).job_id
-        schedule_id = make(store, request=stored).schedule_id
-        with store._database.write() as connection:
-            migrate(connection, command.downgrade, "0002")
-        store.migrate()
-        assert store.get(job_id).request.settings == new
-        assert store.schedules.get(schedule_id).definition.request.settings == new
+        with JobStore(url) as store:
+            with at_revision(store, "0002") as connection:
+                job_id = add_old_job(connection, dataclasses.replace(request(), settings=old))
+            store.migrate()
+            assert store.get(job_id).request.settings == new
 
     # --- made, read, changed, removed
 
