@@ -38,7 +38,7 @@ def compare(
         from pipeline.options import ModelFiles, ModelOptions, chosen_settings, values_of
         from pipeline.ruler.evaluation.chapters import chapters
         from pipeline.ruler.evaluation.files import EvaluationRequest
-        from pipeline.ruler.report.compare_files import compare_files, comparison_facts
+        from pipeline.ruler.report.comparison import compare_files, comparison_facts
         from pipeline.ruler.report.evaluation_page import headline
         from pipeline.runtime.compiling import compile_for, kernel_groups
         from pipeline.runtime.request import RunRequest

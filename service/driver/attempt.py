@@ -59,8 +59,8 @@ _NAMED = 10
 def compare(
     request: CompareRequest, on_event: Listener, executor: Executor | None, cancelled: Callable[[], bool]
 ) -> CompareSummary:
-    """`report.compare_files.compare_files` without a reference; imported late: it loads matplotlib."""
-    from pipeline.ruler.report.compare_files import compare_files
+    """`report.comparison.compare_files` without a reference; imported late: it loads matplotlib."""
+    from pipeline.ruler.report.comparison import compare_files
 
     return compare_files(request, on_event=on_event, executor=executor, cancelled=cancelled).summary
 

@@ -224,8 +224,7 @@ def load() -> None:
     import pyarrow.parquet
     import pyproj
 
-    import service.outputs.building_index
-    import service.outputs.footprints
+    import service.features.writing
     import service.outputs.merged_cityjson
     import service.outputs.merged_table
     import service.outputs.report  # noqa: F401

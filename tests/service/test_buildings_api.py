@@ -1,10 +1,9 @@
 """Buildings by REST: pages by window and words against a slow twin, single buildings in four forms."""
 
-import contextlib
 import dataclasses
 import json
 import re
-import sqlite3
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -26,8 +25,8 @@ from starlette.testclient import TestClient
 from pipeline.export.geoparquet import read_table
 from pipeline.model import Decision, DecisionKind, Outcome
 from service.errors import RequestError
-from service.outputs import building_pages, write_outputs
-from service.outputs.building_pages import BuildingQuery, building_page, parsed_bbox
+from service.features.index import NAME
+from service.wire.queries import window
 
 GABLE = runs.ident("gable")
 FAILED = runs.ident("failed")
@@ -57,14 +56,6 @@ def job_id(service: runs.Service) -> str:
 def many(service: runs.Service) -> str:
     """A job of 108 buildings in nine tiles."""
     return service.finished(lambda run_dir: runs.write_run(run_dir, nine_tiles()))
-
-
-@pytest.fixture(scope="module")
-def out_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The outputs of 108 buildings in nine tiles."""
-    folder = tmp_path_factory.mktemp("many")
-    write_outputs(runs.write_run(folder / "run", nine_tiles()), folder / "out")
-    return folder / "out"
 
 
 def answered(client: TestClient, job_id: str, **asked: Any) -> httpx.Response:
@@ -166,6 +157,11 @@ def test_a_window_in_degrees_and_one_in_metres_find_the_same(client: TestClient,
     assert ids(page(client, job_id, bbox=degrees, bbox_crs=uri, crs=uri)) == [TWO_PARTS]
 
 
+def test_a_window_over_the_180th_meridian_is_two(client: TestClient, job_id: str) -> None:
+    assert ids(page(client, job_id, bbox="170,-10,-170,10")) == []
+    assert page(client, job_id, bbox="4,-10,3,80")["numberMatched"] == 5
+
+
 def test_the_border_of_a_window_belongs_to_it(client: TestClient, job_id: str) -> None:
     touching = page(client, job_id, bbox="84990,446990,85000,447000", bbox_crs="native")
     assert ids(touching) == [GABLE]
@@ -193,7 +189,7 @@ def test_words_filter_alone_repeated_and_with_commas(client: TestClient, job_id:
         ("bbox", "inf,0,1,1", "give four numbers"),
         ("bbox", "", "give four numbers"),
         ("bbox", "0,2,1,1", "south 2 lies north"),
-        ("bbox", "170,0,-170,1", "180th meridian in two halves"),
+        ("bbox", "0,52,181,53", "longitudes reach from -180 to 180"),
         ("bbox-crs", "EPSG:28992", "bbox-crs"),
         ("crs", "epsg", "crs"),
         ("limit", "0", "limit"),
@@ -224,14 +220,6 @@ def test_a_page_is_only_geojson(client: TestClient, job_id: str) -> None:
     assert client.get(path, headers={"Accept": "text/html"}).status_code == 406
 
 
-def test_a_large_page_comes_in_pieces(out_dir: Path) -> None:
-    found = building_page(out_dir, BuildingQuery(limit=10_000))
-    chunks = list(found.chunks({"links": []}))
-    assert len(chunks) > 1
-    assert max(map(len, chunks)) < 2 * 65_536
-    assert len(json.loads(b"".join(chunks))["features"]) == 108
-
-
 def test_geopandas_reads_a_page(client: TestClient, job_id: str) -> None:
     frame = geopandas.GeoDataFrame.from_features(page(client, job_id)["features"], crs="OGC:CRS84")
     assert len(frame) == 6
@@ -241,72 +229,64 @@ def test_geopandas_reads_a_page(client: TestClient, job_id: str) -> None:
 # --- against a slow twin ---------------------------------------------------------------------------------------------
 
 _WORDS = {
-    "statuses": ("ok", "doubtful", "fallback", "failed"),
-    "roof_types": ("gable", "pent", "flat", "none", "hip"),
-    "reasons": ("invalid_solid", "too_few_points", "no_plane"),
+    "status": ("ok", "doubtful", "fallback", "failed"),
+    "roof_type": ("gable", "pent", "flat", "none", "hip"),
+    "reason": ("invalid_solid", "too_few_points", "no_plane"),
 }
 
 
 @st.composite
-def queries(draw: st.DrawFn) -> BuildingQuery:
+def queries(draw: st.DrawFn) -> dict[str, Any]:
     """Questions of every kind, narrow and wide."""
-    bbox = None
-    if draw(st.booleans()):
-        x, y = draw(st.floats(84_900, 85_400)), draw(st.floats(446_900, 447_400))
-        bbox = (x, y, x + draw(st.floats(0, 400)), y + draw(st.floats(0, 400)))
-    words = {
-        name: tuple(draw(st.lists(st.sampled_from(allowed), max_size=2, unique=True)))
+    asked: dict[str, Any] = {
+        name: ",".join(draw(st.lists(st.sampled_from(allowed), max_size=2, unique=True)))
         for name, allowed in _WORDS.items()
     }
-    limit, offset = draw(st.integers(1, 120)), draw(st.integers(0, 60))
-    return BuildingQuery(bbox=bbox, bbox_native=True, native=True, limit=limit, offset=offset, **words)
+    if draw(st.booleans()):
+        x, y = draw(st.floats(84_900, 85_400)), draw(st.floats(446_900, 447_400))
+        asked["bbox"] = (x, y, x + draw(st.floats(0, 400)), y + draw(st.floats(0, 400)))
+    return asked | {"limit": draw(st.integers(1, 120)), "offset": draw(st.integers(0, 60))}
 
 
-def twin(features: list[dict[str, Any]], query: BuildingQuery) -> list[str]:
+def twin(features: list[dict[str, Any]], asked: dict[str, Any]) -> list[str]:
     """The ids that fit, found by looking at every feature."""
-    wanted = {"status": query.statuses, "roof_type": query.roof_types, "reason": query.reasons}
     found = []
     for feature in features:
-        if query.bbox is not None:
+        if "bbox" in asked:
             if feature["geometry"] is None:
                 continue
             own = shapely.box(*shapely.geometry.shape(feature["geometry"]).bounds)
-            if not own.intersects(shapely.box(*query.bbox)):
+            if not own.intersects(shapely.box(*asked["bbox"])):
                 continue
-        if all(not words or feature["properties"][name] in words for name, words in wanted.items()):
+        if all(not asked[name] or feature["properties"][name] in asked[name].split(",") for name in _WORDS):
             found.append(feature["id"])
     return sorted(found)
 
 
-@pytest.mark.parametrize("narrow_share", [0.0, 0.05, 1.0])
-def test_pages_are_what_a_look_at_every_building_finds(
-    out_dir: Path, narrow_share: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(building_pages, "_NARROW_SHARE", narrow_share)
-    every = building_page(out_dir, BuildingQuery(native=True, limit=10_000))
-    features = [json.loads(text) for text in every.features()]
+def test_pages_are_what_a_look_at_every_building_finds(client: TestClient, many: str) -> None:
+    features = page(client, many, crs="native", limit=10_000)["features"]
     assert len(features) == 108
 
     @settings(max_examples=examples(150), suppress_health_check=[HealthCheck.too_slow], deadline=None)
     @given(queries())
-    def check(query: BuildingQuery) -> None:
-        expected = twin(features, query)
-        found = building_page(out_dir, query)
-        assert found.matched == len(expected)
-        reported = [json.loads(text)["id"] for text in found.features()]
-        assert reported == expected[query.offset : query.offset + query.limit]
+    def check(asked: dict[str, Any]) -> None:
+        expected = twin(features, asked)
+        sent = asked | ({"bbox": ",".join(map(repr, asked["bbox"])), "bbox_crs": "native"} if "bbox" in asked else {})
+        found = page(client, many, **sent)
+        assert found["numberMatched"] == len(expected)
+        assert ids(found) == expected[asked["offset"] : asked["offset"] + asked["limit"]]
 
     check()
 
 
-@given(st.text(alphabet="0123456789.,-+einfa ", max_size=40))
-def test_any_text_is_a_window_or_refused(text: str) -> None:
+@given(st.text(alphabet="0123456789.,-+einfa ", max_size=40), st.booleans(), st.booleans())
+def test_any_text_is_a_window_or_refused(text: str, in_degrees: bool, northing_first: bool) -> None:
     try:
-        west, south, east, north = parsed_bbox(text, native=False)
+        found = window(text, in_degrees=in_degrees, northing_first=northing_first)
     except RequestError as error:
         reported = str(error)
     else:
-        reported = "bbox" if west <= east and south <= north else "a window that is none"
+        reported = "bbox" if all(west <= east and south <= north for west, south, east, north in found) else "no window"
     assert "bbox" in reported
 
 
@@ -365,12 +345,17 @@ def test_a_building_says_what_was_checked_and_tried(service: runs.Service, clien
 
 def test_a_job_of_a_version_without_decisions_says_so(service: runs.Service, client: TestClient) -> None:
     job = service.finished()
-    index = service.folder.outputs(job, 1) / "index.sqlite"
-    with contextlib.closing(sqlite3.connect(index)) as connection:
-        connection.execute("DROP TABLE decision")
+    shutil.rmtree(service.folder.run(job, 1) / "decisions")
     answer = client.get(f"/jobs/{job}/buildings/{GABLE}/decisions")
     assert "recorded no decisions: submit it again" in runs.problem(answer, 404, "no-such-output")
     assert client.get(f"/jobs/{job}/buildings/{GABLE}").status_code == 200
+
+
+def test_a_job_of_a_version_without_an_index_of_rows_gets_one(service: runs.Service, client: TestClient) -> None:
+    job = service.finished()
+    before = client.get(f"/jobs/{job}/buildings").json()["features"]
+    (service.folder.outputs(job, 1) / NAME).unlink()
+    assert client.get(f"/jobs/{job}/buildings").json()["features"] == before
 
 
 def test_the_form_is_chosen_by_f_or_by_the_header(client: TestClient, job_id: str) -> None:
@@ -570,21 +555,24 @@ _ANSWER = """
 import json, sys
 from pathlib import Path
 import service.routes.buildings, service.routes.results
+from service.features.index import NAME, RowIndex
+from service.features.pages import among, bounded_by, feature_texts, sorted_page
 from service.outputs import output_file
-from service.outputs.building_pages import BuildingQuery, building_page
 from service.outputs.single_building import building_cityjson, building_obj, stored_building
 run, out = Path(sys.argv[1]), Path(sys.argv[2])
 output_file(out, "buildings")
-page = building_page(out, BuildingQuery(bbox=(4.0, 51.0, 5.0, 53.0), statuses=("ok",)))
-first = json.loads(next(page.features()))["id"]
-one = stored_building(out, first)
+index = RowIndex(out / NAME)
+conditions = [among("status", ["ok"]), bounded_by([(4.0, 51.0, 5.0, 53.0)], native=False)]
+_, positions = sorted_page(index, conditions, by="id", limit=10, offset=0)
+first = json.loads(next(feature_texts(index, "buildings", positions)))["id"]
+one = stored_building(index, first)
 list(building_obj(run, one)), building_cityjson(run, one)
 print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
 """
 
 
-def test_answering_loads_no_numerical_library(out_dir: Path) -> None:
-    command = [sys.executable, "-c", _ANSWER, str(out_dir.parent / "run"), str(out_dir)]
+def test_answering_loads_no_numerical_library(service: runs.Service, many: str) -> None:
+    command = [sys.executable, "-c", _ANSWER, str(service.folder.run(many, 1)), str(service.folder.outputs(many, 1))]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
     loaded = set(json.loads(result.stdout))
     heavy = {"numba", "scipy", "pandas", "geopandas", "matplotlib", "dask", "distributed", "pyarrow", "pyproj", "laspy"}

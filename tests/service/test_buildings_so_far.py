@@ -18,10 +18,11 @@ from pipeline.runtime.models_so_far import ModelsSoFar
 from service.driver.janitor import tidy_jobs
 from service.driver.so_far_process import follow
 from service.errors import StoreBusyError
+from service.features.index import NAME, RowIndex
+from service.features.pages import feature_texts, sorted_page
 from service.jobs import JobStatus
 from service.outputs import write_outputs
-from service.outputs.building_pages import BuildingQuery, building_page
-from service.outputs.single_building import building_cityjson, stored_building
+from service.outputs.single_building import building_cityjson, cityjson_so_far, stored_building
 
 OGC = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
 TILE, OTHER = "x850_y4470", "x851_y4470"
@@ -37,14 +38,17 @@ def running(tmp_path: Path) -> RunningRun:
     return RunningRun(tmp_path / "run")
 
 
-def features(folder: Path, **query: Any) -> list[dict[str, Any]]:
+def features(folder: Path, *, native: bool = False) -> list[dict[str, Any]]:
     """The features that readers see, in the order in which they came."""
-    page = building_page(folder, BuildingQuery(by_arrival=True, **query))
-    return [json.loads(text) for text in page.features()]
+    index = RowIndex(folder / NAME)
+    _, positions = sorted_page(index, [], by="position", limit=100, offset=0)
+    return [
+        json.loads(text) for text in feature_texts(index, "buildings", positions, (lambda s: s) if native else None)
+    ]
 
 
-def ids(folder: Path, **query: Any) -> list[str]:
-    return [feature["id"] for feature in features(folder, **query)]
+def ids(folder: Path) -> list[str]:
+    return [feature["id"] for feature in features(folder)]
 
 
 def corners(document: dict[str, Any]) -> list[list[float]]:
@@ -75,16 +79,22 @@ def test_buildings_so_far_are_those_of_the_outputs_but_for_their_meshes(running:
     finished = runs.write_run(tmp_path / "finished", whole)
     write_outputs(finished, tmp_path / "out")
     assert ids(tmp_path / "so-far") == [r.building_id for r in (COURTYARD, FAILED, TWO_PARTS, GABLE)]
+    for native in (False, True):
+        now = {feature["id"]: feature for feature in features(tmp_path / "so-far", native=native)}
+        later = {feature["id"]: feature for feature in features(tmp_path / "out", native=native)}
+        for name, feature in later.items():
+            for column in ("mesh_path", "acquired_from", "acquired_to"):  # the last two come with facts of candidates
+                feature["properties"][column] = now[name]["properties"][column]
+        assert now == later
     for result in (COURTYARD, FAILED, TWO_PARTS, GABLE):
-        for native in (False, True):
-            now = stored_building(tmp_path / "so-far", result.building_id, native=native)
-            later = stored_building(tmp_path / "out", result.building_id, native=native)
-            for name in ("mesh_path", "acquired_from", "acquired_to"):  # the last two come with the facts of candidates
-                later.feature["properties"][name] = now.feature["properties"][name]
-            assert (now.feature, now.planes, now.tile) == (later.feature, later.planes, later.tile)
-        document = building_cityjson(tmp_path / "so-far", now)
+        so_far, end = (
+            stored_building(RowIndex(folder / NAME), result.building_id)
+            for folder in (tmp_path / "so-far", tmp_path / "out")
+        )
+        assert so_far.planes == end.planes
+        document = cityjson_so_far(tmp_path / "so-far", so_far)
         assert document_faults(document, result.building_id) == []
-        assert corners(document) == corners(building_cityjson(finished, later))
+        assert corners(document) == corners(building_cityjson(finished, end))
 
 
 def test_a_rejected_candidate_is_not_shown(running: RunningRun, tmp_path: Path) -> None:
@@ -106,32 +116,22 @@ def test_a_writer_that_was_killed_shows_nothing_twice_and_loses_nothing(running:
         running.models(OTHER, "c", TWO_PARTS)
         running.add_to(first)
         # as a killed process leaves it: more in the files than the index knows
-        first._features.flush()
+        first._city.flush()
         shutil.copytree(folder, tmp_path / "killed")
     assert ids(tmp_path / "killed") == [COURTYARD.building_id]
-    assert (tmp_path / "killed/cityjson" / f"tile={OTHER}").exists()
+    city = tmp_path / "killed/city.jsonl"
+    known = sum(map(len, city.read_bytes().splitlines(keepends=True)[:2]))
+    assert city.stat().st_size > known
     with running.writer(tmp_path / "killed") as second:
         assert len(second.batches) == 1
+        assert city.stat().st_size == known
         running.add_to(second)
         running.add_to(second)
         second.show()
     assert ids(tmp_path / "killed") == [r.building_id for r in (COURTYARD, GABLE, TWO_PARTS)]
     for result in (COURTYARD, GABLE, TWO_PARTS):
-        found = stored_building(tmp_path / "killed", result.building_id)
-        assert building_cityjson(tmp_path / "killed", found)["CityObjects"][result.building_id]["type"] == "Building"
-
-
-def test_a_window_and_words_select_from_the_buildings_so_far(running: RunningRun, tmp_path: Path) -> None:
-    running.models(TILE, "a", COURTYARD, FAILED)
-    running.models(OTHER, "b", TWO_PARTS)
-    with running.writer(tmp_path) as shown:
-        running.add_to(shown)
-        shown.show()
-    x, y, _ = TWO_PARTS.origin
-    window = (x - 1.0, y - 1.0, x + 30.0, y + 30.0)
-    assert ids(tmp_path, bbox=window, bbox_native=True) == [TWO_PARTS.building_id]
-    assert ids(tmp_path, statuses=("failed",)) == [FAILED.building_id]
-    assert ids(tmp_path, offset=1, limit=1) == [FAILED.building_id]
+        found = stored_building(RowIndex(tmp_path / "killed" / NAME), result.building_id)
+        assert cityjson_so_far(tmp_path / "killed", found)["CityObjects"][result.building_id]["type"] == "Building"
 
 
 # --- the process that shows them
@@ -230,6 +230,10 @@ def test_a_client_reads_buildings_as_they_come_and_all_of_them_in_the_end(tmp_pa
             running.models(OTHER, "b", TWO_PARTS)
             running.add_to(shown)
             shown.show()
+        for query in ("bbox=85125,447015,85155,447030&bbox-crs=native", "status=ok&roof_type=gable,none&limit=1"):
+            assert [f["id"] for f in service.client.get(f"{place}?{query}").json()["features"]] == [
+                TWO_PARTS.building_id
+            ]
         # what is new comes after what was there
         answer = service.client.get(f"{place}?offset=2")
         more = answer.json()

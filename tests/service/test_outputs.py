@@ -81,7 +81,7 @@ def test_doing_it_again_gives_the_same_bytes_and_leaves_nothing_beside(
     write_outputs(run_dir, tmp_path)
     assert contents(tmp_path) == first
     made = [kind.filename for name, kind in OUTPUTS.items() if name not in ON_REQUEST]
-    assert set(first) == {"outputs.json", "index.sqlite", *made}
+    assert set(first) == {"outputs.json", "rows.sqlite", *made}
 
 
 def test_only_the_wanted_outputs_are_offered(run_dir: Path, tmp_path: Path) -> None:
@@ -112,10 +112,10 @@ def test_work_that_is_stopped_leaves_no_file(run_dir: Path, tmp_path: Path) -> N
         read_catalogue(tmp_path)
 
 
-def test_progress_counts_the_tiles(run_dir: Path, tmp_path: Path) -> None:
+def test_progress_counts_the_tiles_of_each_file(run_dir: Path, tmp_path: Path) -> None:
     steps: list[tuple[int, int]] = []
     write_outputs(run_dir, tmp_path, None, lambda done, total: steps.append((done, total)))
-    assert steps == [(done, 4) for done in range(5)]
+    assert steps == [(done, 24) for done in range(25)]
 
 
 @pytest.mark.parametrize("status", [RunStatus.RUNNING, RunStatus.FAILED])

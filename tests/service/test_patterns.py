@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable
 from zoneinfo import available_timezones
 
-import pyproj
 import pytest
 from examples import examples
 from hypothesis import HealthCheck, given, settings
@@ -15,15 +14,12 @@ from hypothesis import strategies as st
 from pipeline.schedule.cron import LONGEST, expression_faults
 from service.deliveries import key_of
 from service.errors import RequestError
-from service.features.coordinates import CRS84, NamedCrs, parsed_window
-from service.outputs.building_pages import parsed_bbox
 from service.routes.tus import _checksum, _metadata
 from service.wire import patterns
 from service.wire.inputs import _printable
-from service.wire.queries import interval, words
+from service.wire.queries import interval, window, words
 
 WORDS = ["ok", "fallback", "failed"]
-GLOBE = NamedCrs(uri=CRS84, crs=pyproj.CRS("OGC:CRS84"))
 
 
 def cron(text: str) -> None:
@@ -41,17 +37,10 @@ CASES: dict[str, tuple[str, Callable[[str], object], str, list[str], list[str]]]
     ),
     "window": (
         patterns.WINDOW,
-        lambda text: parsed_window(text, GLOBE),
+        lambda text: window(text, in_degrees=True),
         "longitudes reach|lies north",
         ["4.35,51.99,4.37,52.01", "1,2,3,4", "-1e1,+.5, 3. ,4"],
-        ["", "1,2,3", "1,2,3,4,5", "a,b,c,d", "1_0,2,3,4", "nan,1,2,3", "1e999,2,3,4"],
-    ),
-    "bounds": (
-        patterns.WINDOW,
-        lambda text: parsed_bbox(text, native=True),
-        "is empty|lies|south|west|x_min|180th",
-        ["1,2,3,4"],
-        ["", "inf,2,3,4"],
+        ["", "1,2,3", "1,2,3,4,5", "a,b,c,d", "1_0,2,3,4", "nan,1,2,3", "1e999,2,3,4", "inf,2,3,4"],
     ),
     "key": (
         patterns.KEY,

@@ -141,7 +141,7 @@ def test_the_catalogue_leads_to_the_points_and_names_no_folder(client: TestClien
 @pytest.mark.parametrize(
     "path",
     ["results/3dtiles/..%2f..%2frun%2frun.json", "results/3dtiles/outputs.json", "results/3dtiles/models/x1_y1.glb",
-     "results/3dtiles/..%2findex.sqlite", "results/stac/x850_y4470/x851_y4470.json", "results/report/tileset.json",
+     "results/3dtiles/..%2frows.sqlite", "results/stac/x850_y4470/x851_y4470.json", "results/report/tileset.json",
      "results/nothing/tileset.json", "results/3dtiles/tileset.json%0a", "run/state/x850_y4470/x850_y4470.json",
      "run/buildings/tile=x850_y4470/..%2f..%2frun.json", "run/buildings/tile=x1_y1/part-0.parquet",
      "results/3dtiles/skylines/x1_y1.glb"],

@@ -74,7 +74,7 @@ def test_the_answer_to_an_output_that_was_not_made_names_those_that_were(service
         assert "it has: meshes, report" in runs.problem(service.client.get(path), 404, "no-such-output")
 
 
-@pytest.mark.parametrize("name", ["colours", "outputs.json", "index.sqlite", "..%2f..%2fservice.db", "%00"])
+@pytest.mark.parametrize("name", ["colours", "outputs.json", "rows.sqlite", "..%2f..%2fservice.db", "%00"])
 def test_nothing_but_outputs_is_served(client: TestClient, job_id: str, name: str) -> None:
     answer = client.get(f"/jobs/{job_id}/results/{name}")
     assert answer.status_code == 404
@@ -246,8 +246,9 @@ def test_results_whose_files_are_gone_are_not_found(service: runs.Service) -> No
 
 def test_a_building_whose_job_is_being_removed_is_not_found(service: runs.Service) -> None:
     job_id = service.finished()
-    for name, path in (("buildings.geojson", f"buildings/{runs.ident('gable')}"), ("index.sqlite", "buildings")):
-        (service.folder.outputs(job_id, 1) / name).unlink()
+    (service.folder.outputs(job_id, 1) / "rows.sqlite").unlink()
+    shutil.rmtree(service.folder.run(job_id, 1))
+    for path in ("buildings", f"buildings/{runs.ident('gable')}"):
         answer = service.client.get(f"/jobs/{job_id}/{path}")
         assert "no longer in the state folder" in runs.problem(answer, 404, "no-such-output")
 

@@ -24,6 +24,7 @@ from pipeline.extras.publish.publishing import disk_at
 from pipeline.model import Doubt, Reason, Status
 from service.errors import SelectionBusyError
 from service.outputs import selected
+from service.outputs.kinds import SELECTABLE
 
 pytestmark = pytest.mark.slow  # each selection is made by a process
 
@@ -49,8 +50,8 @@ def job_id(service: runs.Service) -> str:
 def test_every_output_of_buildings_holds_those_of_the_status_alone(client: TestClient, job_id: str) -> None:
     found = client.get(f"/jobs/{job_id}/results", params={"status": "ok"}).json()
     whole = client.get(f"/jobs/{job_id}/results").json()
-    assert list(found) == [name for name in whole if name in selected.OFFERED]
-    assert set(found) == selected.OFFERED - {"pmtiles"}  # which the job was not asked for
+    assert list(found) == [name for name in whole if name in SELECTABLE]
+    assert set(found) == set(SELECTABLE) - {"pmtiles"}  # which the job was not asked for
     files = {}
     for name, entry in found.items():
         assert entry["href"] == f"http://127.0.0.1/jobs/{job_id}/results/{name}?status=ok"

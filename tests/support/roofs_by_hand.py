@@ -2,7 +2,8 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,26 @@ from pipeline.model import RoofType
 from pipeline.ruler.evaluation.measure import Measure
 from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
 from pipeline.ruler.evaluation.reference import Conditions, Reference, ReferencePoints
+from pipeline.ruler.evaluation.residuals import BIAS, COVERAGE, RMSE, WITHIN, Tallies
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofShape
 from pipeline.ruler.simulation.scene import Scene, Terrain, place_building
 
 ORIGIN = (1000.0, 2000.0, 0.0)
 EXTENT = shapely.box(900.0, 1900.0, 1600.0, 2300.0)
+
+
+def rows(columns: Mapping[str, Any]) -> list[SimpleNamespace]:
+    """Columns of one length, row by row."""
+    return [SimpleNamespace(**dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
+
+
+def tally_rows(tallies: Tallies, **more: Any) -> list[SimpleNamespace]:
+    """The sums and figures of each building; its own columns replace them."""
+    figures = {"rmse_m": RMSE, "bias_m": BIAS, "share_within": WITHIN, "coverage": COVERAGE}
+    figures |= {"median_m": tallies.quantile(0.5), "p95_m": tallies.quantile(0.95)}
+    columns = {name: tallies.figure(of) for name, of in figures.items()}
+    return rows({**tallies.columns(), "histogram": tallies.histogram, **columns, **more})
 
 
 def surface(ring: Any, coefficients: tuple[float, float, float], plane_id: int = 0, group: int = -1) -> RoofSurface:

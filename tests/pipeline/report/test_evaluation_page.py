@@ -42,7 +42,7 @@ from pipeline.ruler.evaluation.writing import markdown
 from pipeline.ruler.report.evaluation_maps import maps
 from pipeline.ruler.report.evaluation_page import HEADLINE, page, write_page
 from pipeline.ruler.report.histograms import charts
-from pipeline.ruler.report.models_view import models_view
+from pipeline.ruler.report.model_pictures import models_view
 from pipeline.ruler.report.section import RESIDUAL_CLASSES, UNCOVERED, profile_line, residual_class, section_svg
 from pipeline.ruler.report.svg_chart import rebinned
 from pipeline.ruler.report.worst_cases import MAX_NOT_FOUND, chosen_rows, worst_cases

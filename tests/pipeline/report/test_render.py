@@ -15,7 +15,8 @@ from matplotlib.patches import PathPatch
 
 from pipeline.errors import RunError
 from pipeline.model import FaceKind, RoofType
-from pipeline.report.perspective import MAP_SUN, View, ViewedFace, draw_view, drawn_path, lambert
+from pipeline.report.perspective import MAP_SUN, View, ViewedFace, draw_view, lambert
+from pipeline.report.pictures import drawn_path
 from pipeline.report.render import FAILED_COLOUR, ROOF_COLOURS, render_run
 
 TRUTH_COLOUR = "#0050a0"

@@ -18,7 +18,7 @@ TRUTH = [gable("a"), hip("b", 20.0), flat("c", 40.0), gable("d", 60.0)]
 
 
 def stands(models: list[RoofModel], truth: Reference) -> list[Stands]:
-    return [row.stands for row in score_delivery(models, truth, match_footprints(models, truth)).models]
+    return score_delivery(models, truth, match_footprints(models, truth)).models["stands"].tolist()
 
 
 def figures_of(models: list[RoofModel], truth: Reference, subset: int = 0) -> dict[str, float]:
@@ -42,7 +42,7 @@ def test_blocks_and_gaps_are_distinguished() -> None:
     ]
     truth = reference(TRUTH)
     delivery = score_delivery(models, truth, match_footprints(models, truth))
-    assert [row.delivered for row in delivery.buildings] == [
+    assert delivery.buildings["delivered"].tolist() == [
         Delivered.LOD2,
         Delivered.BLOCK,
         Delivered.BLOCK,
@@ -59,10 +59,10 @@ def test_a_model_where_no_building_is_is_false_where_the_reference_is_complete()
     figures = figures_of([*TRUTH, tree, corner], truth)
     assert (figures["false_models"], figures["correctness"]) == (2, pytest.approx(4 / 6))
     assert figures["lod2"] == 1.0
-    assert stands([*TRUTH, tree], reference(TRUTH, extent=None))[4] is Stands.LEFT_OUT
+    assert stands([*TRUTH, tree], reference(TRUTH, extent=None))[4] == Stands.LEFT_OUT
     assert figures_of([*TRUTH, tree], reference(TRUTH, extent=None))["correctness"] == 1.0
     at_edge = flat("at the edge", -99.0, touches_data_edge=True)  # the extent begins at -100
-    assert stands([at_edge, *TRUTH], truth)[0] is Stands.LEFT_OUT
+    assert stands([at_edge, *TRUTH], truth)[0] == Stands.LEFT_OUT
 
 
 def test_no_model_is_excused_by_what_it_says_of_itself() -> None:
@@ -105,9 +105,9 @@ def test_a_model_over_several_buildings_joins_them() -> None:
     truth = reference([*true, flat("alone", 50.0)])
     row = flat("row", width=30.0)
     delivery = score_delivery([row], truth, match_footprints([row], truth))
-    assert [one.stands for one in delivery.models] == [Stands.JOINS]
-    assert [one.covers for one in delivery.models] == [3]
-    assert [one.joined for one in delivery.buildings] == [True, True, True, False]
+    assert delivery.models["stands"].tolist() == [Stands.JOINS]
+    assert delivery.models["covers"].tolist() == [3]
+    assert delivery.buildings["joined"].tolist() == [True, True, True, False]
     figures = figures_of([row], truth)
     assert (figures["joined"], figures["joining_models"], figures["nothing"]) == (0.75, 1, 1.0)
     pair = flat("pair", 4.0, width=15.9)  # half of the first and nearly all of the second
@@ -126,8 +126,8 @@ def test_what_the_data_edge_cuts_does_not_count() -> None:
     truth = reference([*TRUTH, cut])
     assert figures_of(TRUTH, truth)["lod2"] == 1.0
     part = flat("part", 80.0, width=3.0)
-    assert stands([*TRUTH, part], truth)[4] is Stands.LEFT_OUT
-    assert stands([*TRUTH, cut], truth)[4] is Stands.FOR_BUILDING
+    assert stands([*TRUTH, part], truth)[4] == Stands.LEFT_OUT
+    assert stands([*TRUTH, cut], truth)[4] == Stands.FOR_BUILDING
     assert figures_of([*TRUTH, cut], truth) == figures_of(TRUTH, truth)
 
 

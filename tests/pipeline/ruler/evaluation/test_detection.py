@@ -265,10 +265,10 @@ def test_half_of_the_area_decides_whatever_the_number_of_models() -> None:
         model("wide", shapely.box(1040, 2000, 1062, 2010)),  # 10 of 22 m
     ]
     rows = detect(parts, truth_of(truth, EXTENT))
-    assert [round(b.overlap, 3) for b in rows.buildings] == [0.6, 0.49, 1.0]
-    assert [b.found for b in rows.buildings] == [True, False, True]
-    assert [m.found for m in rows.models] == [True, True, True, False]
-    assert [m.building for m in rows.models] == [0, 0, 1, 2]
+    assert rows.buildings["overlap"].round(3).tolist() == [0.6, 0.49, 1.0]
+    assert (rows.buildings["overlap"] >= 0.5).tolist() == [True, False, True]
+    assert (rows.models["overlap"] >= 0.5).tolist() == [True, True, True, False]
+    assert rows.models["building"].tolist() == [0, 0, 1, 2]
     measured = figures(rows, truth_of(truth, EXTENT))
     assert measured["object_completeness"].value == pytest.approx(2 / 3)
     assert measured["object_correctness"].value == pytest.approx(3 / 4)
@@ -330,8 +330,8 @@ def test_a_footprint_that_crosses_itself_counts_with_the_area_that_it_encloses()
     truth = squares(1)
     bow_tie = model("x", shapely.Polygon([(1000, 2000), (1010, 2010), (1010, 2000), (1000, 2010)]))
     rows = detect([bow_tie], truth_of(truth, EXTENT))
-    assert rows.buildings[0].overlap == pytest.approx(0.5)
-    assert sum(block.found for block in rows.blocks) == pytest.approx(200, abs=20)
+    assert rows.buildings["overlap"][0] == pytest.approx(0.5)
+    assert rows.blocks["found"].sum() == pytest.approx(200, abs=20)
 
 
 def test_without_models_nothing_is_found_and_nothing_is_wrong() -> None:

@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 import roofs_by_hand as by_hand
 import shapely
-from matplotlib.path import Path
-from roofs_by_hand import bent_gable, flat, gable, hip, lifted, moved, rectangle, reference, surface, turned, with_face
+from roofs_by_hand import (
+    bent_gable,
+    flat,
+    gable,
+    hip,
+    lifted,
+    moved,
+    rectangle,
+    reference,
+    rows,
+    surface,
+    turned,
+    with_face,
+)
 from shapely import affinity
 
 from pipeline.model import RoofType
@@ -36,7 +47,7 @@ def scored(models: list[RoofModel], truth: list[RoofModel], **more: object) -> d
 
 
 def found(models: list[RoofModel], truth: list[RoofModel]) -> list[bool]:
-    return [row.found for row in score_faces(models, reference(truth)).reference]
+    return [row.found for row in rows(score_faces(models, reference(truth)).true)]
 
 
 @pytest.mark.parametrize(
@@ -56,12 +67,12 @@ def test_the_truth_scored_against_itself_is_perfect(truth: list[RoofModel]) -> N
     for name in SHARES:
         assert facts[name].value == 1.0
         assert facts[name].high == 1.0 or len(truth) == 1
-    assert {row.verdict for row in score.models} <= {FaceVerdict.RIGHT, FaceVerdict.NEITHER}
-    assert all(row.found and row.matched and not row.as_group for row in score.reference)
-    assert max(row.angle_deg for row in score.reference) == 0.0
-    assert max(abs(row.offset_m) for row in score.reference) == 0.0
-    assert {one.kind for one in score.components} == {Topology.ONE_TO_ONE}
-    large = len({row.unit for row in score.reference if row.unit_area_m2 >= 10})
+    assert {row.verdict for row in rows(score.made)} <= {FaceVerdict.RIGHT, FaceVerdict.NEITHER}
+    assert all(row.found and row.matched and not row.as_group for row in rows(score.true))
+    assert max(row.angle_deg for row in rows(score.true)) == 0.0
+    assert max(abs(row.offset_m) for row in rows(score.true)) == 0.0
+    assert {one.kind for one in rows(score.components)} == {Topology.ONE_TO_ONE}
+    large = len({row.unit for row in rows(score.true) if row.unit_area_m2 >= 10})
     assert facts["faces.topology_1_1"].value == large
     assert facts["faces.completeness_10m2"].n == large
 
@@ -87,8 +98,8 @@ def test_a_dropped_building_loses_its_faces() -> None:
 @pytest.mark.parametrize(("lift", "kept"), [(0.2, True), (0.3, True), (-0.3, True), (0.31, False), (-0.31, False)])
 def test_a_flat_face_is_found_up_to_a_lift_of_0_3_m(lift: float, kept: bool) -> None:
     one = TRUTH[2]
-    (row,) = score_faces([with_face(one, 0, lifted(one.surfaces[0], lift))], reference([one])).reference
-    assert row.found is kept
+    (row,) = rows(score_faces([with_face(one, 0, lifted(one.surfaces[0], lift))], reference([one])).true)
+    assert bool(row.found) is kept
     assert row.offset_m == pytest.approx(lift)
     assert row.angle_deg == 0.0
 
@@ -97,15 +108,15 @@ def test_a_lift_counts_across_the_plane() -> None:
     one = TRUTH[0]
     limit = 0.3 * math.sqrt(1 + 0.7**2)
     for lift, kept in ((limit - 1e-4, True), (limit + 1e-4, False)):
-        (row, _) = score_faces([with_face(one, 0, lifted(one.surfaces[0], lift))], reference([one])).reference
-        assert row.found is kept
+        (row, _) = rows(score_faces([with_face(one, 0, lifted(one.surfaces[0], lift))], reference([one])).true)
+        assert bool(row.found) is kept
         assert row.offset_m == pytest.approx(lift / math.sqrt(1 + 0.7**2))
 
 
 def test_the_offset_of_a_turned_face_is_across_the_true_plane() -> None:
     one = TRUTH[0]
     face = lifted(turned(one.surfaces[0], 8.0), 0.2)
-    (row, _) = score_faces([with_face(one, 0, face)], reference([one])).reference
+    (row, _) = rows(score_faces([with_face(one, 0, face)], reference([one])).true)
     assert row.offset_m == pytest.approx(0.2 / math.sqrt(1 + 0.7**2))
 
 
@@ -114,8 +125,8 @@ def test_the_offset_of_a_turned_face_is_across_the_true_plane() -> None:
 def test_a_face_is_found_up_to_a_turn_of_10_deg(place: tuple[int, int], angle: float, kept: bool) -> None:
     building, face = place
     one = TRUTH[building]
-    row = score_faces([with_face(one, face, turned(one.surfaces[face], angle))], reference([one])).reference[face]
-    assert row.found is kept
+    row = rows(score_faces([with_face(one, face, turned(one.surfaces[face], angle))], reference([one])).true)[face]
+    assert bool(row.found) is kept
     assert row.angle_deg == pytest.approx(angle)
     assert row.offset_m == pytest.approx(0.0, abs=1e-9)
 
@@ -123,8 +134,8 @@ def test_a_face_is_found_up_to_a_turn_of_10_deg(place: tuple[int, int], angle: f
 def test_a_lost_face_of_a_model_is_wrong_where_it_should_have_been() -> None:
     one = with_face(TRUTH[1], 2, turned(TRUTH[1].surfaces[2], 11.0))
     score = score_faces([TRUTH[0], one], reference(TRUTH[:2]))
-    assert [row.verdict for row in score.models].count(FaceVerdict.WRONG) == 1
-    (wrong,) = [row for row in score.models if row.verdict is FaceVerdict.WRONG]
+    assert [row.verdict for row in rows(score.made)].count(FaceVerdict.WRONG) == 1
+    (wrong,) = [row for row in rows(score.made) if row.verdict == FaceVerdict.WRONG]
     assert (wrong.building, wrong.model_id, wrong.plane_id) == (1, "b", 2)
     facts = figures(score, reference(TRUTH[:2]))
     assert facts["completeness_10m2"] == facts["correctness_10m2"] == pytest.approx(5 / 6)
@@ -202,11 +213,11 @@ def test_a_bent_face_is_found_by_its_mean_plane_where_no_piece_matches_alone(
     mean_z = (bend * (4.0 + lower * bend / 2) + rest * (4.0 + lower * bend + upper * rest / 2)) / 6
     made = one_sided(true, rise, mean_z - 3 * rise)
     score = score_faces([made], reference([true]))
-    assert all(row.found and row.as_group and row.matched for row in score.reference)
-    assert [row.angle_deg for row in score.reference] == pytest.approx([0.0] * 4, abs=1e-9)
-    assert [row.offset_m for row in score.reference] == pytest.approx([0.0] * 4, abs=1e-9)
-    assert [row.overlap_reference for row in score.reference] == pytest.approx([1.0] * 4)
-    assert [row.verdict for row in score.models] == [FaceVerdict.RIGHT] * 2
+    assert all(row.found and row.as_group and row.matched for row in rows(score.true))
+    assert [row.angle_deg for row in rows(score.true)] == pytest.approx([0.0] * 4, abs=1e-9)
+    assert [row.offset_m for row in rows(score.true)] == pytest.approx([0.0] * 4, abs=1e-9)
+    assert [row.overlap_true for row in rows(score.true)] == pytest.approx([1.0] * 4)
+    assert [row.verdict for row in rows(score.made)] == [FaceVerdict.RIGHT] * 2
     assert found([with_face(made, 0, lifted(made.surfaces[0], 0.5))], [true]) == [False, False, True, True]
 
 
@@ -223,18 +234,18 @@ def test_a_bent_face_needs_half_of_its_area_in_matched_pieces() -> None:
     assert found([with_face(true, 0, None)], [true]) == [True] * 4
     assert found([with_face(true, 1, None)], [true]) == [False, False, True, True]
     score = score_faces([with_face(true, 1, None)], reference([true]))
-    assert [row.verdict for row in score.models] == [FaceVerdict.RIGHT] * 3  # a piece of a lost face is not wrong
-    assert [row.matched for row in score.reference] == [True, False, True, True]
+    assert [row.verdict for row in rows(score.made)] == [FaceVerdict.RIGHT] * 3  # a piece of a lost face is not wrong
+    assert [row.matched for row in rows(score.true)] == [True, False, True, True]
 
 
 def test_area_and_points_of_a_bent_face_are_summed() -> None:
     true = bent_gable("t", bend=0.5)
     points = {("t", 0): 4, ("t", 1): 7, ("t", 2): 4, ("t", 3): 6}
     score = score_faces([true], reference([true], face_points=points))
-    assert [row.to_be_found for row in score.reference] == [True, True, False, False]
-    assert [row.n_points for row in score.reference] == [4, 7, 4, 6]
-    assert score.reference[0].area_m2 < 10.0 < score.reference[0].unit_area_m2
-    assert score.reference[0].unit_area_m2 == pytest.approx(score.reference[0].area_m2 + score.reference[1].area_m2)
+    assert [row.to_be_found for row in rows(score.true)] == [True, True, False, False]
+    assert [row.n_points for row in rows(score.true)] == [4, 7, 4, 6]
+    assert rows(score.true)[0].area_m2 < 10.0 < rows(score.true)[0].unit_area_m2
+    assert rows(score.true)[0].unit_area_m2 == pytest.approx(rows(score.true)[0].area_m2 + rows(score.true)[1].area_m2)
 
 
 # ----------------------------------------------------------------------- what need not be found, what is no fault
@@ -253,7 +264,7 @@ def test_small_faces_are_neither_right_nor_wrong() -> None:
         ([true[0], flat("much", 20.0, width=6.0, depth=6.0)], [FaceVerdict.RIGHT, FaceVerdict.WRONG], 0.5),
     ):
         score = score_faces(models, known)
-        assert [row.verdict for row in score.models] == verdicts
+        assert [row.verdict for row in rows(score.made)] == verdicts
         facts = {one.name: one for one in measures(score, subsets(known)[0])}
         assert facts["faces.completeness_10m2"].value == 1.0
         assert facts["faces.completeness_10m2"].n == 1
@@ -265,7 +276,7 @@ def test_faces_with_too_few_points_need_not_be_found() -> None:
     points = {("a", 0): 11, ("a", 1): 10, ("c", 0): 500}
     known = reference(TRUTH, face_points=points)
     score = score_faces(TRUTH, known)
-    assert [row.to_be_found for row in score.reference] == [True, False, *[False] * 4, True]
+    assert [row.to_be_found for row in rows(score.true)] == [True, False, *[False] * 4, True]
     facts = {one.name: one for one in measures(score, subsets(known)[0])}
     assert (facts["faces.completeness_10m2"].value, facts["faces.completeness_10m2"].n) == (1.0, 2)
     assert (facts["faces.correctness_10m2"].value, facts["faces.correctness_10m2"].n) == (1.0, 2)
@@ -283,7 +294,7 @@ def test_what_the_data_edge_cuts_is_neither_found_nor_wrong() -> None:
         [TRUTH[0], dataclasses.replace(other, touches_data_edge=False)],
     ):
         score = score_faces(models, known)
-        assert [row.verdict for row in score.models[2:]] == [FaceVerdict.LEFT_OUT] * (len(models) - 1)
+        assert [row.verdict for row in rows(score.made)[2:]] == [FaceVerdict.LEFT_OUT] * (len(models) - 1)
         facts = {one.name: one for one in measures(score, subsets(known)[0])}
         assert [facts[name].value for name in SHARES] == [1.0] * len(SHARES)
         assert facts["faces.completeness_all"].n == facts["faces.topology_1_1"].value == 2
@@ -297,7 +308,7 @@ def test_faces_of_models_that_call_themselves_cut_are_wrong_all_the_same() -> No
     tree = flat("tree", 200.0)
     plain = score_faces([*lifted_all, tree], known)
     claimed = score_faces([dataclasses.replace(one, touches_data_edge=True) for one in (*lifted_all, tree)], known)
-    assert [row.verdict for row in claimed.models] == [row.verdict for row in plain.models]
+    assert [row.verdict for row in rows(claimed.made)] == [row.verdict for row in rows(plain.made)]
     assert figures(claimed, known)["correctness_10m2"] == 0.0
 
 
@@ -305,7 +316,7 @@ def test_a_face_over_everything_is_wrong_however_far_it_goes_beyond_the_extent()
     known = reference(TRUTH)
     wide = dataclasses.replace(flat("lid").surfaces[0], polygon=by_hand.EXTENT.buffer(2_000.0))
     score = score_faces([*TRUTH, with_face(flat("lid"), 0, wide)], known)
-    assert score.models[-1].verdict is FaceVerdict.WRONG
+    assert rows(score.made)[-1].verdict == FaceVerdict.WRONG
 
 
 def test_a_face_elsewhere_is_wrong_only_where_the_reference_is_complete() -> None:
@@ -313,13 +324,13 @@ def test_a_face_elsewhere_is_wrong_only_where_the_reference_is_complete() -> Non
     for extent, verdict in ((by_hand.EXTENT, FaceVerdict.WRONG), (None, FaceVerdict.LEFT_OUT)):
         known = reference(TRUTH, extent=extent)
         score = score_faces([*TRUTH, far], known)
-        assert score.models[-1].verdict is verdict
-        assert score.models[-1].building == -1
+        assert rows(score.made)[-1].verdict == verdict
+        assert rows(score.made)[-1].building == -1
         facts = figures(score, known)
         assert facts["correctness_10m2"] == pytest.approx(7 / 8 if extent else 1.0)
         assert facts["completeness_10m2"] == 1.0
     high = with_face(TRUTH[2], 0, lifted(TRUTH[2].surfaces[0], 3.0))
-    assert score_faces([high], reference(TRUTH, extent=None)).models[0].verdict is FaceVerdict.WRONG
+    assert rows(score_faces([high], reference(TRUTH, extent=None)).made)[0].verdict == FaceVerdict.WRONG
 
 
 def test_good_and_hard_buildings_are_separate() -> None:
@@ -340,7 +351,7 @@ def test_good_and_hard_buildings_are_separate() -> None:
 def test_without_true_faces_there_is_nothing_to_say() -> None:
     known = reference(TRUTH, has_faces=False)
     score = score_faces(TRUTH, known)
-    assert score == FaceScore(reference=(), models=(), components=())
+    assert score == FaceScore(true={}, made={}, components={})
     assert measures(score, subsets(known)[0]) == []
 
 
@@ -364,9 +375,9 @@ def test_the_score_does_not_change_where_the_scene_moves_or_turns(x: float, y: f
         [moved(one, x, y, 7.0, turn) for one in models],
         reference([moved(one, x, y, 7.0, turn) for one in truth], extent=None),
     )
-    assert [row.found for row in before.reference] == [row.found for row in after.reference]
-    assert [row.verdict for row in before.models] == [row.verdict for row in after.models]
-    assert 0 < sum(row.found for row in before.reference) < len(before.reference)
+    assert [row.found for row in rows(before.true)] == [row.found for row in rows(after.true)]
+    assert [row.verdict for row in rows(before.made)] == [row.verdict for row in rows(after.made)]
+    assert 0 < sum(row.found for row in rows(before.true)) < len(rows(before.true))
 
 
 def test_the_score_does_not_depend_on_the_order_of_models() -> None:
@@ -375,13 +386,6 @@ def test_the_score_does_not_depend_on_the_order_of_models() -> None:
     known = reference(truth, extent=None)
     facts, other = figures(score_faces(models, known), known), figures(score_faces(models[::-1], known), known)
     assert facts == pytest.approx(other, nan_ok=True)
-
-
-# ------------------------------------------------ the slow twin: rasters of 5 cm, counting, naive double loops
-
-CELL = 0.05
-SURE_OVERLAP, SURE_OFFSET, SURE_ANGLE, SURE_HELD = 0.02, 0.01, 0.05, 0.02
-"""A face is compared where no figure that decides about it is closer to its limit than this: cells are counted."""
 
 
 def damaged(truth: list[RoofModel], random: np.random.Generator) -> list[RoofModel]:
@@ -424,183 +428,6 @@ def damaged_face(face: RoofSurface, random: np.random.Generator) -> list[RoofSur
         cuts = [face.polygon.intersection(box) for box in boxes]
         return [dataclasses.replace(face, polygon=cut) for cut in cuts if cut.geom_type == "Polygon"]
     return [face]
-
-
-class Cells:
-    """A window of a raster with 5 cm cells: row and column of its corner, and which cells are in."""
-
-    def __init__(self, row: int, column: int, inside: np.ndarray) -> None:
-        self.row, self.column, self.inside = row, column, inside
-        self.count = int(inside.sum())
-
-    @property
-    def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Middles of the cells that are in."""
-        rows, columns = np.nonzero(self.inside)
-        return (columns + self.column + 0.5) * CELL, (rows + self.row + 0.5) * CELL
-
-    def common(self, other: Cells) -> Cells:
-        row, column = max(self.row, other.row), max(self.column, other.column)
-        end = [min(one.row + one.inside.shape[0] for one in (self, other)) - row]
-        end.append(min(one.column + one.inside.shape[1] for one in (self, other)) - column)
-        if min(end) <= 0:
-            return Cells(row, column, np.zeros((0, 0), bool))
-        parts = [
-            one.inside[row - one.row : row - one.row + end[0], column - one.column : column - one.column + end[1]]
-            for one in (self, other)
-        ]
-        return Cells(row, column, parts[0] & parts[1])
-
-
-def rasterised(face: RoofSurface) -> Cells:
-    """Cells whose middles matplotlib sees inside the outline."""
-    ring = np.array(face.polygon.exterior.coords)
-    corner, end = np.floor(ring.min(axis=0) / CELL).astype(int), np.ceil(ring.max(axis=0) / CELL).astype(int)
-    columns, rows = (np.arange(end[k] - corner[k]) + 0.5 for k in (0, 1))
-    places = np.stack(np.meshgrid(columns * CELL, rows * CELL), axis=-1)
-    flat_places = places.reshape(-1, 2)
-    inside = Path(ring - corner * CELL).contains_points(flat_places)
-    for hole in face.polygon.interiors:
-        inside &= ~Path(np.array(hole.coords) - corner * CELL).contains_points(flat_places)
-    inside = inside.reshape(places.shape[:2])
-    return Cells(int(corner[1]), int(corner[0]), inside)
-
-
-Slope = tuple[float, float]
-Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
-def slow_pair(
-    cells: Cells, height: Height, slope: Slope, other: Cells, face: RoofSurface
-) -> tuple[float, float, float]:
-    """Smaller share of both, angle in degrees, offset in metres of a true area and a model face, from cells."""
-    common = cells.common(other)
-    if common.count == 0:
-        return 0.0, 180.0, 99.0
-    (a, b), (p, q, _) = slope, face.coefficients
-    dot = (a * p + b * q + 1.0) / math.sqrt((a * a + b * b + 1.0) * (p * p + q * q + 1.0))
-    difference = face.elevation(*common.places) - height(*common.places)
-    offset = float(difference.mean()) / math.sqrt(a * a + b * b + 1.0)
-    return common.count / max(cells.count, other.count), math.degrees(math.acos(min(1.0, dot))), offset
-
-
-def slow_fit(figures: tuple[float, float, float]) -> tuple[bool, bool]:
-    """Whether a pair fits, and whether that is sure."""
-    share, angle, offset = figures
-    tests = [(share, 0.5, SURE_OVERLAP, 1), (angle, 10.0, SURE_ANGLE, -1), (abs(offset), 0.3, SURE_OFFSET, -1)]
-    if any(sign * (value - limit) < -margin for value, limit, margin, sign in tests):
-        return False, True
-    return all(sign * (v - limit) >= 0 for v, limit, _, sign in tests), all(
-        abs(v - limit) > margin for v, limit, margin, _ in tests
-    )
-
-
-def slow_found(models: list[RoofModel], truth: list[RoofModel]) -> tuple[list[bool], ...]:
-    """Found and sure of every true face, matched and sure of every model face, by counting cells in naive loops."""
-    true = [(owner, face, rasterised(face)) for owner, one in enumerate(truth) for face in one.surfaces]
-    made = [(face, rasterised(face)) for one in models for face in one.surfaces]
-    group_of: list[tuple[int, int] | None] = [None] * len(made)
-    own_match, found, sure = [False] * len(true), [False] * len(true), [True] * len(true)
-    matched, matched_sure = [False] * len(made), [True] * len(made)
-    candidates = []
-    for t, (_, face, cells) in enumerate(true):
-        for m, (other, others) in enumerate(made):
-            fits, certain = slow_fit(slow_pair(cells, face.elevation, face.coefficients[:2], others, other))
-            if not certain:
-                sure[t] = matched_sure[m] = False
-            if fits:
-                candidates.append((-cells.common(others).count, t, m))
-    for _, t, m in sorted(candidates):
-        if not own_match[t] and not matched[m]:
-            own_match[t] = matched[m] = True
-            group_of[m] = (true[t][0], true[t][1].group)
-    done = set()
-    for t, (owner, first, _) in enumerate(true):
-        pieces = [k for k, (o, other, _) in enumerate(true) if o == owner and other.group == first.group >= 0] or [t]
-        if t in done:
-            continue
-        done.update(pieces)
-        area = {k: true[k][2].count * math.hypot(1.0, *true[k][1].coefficients[:2]) for k in pieces}
-        held = sum(area[k] for k in pieces if own_match[k]) / sum(area.values())
-        is_found, certain = held >= 0.5, all(sure[k] for k in pieces) and abs(held - 0.5) > SURE_HELD
-        if not is_found and len(pieces) > 1:
-            whole, height, slope = slow_union([(true[k][1], true[k][2]) for k in pieces])
-            for m, (other, others) in enumerate(made):
-                fits, known = slow_fit(slow_pair(whole, height, slope, others, other))
-                certain &= known
-                if fits and (not matched[m] or group_of[m] == (owner, first.group)):
-                    is_found = matched[m] = True
-        for k in pieces:
-            found[k], sure[k] = is_found, certain
-        if not certain and len(pieces) > 1:
-            matched_sure = [False] * len(made)
-    return found, sure, matched, matched_sure
-
-
-def slow_union(pieces: list[tuple[RoofSurface, Cells]]) -> tuple[Cells, Height, Slope]:
-    """All cells of some faces, and the plane with the mean of their elevations and rises."""
-    row, column = min(cells.row for _, cells in pieces), min(cells.column for _, cells in pieces)
-    rows = max(cells.row + cells.inside.shape[0] for _, cells in pieces) - row
-    columns = max(cells.column + cells.inside.shape[1] for _, cells in pieces) - column
-    inside = np.zeros((rows, columns), bool)
-    x, y, z, a, b = [], [], [], [], []
-    for face, cells in pieces:
-        at = cells.row - row, cells.column - column
-        inside[at[0] : at[0] + cells.inside.shape[0], at[1] : at[1] + cells.inside.shape[1]] |= cells.inside
-        x += list(cells.places[0])
-        y += list(cells.places[1])
-        z += list(face.elevation(*cells.places))
-        a += [face.coefficients[0]] * cells.count
-        b += [face.coefficients[1]] * cells.count
-    mean_x, mean_y, mean_z, rise_x, rise_y = (float(np.mean(one)) for one in (x, y, z, a, b))
-    return (
-        Cells(row, column, inside),
-        lambda u, v: mean_z + rise_x * (u - mean_x) + rise_y * (v - mean_y),
-        (rise_x, rise_y),
-    )
-
-
-def grouped(truth: list[RoofModel], random: np.random.Generator) -> list[RoofModel]:
-    """Some of the roofs with each face in two by a line across it, its lower part flatter: groups of two."""
-    changed = []
-    for one in truth:
-        faces: list[RoofSurface] = []
-        for number, face in enumerate(one.surfaces):
-            if random.random() < 0.5:
-                faces.append(dataclasses.replace(face, group=number))
-                continue
-            low_x, low_y, high_x, high_y = face.polygon.bounds
-            at = low_y + random.uniform(0.3, 0.7) * (high_y - low_y)
-            for k, box in enumerate((shapely.box(low_x, low_y, high_x, at), shapely.box(low_x, at, high_x, high_y))):
-                part = dataclasses.replace(face, polygon=face.polygon.intersection(box), group=number)
-                faces.append(turned(part, -6.0) if k else part)
-        changed.append(dataclasses.replace(one, surfaces=tuple(faces)))
-    return changed
-
-
-def assert_the_slow_twin_agrees(models: list[RoofModel], truth: list[RoofModel]) -> None:
-    score = score_faces(models, reference(truth, extent=None))
-    found, sure, matched, matched_sure = slow_found(models, truth)
-    compared = [(row.found, slow) for row, slow, certain in zip(score.reference, found, sure, strict=True) if certain]
-    assert [ours for ours, _ in compared] == [slow for _, slow in compared]
-    assert len(compared) >= 0.7 * len(found)
-    assert {slow for _, slow in compared} == {True, False}
-    made = [row.matched for row, certain in zip(score.models, matched_sure, strict=True) if certain]
-    assert made == [slow for slow, certain in zip(matched, matched_sure, strict=True) if certain]
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_counting_cells_in_naive_loops_finds_the_same_faces(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    plain = by_hand.models_of_scene(suburb(100 + seed, size_m=(150.0, 150.0)))
-    assert_the_slow_twin_agrees(damaged(plain, random), plain if seed % 2 == 0 else grouped(plain, random))
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_counting_cells_agrees_on_roofs_of_all_shapes(seed: int) -> None:
-    truth = by_hand.models_of_scene(by_hand.scene_of_all_shapes(seed))
-    assert max(face.group for one in truth for face in one.surfaces) < max(len(one.surfaces) for one in truth)
-    assert_the_slow_twin_agrees(damaged(truth, np.random.default_rng(seed)), truth)
 
 
 def test_roof_types_of_models_do_not_matter_to_faces() -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,6 @@ from pipeline.model import BoolArray, FloatArray
 from pipeline.ruler.evaluation import ground
 from pipeline.ruler.evaluation.ground import (
     DEFINITIONS,
-    GroundBlock,
     GroundOfFiles,
     GroundOfRun,
     ground_blocks,
@@ -28,7 +28,7 @@ from pipeline.ruler.evaluation.ground import (
 )
 from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
 from pipeline.ruler.evaluation.reference_points import read_points_reference
-from pipeline.ruler.evaluation.subsets import subsets
+from pipeline.ruler.evaluation.subsets import Columns, subsets
 from pipeline.scene import WindowPoints, terrain_of
 from pipeline.terrain.ground import ground_points
 from pipeline.terrain.settings import ClassesInUse, SceneSettings
@@ -50,16 +50,16 @@ def reference_of(parts: Sequence[ReferencePoints]) -> Reference:
     return dataclasses.replace(by_hand.reference([], has_faces=False, has_ground=True), tiles=tiles)
 
 
-def block(right: int, missed: int, taken: int, other: int, name: str = "t", column: int = 0) -> GroundBlock:
-    return GroundBlock(
-        tile=name,
-        row=0,
-        column=column,
-        ground_as_ground=right,
-        ground_as_object=missed,
-        object_as_ground=taken,
-        object_as_object=other,
-    )
+def blocks(*counts: tuple[int, int, int, int], tiles: str = "t") -> Columns:
+    """Blocks of ground found and missed, objects taken for ground and found; a letter names the tile of each."""
+    columns = dict(zip(("right", "missed", "taken", "other"), np.array(counts).T, strict=True))
+    return {"tile": np.array(list(tiles), object), **columns}
+
+
+def figures_of(rows: Columns) -> SimpleNamespace:
+    """The figures of the only tile."""
+    (found,) = by_hand.rows(tile_figures(rows))
+    return found
 
 
 def hilly(n: int = 40_000, side: float = 160.0, seed: int = 0) -> tuple[FloatArray, BoolArray]:
@@ -82,7 +82,7 @@ def hilly(n: int = 40_000, side: float = 160.0, seed: int = 0) -> tuple[FloatArr
 
 def test_a_table_counts_as_by_hand() -> None:
     """45 and 5 of the ground, 10 and 40 of the objects: agreement .85, by chance .5, kappa .7."""
-    (figures,) = tile_figures([block(45, 5, 10, 40)])
+    figures = figures_of(blocks((45, 5, 10, 40)))
     assert figures.type_1 == pytest.approx(0.1)
     assert figures.type_2 == pytest.approx(0.2)
     assert figures.total == pytest.approx(0.15)
@@ -96,10 +96,10 @@ def test_kappa_is_that_of_the_formula_over_single_points() -> None:
     found = np.where(rng.random(5000) < 0.85, truth, ~truth)
     xyz = np.column_stack((rng.uniform(0, 200, (5000, 2)), np.zeros(5000)))
     rows = ground_blocks(reference_of([tile(xyz, truth)]), lambda _: found)
-    assert len(rows) == 16
+    assert len(rows["tile"]) == 16
     agreed = np.mean(truth == found)
     chance = truth.mean() * found.mean() + (1 - truth.mean()) * (1 - found.mean())
-    (figures,) = tile_figures(rows)
+    figures = figures_of(rows)
     assert figures.kappa == pytest.approx((agreed - chance) / (1 - chance))
     # of two kinds, with margins alike, kappa is close to the correlation
     assert figures.kappa == pytest.approx(stats.pearsonr(truth, found).statistic, abs=0.02)
@@ -116,7 +116,7 @@ def test_kappa_is_that_of_the_formula_over_single_points() -> None:
 
 def test_perfect_labels_have_no_error_and_kappa_one() -> None:
     xyz, is_ground = hilly(500)
-    (figures,) = tile_figures(ground_blocks(reference_of([tile(xyz, is_ground)]), lambda _: is_ground))
+    figures = figures_of(ground_blocks(reference_of([tile(xyz, is_ground)]), lambda _: is_ground))
     assert (figures.type_1, figures.type_2, figures.total, figures.kappa) == (0.0, 0.0, 0.0, 1.0)
 
 
@@ -124,7 +124,7 @@ def test_only_last_returns_are_judged_and_neither_noise_nor_water() -> None:
     xyz, is_ground = hilly(100)
     points = tile(xyz, is_ground, last=np.arange(100) >= 10)
     points.classification[10:30] = np.repeat([7, 9, 18, 6], 5)
-    (figures,) = tile_figures(ground_blocks(reference_of([points]), lambda _: np.zeros(100, np.bool_)))
+    figures = figures_of(ground_blocks(reference_of([points]), lambda _: np.zeros(100, np.bool_)))
     assert figures.ground + figures.object == 90 - 15
     assert math.isnan(figures.type_2) if figures.object == 0 else figures.type_2 == 0.0
     assert figures.type_1 == 1.0
@@ -135,19 +135,19 @@ def test_what_a_file_leaves_unclassified_is_object_only_where_it_names_no_object
     points = tile(xyz, is_ground)
     points.classification[:] = np.repeat([2, 0, 1, 6], 25)
     reference = reference_of([points])
-    (every,) = tile_figures(ground_blocks(reference, lambda _: np.ones(100, np.bool_)))
+    every = figures_of(ground_blocks(reference, lambda _: np.ones(100, np.bool_)))
     assert (every.ground, every.object) == (25, 75)
     named = dataclasses.replace(reference, unclassified_is_object=False)
-    (facts,) = tile_figures(ground_blocks(named, lambda _: np.ones(100, np.bool_)))
+    facts = figures_of(ground_blocks(named, lambda _: np.ones(100, np.bool_)))
     assert (facts.ground, facts.object) == (25, 25)
 
 
 def test_tiles_are_separate_and_add_up() -> None:
-    rows = [block(10, 0, 0, 10, "a"), block(0, 10, 10, 0, "b"), block(10, 0, 0, 10, "a", 3)]
-    assert [(f.tile, f.total) for f in tile_figures(rows)] == [("a", 0.0), ("b", 1.0)]
+    rows = blocks((10, 0, 0, 10), (0, 10, 10, 0), (10, 0, 0, 10), tiles="aba")
+    assert [(one.tile, one.total) for one in by_hand.rows(tile_figures(rows))] == [("a", 0.0), ("b", 1.0)]
     measured = {m.name: m.value for m in ground_measures(rows, subsets(reference_of([]))[0])}
     assert measured["ground.total"] == pytest.approx(1 / 3)
-    assert ground_measures([], subsets(reference_of([]))[0]) == []
+    assert ground_measures({}, subsets(reference_of([]))[0]) == []
 
 
 # ------------------------------------------------------------------------------------------------------------- files
@@ -191,8 +191,8 @@ def test_files_of_another_program_give_their_ground_in_any_order_and_tiling(tmp_
     ]
     rows = ground_blocks(reference, GroundOfFiles(halves))
     direct = ground_blocks(reference, lambda _: found)
-    assert rows == direct
-    (figures,) = tile_figures(rows)
+    assert {name: column.tolist() for name, column in rows.items()} == {n: c.tolist() for n, c in direct.items()}
+    figures = figures_of(rows)
     assert figures.total == pytest.approx(np.mean(found != is_ground))
 
 
@@ -268,6 +268,6 @@ def test_samples_of_the_benchmark_stay_within_what_was_measured(shared_data: Pat
     limits = {"samp21": 0.02, "samp23": 0.05, "samp31": 0.03, "samp41": 0.045, "samp51": 0.035}
     for name, limit in limits.items():
         reference = read_points_reference([shared_data / "isprs" / f"{name}-utm.laz"])
-        (figures,) = tile_figures(ground_blocks(reference, GroundOfRun(reference, SETTINGS)))
+        figures = figures_of(ground_blocks(reference, GroundOfRun(reference, SETTINGS)))
         assert figures.total < limit, name
         assert figures.kappa > 0.88, name

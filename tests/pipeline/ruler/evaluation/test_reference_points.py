@@ -154,7 +154,7 @@ def test_without_class_6_only_the_ground_can_be_measured(tmp_path: Path) -> None
     assert reference.has_ground
     assert any("only the ground can be measured" in note for note in reference.notes)
     rows = ground_blocks(reference, lambda points: points.xyz[:, 2] < 3.0)
-    assert sum(row.ground_as_ground + row.object_as_object for row in rows) == len(xyz)
+    assert (rows["right"] + rows["other"]).sum() == len(xyz)
     assert detection_measures(detect([], reference), subsets(reference)[0]) == []
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import roofs_by_hand as by_hand
 import shapely
-from roofs_by_hand import lifted, moved, points_of, shrunk, with_face
+from roofs_by_hand import lifted, moved, points_of, shrunk, tally_rows, with_face
 from scipy.spatial import cKDTree
 
 from pipeline.model import FloatArray, LabelArray, RoofType
@@ -18,7 +18,7 @@ from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
 from pipeline.ruler.evaluation.residuals import (
     DEFINITIONS,
     EDGES_M,
-    BuildingResiduals,
+    Residuals,
     building_residuals,
     residual_measures,
     top_surface_of,
@@ -72,7 +72,7 @@ def one_house(step: float) -> Reference:
     return reference_of([truth], [tile(xyz, zeros(len(xyz)))])
 
 
-def figures(rows: Sequence[BuildingResiduals], reference: Reference) -> dict[str, Measure]:
+def figures(rows: Residuals, reference: Reference) -> dict[str, Measure]:
     return {m.name.removeprefix("residuals."): m for m in residual_measures(rows, subsets(reference)[0])}
 
 
@@ -81,14 +81,14 @@ def test_a_handful_of_points_counts_as_by_hand() -> None:
     # eave at 8, ridge at 10: the roof at y = 2 is 9 m high
     xyz = np.array([(1, 2, 9.1), (2, 2, 8.9), (3, 2, 9.4), (4, 2, 9.0), (12, 2, 9.0)], float)
     reference = reference_of([dataclasses.replace(model, footprint=shapely.box(0, 0, 13, 8))], [tile(xyz, zeros(5))])
-    (row,) = building_residuals([model], reference)
-    tally = row.all_points
+    residuals = building_residuals([model], reference)
+    (tally,) = tally_rows(residuals.all_points)
     assert (tally.n_points, tally.n_covered, tally.n_within) == (5, 4, 3)
     assert tally.sum_m == pytest.approx(0.4)
     assert tally.rmse_m == pytest.approx(math.sqrt((0.01 + 0.01 + 0.16) / 4))
     assert tally.share_within == 0.6
     assert tally.coverage == 0.8
-    measured = figures([row], reference)
+    measured = figures(residuals, reference)
     assert measured["within_0_2m"].value == 0.6
     assert measured["coverage"].value == 0.8
     assert measured["rmse"].value == pytest.approx(tally.rmse_m)
@@ -143,8 +143,8 @@ def test_rows_are_those_of_a_slow_twin_point_by_point(seed: int) -> None:
     rows = building_residuals(models, reference)
     surfaces = [surface for model in models for surface in model.surfaces]
     tree = cKDTree(xyz[:, :2])
-    for row in rows:
-        own = np.flatnonzero(building == row.building)
+    for number, tallies in enumerate(zip(tally_rows(rows.all_points), tally_rows(rows.top_visible), strict=True)):
+        own = np.flatnonzero(building == number)
         residuals, seen = [], []
         for i in own:
             x, y, z = xyz[i]
@@ -157,9 +157,9 @@ def test_rows_are_those_of_a_slow_twin_point_by_point(seed: int) -> None:
                 if distance <= limit
             ]
             residuals.append(z - max(tops) if tops else math.nan)
-            near = [j for j in tree.query_ball_point((x, y), 0.5) if building[j] == row.building]
+            near = [j for j in tree.query_ball_point((x, y), 0.5) if building[j] == number]
             seen.append(bool(np.all(xyz[near, 2] <= z + 1.1 + 1e-6)))
-        for tally, chosen in ((row.all_points, np.ones(len(own), bool)), (row.top_visible, np.array(seen))):
+        for tally, chosen in zip(tallies, (np.ones(len(own), bool), np.array(seen)), strict=True):
             all_of = np.array(residuals)[chosen]
             of = all_of[~np.isnan(all_of)]
             assert (tally.n_points, tally.n_covered) == (len(all_of), len(of))
@@ -246,12 +246,12 @@ def test_tiles_that_cut_buildings_change_nothing(cut: float) -> None:
     parts = [tile(xyz[side], building[side]) for side in (west, ~west)]
     bounds = [(*xyz[side, :2].min(axis=0), *xyz[side, :2].max(axis=0)) for side in (west, ~west)]
     split = reference_of(whole.buildings, parts, bounds)
-    for one, two in zip(building_residuals(models, whole), building_residuals(models, split), strict=True):
-        for a, b in ((one.all_points, two.all_points), (one.top_visible, two.top_visible)):
-            assert (a.n_points, a.n_covered, a.n_within) == (b.n_points, b.n_covered, b.n_within)
-            assert (a.histogram == b.histogram).all()
-            assert a.sum_squares_m2 == pytest.approx(b.sum_squares_m2)
-    assert sum(row.top_visible.n_points for row in building_residuals(models, whole)) < (building >= 0).sum()
+    one, two = building_residuals(models, whole), building_residuals(models, split)
+    for a, b in ((one.all_points, two.all_points), (one.top_visible, two.top_visible)):
+        assert (a.counts == b.counts).all()
+        assert (a.histogram == b.histogram).all()
+        assert a.sums == pytest.approx(b.sums)
+    assert one.top_visible.counts[:, 0].sum() < (building >= 0).sum()
 
 
 def test_buildings_at_the_edge_of_the_data_need_not_be_found() -> None:

@@ -239,16 +239,16 @@ def test_rows_do_not_depend_on_how_they_are_divided() -> None:
 def test_models_of_given_outlines_belong_to_the_wireframe_of_their_id() -> None:
     houses = [rectangle_at("a"), rectangle_at("b", 10.0)]
     shed = flat("shed", 7.0, width=3.0)
-    assert score_wireframes([shed], houses).rows[0].model_ids == ("shed",)
+    assert score_wireframes([shed], houses).model_ids[0] == ("shed",)
     over = flat("m", 6.0, width=5.0, source_id="b")  # mostly on a, but drawn as b
-    assert [row.model_ids for row in score_wireframes([over], houses).rows] == [(), ("m",)]
+    assert list(score_wireframes([over], houses).model_ids) == [(), ("m",)]
     elsewhere = flat("m", source_id="b")  # an id by chance: another place
-    assert [row.model_ids for row in score_wireframes([elsewhere], houses).rows] == [("m",), ()]
+    assert list(score_wireframes([elsewhere], houses).model_ids) == [("m",), ()]
 
 
 def test_neighbours_that_reach_over_are_not_judged() -> None:
     score = score_wireframes([flat("m"), flat("neighbour", 9.5)], [rectangle_at("a")])
-    assert score.rows[0].model_ids == ("m",)
+    assert score.model_ids[0] == ("m",)
     assert score.elsewhere == 1
 
 
@@ -262,9 +262,9 @@ def test_the_order_of_the_models_does_not_matter() -> None:
 
 def test_a_wireframe_with_a_gap_still_has_a_place() -> None:
     open_ends = drawn("a", [(0, 0, 6), (10, 0, 6), (10, 8, 6), (0, 8, 6), (0, 0.4, 6)], [*SQUARE[:3], (3, 4)])
-    assert score_wireframes([flat("m")], [open_ends]).rows[0].model_ids == ("m",)
+    assert score_wireframes([flat("m")], [open_ends]).model_ids[0] == ("m",)
     angle = drawn("a", [(0, 0, 6), (10, 0, 6), (10, 8, 6)], [(0, 1), (1, 2)])
-    assert score_wireframes([flat("m")], [angle]).rows[0].model_ids == ("m",)
+    assert score_wireframes([flat("m")], [angle]).model_ids[0] == ("m",)
 
 
 def test_wireframes_go_with_any_reference_and_show_by_building() -> None:
