@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime as dt
 import uuid
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ from sqlalchemy.engine import Connection
 from pipeline.runtime.monitoring import tracing
 from service.deliveries import Delivery
 from service.errors import NoSuchUploadError, QueueFullError, ResultNotReadyError
-from service.jobs import Job, JobRequest, JobStatus
+from service.jobs import UNLIMITED, Job, JobRequest, JobStatus, QueueLimits
 from service.store.changes import lock_job, move, note_status
 from service.store.database import LOCK_SUBMISSIONS, lock
 from service.store.policies import lease_expired
@@ -25,16 +24,6 @@ from service.store.uploads import creating
 _WATCH_WAIT_S = 0.2
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class QueueLimits:
-    """How many jobs may wait."""
-
-    max_queued: int
-    """All jobs."""
-    max_queued_per_key: int
-    """Jobs of one key."""
-
-
 class JobSubmissions(JobQueries):
     """What clients do with jobs."""
 
@@ -44,8 +33,7 @@ class JobSubmissions(JobQueries):
         *,
         owner: str | None,
         priority: int = 0,
-        max_queued: int,
-        max_queued_per_key: int,
+        limits: QueueLimits = UNLIMITED,
         delivery: Delivery[Job] | None = None,
     ) -> Job:
         """Submit a job; its row is committed when this returns.
@@ -58,8 +46,8 @@ class JobSubmissions(JobQueries):
             The key that submits; None if keys are not used, then only the whole queue is limited.
         priority : int
             Higher runs first.
-        max_queued, max_queued_per_key : int
-            Maximum number of waiting jobs, in total and of this key; running jobs do not count.
+        limits : QueueLimits
+            How many jobs may wait.
         delivery : Delivery, optional
             What is written with the job: uploads, and the answer under the request's key.
 
@@ -75,7 +63,6 @@ class JobSubmissions(JobQueries):
             The request names an upload that is gone.
         """
         with creating(self._database, delivery) as (connection, made):
-            limits = QueueLimits(max_queued=max_queued, max_queued_per_key=max_queued_per_key)
             check_queue(connection, owner, limits)
             now = self._database.now(connection)
             job_id = insert(connection, request, owner=owner, priority=priority, now=now)

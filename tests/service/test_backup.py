@@ -47,7 +47,7 @@ class Site:
     def waiting(self, upload: Upload | None = None) -> Job:
         kind, value = ("path", "/srv/a.laz") if upload is None else ("upload", upload.upload_id)
         asked = JobRequest(tiles=(InputReference(kind=kind, value=value),))
-        return self.store.create(asked, owner=None, max_queued=1000, max_queued_per_key=1000)
+        return self.store.create(asked, owner=None)
 
     def finished(self, content: str = "models") -> Job:
         self.waiting()

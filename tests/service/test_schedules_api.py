@@ -17,7 +17,6 @@ from service.keys import Scope
 from service.store.tables import UPLOADS
 
 HOUR = dt.timedelta(hours=1)
-LIMITS = {"max_queued": 1000, "max_queued_per_key": 1000}
 
 
 def body(upload: str, **values: Any) -> dict[str, Any]:
@@ -312,8 +311,8 @@ def test_the_history_of_the_slots_is_shown(local_service) -> None:
     made = make(local_service, cron="0 * * * *", timeZone="UTC")
     store = local_service.store
     start = store.schedules.get(made["scheduleID"]).next_at
-    store.schedules.tick(now=start + 5 * HOUR, **LIMITS)
-    store.schedules.tick(now=start + 6 * HOUR, **LIMITS)
+    store.schedules.tick(now=start + 5 * HOUR)
+    store.schedules.tick(now=start + 6 * HOUR)
     answer = local_service.client.get(f"/schedules/{made['scheduleID']}/runs")
     skipped, submitted, missed = answer.json()["runs"]
     assert [one["outcome"] for one in (skipped, submitted, missed)] == ["skipped", "submitted", "missed"]

@@ -33,14 +33,12 @@ from service.errors import (
     TooManySchedulesError,
     UploadInUseError,
 )
-from service.jobs import Job, JobStatus
+from service.jobs import Job, JobStatus, QueueLimits
 from service.keys import Scope, new_key
 from service.schedules import COUNTED, Definition, Schedule, ScheduleRun, Trigger
 from service.store import JobFilter, JobStore, ScheduleFilter, schedules
 from service.store.slot_book import MAX_KEPT, SlotBook
 from service.store.tables import SCHEDULE_RUNS, SCHEDULES, UPLOADS
-
-LIMITS = {"max_queued": 10_000, "max_queued_per_key": 10_000}
 
 
 def definition(cron: str = "@hourly", zone: str = "UTC", **values: Any) -> Definition:
@@ -59,7 +57,7 @@ def make(store: JobStore, *, owner: str | None = None, at: dt.datetime = NOON, *
 
 def tick(store: JobStore, now: dt.datetime) -> list[tuple[Outcome, dt.datetime | None, int]]:
     """What one tick decides: outcome, slot, how many."""
-    return [(run.outcome, run.slot, run.slots) for run in store.schedules.tick(now=now, **LIMITS)]
+    return [(run.outcome, run.slot, run.slots) for run in store.schedules.tick(now=now)]
 
 
 def jobs_of(store: JobStore, schedule: Schedule) -> list[Job]:
@@ -79,9 +77,8 @@ def end(store: JobStore, job: Job) -> None:
 def assert_not_there(store: JobStore, schedule_id: str, **owner: str) -> None:
     """To all questions the answer is that there is no such schedule."""
     book = store.schedules
-    run_now = functools.partial(book.run_now, **LIMITS)
     change = functools.partial(book.change, definition=definition(), version=1)
-    for ask in (book.get, book.remove, book.runs, run_now, change):
+    for ask in (book.get, book.remove, book.runs, book.run_now, change):
         with pytest.raises(NoSuchScheduleError, match="no schedule"):
             ask(schedule_id, **owner)
 
@@ -379,7 +376,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
     def test_a_full_queue_is_reported_and_leaves_no_half_a_job(self, store: JobStore) -> None:
         made = make(store, owner="k")
         submit(store, owner="k")
-        entries = store.schedules.tick(now=NOON + HOUR, max_queued=10, max_queued_per_key=1)
+        entries = store.schedules.tick(now=NOON + HOUR, limits=QueueLimits(max_queued=10, max_queued_per_key=1))
         assert [(run.outcome, run.job_id) for run in entries] == [(Outcome.FAILED, None)]
         assert "1 jobs of this key wait, the limit is 1" in entries[0].message
         assert runs_of(store, made) == entries
@@ -393,7 +390,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         made = make(store, request=request(sent.upload_id, "upload"))
         with store._database.write() as connection:
             connection.execute(sa.delete(UPLOADS))
-        (entry,) = store.schedules.tick(now=NOON + HOUR, **LIMITS)
+        (entry,) = store.schedules.tick(now=NOON + HOUR)
         assert (entry.outcome, entry.job_id) == (Outcome.FAILED, None)
         assert sent.upload_id in entry.message
         assert jobs_of(store, made) == []
@@ -406,7 +403,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         tick(store, NOON + HOUR)
         end(store, jobs_of(store, made)[0])
         store.revoke_key(key.key_id)
-        (entry,) = store.schedules.tick(now=NOON + 2 * HOUR, **LIMITS)
+        (entry,) = store.schedules.tick(now=NOON + 2 * HOUR)
         assert entry.outcome is Outcome.FAILED
         assert "'old'" in entry.message
         assert "was revoked" in entry.message
@@ -417,7 +414,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         with store._database.write() as connection:
             one = sa.update(SCHEDULES).where(SCHEDULES.c.schedule_id == bad.schedule_id)
             connection.execute(one.values(time_zone="Mars/Olympus"))
-        entries = {run.schedule_id: run for run in store.schedules.tick(now=NOON + HOUR, **LIMITS)}
+        entries = {run.schedule_id: run for run in store.schedules.tick(now=NOON + HOUR)}
         assert (entries[bad.schedule_id].outcome, entries[bad.schedule_id].slot) == (Outcome.FAILED, NOON + HOUR)
         assert "Mars/Olympus" in entries[bad.schedule_id].message
         assert entries[good.schedule_id].outcome is Outcome.SUBMITTED
@@ -434,7 +431,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
 
     def test_a_run_by_hand_is_a_job_at_once_and_leaves_the_times_alone(self, store: JobStore) -> None:
         made = make(store, owner="k", title="by the hour")
-        job = store.schedules.run_now(made.schedule_id, owner="k", **LIMITS)
+        job = store.schedules.run_now(made.schedule_id, owner="k")
         assert (job.status, job.schedule_id, job.request.title) == (JobStatus.ACCEPTED, made.schedule_id, "by the hour")
         (run,) = runs_of(store, made)
         assert (run.trigger, run.outcome) == (Trigger.HAND, Outcome.SUBMITTED)
@@ -444,20 +441,20 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
 
     def test_a_run_by_hand_is_refused_while_a_job_is_under_way(self, store: JobStore) -> None:
         made = make(store, overlap=Overlap.WAIT)
-        job = store.schedules.run_now(made.schedule_id, **LIMITS)
+        job = store.schedules.run_now(made.schedule_id)
         with pytest.raises(ScheduleBusyError, match=job.job_id) as raised:
-            store.schedules.run_now(made.schedule_id, **LIMITS)
+            store.schedules.run_now(made.schedule_id)
         assert raised.value.job_id == job.job_id
         assert tick(store, NOON + HOUR) == [(Outcome.WAITING, NOON + HOUR, 1)]
         end(store, job)
-        store.schedules.run_now(made.schedule_id, **LIMITS)
+        store.schedules.run_now(made.schedule_id)
         # the slot goes on waiting for this one
         assert store.schedules.get(made.schedule_id).waiting_slot == NOON + HOUR
         assert tick(store, NOON + HOUR + MINUTE) == []
 
     def test_a_paused_schedule_can_be_run_by_hand(self, store: JobStore) -> None:
         made = make(store, is_paused=True)
-        store.schedules.run_now(made.schedule_id, **LIMITS)
+        store.schedules.run_now(made.schedule_id)
         found = store.schedules.get(made.schedule_id)
         assert (found.next_at, found.counts[Outcome.SUBMITTED]) == (None, 1)
 
@@ -465,7 +462,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         made = make(store)
         submit(store)
         with pytest.raises(QueueFullError):
-            store.schedules.run_now(made.schedule_id, max_queued=1, max_queued_per_key=1)
+            store.schedules.run_now(made.schedule_id, limits=QueueLimits(max_queued=1, max_queued_per_key=1))
         assert runs_of(store, made) == []
 
     # --- several at once, and failures
@@ -481,7 +478,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
                 return
             for schedule in made:
                 try:
-                    store.schedules.run_now(schedule.schedule_id, **LIMITS)
+                    store.schedules.run_now(schedule.schedule_id)
                 except ScheduleBusyError:
                     continue
 
