@@ -235,8 +235,7 @@ async def run_schedule(
         return store.schedules.run_now(
             schedule_id,
             owner=submitting.caller.owner,
-            max_queued=settings.max_queued,
-            max_queued_per_key=settings.max_queued_per_key,
+            limits=settings.queue_limits,
             delivery=delivery,
         )
 

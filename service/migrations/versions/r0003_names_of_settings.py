@@ -33,10 +33,6 @@ def upgrade() -> None:
                 connection.execute(sa.update(rows).where(rows.c[key] == identity).values(request=changed))
 
 
-def downgrade() -> None:
-    """Keep the new names: two old names became `min_points`, so the old ones are lost."""
-
-
 def _renamed(values: Any) -> Any:
     """A table of settings with the new names; a general setting as it is."""
     if not isinstance(values, Mapping):
