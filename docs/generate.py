@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -523,6 +524,17 @@ def party_walls() -> str:
     return "\n".join(lines) + "\n"
 
 
+VIEWER_WORDS = REFERENCE.parents[1] / "service" / "viewer" / "tests" / "words.json"
+"""The words of the web page, for its own tests: the service puts them into the page."""
+
+
+def viewer_words() -> str:
+    """The words as JSON."""
+    from service.page_words import page_words
+
+    return json.dumps(page_words(), indent=1, ensure_ascii=False) + "\n"
+
+
 PAGES: Mapping[str, Callable[[], str]] = {
     "settings.md": settings,
     "batch_file.md": batch_file,
@@ -544,6 +556,8 @@ def main() -> None:
     for name, render in PAGES.items():
         (REFERENCE / name).write_text(render(), encoding="utf-8")
         print(f"wrote docs/reference/{name}")
+    VIEWER_WORDS.write_text(viewer_words(), encoding="utf-8")
+    print(f"wrote {VIEWER_WORDS.relative_to(REFERENCE.parents[1])}")
 
 
 if __name__ == "__main__":

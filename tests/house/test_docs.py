@@ -16,8 +16,9 @@ from pipeline.export.records import SCHEMAS
 from pipeline.extras.overrides.overrides_file import overrides_of
 from pipeline.extras.papers.settings import FuzzySartSettings
 from pipeline.io import SpatialReference
-from pipeline.model import REASONS, Reason, RoofType, Status
+from pipeline.model import Reason, RoofType, Status
 from pipeline.parameters import Parameters
+from pipeline.reasons import REASONS
 from pipeline.roof.settings import RoofSettings, RoofTypeSettings
 from pipeline.ruler.epochs.settings import DiffSettings, read_settings
 from pipeline.settings import RunSettings
@@ -58,6 +59,10 @@ GENERATED = (
 def test_a_generated_page_is_what_the_code_says(generator: ModuleType, page: str) -> None:
     assert tuple(generator.PAGES) == GENERATED
     assert (DOCS / "reference" / page).read_text() == generator.PAGES[page](), "run make docs"
+
+
+def test_the_words_for_the_tests_of_the_page_are_those_of_the_service(generator: ModuleType) -> None:
+    assert generator.VIEWER_WORDS.read_text() == generator.viewer_words(), "run make docs"
 
 
 def test_every_option_is_in_the_reference(generator: ModuleType) -> None:
@@ -163,7 +168,9 @@ def test_every_reason_status_and_roof_type_is_reported() -> None:
     reasons = text.split("## Reasons")[1]
     assert re.findall(r"^\| `(\w+)` \|", reasons, re.MULTILINE) == [reason.value for reason in Reason]
     reported = re.findall(r"^\| `\w+` \| [\w, ]+ \| (.*) \|$", reasons, re.MULTILINE)
-    assert [re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text) for text in reported] == [REASONS[reason] for reason in Reason]
+    assert [re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text) for text in reported] == [
+        REASONS[reason].meaning for reason in Reason
+    ]
     status = text.split("## Status")[1].split("## Support")[0]
     assert re.findall(r"^\| `(\w+)` \|", status, re.MULTILINE) == [entry.value for entry in Status]
     meaning = next(column.meaning for column in COLUMNS["buildings"] if column.name == "roof_type")
