@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -23,9 +24,10 @@ from pipeline.extras.party_walls import party_wall_tables
 from pipeline.extras.publish_gis import geopackage, pmtiles
 from pipeline.extras.solar import solar_table
 from pipeline.methods import METHODS
-from pipeline.model import REASONS, Reason
+from pipeline.model import Reason
 from pipeline.parameters import Parameters
 from pipeline.quality import validity as checker
+from pipeline.reasons import REASONS
 from pipeline.ruler.epochs import records as changes_of
 from pipeline.ruler.epochs.settings import DiffSettings
 from pipeline.ruler.evaluation.chapters import TITLES
@@ -356,7 +358,7 @@ def reasons() -> str:
     modelled = {Reason.TOO_FEW_POINTS, *Reason} - (rejected - {Reason.TOO_FEW_POINTS})
 
     def rows(chosen: set[Reason]) -> list[list[object]]:
-        return [[f"`{reason.value}`", meaning] for reason, meaning in REASONS.items() if reason in chosen]
+        return [[f"`{reason.value}`", words.meaning] for reason, words in REASONS.items() if reason in chosen]
 
     lines = [
         NOTE,
@@ -594,6 +596,17 @@ def party_walls() -> str:
     return "\n".join(lines) + "\n"
 
 
+VIEWER_WORDS = REFERENCE.parents[1] / "service" / "viewer" / "tests" / "words.json"
+"""The words of the web page, for its own tests: the service puts them into the page."""
+
+
+def viewer_words() -> str:
+    """The words as JSON."""
+    from service.page_words import page_words
+
+    return json.dumps(page_words(), indent=1, ensure_ascii=False) + "\n"
+
+
 PAGES: Mapping[str, Callable[[], str]] = {
     "settings.md": settings,
     "batch_file.md": batch_file,
@@ -616,6 +629,8 @@ def main() -> None:
     for name, render in PAGES.items():
         (REFERENCE / name).write_text(render(), encoding="utf-8")
         print(f"wrote docs/reference/{name}")
+    VIEWER_WORDS.write_text(viewer_words(), encoding="utf-8")
+    print(f"wrote {VIEWER_WORDS.relative_to(REFERENCE.parents[1])}")
 
 
 if __name__ == "__main__":

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
-import pyarrow as pa
+if TYPE_CHECKING:
+    import pyarrow as pa
 
-TEXT, BOOL, INT32, INT64, FLOAT64 = pa.string(), pa.bool_(), pa.int32(), pa.int64(), pa.float64()
-TIME, WKB = pa.timestamp("us", tz="UTC"), pa.binary()
-INT32S, TEXTS, FLOAT64S = pa.list_(INT32), pa.list_(TEXT), pa.list_(FLOAT64)
+TEXT, BOOL, INT32, INT64, FLOAT64, TIME, WKB = "string", "bool", "int32", "int64", "double", "timestamp", "binary"
+INT32S, TEXTS, FLOAT32S, FLOAT64S = f"list {INT32}", f"list {TEXT}", "list float", f"list {FLOAT64}"
+"""Types of columns, as Arrow's in `arrow_type`: the names alone need not load it."""
 
 NONE = ""
 """Unit of what has none."""
@@ -29,8 +31,8 @@ class Column:
 
     name: str
     """Its name, the same in every format."""
-    kind: pa.DataType
-    """Its type in the run's own tables."""
+    word: str
+    """Its type in the run's own tables, in a word."""
     unit: str
     """Its unit; empty if it has none."""
     meaning: str
@@ -39,6 +41,11 @@ class Column:
     """The page that says more, relative to docs/reference; empty if there is none."""
     required: bool = dataclasses.field(default=False, kw_only=True)
     """Whether every row has a value."""
+
+    @property
+    def kind(self) -> pa.DataType:
+        """Its type in the run's own tables."""
+        return arrow_type(self.word)
 
     @property
     def comment(self) -> str:
@@ -364,6 +371,40 @@ BUILDINGS = (
 )
 """One row per candidate."""
 
+SHOWN: Mapping[str, Mapping[str, tuple[str, int]]] = {
+    "Height": {
+        "height_m": ("Ridge above floor", 2),
+        "ground_z": ("Ground", 2),
+        "eave_z": ("Eaves", 2),
+        "ridge_z": ("Ridge", 2),
+        "h_50p": ("Median of the roof", 2),
+    },
+    "Size": {
+        "footprint_area_m2": ("Footprint", 1),
+        "roof_area_m2": ("Roof, slanted", 1),
+        "volume_m3": ("Volume", 0),
+        "n_planes": ("Roof planes", 0),
+    },
+    "Fit to the points": {
+        "share_within_0_2m": ("Within 0.2 m of the roof", 1),
+        "rmse_m": ("RMSE", 3),
+        "p95_m": ("95th percentile", 3),
+        "coverage": ("Points covered", 1),
+        "share_below_roof": ("Points on facades and below", 1),
+        "footprint_share": ("Given footprint covered", 1),
+        "noise_m": ("Noise of the points", 3),
+        "ridge_z_sigma_m": ("Ridge uncertainty (one sigma)", 3),
+        "unexplained_m2": ("Roof unexplained by points", 1),
+        "extrapolated_share": ("Roof that was not seen", 1),
+        "largest_hole_m": ("Largest hole in the points", 1),
+        "detection_confidence": ("Confidence that it is a building", 1),
+        "n_points": ("Points", 0),
+        "density_per_m2": ("Density", 1),
+    },
+}
+"""The columns of a building that the page shows, by section: label and digits; a share is shown in percent."""
+
+
 PLANES = (
     Column("building_id", TEXT, NONE, "the building", required=True),
     Column(
@@ -506,17 +547,34 @@ KINDS = ("string", "bool", "int32", "int64", "double", "timestamp", "binary", "l
 """The types of all columns by their names (`kind_of`); every format says what it makes of each."""
 
 
+def arrow_type(word: str) -> pa.DataType:
+    """The Arrow type of a word.
+
+    >>> arrow_type(INT32S)
+    ListType(list<item: int32>)
+    """
+    import pyarrow as pa
+
+    if word.startswith("list "):
+        return pa.list_(arrow_type(word.removeprefix("list ")))
+    return pa.timestamp("us", tz="UTC") if word == TIME else pa.type_for_alias(word)
+
+
 def schema_of(columns: Iterable[Column]) -> pa.Schema:
     """The Arrow schema of some columns, in their order."""
+    import pyarrow as pa
+
     return pa.schema([pa.field(one.name, one.kind, nullable=not one.required) for one in columns])
 
 
 def kind_of(kind: pa.DataType) -> str:
     """The name of a column's type in the reference and in the mappings of the formats.
 
-    >>> kind_of(pa.list_(pa.int32())), kind_of(pa.timestamp("us", tz="UTC")), kind_of(pa.uint64())
-    ('list', 'timestamp', 'uint64')
+    >>> [kind_of(arrow_type(word)) for word in (INT32S, TIME, FLOAT64)]
+    ['list', 'timestamp', 'double']
     """
+    import pyarrow as pa
+
     if pa.types.is_timestamp(kind):
         return "timestamp"
     return "list" if pa.types.is_list(kind) else str(kind)

@@ -70,6 +70,11 @@ class HeaderBlock:
         return min([*later, self.file_size])
 
 
+def promised_points(path: Readable) -> int:
+    """The number of points in the header; raises as `read_header_block`."""
+    return read_header_block(path).point_count
+
+
 def read_header_block(path: Readable) -> HeaderBlock:
     """The header of a LAS or LAZ file, checked.
 

@@ -16,8 +16,9 @@ from pipeline.export.records import SCHEMAS
 from pipeline.extras.overrides.overrides_file import overrides_of
 from pipeline.extras.papers.settings import FuzzySartSettings
 from pipeline.io import SpatialReference
-from pipeline.model import REASONS, Reason, RoofType, Status
+from pipeline.model import Reason, RoofType, Status
 from pipeline.parameters import Parameters
+from pipeline.reasons import REASONS
 from pipeline.roof.settings import RoofSettings, RoofTypeSettings
 from pipeline.ruler.epochs.settings import DiffSettings, read_settings
 from pipeline.settings import RunSettings
@@ -59,6 +60,10 @@ GENERATED = (
 def test_a_generated_page_is_what_the_code_says(generator: ModuleType, page: str) -> None:
     assert tuple(generator.PAGES) == GENERATED
     assert (DOCS / "reference" / page).read_text() == generator.PAGES[page](), "run make docs"
+
+
+def test_the_words_for_the_tests_of_the_page_are_those_of_the_service(generator: ModuleType) -> None:
+    assert generator.VIEWER_WORDS.read_text() == generator.viewer_words(), "run make docs"
 
 
 def test_every_option_is_in_the_reference(generator: ModuleType) -> None:

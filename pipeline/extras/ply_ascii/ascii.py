@@ -47,7 +47,7 @@ class AsciiFile:
 
     Parameters
     ----------
-    columns : str, optional
+    ascii_columns : str, optional
         Names of the columns, parted by spaces, such as `x y z - classification` or `x1 y1 z1 i1 x2 y2 z2 i2`;
         None to find out.
     facts : FileFacts, optional
@@ -63,13 +63,13 @@ class AsciiFile:
         If the columns do not fit the rows.
     """
 
-    def __init__(self, path: Readable, columns: str | None = None, facts: FileFacts | None = None) -> None:
+    def __init__(self, path: Readable, ascii_columns: str | None = None, facts: FileFacts | None = None) -> None:
         self._path = path
         self._width = 0
         self._separator: str | None = None
         self._promised: int | None = None
         self._header_lines, header, sample = self._look(path)
-        self._columns = self._choose(columns, header, sample)
+        self._columns = self._choose(ascii_columns, header, sample)
         self._is_pairs = "x2" in self._columns
         self.facts = self._measure(sample) if facts is None else facts
 

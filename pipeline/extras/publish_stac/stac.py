@@ -18,6 +18,7 @@ import shapely
 
 from pipeline.export.columns import COLUMNS, kind_of
 from pipeline.export.projection import Project
+from pipeline.io.formats import FORMATS
 
 VERSION = "1.1.0"
 """Version of STAC."""
@@ -55,13 +56,7 @@ DOCUMENTS: Mapping[str, tuple[str, str, str, str]] = {
     "points/tileset.json": ("points", "application/json", "visual", "3D Tiles: the points over the models"),
 }
 """Name, media type, role and title of the assets of a Collection, by their files in the run directory."""
-ENCODINGS: Mapping[str, tuple[str, str]] = {
-    "las": ("LAS", "application/vnd.las"),
-    "laz": ("LASzip", "application/vnd.laszip"),
-    "copc": ("COPC", "application/vnd.laszip+copc"),
-    "ply": ("PLY", "application/octet-stream"),
-    "ascii": ("text", "text/plain"),
-}
+ENCODINGS = {name: entry for form in FORMATS for name, entry in form.encodings.items()}
 """`pc:encoding` and media type of the formats of points."""
 _KINDS = {"i": "signed", "u": "unsigned", "f": "floating"}
 _DEGREE_DIGITS = 7

@@ -11,7 +11,7 @@ from pipeline.extras.remote.remote_file import RemoteFile
 from pipeline.extras.remote.retries import GaveUpError, persistently
 from pipeline.extras.remote.urls import filesystem_of, scheme_of
 from pipeline.extras.vector_files.tile_index import TileIndex, read_tile_index
-from pipeline.io.formats import ASCII_SUFFIXES, POINT_SUFFIXES, VALID, first_bytes, is_index, looks_like_points
+from pipeline.io.formats import ASCII, POINT_SUFFIXES, VALID, first_bytes, is_index, looks_like_points
 from pipeline.io.locations import name_in, shown
 
 
@@ -67,6 +67,6 @@ def _is_point_file(url: str) -> bool:
     name = name_in(url).lower()
     if name.startswith(".") or not name.endswith(POINT_SUFFIXES):
         return False
-    if not name.endswith(ASCII_SUFFIXES):
+    if not name.endswith(ASCII.suffixes):
         return True
     return looks_like_points(first_bytes(RemoteFile(url)))

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import pyarrow as pa
-
-from pipeline.export.columns import COUNT, FLOAT64, HORIZONTAL, INT32, NONE, SHARE, TEXT, WKB, Column
+from pipeline.export.columns import COUNT, FLOAT32S, FLOAT64, HORIZONTAL, INT32, NONE, SHARE, TEXT, WKB, Column
 from pipeline.export.result_file import SUFFIX, ResultFile, with_bbox
 
 __all__ = ["COLUMNS", "FACTS", "SCHEMA", "SUFFIX", "SolarFile"]
@@ -25,7 +23,7 @@ COLUMNS = (
     Column("sky_view", FLOAT64, SHARE, "sky view factor, (1 + cos tilt) / 2 in the open; null without a face"),
     Column(
         "horizon_deg",
-        pa.list_(pa.float32()),
+        FLOAT32S,
         "deg",
         "elevation of the horizon in 72 azimuths, 5 degrees apart, from north clockwise, mean of the points; "
         "null without a face",
