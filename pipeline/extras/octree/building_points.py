@@ -1,7 +1,7 @@
 """The points of one building, cut out of the nodes that hold some, without a numerical library.
 
-The files are those of `pipeline.extras.octree.point_glb`. Points of one building follow each other there, so its bytes are
-copied as they are; each node of the octree becomes a node of the new file, with the translation and scale of its own.
+The files are those of `pipeline.extras.octree.point_glb`. Points of one building follow each other there, so its bytes
+are copied as they are; each node of the octree becomes a node of the new file, with its own translation and scale.
 """
 
 from __future__ import annotations
