@@ -25,8 +25,9 @@ from typing import IO, Any
 from pipeline.errors import CrsError, EmptyInputError, InputError, UnreadableInputError
 from pipeline.io.area_of_use import Location
 from pipeline.io.crs import LARGEST_COORDINATE
-from pipeline.io.formats import VECTOR_SUFFIXES, recognise_format
+from pipeline.io.formats import FORMATS, VECTOR_SUFFIXES, recognise_format
 from pipeline.io.temporary import temporary_folder
+from pipeline.registry import loaded
 from service.errors import TooLargeError
 from service.vectors import examine_vector
 from service.wording import as_inputs
@@ -80,14 +81,14 @@ def _examine_points(path: Path, max_points: int) -> dict[str, Any]:
     """Format, count, CRS, bounds of a point cloud."""
     name = recognise_format(path)
     _check_count(path, _count_before_reading(path, name), max_points)
-    if name != "las" and path.stat().st_size > PASS_BYTES:
+    if not FORMATS[name].has_bounds and path.stat().st_size > PASS_BYTES:
         return _only_counted(path, name)
-    from pipeline.io.source import READERS, ReadOptions, open_source
+    from pipeline.io.source import ReadOptions, open_file, open_source
 
     try:
         known = open_source(path).info
     except CrsError as fault:
-        facts = READERS[name](path, ReadOptions()).facts
+        facts = open_file(path, ReadOptions()).facts
         _check_facts(path, facts.point_count, facts.bounds, max_points)
         crs = None if facts.crs is None else {"name": facts.crs.name, "epsg": facts.crs.to_epsg()}
         return _points(
@@ -182,19 +183,13 @@ def promised_points(path: Path) -> int | None:
         Not a supported format, or the header is damaged.
     """
     name = recognise_format(path)
-    return None if name == "ascii" else _count_before_reading(path, name)
+    return _count_before_reading(path, name) if FORMATS[name].promised else None
 
 
 def _count_before_reading(path: Path, name: str) -> int:
     """Points by the header, or for text the largest possible number, without parsing any."""
-    if name == "las":
-        from pipeline.io.las_header import read_header_block
-
-        return read_header_block(path).point_count
-    if name == "ply":
-        from pipeline.extras.ply_ascii.ply import promised_vertices
-
-        return promised_vertices(path)
+    if FORMATS[name].promised:
+        return int(loaded(FORMATS[name].promised)(path))
     lines = 1
     with path.open("rb") as stream:
         while block := stream.read(BLOCK_BYTES):

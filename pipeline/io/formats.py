@@ -2,14 +2,87 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io.locations import is_url
 from pipeline.io.records import Readable
 
-MAGIC = {b"LASF": "las", b"ply\n": "ply", b"ply\r": "ply"}
-"""Formats by their first bytes."""
+File = TypeVar("File", bound=Readable)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PointFormat:
+    """A format of points: with its reader, all that has to be added for another one."""
+
+    name: str
+    """The word for it."""
+    words: str
+    """What it is called in messages, with its endings."""
+    suffixes: tuple[str, ...]
+    """The endings of its files."""
+    magic: tuple[bytes, ...] = ()
+    """What its files begin with; none for text, which is recognised by its ending or by rows of numbers."""
+    reader: str
+    """Opens a file, as "module:name": called with it, and by name with `facts`, and `columns` if these can be named."""
+    promised: str = ""
+    """The number of points that a header promises, as "module:name", called with the file; empty without a header."""
+    has_bounds: bool = False
+    """Whether the header has the bounds, so that a look at a file does not read it through."""
+    has_parts: bool = False
+    """Whether a part of a file can be read alone."""
+    names_columns: bool = False
+    """Whether the user can name its columns."""
+    encodings: Mapping[str, tuple[str, str]]
+    """By `FileFacts.format`, the name that catalogues know (`pc:encoding` of STAC), and the media type."""
+
+
+POINT_FORMATS = (
+    PointFormat(
+        name="las",
+        words="LAS and LAZ (.las, .laz, .copc.laz)",
+        suffixes=(".las", ".laz"),
+        magic=(b"LASF",),
+        reader="pipeline.io.las:LasFile",
+        promised="pipeline.io.las_header:promised_points",
+        has_bounds=True,
+        has_parts=True,
+        encodings={
+            "las": ("LAS", "application/vnd.las"),
+            "laz": ("LASzip", "application/vnd.laszip"),
+            "copc": ("COPC", "application/vnd.laszip+copc"),
+        },
+    ),
+    PointFormat(
+        name="ply",
+        words="PLY (.ply)",
+        suffixes=(".ply",),
+        magic=(b"ply\n", b"ply\r"),
+        reader="pipeline.extras.ply_ascii.ply:PlyFile",
+        promised="pipeline.extras.ply_ascii.ply:promised_vertices",
+        encodings={"ply": ("PLY", "application/octet-stream")},
+    ),
+    PointFormat(
+        name="ascii",
+        words="ASCII x y z (.xyz, .txt, .csv, .asc, .pts)",
+        suffixes=(".xyz", ".txt", ".csv", ".asc", ".pts"),
+        reader="pipeline.extras.ply_ascii.ascii:AsciiFile",
+        names_columns=True,
+        encodings={"ascii": ("text", "text/plain")},
+    ),
+)
+"""The formats that are read."""
+FORMATS: Mapping[str, PointFormat] = {form.name: form for form in POINT_FORMATS}
+"""These by their names."""
+ENCODINGS: Mapping[str, tuple[str, str]] = {
+    name: words for form in POINT_FORMATS for name, words in form.encodings.items()
+}
+"""The name and the media type of each `FileFacts.format`."""
+DIVISIBLE = frozenset(name for form in POINT_FORMATS if form.has_parts for name in form.encodings)
+"""Those of files of which a part can be read alone."""
 FOREIGN_MAGIC = {
     b"PK\x03\x04": "a zip archive: unpack it first",
     b"\x1f\x8b": "a gzip file: unpack it first",
@@ -24,9 +97,10 @@ FOREIGN_MAGIC = {
     b"NCOLS": "an ESRI ASCII raster, not points",
 }
 """What is often mistaken for points, and what to do with it."""
-LAS_SUFFIXES = (".las", ".laz")
-ASCII_SUFFIXES = (".xyz", ".txt", ".csv", ".asc", ".pts")
-POINT_SUFFIXES = (*LAS_SUFFIXES, ".ply", *ASCII_SUFFIXES)
+LAS_SUFFIXES = FORMATS["las"].suffixes
+_TEXT_SUFFIXES = tuple(suffix for form in POINT_FORMATS if not form.magic for suffix in form.suffixes)
+"""Endings of text, of which only what looks like points is taken from a folder."""
+POINT_SUFFIXES = tuple(suffix for form in POINT_FORMATS for suffix in form.suffixes)
 GEOJSON_SUFFIXES = (".geojson", ".json")
 """Endings of GeoJSON."""
 LINES_SUFFIXES = (".geojsonl", ".geojsons", ".ndjson")
@@ -52,7 +126,7 @@ UNREAD_VECTORS = {
 """Vector formats that are not read, by ending."""
 CONVERT = "Convert it to GeoPackage (.gpkg)"
 """The fix for a vector format that is not read."""
-VALID = "Valid are LAS and LAZ (.las, .laz, .copc.laz), PLY (.ply) and ASCII x y z (.xyz, .txt, .csv, .asc, .pts)"
+VALID = f"Valid are {', '.join(form.words for form in POINT_FORMATS[:-1])} and {POINT_FORMATS[-1].words}"
 TEXT_SUFFIXES = (".txt", ".csv", ".lst", ".list")
 """Endings of text files that may be indexes; what they begin with decides."""
 SNIFF_BYTES = 4096
@@ -89,24 +163,21 @@ def first_bytes(path: Readable) -> bytes:
 
 
 def recognise_format(path: Readable) -> str:
-    """las, ply or ascii; raises UnreadableInputError if the file is none of these, or not what its name says."""
+    """The word for a file's format; raises UnreadableInputError if it has none, or is not what its name says."""
     head, suffix = first_bytes(path), path.suffix.lower()
-    for magic, name in MAGIC.items():
-        if head.startswith(magic):
-            return name
+    for form in POINT_FORMATS:
+        if head.startswith(form.magic):
+            return form.name
     for magic, what in FOREIGN_MAGIC.items():
         if head.startswith(magic):
             raise UnreadableInputError(str(path), f"this is {what}", VALID)
-    if suffix in LAS_SUFFIXES:
-        raise UnreadableInputError(
-            str(path), f"not a LAS file: it begins with {head[:4]!r}, not b'LASF'", f"Get the file again. {VALID}"
-        )
-    if suffix == ".ply":
-        raise UnreadableInputError(
-            str(path), f"not a PLY file: it begins with {head[:4]!r}, not b'ply'", f"Get the file again. {VALID}"
-        )
-    if b"\0" not in head and (suffix in ASCII_SUFFIXES or looks_like_points(head)):
-        return "ascii"
+    for form in POINT_FORMATS:
+        if suffix in form.suffixes and form.magic:
+            begins = form.magic[0].strip()
+            problem = f"not a {form.name.upper()} file: it begins with {head[:4]!r}, not {begins!r}"
+            raise UnreadableInputError(str(path), problem, f"Get the file again. {VALID}")
+    if b"\0" not in head and (suffix in _TEXT_SUFFIXES or looks_like_points(head)):
+        return next(form.name for form in POINT_FORMATS if not form.magic)
     raise UnreadableInputError(str(path), f"format not known: it begins with {head[:8]!r}", VALID)
 
 
@@ -141,19 +212,27 @@ def files_in(folder: Path) -> list[Path]:
         raise UnreadableInputError(
             str(folder), f"the folder cannot be read ({fault.strerror or fault})", "Check its permissions"
         ) from fault
-    files = [path for path in entries if _is_point_file(path)]
-    if not files:
-        what = f"none of the {len(entries)} files in the folder is a point file" if entries else "the folder is empty"
-        raise UnreadableInputError(str(folder), what, VALID)
-    return files
+    return point_files(str(folder), entries)
 
 
-def _is_point_file(path: Readable) -> bool:
-    """Whether a file found in a folder is meant, by its suffix, and text by its content."""
-    suffix = path.suffix.lower()
-    if path.name.startswith(".") or suffix not in POINT_SUFFIXES:
+def point_files(folder: str, files: Sequence[File]) -> list[File]:
+    """Those of a folder's files that are meant: by their endings, and text by its content.
+
+    Raises UnreadableInputError without any.
+    """
+    found = [file for file in files if _is_point_file(file)]
+    if not found:
+        what = f"none of the {len(files)} files in the folder is a point file" if files else "the folder is empty"
+        raise UnreadableInputError(folder, what, VALID)
+    return found
+
+
+def _is_point_file(file: Readable) -> bool:
+    """Whether a file found in a folder is meant."""
+    suffix = file.suffix.lower()
+    if file.name.startswith(".") or suffix not in POINT_SUFFIXES:
         return False
-    return suffix not in ASCII_SUFFIXES or (path.stat().st_size > 0 and looks_like_points(first_bytes(path)))
+    return suffix not in _TEXT_SUFFIXES or (file.stat().st_size > 0 and looks_like_points(first_bytes(file)))
 
 
 def names_points(text: str) -> bool:

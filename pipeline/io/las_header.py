@@ -116,6 +116,11 @@ def read_header_block(path: Readable) -> HeaderBlock:
     return block
 
 
+def promised_points(path: Readable) -> int:
+    """The number of points that the header promises; raises as `read_header_block`."""
+    return read_header_block(path).point_count
+
+
 def _check_layout(name: str, block: HeaderBlock, header_size: int, vlr_count: int) -> None:
     """Refuse a header whose parts do not fit into the file."""
     if block.offset_to_points > block.file_size:

@@ -13,23 +13,27 @@ import datetime as dt
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.fs as pafs
 import shapely
 
 from pipeline.errors import RunError
-from pipeline.export.columns import COLUMNS, TILE_COLUMN, kind_of
+from pipeline.export.columns import COLUMNS, HORIZONTAL, TILE_COLUMN, VERTICAL, kind_of
 from pipeline.export.decisions import DECISIONS
 from pipeline.export.decisions import NAME as DECISIONS_NAME
 from pipeline.export.records import SCHEMAS
 from pipeline.export.solid_geometry import SOLID_COLUMNS
+from pipeline.extras.publish.finished_run import FinishedRun, Published, file_outside, new_file
 from pipeline.extras.publish_gis.gdal_layers import gdal_options, write_layer
-
-if TYPE_CHECKING:
-    from pipeline.extras.publish_gis.qml import Style
+from pipeline.extras.publish_gis.qml import STYLES as QGIS_STYLES
+from pipeline.extras.publish_gis.qml import Style
+from pipeline.io import arrow_at
+from pipeline.io.crs_units import unit_name
+from pipeline.runtime.monitoring.progress import Listener, ignore
 
 SUFFIX = ".gpkg"
 """Ending of the files: GDAL and QGIS warn of any other."""
@@ -243,3 +247,37 @@ class GeoPackage:
 def _zulu(at: dt.datetime) -> str:
     """A time as GDAL takes it in place of the time of day."""
     return at.astimezone(dt.UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_event: Listener = ignore) -> Published:
+    """Write a finished run as a GeoPackage, tile by tile; parameters and errors as in `publishing.Form`."""
+    target = file_outside(run_dir, out, SUFFIX, overwrite)
+    run = FinishedRun.at(run_dir, {layer.name for layer in LAYERS})
+    manifest, reference = run.manifest, run.reference
+    with new_file(target, overwrite) as path:
+        made = GeoPackage(
+            path=path,
+            wkt=(manifest.crs or {}).get("wkt"),
+            at=manifest.finished_at or manifest.started_at,
+            facts=run.facts,
+            units={
+                HORIZONTAL: unit_name(reference.horizontal_unit_m),
+                VERTICAL: unit_name(reference.vertical_unit_m),
+            },
+        )
+        rows = {}
+        for layer in LAYERS:
+            if layer.name == DECISIONS_NAME and not _has_decisions(run_dir):
+                continue
+            read = run.batches(layer.name, layer.columns, on_event)
+            rows[layer.name] = made.write(layer, (stored_batch(batch, layer, tile) for tile, batch in read))
+        made.write_styles(QGIS_STYLES)
+        run.check(rows)
+    return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)
+
+
+def _has_decisions(run_dir: str) -> bool:
+    """Whether a run has the table: those of older versions lack it."""
+    filesystem, place = arrow_at(run_dir)
+    found = filesystem.get_file_info(f"{place.rstrip('/')}/{DECISIONS_NAME}")
+    return bool(found.type is pafs.FileType.Directory)

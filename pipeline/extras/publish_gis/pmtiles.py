@@ -10,7 +10,7 @@ from __future__ import annotations
 import datetime as dt
 import itertools
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,11 @@ import shapely
 
 from pipeline.errors import NothingToShowError
 from pipeline.export.columns import COLUMNS, ELEVATIONS, TILE_COLUMN, kind_of
-from pipeline.export.projection import Project
+from pipeline.export.projection import Project, projection_to
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
+from pipeline.extras.publish.finished_run import FinishedRun, Published, file_outside, new_file
 from pipeline.extras.publish_gis.gdal_layers import write_layer
+from pipeline.runtime.monitoring.progress import Listener, ignore
 
 SUFFIX = ".pmtiles"
 """Ending of the files, by which GDAL knows the format."""
@@ -152,3 +154,26 @@ def write_pmtiles(path: Path, batches: Iterable[pa.RecordBatch], facts: Mapping[
         geometry_type="MultiPolygon",
         crs=CRS,
     )
+
+
+def publish_pmtiles(run_dir: str, out: str, *, overwrite: bool = False, on_event: Listener = ignore) -> Published:
+    """Write the footprints of a finished run; parameters and errors as in `publishing.Form`.
+
+    Raises RunError if the run's CRS is unknown, too.
+    """
+    target = file_outside(run_dir, out, SUFFIX, overwrite)
+    run = FinishedRun.at(run_dir, {LAYER})
+    project = projection_to(run.manifest.crs, CRS)
+    unit_m = run.reference.vertical_unit_m
+    read = 0
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        nonlocal read
+        for tile, batch in run.batches(LAYER, READ, on_event):
+            read += batch.num_rows
+            yield map_batch(batch, tile, project, unit_m)
+
+    with new_file(target, overwrite) as path:
+        rows = {LAYER: write_pmtiles(path, batches(), run.facts)}
+        run.check({LAYER: read})
+    return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)

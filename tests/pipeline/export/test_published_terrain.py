@@ -14,9 +14,10 @@ from glb_rules import chunks
 from small_runs import content, moved, restated, street, tiled_run
 
 from pipeline.errors import RunError
-from pipeline.extras.publish.publishing import publish_cityjson, publish_stac
+from pipeline.extras.publish.cityjson_file import publish_cityjson
 from pipeline.extras.publish_3dtiles.globe_terrain import PlacedTerrain, terrain_glb
 from pipeline.extras.publish_3dtiles.publishing_3dtiles import publish_3dtiles
+from pipeline.extras.publish_stac.stac import publish_stac
 from pipeline.extras.terrain_tin.terrain_files import TerrainTriangles, read_terrain, terrain_lines, terrain_path
 from pipeline.io import storage_at
 from pipeline.runtime.manifest_reading import read_manifest

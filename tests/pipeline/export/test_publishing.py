@@ -1,6 +1,7 @@
 """Publishing a run: all of it, nothing of it changed, and a file that is whole or the one of before."""
 
 import dataclasses
+import inspect
 import json
 import shutil
 from collections.abc import Callable
@@ -14,15 +15,18 @@ import pytest
 from command_line import invoke
 from small_runs import content, moved, restated, street, write_run, write_whole_run
 
-import pipeline.extras.publish.publishing as publishing
+import pipeline.extras.publish.cityjson_file
+import pipeline.extras.publish_gis.geopackage
 from pipeline.errors import RunError, SettingsError
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import KEYS
 from pipeline.export.tile import write_tile
-from pipeline.extras.publish.cityjson_file import city_of
-from pipeline.extras.publish.publishing import publish_cityjson, publish_geopackage, publish_pmtiles
-from pipeline.extras.publish_gis.geopackage import LAYERS, Layer, stored_batch
+from pipeline.extras.publish.cityjson_file import city_of, publish_cityjson
+from pipeline.extras.publish.publishing import FORMS, Form
+from pipeline.extras.publish_gis.geopackage import LAYERS, Layer, publish_geopackage, stored_batch
+from pipeline.extras.publish_gis.pmtiles import publish_pmtiles
 from pipeline.io import storage_at
+from pipeline.registry import loaded
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus
 
@@ -31,6 +35,16 @@ from pipeline.runtime.manifest import RunStatus
 def run_dir(tmp_path: Path) -> Path:
     """A finished run of four buildings on two tiles, whose states list their files."""
     return write_whole_run(tmp_path / "run")
+
+
+@pytest.mark.parametrize("form", FORMS.values(), ids=lambda form: form.name)
+def test_a_form_names_its_writer_and_the_options_that_it_takes(form: Form) -> None:
+    taken = inspect.signature(loaded(form.place)).parameters
+    assert list(taken)[:2] == ["run_dir", "out"]
+    assert {"overwrite", "on_event", *form.options, *form.beside} <= set(taken)
+    assert bool(form.root) == bool(form.moved) == any(one.holds == "root" for one in form.outputs)
+    assert not form.moved or callable(loaded(form.moved))
+    assert set(form.beside.values()) <= {one.output_id for one in form.outputs}
 
 
 def test_every_row_is_published_and_the_run_stays_as_it_is(run_dir: Path, tmp_path: Path) -> None:
@@ -134,7 +148,7 @@ def test_where_publishing_breaks_off_the_old_file_stays(
     out = tmp_path / "run.gpkg"
     publish_geopackage(str(run_dir), str(out))
     before = content(tmp_path)
-    monkeypatch.setattr(publishing, "stored_batch", fails_at("t2", fault))
+    monkeypatch.setattr(pipeline.extras.publish_gis.geopackage, "stored_batch", fails_at("t2", fault))
     with pytest.raises(type(fault)):
         publish_geopackage(str(run_dir), str(out), overwrite=True)
     assert content(tmp_path) == before
@@ -147,7 +161,7 @@ def test_a_run_that_changes_meanwhile_is_not_published(
         restated(run_dir, status=RunStatus.RUNNING)
         return stored_batch(batch, layer, tile)
 
-    monkeypatch.setattr(publishing, "stored_batch", changing)
+    monkeypatch.setattr(pipeline.extras.publish_gis.geopackage, "stored_batch", changing)
     with pytest.raises(RunError, match="changed while it was published"):
         publish_geopackage(str(run_dir), str(tmp_path / "run.gpkg"))
     assert not (tmp_path / "run.gpkg").exists()
@@ -190,7 +204,7 @@ def test_memory_holds_a_tile_and_not_the_run(
             held.append(pa.total_allocated_bytes())
         return stored
 
-    monkeypatch.setattr(publishing, "stored_batch", watched)
+    monkeypatch.setattr(pipeline.extras.publish_gis.geopackage, "stored_batch", watched)
     publish_geopackage(str(run_dir), str(tmp_path / "run.gpkg"))
     assert len(held) >= 8
     assert max(held) < 2 * held[0]
@@ -256,7 +270,7 @@ def test_where_cityjson_breaks_off_the_old_folder_stays(
             raise fault
         return city_of(lines)
 
-    monkeypatch.setattr(publishing, "city_of", breaking)
+    monkeypatch.setattr(pipeline.extras.publish.cityjson_file, "city_of", breaking)
     with pytest.raises(type(fault)):
         publish_cityjson(str(run_dir), str(out), overwrite=True)
     assert content(tmp_path) == before

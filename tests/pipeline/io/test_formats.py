@@ -7,8 +7,7 @@ import pytest
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io import find_inputs, open_source
-from pipeline.io.formats import recognise_format
-from pipeline.io.source import READERS
+from pipeline.io.formats import FORMATS, recognise_format
 
 
 @pytest.fixture
@@ -119,7 +118,7 @@ def test_every_format_has_its_reader(tmp_path):
     (tmp_path / "a.ply").write_bytes(b"ply\n")
     (tmp_path / "a.xyz").write_text("1 2 3\n")
     (tmp_path / "a.las").write_bytes(b"LASF")
-    assert {recognise_format(tmp_path / f"a.{suffix}") for suffix in ("ply", "xyz", "las")} == set(READERS)
+    assert {recognise_format(tmp_path / f"a.{suffix}") for suffix in ("ply", "xyz", "las")} == set(FORMATS)
 
 
 def test_links_to_one_file_are_one_input(folder):

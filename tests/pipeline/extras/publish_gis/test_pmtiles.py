@@ -24,8 +24,8 @@ from pipeline.errors import RunError, SettingsError
 from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, kind_of
 from pipeline.export.geoparquet import read_table
 from pipeline.export.projection import projection_to
-from pipeline.extras.publish.publishing import publish_pmtiles
 from pipeline.extras.publish_gis import pmtiles
+from pipeline.extras.publish_gis.pmtiles import publish_pmtiles
 from pipeline.runtime.manifest import RunStatus
 
 RD = {"wkt": pyproj.CRS.from_epsg(28992).to_wkt()}

@@ -22,11 +22,11 @@ from small_runs import content, restated, write_run, write_whole_run
 from pipeline.errors import RunError, SettingsError
 from pipeline.export.columns import COLUMNS
 from pipeline.export.geoparquet import read_table
-from pipeline.export.projection import projection_to
-from pipeline.extras.publish.publishing import publish_stac
+from pipeline.export.projection import Project, projection_to
 from pipeline.extras.publish_stac import stac
+from pipeline.extras.publish_stac.stac import publish_stac
 from pipeline.io import storage_at
-from pipeline.runtime.manifest import InputFile, PointFileFacts, RunStatus
+from pipeline.runtime.manifest import InputFile, PointFileFacts, RunManifest, RunStatus
 
 RD = {"wkt": pyproj.CRS.from_epsg(7415).to_wkt(), "epsg": 7415, "horizontal_unit_m": 1.0, "vertical_unit_m": 1.0}
 MADE = dt.datetime(2026, 1, 1, 2, tzinfo=dt.UTC)
@@ -38,6 +38,21 @@ def run_dir(tmp_path: Path) -> Path:
     run = write_whole_run(tmp_path / "my models")
     restated(run, crs=RD, finished_at=MADE, source_licence="CC-BY-4.0", tiles=("t1", "t2"))
     return run
+
+
+def catalogued(project: Project = lambda xy: xy) -> stac.Run:
+    """A run whose places are degrees."""
+    manifest = RunManifest(
+        status=RunStatus.FINISHED,
+        engine_version="1",
+        method="m",
+        settings={},
+        settings_hash="",
+        started_at=MADE,
+        finished_at=MADE,
+        crs=RD,
+    )
+    return stac.Run(name="r", manifest=manifest, project=project)
 
 
 def validated(path: Path) -> dict[str, Any]:
@@ -114,12 +129,12 @@ def test_times_are_those_of_the_points_and_else_that_of_the_run(run_dir: Path, t
     unknown = pystac.Item.from_file(str(tmp_path / "out" / "t1" / "t1.json"))
     assert (unknown.datetime, unknown.properties["processing:datetime"]) == (MADE, "2026-01-01T02:00:00Z")
     start, end = dt.datetime(2020, 5, 1, tzinfo=dt.UTC), dt.datetime(2020, 5, 2, 1, 2, 3, 4, tzinfo=dt.UTC)
-    run = stac.Run(name="r", version="1", method="m", finished_at=MADE, licence=None, crs=RD)
+    run = catalogued()
     tile = stac.TileFacts(key="t", files={}, bounds=(0.0, 0.0, 1.0, 1.0), acquired=(start, end), rows={})
-    known = stac.item(tile, run, lambda xy: xy, "")["properties"]
+    known = stac.item(tile, run, "")["properties"]
     assert (known["datetime"], known["start_datetime"]) == (None, "2020-05-01T00:00:00Z")
     assert known["end_datetime"] == "2020-05-02T01:02:03.000004Z"
-    later = stac.item(tile, run, lambda xy: xy, "") | {"id": "u"}
+    later = stac.item(tile, run, "") | {"id": "u"}
     collection = stac.collection(run, [later], [], "")
     assert collection["extent"]["temporal"]["interval"] == [[known["start_datetime"], known["end_datetime"]]]
     bare = dataclasses.replace(tile, acquired=None)
@@ -136,7 +151,7 @@ def test_times_are_compared_as_times_not_as_texts() -> None:
     """As a text, half a second after comes before."""
     at = ("2020-05-01T00:00:00Z", "2020-05-01T00:00:00.500000Z")
     items = [{"id": text, "bbox": [0.0, 0.0, 1.0, 1.0], "properties": {"datetime": text}} for text in at]
-    run = stac.Run(name="r", version="1", method="m", finished_at=MADE, licence=None, crs=RD)
+    run = catalogued()
     assert stac.collection(run, items, [], "")["extent"]["temporal"]["interval"] == [list(at)]
 
 
@@ -183,9 +198,8 @@ def test_a_place_that_is_not_on_the_earth_is_refused(run_dir: Path, tmp_path: Pa
 @pytest.mark.parametrize("flip", [1.0, -1.0])
 @pytest.mark.parametrize("size", [0.0, 1e-9, 3e-8, 1e-3])
 def test_rings_are_counterclockwise_and_never_empty(flip: float, size: float) -> None:
-    run = stac.Run(name="r", version="1", method="m", finished_at=MADE, licence=None, crs=RD)
     tile = stac.TileFacts(key="t", files={}, bounds=(5.0, 50.0, 5.0 + size, 50.0), acquired=None, rows={})
-    item = stac.item(tile, run, lambda xy: xy * (flip, 1.0), "")
+    item = stac.item(tile, catalogued(lambda xy: xy * (flip, 1.0)), "")
     place = shapely.geometry.shape(item["geometry"])
     assert place.is_valid
     assert place.area > 0.0
@@ -194,11 +208,11 @@ def test_rings_are_counterclockwise_and_never_empty(flip: float, size: float) ->
 
 
 def test_a_tile_across_180_deg_is_split_there() -> None:
-    run = stac.Run(name="r", version="1", method="m", finished_at=MADE, licence=None, crs=RD)
+    run = catalogued(lambda xy: np.where(xy > 180.0, xy - 360.0, xy))
     items = []
     for west, east in ((179.5, 180.25), (180.0, 180.5), (179.0, 179.5)):
         tile = stac.TileFacts(key="t", files={}, bounds=(west, -17.0, east, -16.0), acquired=None, rows={})
-        items.append(stac.item(tile, run, lambda xy: np.where(xy > 180.0, xy - 360.0, xy), ""))
+        items.append(stac.item(tile, run, ""))
     assert items[0]["bbox"] == [179.5, -17.0, -179.75, -16.0]
     parts = shapely.geometry.shape(items[0]["geometry"]).geoms
     assert [part.bounds for part in parts] == [(179.5, -17.0, 180.0, -16.0), (-180.0, -17.0, -179.75, -16.0)]
