@@ -2,7 +2,7 @@
 
 A layer has the columns of its table by the same names, without `bbox` (the layer has a spatial index) and without those
 of the solids: a layer has one geometry. `tile` is added, as every reader of the run's folders sees it. GeoPackage lacks
-some types of Arrow; `STORED_TYPES` says what each becomes. A layer is written as a stream of batches, so memory does
+some types of Arrow; `columns.KINDS` says what each becomes. A layer is written as a stream of batches, so memory does
 not grow with the run.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ import pyarrow.fs as pafs
 import shapely
 
 from pipeline.errors import RunError
-from pipeline.export.columns import COLUMNS, HORIZONTAL, TILE_COLUMN, VERTICAL, kind_of
+from pipeline.export.columns import COLUMNS, HORIZONTAL, KINDS, TILE_COLUMN, VERTICAL, kind_of, text_of
 from pipeline.export.decisions import DECISIONS
 from pipeline.export.decisions import NAME as DECISIONS_NAME
 from pipeline.export.records import SCHEMAS
@@ -123,23 +122,11 @@ LAYERS = (
 )
 """The layers of a file, in their order."""
 
-STORED_TYPES: Mapping[str, str] = {
-    "string": "TEXT",
-    "bool": "BOOLEAN",
-    "int32": "MEDIUMINT",
-    "int64": "INTEGER",
-    "double": "REAL",
-    "timestamp": "DATETIME",
-    "binary": "BLOB",
-    "list": "TEXT",
-}
-"""The type in the GeoPackage of each type of the tables; lists become the text of a JSON array."""
-
 
 def stored_field(field: pa.Field) -> pa.Field:
     """A column of a table as it is written; raises RunError if GeoPackage has no type for it."""
     kind = kind_of(field.type)
-    if kind not in STORED_TYPES:
+    if kind not in KINDS:
         raise RunError(
             f"column {field.name} has type {field.type}, for which GeoPackage has none: add it to the mapping"
         )
@@ -160,8 +147,7 @@ def _stored(column: pa.Array, name: str) -> pa.Array:
         return multi_polygons(column)
     kind = kind_of(column.type)
     if kind == "list":
-        texts = [None if value is None else json.dumps(value, separators=(",", ":")) for value in column.to_pylist()]
-        return pa.array(texts, pa.string())
+        return pa.array([text_of(value) for value in column.to_pylist()], pa.string())
     if kind == "timestamp":
         return pc.cast(pc.floor_temporal(column, unit="millisecond"), _MILLISECONDS)
     return column

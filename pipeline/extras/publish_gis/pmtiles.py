@@ -7,12 +7,9 @@ into tiles on the disk, so memory does not grow with the run.
 
 from __future__ import annotations
 
-import datetime as dt
 import itertools
-import json
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -20,7 +17,7 @@ import pyarrow.compute as pc
 import shapely
 
 from pipeline.errors import NothingToShowError
-from pipeline.export.columns import COLUMNS, ELEVATIONS, TILE_COLUMN, kind_of
+from pipeline.export.columns import COLUMNS, ELEVATIONS, TILE_COLUMN, kind_of, text_of
 from pipeline.export.projection import Project, projection_to
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
 from pipeline.extras.publish.finished_run import FinishedRun, Published, file_outside, new_file
@@ -45,18 +42,6 @@ GEOMETRY = "geometry"
 """The column of geometry."""
 LEFT_OUT = ("mesh_path", "input_hash", "settings_hash", "engine_version")
 """Columns that a map does not need: with them a file is a third larger, and most are the same for all buildings."""
-
-PROPERTY_TYPES: Mapping[str, str] = {
-    "string": "string",
-    "bool": "bool",
-    "int32": "int",
-    "int64": "int",
-    "double": "double",
-    "timestamp": "string, ISO 8601",
-    "binary": "none",
-    "list": "string, a JSON array",
-}
-"""The type of a value in the tiles for each type of the tables; a null is a property that is not there."""
 
 READ = tuple(
     column.name for column in COLUMNS[LAYER] if column.name not in SHAPE_COLUMNS and column.name not in LEFT_OUT
@@ -107,13 +92,7 @@ def _property(column: pa.Array, name: str, project: Project) -> pa.Array:
     kind = kind_of(column.type)
     if kind not in _TEXTS:
         return column
-    values = [None if value is None else _text(value) for value in column.to_pylist()]
-    return pa.array(values, pa.string())
-
-
-def _text(value: Any) -> str:
-    """A time or a list as text."""
-    return value.isoformat() if isinstance(value, dt.datetime) else json.dumps(value, separators=(",", ":"))
+    return pa.array([text_of(value) for value in column.to_pylist()], pa.string())
 
 
 def write_pmtiles(path: Path, batches: Iterable[pa.RecordBatch], facts: Mapping[str, str]) -> int:
