@@ -13,10 +13,10 @@ import shapely
 
 from pipeline.errors import SettingsError
 from pipeline.export.coordinates import decimals
-from pipeline.export.result_file import SUFFIX
+from pipeline.export.result_file import SUFFIX, ResultFile
 from pipeline.export.solid_geometry import SURFACES
 from pipeline.extras.party_walls.contacts import ROUNDED_M, Contacts, Walls, contacts, wall_areas
-from pipeline.extras.party_walls.party_wall_tables import PartyWallFile, WallAreaFile
+from pipeline.extras.party_walls.party_wall_tables import TABLES
 from pipeline.extras.party_walls.settings import PartyWallSettings
 from pipeline.extras.publish.finished_run import FinishedRun, Published, file_outside, new_file
 from pipeline.model import BoolArray, FaceKind
@@ -57,10 +57,10 @@ def party_walls(  # each is an option of the command
     run = _Run(run_dir, finished.manifest)
     facts = {**finished.facts, **dataclasses.asdict(settings)}
     with contextlib.ExitStack() as stack:
-        kinds = (PartyWallFile, WallAreaFile)
+        places = [stack.enter_context(new_file(target, overwrite)) for target in targets]
         files = [
-            stack.enter_context(kind(stack.enter_context(new_file(target, overwrite)), run.reference.projjson, facts))
-            for kind, target in zip(kinds, targets, strict=False)
+            stack.enter_context(ResultFile(table, place, run.reference.projjson, facts))
+            for table, place in zip(TABLES, places, strict=False)
         ]
         for done, tile in enumerate(run.tiles, start=1):
             _write_tile(files, run, tile, settings)
@@ -120,7 +120,7 @@ def _joined(lists: list[list[Any]], kind: type) -> Any:
     return np.array([value for one in lists for value in one], dtype=kind)
 
 
-def _write_tile(files: list[Any], run: _Run, tile: str, settings: PartyWallSettings) -> None:
+def _write_tile(files: list[ResultFile], run: _Run, tile: str, settings: PartyWallSettings) -> None:
     """Add the rows of a tile to the files: the pairs, and the buildings if they are wanted."""
     own = run.tile(tile)
     if not len(own.ids):
@@ -136,7 +136,7 @@ def _write_tile(files: list[Any], run: _Run, tile: str, settings: PartyWallSetti
         _write_buildings(file, tile, own, walls, found)
 
 
-def _write_pairs(file: PartyWallFile, run: _Run, tile: str, walls: Walls, found: Contacts, is_own: BoolArray) -> None:
+def _write_pairs(file: ResultFile, run: _Run, tile: str, walls: Walls, found: Contacts, is_own: BoolArray) -> None:
     """Add the pairs of different buildings of which the first is of the tile: so each pair is written once."""
     a, b = walls.building[found.first], walls.building[found.second]
     kept = np.flatnonzero(is_own[found.first] & (a != b))
@@ -163,7 +163,7 @@ def _write_pairs(file: PartyWallFile, run: _Run, tile: str, walls: Walls, found:
     file.write(columns, shapes)
 
 
-def _write_buildings(file: WallAreaFile, tile: str, own: _Tile, walls: Walls, found: Contacts) -> None:
+def _write_buildings(file: ResultFile, tile: str, own: _Tile, walls: Walls, found: Contacts) -> None:
     """Add the wall areas of the buildings of a tile."""
     areas = wall_areas(walls, found)
     order = np.argsort(own.ids)

@@ -12,12 +12,13 @@ import shapely
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import table_batches
+from pipeline.export.result_file import SUFFIX, ResultFile
 from pipeline.extras.publish.finished_run import FinishedRun, Published, file_outside, new_file
 from pipeline.extras.solar.figures import Figures, figures
 from pipeline.extras.solar.horizon import obstacles_of
 from pipeline.extras.solar.roof_planes import RoofPlanes
 from pipeline.extras.solar.settings import SolarSettings
-from pipeline.extras.solar.solar_table import SUFFIX, SolarFile
+from pipeline.extras.solar.solar_table import TABLE
 from pipeline.extras.solar.true_north import convergence_deg, longitude_and_latitude
 from pipeline.extras.solar.weather import Site, Weather, YearOfLight, clear_sky, the_pvlib, weather_of, year_of_light
 from pipeline.io import SpatialReference
@@ -65,7 +66,7 @@ def solar(  # each is an option of the command
     light, light_facts = (None, {}) if sky_only else _light(run, settings, weather, on_event)
     facts = {**finished.facts, **_assumptions(settings, run.reference), **light_facts}
     with new_file(target, overwrite) as made:
-        with SolarFile(made, run.reference.projjson, facts) as file:
+        with ResultFile(TABLE, made, run.reference.projjson, facts) as file:
             for done, tile in enumerate(run.tiles, start=1):
                 _write_tile(file, run, tile, settings, light)
                 on_event(Event(kind="progress", stage="solar", done=done, total=len(run.tiles)))
@@ -171,7 +172,7 @@ def _assumptions(settings: SolarSettings, reference: SpatialReference) -> dict[s
     }
 
 
-def _write_tile(file: SolarFile, run: _Run, tile: str, settings: SolarSettings, light: YearOfLight | None) -> None:
+def _write_tile(file: ResultFile, run: _Run, tile: str, settings: SolarSettings, light: YearOfLight | None) -> None:
     """Add the rows of a tile, if it has any."""
     columns, planes = run.tile(tile)
     if not len(planes.faces):

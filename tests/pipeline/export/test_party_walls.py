@@ -20,8 +20,9 @@ import pipeline.extras.party_walls.party_walls_of_run as runs
 from pipeline.errors import RunError, SettingsError
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import RecordContext
+from pipeline.export.result_file import ResultFile
 from pipeline.export.tile import write_tile
-from pipeline.extras.party_walls.party_wall_tables import BUILDINGS, FACTS, WALLS, PartyWallFile
+from pipeline.extras.party_walls.party_wall_tables import BUILDINGS, FACTS, WALLS
 from pipeline.extras.party_walls.party_walls_of_run import party_walls
 from pipeline.extras.party_walls.settings import PartyWallSettings
 from pipeline.model import BuildingResult, Reason, Status
@@ -203,7 +204,7 @@ def test_what_cannot_be_written_or_read_is_refused_and_leaves_the_files_of_befor
         raise RunError("the disk is gone")
 
     with monkeypatch.context() as patched:
-        patched.setattr(PartyWallFile, "write", broken)
+        patched.setattr(ResultFile, "write", broken)
         with pytest.raises(RunError, match="the disk is gone"):
             party_walls(str(run_dir), str(out), buildings=str(areas), overwrite=True)
     restated(run_dir, status=RunStatus.RUNNING)

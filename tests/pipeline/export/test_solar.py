@@ -25,11 +25,12 @@ import pipeline.extras.solar.solar_of_run as runs
 from pipeline.errors import RunError, SettingsError
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import RecordContext
+from pipeline.export.result_file import ResultFile
 from pipeline.export.tile import write_tile
 from pipeline.extras.solar.roof_planes import RoofPlanes
 from pipeline.extras.solar.settings import SolarSettings
 from pipeline.extras.solar.solar_of_run import solar
-from pipeline.extras.solar.solar_table import COLUMNS, FACTS, SolarFile
+from pipeline.extras.solar.solar_table import COLUMNS, FACTS
 from pipeline.extras.solar.true_north import convergence_deg
 from pipeline.extras.solar.weather import Site, clear_sky
 from pipeline.io import SpatialReference, storage_at
@@ -264,14 +265,14 @@ def test_where_it_breaks_off_the_old_file_stays(
 ) -> None:
     sky(run_dir, tmp_path / "sky.parquet")
     before = content(tmp_path)
-    write = SolarFile.write
+    write = ResultFile.write
 
-    def breaking(file: SolarFile, columns: Any, faces: Any) -> None:
+    def breaking(file: ResultFile, columns: Any, faces: Any) -> None:
         if columns["tile"][0] == "t2":
             raise fault
         write(file, columns, faces)
 
-    monkeypatch.setattr(SolarFile, "write", breaking)
+    monkeypatch.setattr(ResultFile, "write", breaking)
     with pytest.raises(type(fault)):
         sky(run_dir, tmp_path / "sky.parquet", overwrite=True)
     assert content(tmp_path) == before
