@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.export.glb_arrays import TYPES, add_vertices, quantized
-from pipeline.export.glb_container import QUANTIZATION, GlbFile, read_document
+from pipeline.export.glb_arrays import add_vertices, quantized
+from pipeline.export.glb_container import QUANTIZATION, GlbFile
 from pipeline.model import ByteArray, IntArray
 
 NO_BUILDING = 65_535
@@ -27,7 +27,6 @@ NO_RESIDUAL = -32_768
 UShortArray = npt.NDArray[np.uint16]
 ShortArray = npt.NDArray[np.int16]
 
-_MM = 1000
 _POINTS = 0
 _STEPS = 65_535
 
@@ -135,34 +134,3 @@ def points_glb(points: ModelledPoints, name: str, extras: Mapping[str, Any]) -> 
         "extras": {**extras, "points": len(points), "buildings": list(points.buildings), "starts": points.starts()},
     }
     return file.content([{"name": name, "mesh": 0, **place}], [mesh], used=[QUANTIZATION])
-
-
-def read_points_glb(content: bytes) -> tuple[ModelledPoints, Mapping[str, Any]]:
-    """The points of a file made by `points_glb`, and the extras of its mesh.
-
-    Coordinates have the precision of the file: half a step, or that of a float. Raises ValueError if it is another
-    kind of file.
-    """
-    document, start = read_document(content)
-    mesh, node = document["meshes"][0], document["nodes"][0]
-
-    def column(name: str, width: int) -> npt.NDArray[Any]:
-        accessor = document["accessors"][mesh["primitives"][0]["attributes"][name]]
-        view = document["bufferViews"][accessor["bufferView"]]
-        kind = np.dtype(TYPES[accessor["componentType"]])
-        values = np.frombuffer(content, kind, view["byteLength"] // kind.itemsize, start + view["byteOffset"])
-        return values.reshape(accessor["count"], -1)[:, :width]
-
-    stored = column("POSITION", 3)
-    corner = np.rint(np.array(node["translation"]) * _MM).astype(np.int64)
-    gltf = np.rint(stored * (node["scale"][0] * _MM)).astype(np.int64) + corner
-    extras = mesh["extras"]
-    points = ModelledPoints(
-        xyz_mm=np.column_stack((gltf[:, 0], -gltf[:, 2], gltf[:, 1])),
-        point_class=column("_CLASS", 1)[:, 0],
-        building=column("_BUILDING", 1)[:, 0],
-        plane=column("_PLANE", 1)[:, 0],
-        residual_mm=column("_RESIDUAL", 1)[:, 0],
-        buildings=tuple(extras["buildings"]),
-    )
-    return points, extras

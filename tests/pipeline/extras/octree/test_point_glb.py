@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from points_glb import read_points_glb
 
 from pipeline.export.glb_arrays import MAX_STEP_MM
 from pipeline.extras.octree.building_points import building_points
@@ -16,7 +17,6 @@ from pipeline.extras.octree.point_glb import (
     NO_RESIDUAL,
     ModelledPoints,
     points_glb,
-    read_points_glb,
     united,
 )
 
