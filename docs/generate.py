@@ -18,7 +18,6 @@ import typer
 from pipeline.batch.batch_file import TABLES
 from pipeline.cli import command_line as built
 from pipeline.console import EXIT_CODES
-from pipeline.export import cityjson
 from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, Column
 from pipeline.extras.party_walls import party_wall_tables
 from pipeline.extras.publish_gis import geopackage, pmtiles
@@ -42,11 +41,7 @@ REFERENCE = Path(__file__).resolve().parent / "reference"
 NOTE = "<!-- Written by `make docs` from the code; do not edit. -->"
 
 TITLES_OF_TABLES = {layer.name: f"{layer.description}." for layer in geopackage.LAYERS}
-FORMATS = {
-    "GeoPackage": geopackage.STORED_TYPES,
-    "CityJSON": cityjson.ATTRIBUTE_TYPES,
-    "PMTiles": pmtiles.PROPERTY_TYPES,
-}
+FORMATS = {"GeoPackage": "geopackage", "CityJSON": "cityjson", "PMTiles": "pmtiles"}
 NOTES_OF_FORMATS = [
     "- GeoPackage has no `bbox`, which the spatial index replaces, and no columns of solids, since a layer has one",
     "  geometry. `geometry` is a MultiPolygon in each layer, a single Polygon too; a MultiPolygon Z in `planes`.",
@@ -61,6 +56,11 @@ NOTES_OF_FORMATS = [
     "  `int` and `double` are equal numbers; a double may be stored as an integer or a float that equals it. A null is",
     "  a property that is not there. JavaScript reads integers beyond 2^53 inexactly.",
 ]
+
+
+def types_in(kind: str) -> list[str]:
+    """What a type of the tables becomes in each of `FORMATS`."""
+    return [getattr(KINDS[kind], name) for name in FORMATS.values()]
 
 
 def cell(text: object) -> str:
@@ -548,7 +548,10 @@ def columns() -> str:
         "",
         "GeoParquet holds the types as they are. The other formats lack some of them.",
         "",
-        *table(["type", *FORMATS], [[f"`{kind}`", *(types[kind] for types in FORMATS.values())] for kind in KINDS]),
+        *table(
+            ["type", *FORMATS],
+            [[f"`{kind}`", *(getattr(types, name) for name in FORMATS.values())] for kind, types in KINDS.items()],
+        ),
         "",
         *NOTES_OF_FORMATS,
     ]

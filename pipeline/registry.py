@@ -26,8 +26,8 @@ def extra(name: str) -> Any:
 
     Examples
     --------
-    >>> extra("lower_lods").__name__
-    'lower_lods'
+    >>> extra("ObjectStorage").__name__
+    'ObjectStorage'
     """
     return loaded(f"pipeline.extras.{EXTRAS[name]}")
 
@@ -81,6 +81,6 @@ EXTRAS: Mapping[str, str] = {
 }
 """Where the extras add to a run: what the core asks for by name, and its "folder.module:name".
 
-Formats of points (`FORMATS`), methods (`METHODS`), ground filters (`FILTERS`) and commands (`COMMANDS`) have tables of
+Methods (`METHODS`), ground filters (`FILTERS`), formats of points (`FORMATS`) and commands (`COMMANDS`) have tables of
 their own.
 """

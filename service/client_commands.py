@@ -15,6 +15,7 @@ import typer
 from pipeline.cli.options import AsJson, Quiet, SettingsFile, set_parameters, takes_options
 from pipeline.console import Console, ExitCode, exit_code_of
 from pipeline.errors import SettingsError
+from pipeline.extras.publish.publishing import FORMS
 from pipeline.options import served
 
 if TYPE_CHECKING:
@@ -162,7 +163,7 @@ def submit(
         typer.Option(
             "--publish",
             metavar="FORMAT",
-            help="Also 3dtiles, geopackage, pmtiles, cityjson, stac, solar or party-walls; repeat for several.",
+            help=f"Also {', '.join(list(FORMS)[:-1])} or {list(FORMS)[-1]}; repeat for several.",
         ),
     ] = None,
     geoid_height: Annotated[

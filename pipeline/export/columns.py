@@ -7,8 +7,10 @@ from these lists. A column has the same name in every format; `docs/reference/co
 from __future__ import annotations
 
 import dataclasses
+import datetime as dt
+import json
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -543,8 +545,38 @@ TILE_COLUMN = Column("tile", TEXT, NONE, "key of the tile on the lattice, such a
 """The column that the names of a run's folders hold; other formats have it as a column of its own."""
 
 
-KINDS = ("string", "bool", "int32", "int64", "double", "timestamp", "binary", "list")
-"""The types of all columns by their names (`kind_of`); every format says what it makes of each."""
+class OtherTypes(NamedTuple):
+    """What a type of the tables becomes in other formats: a word for it, and what is in it."""
+
+    geopackage: str
+    """The type of SQL."""
+    tiles: str
+    """Type, and component or content, in a property table of 3D Tiles. Whole numbers of 64 bits become floating-point
+    numbers, exact to 2^53, since JavaScript would have them as BigInt, which does not mix with numbers."""
+    pmtiles: str
+    """The type of a value in vector tiles; a null is a property that is not there."""
+    cityjson: str
+    """The type of JSON of an attribute; geometries are none."""
+
+
+KINDS: Mapping[str, OtherTypes] = {
+    "string": OtherTypes("TEXT", "STRING", "string", "string"),
+    "bool": OtherTypes("BOOLEAN", "BOOLEAN", "bool", "boolean"),
+    "int32": OtherTypes("MEDIUMINT", "SCALAR, INT32", "int", "number"),
+    "int64": OtherTypes("INTEGER", "SCALAR, FLOAT64", "int", "number"),
+    "double": OtherTypes("REAL", "SCALAR, FLOAT64", "double", "number"),
+    "timestamp": OtherTypes("DATETIME", "STRING, ISO 8601", "string, ISO 8601", "string, ISO 8601"),
+    "binary": OtherTypes("BLOB", "none", "none", "none"),
+    "list": OtherTypes("TEXT", "STRING, a JSON array", "string, a JSON array", "array"),
+}
+"""The types of all columns by their names (`kind_of`)."""
+
+
+def text_of(value: Any) -> str | None:
+    """A text, a time (ISO 8601) or a list (JSON) for formats that have no type for the latter; None stays None."""
+    if value is None or isinstance(value, str):
+        return value
+    return value.isoformat() if isinstance(value, dt.datetime) else json.dumps(value, separators=(",", ":"))
 
 
 def arrow_type(word: str) -> pa.DataType:

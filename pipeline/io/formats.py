@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io.locations import is_url
 from pipeline.io.records import Readable
+
+File = TypeVar("File", bound=Readable)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,6 +33,8 @@ class PointFormat:
     """Function that reads the number of points from the header, "module:function"; empty if there is no header."""
     has_bounds: bool = False
     """Whether the header has bounds, so that a file is not read through for them."""
+    has_parts: bool = False
+    """Whether a part of a file can be read alone."""
     magic: tuple[bytes, ...] = ()
     """First bytes; a format without them is known by its content."""
 
@@ -52,6 +57,7 @@ FORMATS = (
         reader="pipeline.io.las:LasFile",
         count="pipeline.io.las_header:promised_points",
         has_bounds=True,
+        has_parts=True,
         magic=(b"LASF",),
     ),
     PointFormat(
@@ -74,6 +80,10 @@ FORMATS = (
 )
 """All formats of points, those with first bytes of their own first."""
 LAS, _, ASCII = FORMATS
+ENCODINGS: Mapping[str, tuple[str, str]] = {name: words for form in FORMATS for name, words in form.encodings.items()}
+"""The encoding and the media type of each `FileFacts.format` in STAC."""
+DIVISIBLE = frozenset(name for form in FORMATS if form.has_parts for name in form.encodings)
+"""Those of files of which a part can be read alone."""
 FOREIGN_MAGIC = {
     b"PK\x03\x04": "a zip archive: unpack it first",
     b"\x1f\x8b": "a gzip file: unpack it first",
@@ -199,19 +209,27 @@ def files_in(folder: Path) -> list[Path]:
         raise UnreadableInputError(
             str(folder), f"the folder cannot be read ({fault.strerror or fault})", "Check its permissions"
         ) from fault
-    files = [path for path in entries if _is_point_file(path)]
-    if not files:
-        what = f"none of the {len(entries)} files in the folder is a point file" if entries else "the folder is empty"
-        raise UnreadableInputError(str(folder), what, VALID)
-    return files
+    return point_files(str(folder), entries)
 
 
-def _is_point_file(path: Readable) -> bool:
-    """Whether a file found in a folder is meant, by its suffix, and text by its content."""
-    suffix = path.suffix.lower()
-    if path.name.startswith(".") or suffix not in POINT_SUFFIXES:
+def point_files(folder: str, files: Sequence[File]) -> list[File]:
+    """Those of a folder's files that are meant: by their endings, and text by its content.
+
+    Raises UnreadableInputError without any.
+    """
+    found = [file for file in files if _is_point_file(file)]
+    if not found:
+        what = f"none of the {len(files)} files in the folder is a point file" if files else "the folder is empty"
+        raise UnreadableInputError(folder, what, VALID)
+    return found
+
+
+def _is_point_file(file: Readable) -> bool:
+    """Whether a file found in a folder is meant."""
+    suffix = file.suffix.lower()
+    if file.name.startswith(".") or suffix not in POINT_SUFFIXES:
         return False
-    return suffix not in ASCII.suffixes or (path.stat().st_size > 0 and looks_like_points(first_bytes(path)))
+    return suffix not in ASCII.suffixes or (file.stat().st_size > 0 and looks_like_points(first_bytes(file)))
 
 
 def names_points(text: str) -> bool:

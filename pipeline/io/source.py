@@ -16,7 +16,7 @@ from pipeline.errors import CrsError, InconsistentInputError, SettingsError
 from pipeline.io.area_of_use import Location, location_of
 from pipeline.io.crs import SpatialReference
 from pipeline.io.crs_resolution import resolve_reference
-from pipeline.io.formats import PointFormat, recognise_format
+from pipeline.io.formats import DIVISIBLE, PointFormat, recognise_format
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.io.places import file_at
 from pipeline.io.reading import one_input
@@ -139,7 +139,7 @@ class SourceInfo:
     @property
     def is_divisible(self) -> bool:
         """Whether each share of it can be read alone: text can only be read from its first line on."""
-        return self.format in {"las", "laz", "copc"}
+        return self.format in DIVISIBLE
 
     @property
     def location(self) -> Location | None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pipeline.export.columns import COUNT, FLOAT32S, FLOAT64, HORIZONTAL, INT32, NONE, SHARE, TEXT, WKB, Column
-from pipeline.export.result_file import SUFFIX, ResultFile, with_bbox
-
-__all__ = ["COLUMNS", "FACTS", "SCHEMA", "SUFFIX", "SolarFile"]
+from pipeline.export.result_file import ResultTable, with_bbox
 
 FACTS = "gablework_solar"
 """The key of the file's metadata that holds the assumptions, as JSON."""
@@ -47,8 +45,5 @@ SCHEMA = with_bbox(COLUMNS)
 """The schema of the file."""
 
 
-class SolarFile(ResultFile):
-    """The file, while it is being written."""
-
-    columns = COLUMNS
-    facts_key = FACTS
+TABLE = ResultTable(COLUMNS, FACTS)
+"""The table."""
