@@ -18,6 +18,7 @@ from pipeline.io import storage_at
 from pipeline.registry import loaded
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.monitoring.progress import Event
 
 Write = Callable[..., Any]
 FOLDERS = {"3dtiles", "cityjson", "stac"}
