@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import small_buildings as small
 from command_line import invoke
-from pipeline.runtime.monitoring.events import Event
 from small_runs import content, moved, restated, street, tiled_run
 
 from pipeline.errors import RunError, SettingsError
