@@ -10,7 +10,7 @@ from pipeline.methods import OVERHANGS
 from pipeline.model import Decision, DecisionKind, NoOverhang, Outcome, Overhangs, OverhangSource, Solid
 from pipeline.quality.validity import check_solid
 from pipeline.roof.facades import Walls
-from pipeline.roof.footprint import footprint_in_mm
+from pipeline.roof.footprint_in_mm import footprint_in_mm
 from pipeline.roof.overhangs import UndrawableError, floor_m2, overhanging_solids
 from pipeline.roof.solid import renumbered, united
 from pipeline.roof.wider_eaves import wider_parts

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from pipeline.io.records import Readable
 from pipeline.io.storage import LocalStorage, Storage
-from pipeline.io.temporary import temporary_folder
 
 if TYPE_CHECKING:
     import pyarrow.fs as pafs
@@ -48,6 +47,7 @@ def on_this_machine(location: str | Path) -> Iterator[Path]:
         yield Path(location)
         return
     from pipeline.io.remote_file import RemoteFile
+    from pipeline.io.temporary import temporary_folder
 
     file = RemoteFile(str(location))
     with temporary_folder() as folder:
@@ -65,6 +65,8 @@ def made_here(place: str) -> Iterator[str]:
     if not is_url(place):
         yield place
         return
+    from pipeline.io.temporary import temporary_folder
+
     storage = storage_at(place)
     with temporary_folder() as folder:
         yield str(folder)

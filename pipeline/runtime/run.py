@@ -29,12 +29,11 @@ from pipeline.runtime.stages.cleanup import tidy
 from pipeline.runtime.stages.content_digest import STAGE as DIGEST
 from pipeline.runtime.stages.content_digest import content_digest
 from pipeline.runtime.stages.counts import about_emptiness, run_counts
-from pipeline.runtime.stages.given_files import footprints_for, guides_for, overrides_for
 from pipeline.runtime.stages.ground import Ground, find_ground
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.publish import Published, RunOutput, publish
-from pipeline.runtime.stages.read_inputs import read_inputs
+from pipeline.runtime.stages.read_inputs import footprints_for, guides_for, overrides_for, read_inputs
 from pipeline.runtime.stages.reconstruct import Models, models_stage, reconstruct
 from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import Splits, split

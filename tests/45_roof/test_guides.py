@@ -18,7 +18,7 @@ from pipeline.model import FloatArray, Guide, GuideKind
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.arrangement.candidate_lines import CandidateLines
 from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides, with_guides
-from pipeline.roof.footprint import footprint_in_mm
+from pipeline.roof.footprint_in_mm import footprint_in_mm
 from pipeline.roof.guided_faces import guided_faces, misfits_of
 from pipeline.roof.guides import followed, guided_outline, inner_pieces, pieces_of
 from pipeline.roof.partition import RoofPartition

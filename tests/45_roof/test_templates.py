@@ -15,7 +15,7 @@ from shapely import Polygon
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, Plane, Reason, Solid
 from pipeline.quality.validity import check_solid
-from pipeline.roof.footprint import footprint_in_mm
+from pipeline.roof.footprint_in_mm import footprint_in_mm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import solid_parts
 from pipeline.roof.templates.drawing import lower_piece

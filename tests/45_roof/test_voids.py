@@ -6,7 +6,7 @@ import shapely
 from shapely import MultiPolygon
 
 from pipeline.model import FloatArray
-from pipeline.roof.footprint import footprint_in_mm
+from pipeline.roof.footprint_in_mm import footprint_in_mm
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.voids import without_voids
 
