@@ -10,14 +10,13 @@ import numpy as np
 from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, Decision, Doubt, Plane, RoofType, Segmentation
 from pipeline.quality.validity import check_solid
-from pipeline.roof.floor_cut import cut_at_floor
 from pipeline.roof.forms import FaceForm
 from pipeline.roof.named_form import RankedFaces
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints
 from pipeline.roof.solid import LodParts, SolidPart, solid_parts
 from pipeline.roof.unlike_points import contradiction_of
-from pipeline.roof.unsupported_faces import goes_far, level_unsupported_faces, levelled_share_of
+from pipeline.roof.unsupported_faces import cut_at_floor, goes_far, level_unsupported_faces, levelled_share_of
 
 _MUCH_LEVELLED = 0.05
 """Share of the plan. Where faces of more than this had to be made level, other forms are drawn and compared with it."""

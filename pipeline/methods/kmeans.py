@@ -26,10 +26,16 @@ from pipeline.model import FloatArray, LabelArray, Plane, PlanFace, PreparedClou
 from pipeline.prepared_cloud import require_visible
 from pipeline.roof.primitives import BuildingPrimitive, fit_box, fit_gable
 from pipeline.segmentation.facet_clusters import connected_parts
-from pipeline.segmentation.facet_geometry import facet_areas_m2, facet_normals, noise_sigma_m, vertical_residuals_m
+from pipeline.segmentation.facet_geometry import (
+    best_fit_planes,
+    facet_areas_m2,
+    facet_normals,
+    noise_sigma_m,
+    vertical_residuals_m,
+)
 from pipeline.segmentation.facet_smoothing import passes_for_noise, smoothed_normals
 from pipeline.segmentation.kmeans_normals import FacetClusters, choose_clusters, labels_around
-from pipeline.segmentation.plane_regression import best_fit_planes, describe_planes
+from pipeline.segmentation.plane_regression import describe_planes
 from pipeline.segmentation.surrounding_ground import far_from
 from pipeline.tin.delaunay import triangulate
 

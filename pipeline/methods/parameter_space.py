@@ -19,10 +19,10 @@ from pipeline.model import BoolArray, FloatArray, LabelArray, PreparedCloud, Roo
 from pipeline.prepared_cloud import require_visible
 from pipeline.segmentation.cluster_membership import may_be_roof, refine_clusters
 from pipeline.segmentation.facet_clusters import labels_of_points
-from pipeline.segmentation.facet_geometry import facet_areas_m2, noise_sigma_m
+from pipeline.segmentation.facet_geometry import best_fit_planes, facet_areas_m2, kept_clusters, noise_sigma_m
 from pipeline.segmentation.facet_parameters import about_barycentre, cluster_means, facet_parameters
 from pipeline.segmentation.parameter_boxes import coarse_clusters
-from pipeline.segmentation.plane_regression import best_fit_planes, describe_planes, kept_clusters
+from pipeline.segmentation.plane_regression import describe_planes
 from pipeline.segmentation.point_assignment import vote_among_neighbours
 from pipeline.segmentation.region_growing import grow_regions
 from pipeline.segmentation.roof_trees import classify_2d, classify_3d, plausible_slopes

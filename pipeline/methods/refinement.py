@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.model import FloatArray, LabelArray
 from pipeline.segmentation.leftover_planes import cluster_leftovers
 from pipeline.segmentation.plane_refinement import refine_planes
-from pipeline.segmentation.plane_settings import PlaneRefinementSettings
+from pipeline.segmentation.refinement_settings import PlaneRefinementSettings
 from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
 
 

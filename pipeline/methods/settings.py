@@ -14,7 +14,7 @@ from pipeline.segmentation.clustering_settings import (
     RoofTreeSettings,
     SingleLinkageSettings,
 )
-from pipeline.segmentation.plane_settings import PlaneRefinementSettings, RegionGrowingSettings
+from pipeline.segmentation.refinement_settings import PlaneRefinementSettings, RegionGrowingSettings
 
 
 class RoofFaceSettings(Parameters):

@@ -11,7 +11,8 @@ from scipy.spatial import Delaunay
 from pipeline.errors import SettingsError
 from pipeline.terrain.ground import Terrain, ground_of
 from pipeline.terrain.hierarchical_filter import _lowest_of_cells, _without_clumps, join_planes
-from pipeline.terrain.lattice import NO_DATA, without_pits
+from pipeline.terrain.lattice import NO_DATA
+from pipeline.terrain.pits import without_pits
 from pipeline.terrain.planar_fitting import plane_around, plane_sums
 from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.tin_densification import join_facets

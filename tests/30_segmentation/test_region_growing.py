@@ -6,7 +6,7 @@ import pytest
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import FloatArray, LabelArray, Reason
-from pipeline.segmentation.plane_settings import RegionGrowingSettings
+from pipeline.segmentation.refinement_settings import RegionGrowingSettings
 from pipeline.segmentation.region_growing import grow_regions
 
 

@@ -21,8 +21,8 @@ from pipeline.kernels.union_find import united
 from pipeline.model import IntArray, Tin
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.stages.border_facets import are_beyond, facet_names, shared_facets, united_by_name
-from pipeline.runtime.stages.join import join_tiles
 from pipeline.runtime.stages.open_fragments import open_fragments
+from pipeline.runtime.stages.rehearsal import join_tiles
 from pipeline.runtime.stages.sites import FoundSites
 from pipeline.runtime.stages.split import Split, SplitFigures
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints

@@ -5,20 +5,17 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-import pickle
 import resource
 import socket
 import threading
 import time
-import traceback
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
-from pipeline.errors import GableworkError, RunCancelledError, VersionMismatchError
-from pipeline.runtime.monitoring.logs import LOG, about, facts_of_task, wants_json
-from pipeline.runtime.monitoring.versions import differences, fingerprint, versions_here, versions_of
+from pipeline.errors import GableworkError, RunCancelledError
+from pipeline.runtime.monitoring.logs import LOG, about, facts_of_task
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -96,52 +93,6 @@ def measure(function: Callable[[Task], Result], task: Task, stage: str = "") -> 
         process=process,
         peak_bytes=peak_bytes,
         tile=None if tile is None else str(tile),
-    )
-
-
-def measure_in_child(work: tuple[Callable[[Task], Result], Task, str]) -> Measured[Result]:
-    """Run one task in a child process; an unexpected error carries its traceback as a note."""
-    try:
-        return measure(*work)
-    except GableworkError:
-        raise
-    except Exception as error:
-        # a traceback does not survive pickling, a note does
-        error.add_note(traceback.format_exc())
-        raise
-
-
-def pack_tasks(function: Callable[[Task], Result], tasks: Sequence[Task]) -> bytes:
-    """A function and some of its tasks as bytes for another process.
-
-    A Dask scheduler unpickles what it passes on; with bytes it need not import what only workers need.
-    """
-    return pickle.dumps((function, tasks), protocol=pickle.HIGHEST_PROTOCOL)
-
-
-def measure_packed(client_fingerprint: str, packed: bytes, stage: str = "") -> list[Measured[Any]]:
-    """Run and measure a client's packed tasks one after the other, if this process has the client's versions.
-
-    If it has others VersionMismatchError is raised, since a late worker must not mix other versions into a result. This
-    happens before the tasks are unpickled, which could then fail in strange ways.
-    """
-    if wants_json():
-        from pipeline.runtime.monitoring.log_lines import configure_as_json
-
-        configure_as_json()
-    if client_fingerprint != fingerprint():
-        process, _ = peak_of_process()
-        differing = differences(versions_of(client_fingerprint), versions_here())
-        raise VersionMismatchError(mismatch_message([f"worker {process}: {', '.join(differing)}"]))
-    function, tasks = pickle.loads(packed)  # noqa: S301 - from the client, whose code the worker runs anyway
-    return [measure(function, task, stage) for task in tasks]
-
-
-def mismatch_message(faults: list[str]) -> str:
-    """The message of a version mismatch, from the differences of each process."""
-    return (
-        f"the processes do not run the same versions: {'; '.join(faults)}. "
-        "Install the same gablework with the same locks everywhere (one image), then start again"
     )
 
 
