@@ -13,8 +13,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
-from pipeline.geometry import spacing_over_area_m
-from pipeline.kernels.bounds import bounds_of
+from pipeline.geometry import bounds_of, spacing_over_area_m
 from pipeline.model import (
     BoolArray,
     Candidate,
@@ -33,7 +32,7 @@ from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides
 from pipeline.roof.eaves import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
 from pipeline.roof.footprint import outline
-from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels, nearest_points
+from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
 from pipeline.roof.partition import OUTSIDE, MinAreas, RoofPartition, absorb_small_regions, march
 from pipeline.roof.settings import ArrangementSettings, RoofSettings
 from pipeline.tin.delaunay import triangulate
@@ -209,6 +208,7 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
         counted[: n + m] = 1
     else:
         from pipeline.roof.footprint_in_mm import in_footprint
+        from pipeline.roof.nearest_points import nearest_points
 
         counted[: n + m] = in_footprint(given, xy_mm[: n + m])
         # beyond the footprint the faces go on, within it they close gaps that are not too wide
@@ -231,6 +231,8 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
         return RoofPlan(planes=tuple(planes), faces=partition, outline_mm=around, raw=partition)
     faces = partition
     if continued:
+        from pipeline.roof.nearest_points import nearest_points
+
         labels[:n] = fill_labels(roof.xy_mm, labels[:n])
         outside = np.flatnonzero(labels[n : n + m] < 0)
         nearest, _ = nearest_points(roof.xy_mm, samples[outside])

@@ -21,14 +21,13 @@ from pipeline.runtime.monitoring.progress import Listener, Progress, ignore, nev
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest, plan_inputs
 from pipeline.runtime.run_context import RunContext, run_context
-from pipeline.runtime.run_directory import RunDirectory, input_files
+from pipeline.runtime.run_directory import RunDirectory, about_emptiness, input_files, run_counts
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.location import check_scratch, run_scratch
 from pipeline.runtime.scratch.outcomes import Place
 from pipeline.runtime.stages.cleanup import tidy
 from pipeline.runtime.stages.content_digest import STAGE as DIGEST
 from pipeline.runtime.stages.content_digest import content_digest
-from pipeline.runtime.stages.counts import about_emptiness, run_counts
 from pipeline.runtime.stages.ground import Ground, find_ground
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.join import join

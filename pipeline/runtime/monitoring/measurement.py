@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
+import logging
 import math
 import os
 import resource
@@ -10,9 +13,9 @@ import socket
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from pipeline.errors import GableworkError, RunCancelledError
 from pipeline.runtime.monitoring.logs import LOG, about, facts_of_task
@@ -181,3 +184,46 @@ class Tallies:
 
 TALLIES = Tallies()
 """Tallies of this process."""
+
+
+TRACING_LOG = logging.getLogger("gablework.tracing")
+
+
+ENDPOINTS = ("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT")
+"""Variables that turn traces on."""
+
+
+SLOW_BUILDING_S = 1.0
+"""Seconds of a building from which it gets a span, unless `GABLEWORK_TRACE_BUILDING_S` has another number."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Part:
+    """A part of a task that gets a span of its own."""
+
+    name: str
+    """Its kind."""
+    began_s: float
+    ended_s: float
+    """Its times in seconds since 1970."""
+    error: str | None = None
+    """Why it failed."""
+    facts: Mapping[str, Any]
+    """Its attributes."""
+
+
+def traces_are_wanted() -> bool:
+    """Whether a variable names a collector."""
+    return any(os.environ.get(name) for name in ENDPOINTS)
+
+
+@functools.cache
+def slow_building_s() -> float:
+    """Seconds of a building from which it gets a span of its own; a number that makes no sense costs a warning."""
+    text = os.environ.get("GABLEWORK_TRACE_BUILDING_S", "")
+    with contextlib.suppress(ValueError):
+        seconds = float(text or SLOW_BUILDING_S)
+        if seconds >= 0.0:
+            return seconds
+    TRACING_LOG.warning("GABLEWORK_TRACE_BUILDING_S is %r: give seconds from 0 on; %g is used", text, SLOW_BUILDING_S)
+    return SLOW_BUILDING_S
