@@ -98,7 +98,10 @@ def test_a_header_comes_back_as_it_was() -> None:
 
 def test_a_stage_has_its_tiles_and_a_tile_its_parts(spans: Spans) -> None:
     progress = Progress(lambda _event: None)
-    part = measurement.Part(name="building", began_s=101.0, ended_s=102.5, error="timed_out", facts={"building_id": "b"})
+    facts = {"building_id": "b"}
+    part = measurement.Part(name="building", began_s=101.0, ended_s=102.5, error="timed_out", facts=facts)
+        name="building", began_s=101.0, ended_s=102.5, error="timed_out", facts={"building_id": "b"}
+    )
     found = Measured(result=1, seconds=4.0, cpu_s=1.0, began_s=100.0, process="far:7", peak_bytes=5, tile="0_0")
     with tracing.span("attempt", parent=ABOVE), progress.stage("reconstruct", 3):
         progress.measured(found, lambda: [part])
